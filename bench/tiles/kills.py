@@ -24,10 +24,9 @@ import numpy as np
 from radarsdf import FitConfig, TiledMap
 from radarsdf.io import Scan
 from radarsdf.map import storage
-from radarsdf.tiles.cluster import cluster_executor
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
-from radarsdf.tiles.plan import Plan, map_path
-from radarsdf.tiles.tile_fit import is_done
+from radarsdf.tiles.plan import Plan, is_done, map_path
+from radarsdf.tiles.tasks import cluster_executor
 
 from bench.growth.street import street_scans
 

@@ -25,8 +25,8 @@ from .poses.odometry import Odometry as Odometry
 from .poses.odometry import odometry as odometry
 from .poses.refine import RefinedPoses as RefinedPoses
 from .poses.refine import refine_poses as refine_poses
-from .tiles.any_map import load as load
 from .tiles.fit_tiles import fit_tiles as fit_tiles
 from .tiles.tiled_map import TiledMap as TiledMap
+from .tiles.tiled_map import load as load
 
 __version__: str

@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 import trimesh
 from radarsdf.io.npz import read_scans
-from radarsdf.tiles import cluster
+from radarsdf.tiles import tasks
 
 from .calls import QUICK, call, refusal, values
 
@@ -125,6 +125,6 @@ def test_folders_and_words_that_are_wrong(city, tmp_path, capsys):
 
 def test_no_cluster(city, capsys, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(tasks, "_CONNECT_S", 0.5)
     words = ["tiles", "fit", city, "--cluster", "tcp://127.0.0.1:9"]
     assert "127.0.0.1:9" in refusal(capsys, tmp_path, *words)

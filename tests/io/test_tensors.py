@@ -12,8 +12,8 @@ import pytest
 import radarsdf
 from radarsdf import LiveMap
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.map.storage import load_contents
 from radarsdf.tiles.plan import Plan, map_path
-from radarsdf.tiles.tile_fit import contents_of_tile
 
 from bench.stress import samples
 
@@ -43,9 +43,7 @@ def written_tile(scene, folder):
     scans = radarsdf.io.Scans(scene.points, scene.poses)
     radarsdf.fit_tiles(scans, folder / "city", config=CONFIG, progress=False)
     plan = Plan.load(folder / "city")
-    return map_path(folder / "city", plan.tiles[0]), lambda _: contents_of_tile(
-        folder / "city", plan, plan.tiles[0]
-    )
+    return map_path(folder / "city", plan.tiles[0]), load_contents
 
 
 def written_live_state(scene, folder):

@@ -10,7 +10,7 @@ import radarsdf
 from radarsdf import FitConfig, LiveMap
 from radarsdf._core import cell_keys
 from radarsdf.live.ghosts import means_of, surfels_of
-from radarsdf.live.regions import REGION_CELLS, RegionTable, cubes_of, regions_of, regions_round
+from radarsdf.live.regions import REGION_CELLS, RegionTable, region_places
 from radarsdf.map.mesh import Surface
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.sums import lattice_of
@@ -26,7 +26,7 @@ def keys_of(cells):
 @pytest.mark.parametrize("leaves_per_cell", [1, 2])
 def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
     keys = keys_of(CELLS)
-    table = RegionTable(leaves_per_cell, number=np.zeros(0))
+    table = RegionTable(leaves_per_cell, number=np.zeros(1))
     regions = np.unique(table.regions_of(keys))
     table.put(regions, {"keys": keys, "number": np.arange(len(keys)) * 1.0})
     np.testing.assert_array_equal(table.regions, regions)
@@ -34,7 +34,7 @@ def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
     np.testing.assert_array_equal(whole["keys"], keys)
     np.testing.assert_array_equal(whole["number"], np.arange(len(keys)))
     edge = REGION_CELLS // leaves_per_cell
-    for region, cube in zip(regions, cubes_of(regions), strict=True):
+    for region, cube in zip(regions, region_places(regions), strict=True):
         expected = (lattice_of(keys) // edge == cube).all(axis=1)
         np.testing.assert_array_equal(table.gather(region[None])["number"], np.flatnonzero(expected))
     some = regions[::3]
@@ -42,16 +42,6 @@ def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
     np.testing.assert_array_equal(table.regions, np.setdiff1d(regions, some))
     assert table.num_rows == (~np.isin(table.regions_of(keys), some)).sum()
     assert table.num_bytes == 16 * table.num_rows
-
-
-def test_regions_round_others_are_all_within_reach():
-    regions = regions_of(keys_of([[0, 0, 0], [63, 5, 9], [-1, 0, 0]]))
-    np.testing.assert_array_equal(cubes_of(regions).tolist(), [[-1, 0, 0], [0, 0, 0]])
-    around = cubes_of(regions_round(regions, 2)).tolist()
-    assert len(around) == 6 * 5 * 5
-    assert [-3, -2, 2] in around
-    assert [2, -2, 2] in around
-    assert len(regions_round(regions[:0], 2)) == 0
 
 
 def test_ghosts_are_those_of_all_rays_and_planes():
@@ -81,7 +71,7 @@ def test_areas_round_vertices_of_several_regions_are_those_of_all_their_triangle
         live.integrate(scans.points[i], scans.poses[i])
         live.mesh()
     growing = live._state._surface
-    assert len(growing._triangles._pieces) > 2
+    assert len(growing._triangles._parts) > 2
     found = growing.triangles().surface
     scene = growing.triangles().scene
     whole = Surface.told_by(scene, found.vertices, found.faces, found.evidence, found.cells_searched)

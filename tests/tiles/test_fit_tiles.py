@@ -9,14 +9,14 @@ import errno
 import multiprocessing
 import os
 import shutil
-from concurrent.futures import Future, ProcessPoolExecutor
-from pathlib import Path
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Scan
+from radarsdf.io.files import take_lock
 from radarsdf.map import storage
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, map_path
@@ -46,8 +46,9 @@ def tiles_of(drive, out, **arguments):
 
 
 def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
-    # Positions are rounded to float32 in another frame, and smoothing hands that on from corner to corner.
-    city = tiles_of(drive, tmp_path / "city", tile_size=512, halo=51.2, config=CONFIG)
+    # Positions are rounded to float32 in another frame. Smoothing would hand that on from vertex to vertex.
+    config = CONFIG.override(training={"start": "average"})
+    city = tiles_of(drive, tmp_path / "city", tile_size=512, halo=51.2, config=config)
     contents = {tile.tile: city.contents_of(tile.tile) for tile in city.tiles}
     assert len(contents) == 2  # the drive crosses a border, and each knows what lies within 51 m
     part = contents[0, 0]
@@ -58,15 +59,15 @@ def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
     }
     whole = radarsdf.fit(
         drive,
-        config=CONFIG.override(returns=known),
+        config=config.override(returns=known),
         origin=part.origin,
         intensity_range=scale,
         progress=False,
     )
-    np.testing.assert_array_equal(whole.field.table.leaf_keys(), part.field.table.leaf_keys())
+    np.testing.assert_array_equal(whole.field.cells.table.leaf_keys(), part.field.cells.table.leaf_keys())
     np.testing.assert_array_equal(whole.evidence.looks, part.evidence.looks)
     points = np.concatenate([s.world_points for s in drive])[::50]
-    np.testing.assert_allclose(city.sdf(points), whole.sdf(points), atol=1e-3)
+    np.testing.assert_allclose(city.sdf(points), whole.sdf(points), atol=1e-4)
     # So a return at the edge of a cell may lie in the next one.
     error = np.abs(city.intensity(points, [0, 0, 1]) - whole.intensity(points, [0, 0, 1]))
     assert error.mean() < 0.004 * (scale[1] - scale[0])
@@ -98,25 +99,6 @@ def test_done_tiles_are_kept_and_others_are_made_with_the_same_bits(drive, folde
     assert city.missing == {}
     assert {tile.name: map_path(again, tile).stat().st_mtime_ns for tile in plan.tiles[2:]} == others
     assert_same_bits(maps_of(folder), maps_of(again))
-
-
-def two_processes():
-    """Where it can be, forks of one that has imported PyTorch and has no threads."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return ProcessPoolExecutor(2, multiprocessing.get_context("spawn"))
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["radarsdf.fitting.fit", "radarsdf.map.mesh", "radarsdf.tiles.fit_tiles"])
-    return ProcessPoolExecutor(2, context)
-
-
-def test_processes_give_the_same_bits(drive, folder, tmp_path):
-    with two_processes() as executor:
-        city = tiles_of(drive, tmp_path / "city", executor=executor)
-        mesh = city.mesh(0.2, executor=executor, progress=False)
-    assert_same_bits(maps_of(folder), maps_of(tmp_path / "city"))
-    here = radarsdf.load(folder).mesh(0.2, progress=False)
-    np.testing.assert_array_equal(mesh.vertices, here.vertices)
-    np.testing.assert_array_equal(mesh.faces, here.faces)
 
 
 def test_a_tile_that_fails_is_named_and_the_others_go_on(drive, tmp_path):
@@ -203,11 +185,20 @@ def test_another_plan_is_refused(drive, folder):
         tiles_of(drive, folder, config=CONFIG.override(num_threads=2))
 
 
-def test_a_folder_of_something_else_is_left_alone(drive, tmp_path):
-    (tmp_path / "thesis.tex").write_text("all of it")
-    with pytest.raises(ValueError, match="holds other files"):
-        tiles_of(drive, tmp_path)
-    assert (tmp_path / "thesis.tex").read_text() == "all of it"
+def test_one_process_at_a_time_plans_a_folder(drive, folder, tmp_path):
+    out, lock = (
+        tmp_path / "city",
+        take_lock(folder / "plan.lock", "planned"),
+    )  # of a folder with a plan, it is free
+    os.close(lock)
+    out.mkdir()
+    lock = take_lock(out / "plan.lock", "planned")
+    with pytest.raises(BlockingIOError, match=f"city is being planned by process {os.getpid()}"):
+        plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
+    os.close(lock)
+    (out / "tiles" / "0_0").mkdir(parents=True)  # as a process that was killed leaves it
+    (out / "tiles" / "0_0" / "rays.bin").write_bytes(b"half")
+    assert plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG) == Plan.load(folder)
 
 
 def test_scans_may_come_one_after_another(drive, folder, tmp_path):
@@ -218,37 +209,6 @@ def test_scans_may_come_one_after_another(drive, folder, tmp_path):
 def changed(drive, number, **values):
     for i, scan in enumerate(drive):
         yield dataclasses.replace(scan, **values) if i == number else scan
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"T_world_sensor": None}, "scan 7 has no pose"),
-        ({"intensities": None}, "scan 7 has no intensities"),
-    ],
-)
-def test_a_bad_scan_is_named(drive, tmp_path, values, said):
-    with pytest.raises(ValueError, match=said):
-        tiles_of(changed(drive, 7, **values), tmp_path / "city")
-    assert not (tmp_path / "city" / "plan.json").exists()
-    assert tiles_of(drive, tmp_path / "city").missing == {}  # and the folder can be used again
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"T_world_sensor": np.full((4, 4), np.nan)},
-        {"points": np.zeros((0, 3)), "intensities": np.zeros(0)},
-    ],
-    ids=["pose", "empty"],
-)
-def test_a_scan_that_cannot_be_used_is_left_out(drive, tmp_path, values):
-    assert tiles_of(changed(drive, 7, **values), tmp_path / "city").missing == {}
-
-
-def test_something_that_is_no_scan(tmp_path):
-    with pytest.raises(TypeError, match="scan 0 is ndarray"):
-        tiles_of([np.zeros((3, 3))], tmp_path / "city")
 
 
 def test_a_scan_in_another_city_has_a_tile_of_its_own(drive, folder, tmp_path):
@@ -269,49 +229,47 @@ def test_a_scan_in_another_city_has_a_tile_of_its_own(drive, folder, tmp_path):
 def test_plans_of_nothing(tmp_path, drive):
     with pytest.raises(ValueError, match="there are no scans"):
         tiles_of([], tmp_path / "a")
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(ValueError, match="holds other files"):
+        tiles_of(drive, tmp_path)
+    with pytest.raises(TypeError, match="scan 0 is ndarray"):
+        tiles_of([np.zeros((3, 3))], tmp_path / "a")
     with pytest.raises(ValueError, match="no return of any scan lies within the ranges"):
         tiles_of(drive, tmp_path / "b", config=FitConfig.quick(returns={"min_range_m": 5000}))
     with pytest.raises(ValueError, match=r"halo, 25\.6 m, is larger"):
         tiles_of(drive, tmp_path / "c", halo=25.6)
 
 
-def test_a_damaged_plan(folder, tmp_path):
-    (tmp_path / "plan.json").write_text((folder / "plan.json").read_text()[:200])
-    with pytest.raises(ValueError, match="is not a whole plan"):
-        radarsdf.load(tmp_path)
-    (tmp_path / "plan.json").write_text((folder / "plan.json").read_text())
-    with pytest.raises(ValueError, match=r"no tile of .* is done"):
-        radarsdf.load(tmp_path)
+@pytest.mark.parametrize(
+    ("values", "said"), [({"T_world_sensor": None}, "no pose"), ({"intensities": None}, "no intensities")]
+)
+def test_a_bad_scan_is_named(drive, tmp_path, values, said):
+    with pytest.raises(ValueError, match=f"scan 7 has {said}"):
+        tiles_of(changed(drive, 7, **values), tmp_path / "city")
+    assert not (tmp_path / "city" / "plan.json").exists()
+    assert tiles_of(drive, tmp_path / "city").missing == {}  # and the folder can be used again
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-@pytest.mark.parametrize("written", ["rays.bin", "map.safetensors"])
-def test_a_full_disk_is_said_and_what_was_done_is_kept(drive, folder, tmp_path, monkeypatch, written):
+def test_scans_that_cannot_be_used_are_left_out(drive, tmp_path):
+    empty = {"points": np.zeros((0, 3)), "intensities": np.zeros(0)}
+    scans = changed(changed(drive, 7, T_world_sensor=np.full((4, 4), np.nan)), 3, **empty)
+    assert tiles_of(scans, tmp_path / "city").missing == {}
+
+
+def test_a_full_disk_is_said_and_what_was_done_is_kept(drive, folder, tmp_path, monkeypatch):
     out = tmp_path / "city"
-    if written == "rays.bin":
-        monkeypatch.setattr("radarsdf.tiles.ray_files.rays_path", lambda *_: Path("/dev/full"))
-        with pytest.raises(OSError, match="No space left"):
-            plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
-        monkeypatch.undo()
-    else:
-        plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
-        names = [tile.name for tile in Plan.load(out).tiles]
-        run_fits(out, names=names[:1], progress=False)
+    names = [tile.name for tile in plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG).tiles]
+    with pytest.raises(ValueError, match=r"no tile of .* is done"):
+        radarsdf.load(out)
+    run_fits(out, names=names[:1], progress=False)
 
-        def full(*_):
-            raise OSError(errno.ENOSPC, "No space left on device")
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-        monkeypatch.setattr("radarsdf.map.storage.write_whole", full)
-        city = run_fits(out, progress=False)
-        assert list(city.missing) == names[1:]
-        assert set(city.missing.values()) == {"[Errno 28] No space left on device"}
-        monkeypatch.undo()
+    with monkeypatch.context() as patched:
+        patched.setattr("radarsdf.map.storage.write_whole", full)
+        assert run_fits(out, progress=False).missing == dict.fromkeys(
+            names[1:], "[Errno 28] No space left on device"
+        )
     assert tiles_of(drive, out).missing == {}
     assert_same_bits(maps_of(folder), maps_of(out))
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_cannot_be_written(drive, tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(PermissionError):
-        tiles_of(drive, tmp_path / "city")

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.tiles.grid import TileGrid, neighbours
+from radarsdf.tiles.plan import TileGrid, neighbours
 
 GRID = TileGrid(tile_m=12.8, halo_m=6.4, corner_m=-2.0)
 

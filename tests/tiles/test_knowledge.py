@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from radarsdf.map import queries
-from radarsdf.tiles.knowledge import knowledge
+from radarsdf.tiles.blend import knowledge
 
 from .conftest import TILE_M
 
@@ -102,21 +102,6 @@ def test_the_gradient_is_that_of_the_distance_there(disputed, points_on_border):
     error = np.linalg.norm(disputed.gradient(x) - expected, axis=1)
     assert np.nanmedian(error) < 0.01
     assert np.nanquantile(error, 0.8) < 0.1
-
-
-def test_what_one_tile_alone_knows_is_its_answer(disputed, points_on_border):
-    knowing = [share.rows for share in disputed.known_shares(points_on_border)]
-    tiles = np.bincount(np.concatenate(knowing), minlength=len(points_on_border))
-    alone = 0
-    for share in disputed.known_shares(points_on_border):
-        rows = share.rows[tiles[share.rows] == 1]
-        local = share.local[torch.from_numpy(tiles[share.rows] == 1)]
-        expected = queries.signed_distance(share.contents, local).numpy()
-        found = disputed.sdf(points_on_border.astype(np.float64))[rows].astype(np.float32)
-        np.testing.assert_array_equal(found, expected)
-        alone += len(rows)
-    assert alone > 10
-    assert (tiles == 2).sum() > 10
 
 
 def everywhere(cells):

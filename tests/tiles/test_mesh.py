@@ -6,13 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import radarsdf
 import trimesh
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Threshold
-
-from .conftest import TILE_M
 
 
 def in_one_go(city, steps, min_triangles):
@@ -55,35 +52,7 @@ def test_the_mesh_is_that_of_all_cells_at_once(city, steps, min_triangles):
     assert len(expected) > 5000
     assert found == expected
     assert len(found) == len(mesh.faces)  # no doubled triangle
-
-
-def test_what_is_too_uncertain_is_left_out_in_every_tile(city):
-    all_of_it = {"min_confidence": 0.0, "min_component_triangles": 0, "progress": False}
-    whole = city.mesh(0.2, max_uncertainty=np.inf, **all_of_it)
-    uncertainty_m = whole.vertex_attributes["uncertainty_m"]
-    limit_m = float(np.nanmedian(uncertainty_m))  # NaN: no return is near
-    mesh = city.mesh(0.2, max_uncertainty=limit_m, **all_of_it)
-    certain = whole.faces[(uncertainty_m <= limit_m)[whole.faces].all(axis=1)]
-    assert 1000 < len(certain) < 0.8 * len(whole.faces)
-    assert triangles(mesh.vertices, mesh.faces) == triangles(whole.vertices, certain)
-
-
-def open_edges(vertices, faces, corner_m):
-    """Number of edges with one triangle, of those whose both ends are on a border between tiles."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, counts = np.unique(edges, axis=0, return_counts=True)
-    places = (vertices[edges][:, :, :2] - corner_m) / TILE_M
-    on_border = (np.abs(places - np.round(places)) < 1e-9).all(axis=1).any(axis=1)
-    assert on_border.sum() > 50
-    return int((counts[on_border] == 1).sum()), int((counts > 2).sum())
-
-
-def test_no_gap_at_borders(city):
-    mesh = city.mesh(0.2, min_component_triangles=0, progress=False)
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)  # welded
-    # The surface itself may end on a border, and as often in a mesh that knows no tiles.
-    corner_m = city.plan.grid.corner_m
-    assert open_edges(mesh.vertices, mesh.faces, corner_m) == open_edges(*in_one_go(city, 1, 0), corner_m)
 
 
 def test_export_writes_the_same_mesh(city, tmp_path):
@@ -128,24 +97,10 @@ def test_voxels_that_do_not_divide_cells(city):
     for size in (0.3, 0.15, 0.07):
         with pytest.raises(ValueError, match="do not divide leaf cells"):
             city.mesh(size)
-
-
-def test_limits_are_checked_first(city):
     with pytest.raises(ValueError, match="min_confidence must be in"):
         city.mesh(0.2, min_confidence=2)
-    with pytest.raises(ValueError, match="voxel_size must be"):
-        city.mesh(-1)
     with pytest.raises(TypeError, match="boxes"):
         city.mesh(0.2, boxes=None)
-
-
-def test_the_surface_is_where_one_map_has_it(city, drive):
-    whole = radarsdf.fit(drive, config=city.config, progress=False)
-    mesh = city.mesh(0.2, progress=False)
-    distance_m = np.abs(whole.sdf(np.array(mesh.vertices)))
-    assert np.quantile(distance_m, 0.9) < 0.01
-    at_border = np.abs(mesh.vertices[:, 1] / TILE_M - np.round(mesh.vertices[:, 1] / TILE_M)) < 0.05
-    assert np.quantile(distance_m[at_border], 0.9) < 0.01
 
 
 def test_a_mesh_that_memory_cannot_hold(city, tmp_path, monkeypatch):

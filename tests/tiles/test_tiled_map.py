@@ -9,7 +9,6 @@ import pickle
 import numpy as np
 import pytest
 import radarsdf
-import torch
 from radarsdf import TiledMap
 
 from .conftest import CONFIG, TILE_M
@@ -57,46 +56,11 @@ def test_no_step_between_tiles(city, points, offset_m):
     assert np.median(np.abs(after - before)) < 0.01
 
 
-def test_the_gradient_is_that_of_the_blended_distance(city, points):
-    # Inside a cell, the field of a quick map is trilinear, and so is that of each tile.
-    near = near_borders(points) + [0.05, 0.03, 0.02]
-    near = near[city.observed(near)]
-    step = 1e-3
-    expected = np.stack([
-        (city.sdf(near + step * axis) - city.sdf(near - step * axis)) / (2 * step) for axis in np.eye(3)
-    ], axis=1)  # fmt: skip
-    error = np.linalg.norm(city.gradient(near) - expected, axis=1)
-    assert np.median(error) < 0.01
-    assert np.quantile(error, 0.9) < 0.1
-
-
 def test_little_memory_gives_the_same_bits(folder, city, points):
     small = TiledMap(folder, memory_bytes=1)
     np.testing.assert_array_equal(small.sdf(points), city.sdf(points))
     assert len(small._held) == 1
     assert len(city._held) == len(city.tiles)
-
-
-def test_far_from_all_tiles(city):
-    there = np.array([[1e6, 1e6, 0.0]])
-    assert np.isnan(city.sdf(there)).all()
-    assert np.isnan(city.gradient(there)).all()
-    assert np.isnan(city.intensity(there, [0, 0, 0])).all()
-    assert np.isnan(city.uncertainty(there)).all()
-    assert not city.observed(there).any()
-    assert city.confidence(there) == 0
-    assert city.sdf(np.zeros((0, 3))).shape == (0,)
-
-
-def test_tensors_and_types(city, points):
-    some = points[:10].astype(np.float32)
-    assert city.sdf(some).dtype == np.float32
-    assert city.sdf(some.tolist()).dtype == np.float64
-    answer = city.gradient(torch.from_numpy(some))
-    assert answer.dtype == torch.float32
-    assert answer.shape == (10, 3)
-    with pytest.raises(ValueError, match=r"shape \(N, 3\)"):
-        city.sdf(points[0])
 
 
 def test_views_are_those_of_one_map(city, whole, drive):
@@ -141,18 +105,3 @@ def test_echoes_of_tiles_are_those_of_one_map(drive, tmp_path):
         means = [getattr(e, name) @ w for e, w in zip((found, expected), weights, strict=True)]
         np.testing.assert_allclose(*means, rtol=0.005)
     assert abs(found.sigma / expected.sigma - 1) < 0.03
-
-
-def test_planes_take_one_pass_over_the_tiles(city, monkeypatch):
-    x = np.asarray(city.mesh(0.2).vertices, np.float64)
-    distance_m, gradient = city.sdf(x), city.gradient(x)
-    passes = []
-    shares = type(city).known_shares
-    monkeypatch.setattr(
-        type(city), "known_shares", lambda *args, **options: passes.append(1) or shares(*args, **options)
-    )
-    found_m, normals = city.tangent_planes(x)
-    assert len(passes) == 1
-    length = np.linalg.norm(gradient, axis=1)
-    np.testing.assert_allclose(found_m, distance_m / np.maximum(length, 1), rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(normals, gradient / length[:, None], rtol=1e-6, atol=1e-12)

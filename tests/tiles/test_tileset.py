@@ -82,5 +82,3 @@ def test_a_file_in_the_way_is_said_before_the_work(city, tmp_path):
     (tmp_path / "city").write_text("not a folder")
     with pytest.raises(FileExistsError):
         city.export(tmp_path / "city.json", 0.2, progress=False)
-    with pytest.raises(ValueError, match=r"\.json for 3D Tiles"):
-        city.export(tmp_path / "city.obj", 0.2)

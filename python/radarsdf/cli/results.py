@@ -93,7 +93,7 @@ def counted(count: int, what: str) -> str:
 
 def load_map(path: Path) -> Map:
     """Load a map, and warn of tiles that are missing."""
-    from radarsdf.tiles.any_map import lacking, load
+    from radarsdf.tiles.tiled_map import lacking, load
 
     radar_map = load(path)
     if tiles := lacking(radar_map):
@@ -138,7 +138,7 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
     """Add the intensity errors on scans that a fit left out, and those of a kNN baseline on the scans that it used."""
     from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
     from radarsdf.returns.moving import rays_as_measured
-    from radarsdf.tiles.any_map import predicted
+    from radarsdf.tiles.tiled_map import predicted
 
     if not radar_map.has_intensity or test.intensities is None:
         return

@@ -88,8 +88,8 @@ class Where:
     def executor(self, folder: Path) -> AbstractContextManager[Executor | None]:
         """What runs the tasks. None: this process."""
         if self.cluster is not None:
-            from radarsdf.tiles.cluster import cluster_executor
             from radarsdf.tiles.plan import Plan
+            from radarsdf.tiles.tasks import cluster_executor
 
             return cluster_executor(self.cluster, max(tile.memory_bytes for tile in Plan.load(folder).tiles))
         if self.processes is not None:
@@ -222,8 +222,7 @@ def status(folder: Path, *, tile: list[str] | None = None, results: Results) -> 
     folder: What radarsdf tiles plan wrote.
     tile: Name of a tile, the only one that is looked at; may be repeated.
     """
-    from radarsdf.tiles.plan import Plan, failure_of
-    from radarsdf.tiles.tile_fit import is_done
+    from radarsdf.tiles.plan import Plan, failure_of, is_done
 
     plan = Plan.load(folder)
     tiles = [planned for planned in plan.tiles if tile is None or planned.name in tile]

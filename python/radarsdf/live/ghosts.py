@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The ghosts of a map that grows: what `find_ghosts` of `returns/ghosts.py` finds, asked again only where rays pass changes."""
+"""The ghosts of a map that grows: those of `find_ghosts` in `returns/ghosts.py`, found again only where rays pass changes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks
-from radarsdf.live.regions import REGION_CELLS, RegionTable, Rows, cubes_of, regions_round
-from radarsdf.live.rows import Keys
+from radarsdf.live.regions import REGION_CELLS, Keys, RegionTable, Rows, region_places, regions_near
 from radarsdf.returns.ghosts import are_behind, are_opaque, first_crossed, mostly_behind
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels
@@ -47,7 +46,7 @@ def means_of(rows: Rows) -> MeanRays:
 
 
 class GrowingGhosts:
-    """Answers the four questions of :func:`find_ghosts`, each again only where its answer may differ.
+    """The four steps of :func:`find_ghosts`, each repeated only where its result may differ.
 
     1. Which flat plane does each ray cross first? Columns `first` of leaf cells: the key of the plane's cell, or
        :data:`NOWHERE`; `passed` of cells of surfels: how many rays cross its plane first.
@@ -55,15 +54,8 @@ class GrowingGhosts:
     3. How many rays of each cell end behind an opaque plane? `behind` of cells of surfels.
     4. Round which cells are most returns behind one? `ghosts` of cells of surfels.
 
-    What a ray answers depends on the planes along it, which may be in other regions than its end. So of each region, a box
-    is kept that holds all rays that end in it: a plane matters to them only if the region of the plane meets the box.
-
-    Parameters
-    ----------
-    leaves, cells : RegionTable
-        Of leaf cells with returns, and of cells of surfels. The other columns are theirs.
-    leaf_size_m : float
-        Edge of a leaf cell, m.
+    The result for a ray depends on the planes along it, which may be in other regions than its end. So each region has a box
+    that holds all rays that end in it: a plane matters to them only if the region of the plane meets the box.
     """
 
     def __init__(self, leaves: RegionTable, cells: RegionTable, leaf_size_m: float) -> None:
@@ -73,23 +65,20 @@ class GrowingGhosts:
         self._crossings: dict[int, tuple[Keys, NDArray[np.float64]]] = {}
 
     def update(self, of_rays: Keys, of_planes: Keys, noise: SensorNoise, num_threads: int) -> Keys:
-        """Takes in that mean rays changed that end in the regions `of_rays`, and planes in `of_planes`; both ascending.
+        """Takes changes in, of rays that end in the regions `of_rays` and of planes in `of_planes`, both ascending.
 
-        Returns
-        -------
-        (G,) ndarray
-            Keys of the cells of surfels that became ghosts or are none any more, ascending.
+        Returns the keys of the cells of surfels that became ghosts or are none any more, ascending.
         """
         boxes_before = self._boxes_of(of_rays)
         self._find_boxes(of_rays)
         rays = np.union1d(of_rays, self._ends_of_rays_through(of_planes))
         # Rays that are gone passed planes, too.
         planes = self._planes_in(np.concatenate([self._boxes_of(rays), boxes_before]))
-        self._ask_first(rays, planes, noise, num_threads)
-        of_opaque = np.union1d(of_planes, self._ask_opaque(planes, num_threads))
+        self._find_first(rays, planes, noise, num_threads)
+        of_opaque = np.union1d(of_planes, self._find_opaque(planes, num_threads))
         rays = np.union1d(rays, self._ends_of_rays_through(of_opaque))
-        self._ask_behind(rays, noise, num_threads)
-        return self._ask_ghosts(rays, num_threads)
+        self._find_behind(rays, noise, num_threads)
+        return self._find_ghosts(rays, num_threads)
 
     def _boxes_of(self, regions: Keys) -> _Boxes:
         """Those that hold the rays that end in these regions; of regions without rays none."""
@@ -110,7 +99,7 @@ class GrowingGhosts:
 
     def _cubes(self, regions: Keys) -> _Boxes:
         """What the regions themselves span."""
-        lower = cubes_of(regions)
+        lower = region_places(regions)
         return np.stack([lower, lower + 1], 1) * (REGION_CELLS * self._leaf_size_m)
 
     def _ends_of_rays_through(self, regions: Keys) -> Keys:
@@ -129,15 +118,15 @@ class GrowingGhosts:
         return surfels, np.flatnonzero(surfels.is_flat())
 
     def _put_own(self, regions: Keys, column: str, found: NDArray[Any], cells: Rows) -> NDArray[np.bool_]:
-        """Keeps what was found of `cells`, those in `regions` and round them. Gives which of those in them differ from before."""
+        """Keeps what was found of `cells`, those in `regions` and round them. Returns which of those in them differ from before."""
         own = np.isin(self._cells.regions_of(cells["keys"]), regions)
         differs: NDArray[np.bool_] = own & (found != cells[column])
         cells[column] = found
         self._cells.put(regions, {name: values[own] for name, values in cells.items()})
         return differs
 
-    def _ask_first(self, rays: Keys, planes: Keys, noise: SensorNoise, num_threads: int) -> None:
-        """Question 1, of the rays that end in the regions `rays`. `planes`: all regions that they pass, or passed before."""
+    def _find_first(self, rays: Keys, planes: Keys, noise: SensorNoise, num_threads: int) -> None:
+        """Step 1, of the rays that end in the regions `rays`. `planes`: all regions that they pass, or passed before."""
         rows, cells = self._leaves.gather(rays), self._cells.gather(planes)
         surfels, flat = self._surfels(cells)
         found = first_crossed(surfels, flat, means_of(rows), noise, num_threads)
@@ -162,17 +151,17 @@ class GrowingGhosts:
         self._leaves.put(rays, rows)
         self._cells.put(planes, cells)
 
-    def _ask_opaque(self, planes: Keys, num_threads: int) -> Keys:
-        """Question 2, of the planes in these regions. Gives the regions in which an answer differs, ascending."""
-        cells = self._cells.gather(regions_round(planes, 1))  # rays past the cells round a plane count, too
+    def _find_opaque(self, planes: Keys, num_threads: int) -> Keys:
+        """Step 2, of the planes in these regions. Returns the regions in which an answer differs, ascending."""
+        cells = self._cells.gather(regions_near(planes, 1))  # rays past the cells round a plane count, too
         surfels, flat = self._surfels(cells)
         opaque = np.zeros(len(surfels.keys), bool)
         opaque[surfels.cell_of_plane[flat]] = are_opaque(surfels, flat, cells["passed"], num_threads)
         differs = self._put_own(planes, "opaque", opaque, cells)
         return np.unique(self._cells.regions_of(cells["keys"])[differs])
 
-    def _ask_behind(self, rays: Keys, noise: SensorNoise, num_threads: int) -> None:
-        """Question 3, of the rays that end in these regions."""
+    def _find_behind(self, rays: Keys, noise: SensorNoise, num_threads: int) -> None:
+        """Step 3, of the rays that end in these regions."""
         rows, cells = self._leaves.gather(rays), self._cells.gather(self._planes_in(self._boxes_of(rays)))
         surfels, flat = self._surfels(cells)
         opaque = cells["opaque"][surfels.cell_of_plane[flat]]
@@ -184,11 +173,11 @@ class GrowingGhosts:
         own["behind"] = np.bincount(cell_of_ray[behind], rows["counts"][behind], len(own["keys"]))
         self._cells.put(rays, own)
 
-    def _ask_ghosts(self, rays: Keys, num_threads: int) -> Keys:
-        """Question 4, of the cells in the regions in which these rays end, and round them. Gives the keys of those that differ."""
-        cells = self._cells.gather(regions_round(rays, 2))
+    def _find_ghosts(self, rays: Keys, num_threads: int) -> Keys:
+        """Step 4, of the cells in the regions in which these rays end, and round them. Returns the keys of those that differ."""
+        cells = self._cells.gather(regions_near(rays, 2))
         ghosts = mostly_behind(surfels_of(cells, self._leaf_size_m), cells["behind"], num_threads)
-        differs = self._put_own(regions_round(rays, 1), "ghosts", ghosts, cells)
+        differs = self._put_own(regions_near(rays, 1), "ghosts", ghosts, cells)
         found: Keys = cells["keys"][differs]
         return found
 

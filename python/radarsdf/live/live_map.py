@@ -4,11 +4,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import threading
 import weakref
 from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -16,23 +16,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import (
+    MAX_TIME_S,
     check_pose,
+    check_values_of_scan,
     instance,
     not_negative,
+    number,
     path_of,
     positions,
+    real_array,
     whole_number,
 )
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.following import Follower
-from radarsdf.live.learning import finished, known_now
-from radarsdf.live.rows import Keys
-from radarsdf.live.scan_log import ScanId, ScanLog
-from radarsdf.live.scans import Integrated, checked_scan, finite_time
-from radarsdf.live.shelf import Shelf, locked_folder
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.fitting.fit import fit
+from radarsdf.fitting.steps import fit_rays
+from radarsdf.live.regions import Keys
 from radarsdf.live.state import GrowingState
-from radarsdf.live.storage import load_state, save_state
-from radarsdf.returns.evidence import Looks
+from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder, save_state
+from radarsdf.live.tracking import Follower
+from radarsdf.returns.moving import Movers
+from radarsdf.returns.rays import check_scans
 from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
@@ -41,19 +45,36 @@ if TYPE_CHECKING:
     from radarsdf.map.radar_map import RadarMap
 
 
+@dataclass(frozen=True)
+class Integrated:
+    """What became of a scan."""
+
+    scan_id: ScanId
+    """By which it can be moved and taken out."""
+    pose: NDArray[np.float64]
+    """(4, 4) T_world_sensor, m: where it was placed."""
+    blocks: NDArray[np.uint64]
+    """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
+    movers: int
+    """Number of its returns that were left out, because they move."""
+    moved: tuple[ScanId, ...] = ()
+    """Earlier scans without poses that were placed again, since only now it is clear how the sensor moves. Where they are,
+    :meth:`LiveMap.pose` says."""
+
+
 class LiveMap:
     """A map that grows scan by scan. Scans can be moved, and taken out again, without a trace.
 
-    What a scan adds are integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken
-    out of has the bits of one that never saw it. They do not depend on the order of scans either, except for what is found
-    from single returns: the noise of the sensor, if it is not given, intensities, what :meth:`finish` trains, and the order
-    of scans in files. All methods may be called from any thread; those that
-    change the map wait for each other, and readers see it before a change or after it.
+    A scan adds integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken out of has
+    the bits of one that never saw it, in any order. What is found from single returns depends on the order of scans: the
+    noise of the sensor, if it is not given, intensities, what :meth:`finish` trains, and the order of scans in files. All
+    methods may be called from any thread; those that change the map wait for each other, and readers see it before a change
+    or after it.
 
     Parameters
     ----------
     config : FitConfig, optional
-        Settings. :meth:`mesh` and :meth:`map` are those of :meth:`FitConfig.quick` with the same cells, returns, and bridges
+        Settings. :meth:`mesh` and :meth:`map` use those of :meth:`FitConfig.quick` with the same cells, returns, and bridges
         over gaps; :meth:`finish` fits with all of them.
     origin : (3,) array_like, optional
         Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
@@ -62,9 +83,9 @@ class LiveMap:
         Memory that the map may take, bytes. Beyond it, the oldest scans are let go: they stay in the map, but can no
         longer be moved or taken out. None: all are kept.
     folder : path-like, optional
-        An empty or new folder, or one that a map has used before, to which scans are written instead of being let go, and
-        regions of the map far away by :meth:`clear_outside`, or beyond `max_bytes`, instead of being forgotten. It is locked as
-        long as the map lives.
+        An empty or new folder, or one that a map has used before. Scans are written there instead of being let go, and far
+        regions of the map instead of being forgotten, by :meth:`clear_outside` or beyond `max_bytes`. It is locked as long
+        as the map lives.
 
     Raises
     ------
@@ -106,8 +127,7 @@ class LiveMap:
             config,
             None if origin is None else positions([np.asarray(origin)], "origin")[0],
             None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1),
-            ScanLog(place),
-            None if place is None else Shelf(place),
+            place,
         )
         self._follower = Follower(config, config.num_threads)
         self._lock = threading.RLock()  # of the state
@@ -142,7 +162,7 @@ class LiveMap:
     def sealed_scans(self) -> int:
         """Number of scans that can no longer be moved or taken out."""
         with self._lock:
-            return self._state.log.sealed
+            return len(self._state.log.sealed)
 
     @property
     def num_bytes(self) -> int:
@@ -153,7 +173,10 @@ class LiveMap:
     def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
         """(4, 4) T_world_sensor of a scan, m. Raises a KeyError if it cannot be taken out."""
         with self._lock:
-            return self._state.log.pose(scan_id).copy()
+            entry = self._state.log.entry(scan_id)
+            if entry is None:
+                raise KeyError(scan_id)
+            return entry.pose.copy()
 
     def integrate(
         self,
@@ -165,11 +188,11 @@ class LiveMap:
         time_s: float | None = None,
         scan_id: ScanId | None = None,
     ) -> Integrated:
-        """Adds a scan.
+        """Adds a scan, of N returns.
 
-        Without its pose, it is put where its returns agree with the last scans, near where its Doppler, or the motion so far,
-        lead. The world is then the frame of the first scan. Where many scans drift, :func:`radarsdf.refine_poses` and
-        :meth:`move_all` mend them.
+        Without its pose, it is placed where its returns agree with the last scans, near where its Doppler, or the motion so
+        far, lead. The world is then the frame of the first scan. Where poses drift, :func:`radarsdf.refine_poses` refines them
+        for :meth:`move_all`.
 
         Parameters
         ----------
@@ -180,11 +203,16 @@ class LiveMap:
         intensities : (N,) array_like, optional
             Sensor units. All scans have them, or none has.
         doppler_mps : (N,) array_like, optional
-            Speed along the ray, m/s, folded or not; NaN where it was not measured. Returns that move are left out.
+            Speed along the ray, m/s, folded or not; NaN where it was not measured. Moving returns are left out.
         time_s : float, optional
             When the scan was taken, s. Only scans without a pose need it, and those before them, to go on from.
         scan_id : hashable, optional
             By which the scan is known. By default a number that counts on.
+
+        Returns
+        -------
+        Integrated
+            Where it was placed, and what changed.
 
         Raises
         ------
@@ -194,41 +222,42 @@ class LiveMap:
             A ValueError, if a scan without a pose agrees with the last ones nowhere near. After any error, the map is as
             before.
         """
-        scan = checked_scan(points, intensities, doppler_mps, self._state.config.returns)
+        scan = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
-        scan = dataclasses.replace(scan, time_s=None if time_s is None else finite_time(time_s))
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         if given is None and scan.time_s is None:
             msg = "a scan needs a pose, or a time"
             raise ValueError(msg)
         with self._lock:
+            state = self._state
             if scan_id is None:
-                scan_id = self._state.next_id
-            if scan_id in self._state.log:
+                scan_id = state.next_id
+            if scan_id in state.log:
                 msg = f"the map has a scan {scan_id!r} already: remove or move it"
                 raise ValueError(msg)
             with_intensities = scan.intensities is not None
-            if self._state.with_intensities not in (None, with_intensities):
+            if state.with_intensities not in (None, with_intensities):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
-            steps = self._follower.seek(self._state.log, scan_id, scan) if given is None else []
+            steps = [] if given is not None else self._follower.seek(state.log, scan_id, scan)
             come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
-            scan = come[scan_id] if given is None else scan.at(given)
-            again = [step.scan_id for step in steps[:-1]]
+            if given is not None:
+                come = {scan_id: scan.at(given)}
+            scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
             origin = None
-            if self._state.origin is None:
-                lattice = self._state.config.lattice
+            if state.origin is None:
+                lattice = self.config.lattice
                 origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
-            blocks = self._state.exchange(come | {scan_id: scan}, again, origin)
-            self._state.with_intensities = with_intensities
+            blocks = state.exchange(come, again, origin)
+            state.with_intensities = with_intensities
             if given is None:
                 self._follower.keep(steps)
             else:
                 self._follower.place(scan_id, scan)
             if isinstance(scan_id, int):
-                self._state.next_id = max(self._state.next_id, scan_id + 1)
-        movers = 0 if scan.standing is None else int((~scan.standing).sum())
-        return Integrated(scan_id, scan.pose.copy(), blocks, movers, tuple(again))
+                state.next_id = max(state.next_id, scan_id + 1)
+        moving = 0 if scan.standing is None else int((~scan.standing).sum())
+        return Integrated(scan_id, scan.pose.copy(), blocks, moving, again)
 
     def remove(self, scan_id: ScanId) -> Keys:
         """Takes a scan out. The map then has the bits of one that never saw it.
@@ -325,14 +354,15 @@ class LiveMap:
             If it cannot be read.
         """
         stored = load_state(path)
-        live = cls(stored.config, origin=stored.origin, max_bytes=stored.max_bytes, folder=folder)
+        config, described = FitConfig.from_dict(stored.described.config), stored.described
+        live = cls(config, origin=described.origin, max_bytes=described.max_bytes, folder=folder)
         live._state.restore(stored)
         for scan_id, scan in stored.scans.items():
             live._follower.place(scan_id, scan)
         return live
 
     def mesh(self, **limits: Any) -> trimesh.Trimesh:
-        """The surface as triangles, in voxels of the size of leaf cells. Only what changed is made anew.
+        """The surface as triangles, in voxels of the size of leaf cells. Only what changed is derived again.
 
         Parameters
         ----------
@@ -357,7 +387,8 @@ class LiveMap:
                 self._state.forget_surface()
                 raise
         voxel_m = found.scene.config.leaf_size_m
-        return found.surface.mesh(found.scene.origin, Limits.of(voxel_m, **limits), found.leaf_cells)
+        wanted = Limits.of(voxel_m, **limits)
+        return found.surface.mesh(found.scene.origin, wanted, found.leaf_cells)
 
     def map(self) -> RadarMap:
         """What is known now, as a map that does not grow: the quick fit of all scans, smoothed. Intensities are in closed form.
@@ -368,9 +399,8 @@ class LiveMap:
             If there is no scan that could be taken out.
         """
         with self._lock, self._state.whole():
-            scans, sums = list(self._state.log.scans()), self._state.all_sums()
-            looks = Looks(*self._state.sums.looks_of(self._state.sums.block_keys()))
-        return known_now(scans, sums, looks, self._state.quick, self._state.origin)
+            read = self._state.fit_input()
+        return fit_rays(read, self._state.quick, progress=False)
 
     def finish(self, *, progress: bool | None = None) -> RadarMap:
         """The fit of all scans with all settings, as :func:`radarsdf.fit` makes it with this `origin`.
@@ -381,8 +411,44 @@ class LiveMap:
             If scans were let go, or there are none.
         """
         with self._lock:
-            if self._state.log.sealed:
-                msg = f"{self._state.log.sealed} scans were let go to bound the memory, so that they cannot be fitted: give the map a folder to keep scans in"
+            if sealed := self.sealed_scans:
+                msg = f"{sealed} scans were let go to bound the memory, so that they cannot be fitted: give the map a folder to keep scans in"
                 raise ValueError(msg)
-            scans = list(self._state.log.scans())
-        return finished(scans, self._state.config, self._state.origin, progress)
+            scans, origin = self._state.scans(), self._state.origin
+        intensities = [scan.intensities for scan in scans if scan.intensities is not None]
+        speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
+        return fit(
+            [scan.points for scan in scans],
+            np.stack([scan.pose for scan in scans]),
+            intensities or None,
+            doppler_mps=speeds if len(speeds) == len(scans) else None,
+            config=self.config,
+            progress=progress,
+            origin=origin,
+        )
+
+
+def _checked_scan(
+    points: ArrayLike,
+    intensities: ArrayLike | None,
+    doppler_mps: ArrayLike | None,
+    time_s: float | None,
+    config: ReturnsConfig,
+) -> LoggedScan:
+    """A scan, whose pose is not known yet. Raises a ValueError if it is none."""
+    scans, values, _ = check_scans([points], None if intensities is None else [intensities])
+    scan = scans[0].copy()
+    speeds, static = None, None
+    if doppler_mps is not None:
+        speeds = compact(real_array(doppler_mps, "doppler_mps"))
+        check_values_of_scan(speeds, scan, "doppler_mps", 0)
+        if config.drop_movers:
+            moving = Movers.of([scan], [speeds]).masks[0]
+            static = ~moving if moving.any() else None
+    if time_s is not None:
+        time_s = number(time_s, "time_s")
+        if not abs(time_s) <= MAX_TIME_S:
+            msg = f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
+            raise ValueError(msg)
+    values_of_scan = None if values is None else values[0].copy()
+    return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s)

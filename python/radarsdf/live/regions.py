@@ -1,18 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Columns whose rows belong to cells, kept region by region: what is near a change is found without asking the rest."""
+"""Columns of cells, kept in regions of 64³ leaf cells: what is near a change is found without reading the rest."""
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
-from radarsdf.live.rows import Keys, steps_round
 from radarsdf.returns.sums import lattice_of
 
+Keys = NDArray[np.uint64]
 Rows = dict[str, NDArray[Any]]
 
 REGION_CELLS = 64
@@ -21,7 +23,30 @@ REGION_CELLS = 64
 REGION_BITS = np.uint64(18)
 """Bits by which the key of a leaf cell is longer than that of its region."""
 
+NO_KEYS = np.zeros(0, np.uint64)
 _FARTHEST = 15_600  # region along each axis: keys reach a million cells
+
+
+def steps_near(reach: int) -> NDArray[np.int64]:
+    """((2 reach + 1)³, 3) steps of at most `reach` along each axis."""
+    return np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
+
+
+def shifted(keys: Keys, steps: NDArray[np.int64]) -> Keys:
+    """Keys of the cells that are `steps` (S, 3) away from those with these keys (N,), ascending, each once."""
+    cells = (lattice_of(keys)[:, None] + steps).reshape(-1, 3)
+    # The middle of a cell of 1 m is exact in float64.
+    return np.unique(cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0, 1))
+
+
+def cubes_near(leaf_keys: Keys, edge: int, reach: int) -> Keys:
+    """Keys of the first leaf cells of all cubes of `edge` cells, a power of two, that are within `reach` cells of others.
+
+    Whole cubes are stepped over: stepping from all cells to all takes longer than what is found too far away.
+    """
+    bits = np.uint64(3 * (edge.bit_length() - 1))
+    corners = np.unique(leaf_keys >> bits) << bits
+    return shifted(corners, edge * steps_near(math.ceil(reach / edge)))
 
 
 def regions_of(leaf_keys: Keys) -> Keys:
@@ -29,21 +54,21 @@ def regions_of(leaf_keys: Keys) -> Keys:
     return np.unique(leaf_keys >> REGION_BITS)
 
 
-def regions_round(regions: Keys, reach: int) -> Keys:
-    """Keys of these regions, and of those at most so many away along each axis."""
-    cubes = (cubes_of(regions)[:, None] + steps_round(reach)).reshape(-1, 3)
-    return np.unique(_regions_at(np.unique(np.clip(cubes, -_FARTHEST, _FARTHEST - 1), axis=0)))
+def regions_near(regions: Keys, reach: int) -> Keys:
+    """Keys of these regions, and of those at most `reach` away along each axis."""
+    places = (region_places(regions)[:, None] + steps_near(reach)).reshape(-1, 3)
+    return np.unique(_regions_at(np.unique(np.clip(places, -_FARTHEST, _FARTHEST - 1), axis=0)))
 
 
-def cubes_of(regions: Keys) -> NDArray[np.int64]:
+def region_places(regions: Keys) -> NDArray[np.int64]:
     """(R, 3) positions of regions: that of i spans [i, i + 1) times their edge."""
     return lattice_of(regions << REGION_BITS) // REGION_CELLS
 
 
-def _regions_at(cubes: NDArray[np.int64]) -> Keys:
+def _regions_at(places: NDArray[np.int64]) -> Keys:
     """(R,) keys of the regions at these positions (R, 3)."""
-    places = (REGION_CELLS * cubes).astype(np.float64) + 0.5
-    return cell_keys(np.ascontiguousarray(places), 1.0, 1) >> REGION_BITS
+    cells = (REGION_CELLS * places).astype(np.float64) + 0.5
+    return cell_keys(np.ascontiguousarray(cells), 1.0, 1) >> REGION_BITS
 
 
 class RegionTable:
@@ -54,12 +79,12 @@ class RegionTable:
     leaves_per_cell : int
         Edge of a cell, leaf cells: 1, or 2.
     columns : ndarray
-        Without rows: what types and shapes they have.
+        One row of each column, as a new cell has it.
     """
 
     def __init__(self, leaves_per_cell: int = 1, **columns: NDArray[Any]) -> None:
         self._merged = leaves_per_cell.bit_length() - 1
-        self._empty: Rows = {"keys": np.zeros(0, np.uint64), **columns}
+        self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}
         self.num_bytes = 0
         """Memory of the rows, bytes."""
@@ -78,9 +103,18 @@ class RegionTable:
         """The rows of `regions` (R,), ascending, in the order of their keys."""
         parts = [self._parts[region] for region in regions.tolist() if region in self._parts]
         return {
-            name: np.concatenate([none, *(part[name] for part in parts)])
-            for name, none in self._empty.items()
+            name: np.concatenate([new[:0], *(part[name] for part in parts)])
+            for name, new in self._new.items()
         }
+
+    def carried(self, regions: Keys, keys: Keys) -> Rows:
+        """Rows of cells with these `keys`, all in `regions`: as they are where there are some, else new ones."""
+        before = self.gather(regions)
+        rows = {name: np.repeat(new, len(keys), axis=0) for name, new in self._new.items()}
+        _, after, old = np.intersect1d(keys, before["keys"], assume_unique=True, return_indices=True)
+        for name, column in rows.items():
+            column[after] = before[name][old]
+        return rows | {"keys": keys}
 
     def put(self, regions: Keys, rows: Rows) -> None:
         """All rows of `regions` (R,), ascending, become those of `rows` that are in them."""
@@ -91,7 +125,7 @@ class RegionTable:
             self.num_bytes -= sum(column.nbytes for column in self._parts.pop(region, {}).values())
             if start == end:
                 continue
-            part = self._parts[region] = {name: column[start:end].copy() for name, column in rows.items()}
+            part = self._parts[region] = {name: rows[name][start:end].copy() for name in self._new}
             self.num_bytes += sum(column.nbytes for column in part.values())
 
     def regions_of(self, keys: Keys) -> Keys:

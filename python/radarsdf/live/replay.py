@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Recorded scans, given to a map as a driver would: when they were taken, and gone if the map is not ready in time."""
+"""Replays recorded scans to a live map as a driver would: in real time, dropping those for which the map is not ready."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.live.following import Lost
+from radarsdf.live.tracking import Lost
 
 if TYPE_CHECKING:
     from radarsdf.io.scans import Scans
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
 
 @dataclass
 class Replay:
-    """What became of F scans."""
+    """Results of a replay of F scans."""
 
     rows: list[int] = field(default_factory=list)
-    """Of the scans that are in the map."""
+    """Of the scans that were integrated."""
     poses: list[NDArray[np.float64]] = field(default_factory=list)
     """(4, 4) of each of these."""
     seconds: list[float] = field(default_factory=list)
-    """That each of these took, by the clock."""
+    """Wall time that each of these took."""
     dropped: list[int] = field(default_factory=list)
-    """Rows of the scans that were gone before the map was ready."""
+    """Rows of the scans that were skipped because the map was not ready."""
     lost: list[int] = field(default_factory=list)
-    """Rows of the scans without poses that agreed nowhere with those before."""
+    """Rows of the scans without poses that could not be tracked."""
 
     @property
     def hertz(self) -> float:
-        """Scans that the map could take in a second, by their mean time."""
+        """Scans a second, by their mean time."""
         return len(self.seconds) / max(sum(self.seconds), 1e-9)
 
 
@@ -48,10 +48,10 @@ def replay(
     rate: float = 1.0,
     on_scan: Callable[[Replay], None] | None = None,
 ) -> Replay:
-    """Gives scans to a map at `rate` times the speed at which they were recorded; 0: each once the one before is done.
+    """Integrates scans at `rate` times the recorded speed; 0: as fast as possible.
 
-    A scan waits until the next one is there. `on_scan` is called after each; its time does not count as that of a scan, but
-    scans do not wait for it.
+    A scan waits until the next one arrives, and is then dropped. `on_scan` is called after each; its time does not count as
+    that of a scan, but scans do not wait for it.
     """
     done, count = Replay(), len(scans.points)
     times_s = scans.times_s if scans.times_s is not None else 0.1 * np.arange(count)

@@ -4,49 +4,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import GrowingSums, SumsChange
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.learning import noise_of, quick_of
-from radarsdf.live.regions import REGION_CELLS, cubes_of, regions_of
-from radarsdf.live.rows import Keys
-from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
-from radarsdf.live.scans import rays_of
-from radarsdf.live.shelf import Shelf
-from radarsdf.live.storage import Stored
+from radarsdf.fitting.steps import FitInput
+from radarsdf.live.regions import (
+    NO_KEYS,
+    REGION_BITS,
+    REGION_CELLS,
+    Keys,
+    region_places,
+    regions_of,
+)
+from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, Stored, held_by
 from radarsdf.live.surface import ChangedSums, GrowingSurface
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.intensities import IntensityScale, Plausible
+from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import Surfels
+from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import QUANTA, ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
-_NONE = np.zeros(0, np.uint64)
 _MARKS = 64  # lists of changed blocks, before they are joined
 _BYTES_OF_SUMS = 350  # of a cell with returns, in a table with room for twice as many
 _LEFT = 0.75  # of the cells that there may be, so that regions are not put away for each scan
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
+_NOISE_RETURNS = 100_000  # for the noise: as many as those on flat surfels that are wanted, and more
 
 
 class GrowingState:
     """Sums over scans, the scans themselves, and the surface that follows. One thread at a time.
 
-    Parameters
-    ----------
-    config : FitConfig
-        Settings.
-    origin : ndarray or None
-        (3,) of the local frame, world, m. None: it follows from the first scan.
-    max_bytes : int or None
-        Memory beyond which scans are let go, bytes.
-    log : ScanLog
-        An empty one.
-    shelf : Shelf or None
-        Where sums are put that are far away. None: they are forgotten.
+    `origin` (3,): of the local frame, world, m; None: it follows from the first scan. Beyond `max_bytes`, scans are let go,
+    to `folder` if there is one.
     """
 
     def __init__(
@@ -54,22 +53,29 @@ class GrowingState:
         config: FitConfig,
         origin: NDArray[np.float64] | None,
         max_bytes: int | None,
-        log: ScanLog,
-        shelf: Shelf | None = None,
+        folder: Path | None,
     ) -> None:
-        self.config, self.quick = config, quick_of(config)
+        self.config = config
+        self.quick = FitConfig.quick(  # with the same cells, returns, bridges, seed and limits
+            leaf_size_m=config.leaf_size_m,
+            seed=config.seed,
+            num_threads=config.num_threads,
+            max_memory_bytes=config.max_memory_bytes,
+            returns=config.returns,
+            encoding={"bridge_cells": config.encoding.bridge_cells},
+        )
         self.origin = origin
         self.max_bytes = max_bytes
-        self.log = log
-        self._shelf = shelf
-        self._in_use = _NONE  # regions that the last change reached
+        self.log = ScanLog(folder)
+        self._store = None if folder is None else RegionStore(folder)
+        self._in_use = NO_KEYS  # regions that the last change reached
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
         self.next_id = 0
         self._noise_of = 0  # number of scans that the noise was estimated from
         self._returns_changed: list[Keys] = []
-        self._looks_changed: list[Keys] = []
+        self._visibility_changed: list[Keys] = []
         self._surface: GrowingSurface | None = None
 
     @property
@@ -86,7 +92,7 @@ class GrowingState:
     ) -> Keys:
         """Takes scans out and puts others in, also of the same ids: all of it, or nothing if an error is raised.
 
-        `origin`: of a map that has none yet. Gives the keys of the blocks whose returns changed.
+        `origin`: of a map that has none yet. Returns the keys of the blocks whose returns changed.
         """
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         before, self.origin = self.origin, self.origin if origin is None else origin
@@ -99,7 +105,7 @@ class GrowingState:
             for scan_id, scan in come.items():
                 self.log.put(scan_id, scan)
             if come:
-                self.bound()
+                self._bound()
         except BaseException:  # the disk is full, say
             if done:
                 self._apply(left.values(), come.values())
@@ -112,53 +118,53 @@ class GrowingState:
         return blocks
 
     def _apply(self, come: Iterable[LoggedScan], gone: Iterable[LoggedScan]) -> Keys:
-        """Changes the sums, or leaves all as it was. Gives the keys of the blocks whose returns changed."""
+        """Changes the sums, or leaves all as it was. Returns the keys of the blocks whose returns changed."""
         change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
         for scans, sign in ((gone, -1), (come, 1)):
             for scan in scans:
-                rays = rays_of(scan, self.config, self.origin)
+                rays = _rays_of([scan], self.config, self.origin)
                 change.collect(rays.points, rays.directions, rays.ranges_m, sign)
-        if self._shelf is not None:
+        if self._store is not None:
             blocks = change.block_keys()
-            self._bring_back(self._shelf.touched(blocks))
+            self._bring_back(self._store.reached_by(blocks))
             self._in_use = regions_of(blocks << BLOCK_BITS)
-        returns, looks = self.sums.apply(change)
-        self._mark(returns, looks)
+        returns, visibility = self.sums.apply(change)
+        self._mark(returns, visibility)
         return returns
 
-    def bound(self) -> None:
-        """Lets scans go where memory is short, and puts regions away if there is a folder."""
+    def _bound(self) -> None:
+        """Puts regions away if there is a folder, and lets scans go, where memory is short."""
         if self.max_bytes is None:
             return
-        if self._shelf is not None and len(self._in_use):
+        if self._store is not None and len(self._in_use):
             # The surface grows and shrinks with the next mesh.
             surface = 0.0 if self._surface is None else self._surface.num_bytes_of_cell
             if self.sums.num_bytes + surface * self.sums.num_cells > self.max_bytes:
-                self._bound_cells(int(self.max_bytes / (_BYTES_OF_SUMS + surface)))
+                self._put_farthest_away(int(self.max_bytes / (_BYTES_OF_SUMS + surface)))
         if self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans that tell it may go
                 self._settle_noise()
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
-    def _bound_cells(self, most: int) -> None:
-        """Puts the farthest regions away, if there are more than `most` cells. Those that the last change reached stay."""
+    def _put_farthest_away(self, most: int) -> None:
+        """Puts regions away if there are more than `most` cells, but for those that the last change reached."""
         if self.sums.num_cells <= most:
             return
         regions = np.setdiff1d(regions_of(self.sums.block_keys() << BLOCK_BITS), self._in_use)
-        away = cubes_of(regions) - cubes_of(self._in_use).mean(axis=0)
+        away = region_places(regions) - region_places(self._in_use).mean(axis=0)
         for region in regions[np.argsort(-np.square(away).sum(axis=1), kind="stable")]:
             self._put_away(region[None])
             if self.sums.num_cells <= _LEFT * most:
                 break
 
     def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
-        """Forgets blocks beyond a ball, or puts the regions away that lie beyond it. Gives the keys of the blocks."""
+        """Forgets blocks beyond a ball, or puts the regions away that lie beyond it. Returns the keys of the blocks."""
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
-        if self._shelf is not None:
+        if self._store is not None:
             regions = regions_of(keys << BLOCK_BITS)
-            lower = cubes_of(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
+            lower = region_places(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
             return self._put_away(regions[np.square(nearest - centre).sum(axis=1) > radius_m**2])
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
@@ -171,7 +177,7 @@ class GrowingState:
     @contextmanager
     def whole(self) -> Iterator[None]:
         """Within, nothing is put away. Afterwards, the same regions are again."""
-        away = _NONE if self._shelf is None else self._shelf.regions
+        away = NO_KEYS if self._store is None else self._store.regions
         self._bring_back(away)
         try:
             yield
@@ -179,85 +185,146 @@ class GrowingState:
             self._put_away(away)
 
     def _bring_back(self, regions: Keys) -> None:
-        if self._shelf is not None:
-            blocks = self._shelf.bring_back(self.sums, regions)
+        if self._store is not None:
+            blocks = self._store.bring_back(self.sums, regions)
             self._mark(blocks, blocks)
 
     def _put_away(self, regions: Keys) -> Keys:
-        blocks = _NONE if self._shelf is None else self._shelf.put_away(self.sums, regions)
+        blocks = NO_KEYS if self._store is None else self._store.put_away(self.sums, regions)
         self._mark(blocks, blocks)
         return blocks
-
-    def all_sums(self) -> ScanSums:
-        """Of all cells."""
-        return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
 
     def changes(self) -> tuple[GrowingSurface, ChangedSums, SensorNoise]:
         """The surface as it was derived last, and what it has to take in."""
         if self._surface is None:
-            origin = np.zeros(3) if self.origin is None else self.origin
-            surface = GrowingSurface(self.quick, origin)
+            surface = GrowingSurface(self.quick, np.zeros(3) if self.origin is None else self.origin)
             self._surface = None if self.origin is None else surface
-            self._returns_changed = self._looks_changed = [self.sums.block_keys()]
+            self._returns_changed = self._visibility_changed = [self.sums.block_keys()]
         else:
             surface = self._surface
-        returns, looked = (
-            np.unique(np.concatenate([_NONE, *keys])) for keys in (self._returns_changed, self._looks_changed)
+        returns, seen = (
+            np.unique(np.concatenate([NO_KEYS, *keys]))
+            for keys in (self._returns_changed, self._visibility_changed)
         )
         changes = ChangedSums(
             returns,
-            ScanSums(self.config.leaf_size_m, *self.sums.sums_of(returns)),
-            looked,
-            Looks(*self.sums.looks_of(looked)),
+            ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(returns))),
+            seen,
+            Looks(*self.sums.looks_of(_blocks_of_regions(seen))),
         )
-        self._returns_changed, self._looks_changed = [], []
+        self._returns_changed, self._visibility_changed = [], []
         self._settle_noise()
         return surface, changes, self.noise
 
     def forget_surface(self) -> None:
-        """The surface is derived anew from all sums."""
+        """The surface is derived again from all sums."""
         self._surface = None
 
     def stored(self) -> Stored:
-        """All that a file has to hold."""
-        keys = self.sums.block_keys()
-        return Stored(
-            self.config,
-            self.origin,
-            self.noise,
-            self._noise_of,
-            self.next_id,
-            self.with_intensities,
-            self.max_bytes,
-            self.log.sealed_ids,
-            dict(zip(self.log.ids, self.log.scans(), strict=True)),
-            *self.sums.sums_of(keys),
-            *self.sums.looks_of(keys),
-        )
+        """All that a file has to hold. Raises a ValueError for ids of scans that are neither numbers nor strings."""
+        keys, scans, sealed = self.sums.block_keys(), list(self.log.scans()), list(self.log.sealed)
+        if not all(type(scan_id) in (int, str) for scan_id in [*self.log.ids, *sealed]):
+            msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
+            raise ValueError(msg)
+        described: dict[str, Any] = {
+            "config": self.config.to_dict(),
+            "origin": None if self.origin is None else self.origin.tolist(),
+            "noise": list(dataclasses.astuple(self.noise)),
+            "noise_of": self._noise_of,
+            "next_id": self.next_id,
+            "with_intensities": self.with_intensities,
+            "max_bytes": self.max_bytes,
+            "sealed": sealed,
+            "ids": self.log.ids,
+            "held": held_by(scans),
+        }
+        sums = (*self.sums.sums_of(keys), *self.sums.looks_of(keys))
+        return Stored(Described(**described), dict(zip(self.log.ids, scans, strict=True)), sums)
 
     def restore(self, stored: Stored) -> None:
-        """Of a new state: what was stored."""
-        self.sums.insert(stored.keys, stored.sums, stored.scans_of_cells, stored.look_keys, stored.looks)
-        self.noise, self._noise_of = stored.noise, stored.noise_of
-        self.next_id, self.with_intensities = stored.next_id, stored.with_intensities
+        """Makes a new state that which was stored."""
+        described = stored.described
+        self.sums.insert(*stored.sums)
+        self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
+        self.next_id, self.with_intensities = described.next_id, described.with_intensities
         for scan_id, scan in stored.scans.items():
             self.log.put(scan_id, scan)
-        self.log.restore_sealed(stored.sealed)
-        self.bound()
+        self.log.sealed |= set(described.sealed)
+        self._bound()
 
-    def _mark(self, returns: Keys, looks: Keys) -> None:
+    def scans(self) -> list[LoggedScan]:
+        """Those that can be taken out. Raises a ValueError if there are none."""
+        scans = list(self.log.scans())
+        if not scans:
+            msg = "there are no scans to learn from: integrate some first"
+            raise ValueError(msg)
+        return scans
+
+    def fit_input(self) -> Callable[[], FitInput]:
+        """What a fit of all scans starts from, with the sums that were kept up. It is made of a copy of the state, when called."""
+        scans, sums, origin = self.scans(), self._all_sums(), self.origin
+        looks = Looks(*self.sums.looks_of(self.sums.block_keys()))
+
+        def read() -> FitInput:
+            rays = _without_outliers(_rays_of(scans, self.config, origin))
+            poses = np.stack([scan.pose for scan in scans])
+            moving = sum(int((~scan.standing).sum()) for scan in scans if scan.standing is not None)
+            scale = IntensityScale.of(rays.intensities)
+            return FitInput(rays, scale, poses, moving, sums=sums, looks=looks)
+
+        return read
+
+    def _all_sums(self) -> ScanSums:
+        return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
+
+    def _mark(self, returns: Keys, visibility: Keys) -> None:
         """The surface has to take in these blocks. Of very many scans, the list must not grow without end."""
-        for marked, keys in ((self._returns_changed, returns), (self._looks_changed, looks)):
+        for marked, keys in ((self._returns_changed, returns), (self._visibility_changed, visibility)):
             marked.append(keys)
             if len(marked) > _MARKS:
                 marked[:] = [np.unique(np.concatenate(marked))]
 
     def _settle_noise(self) -> None:
-        """Estimates the sensor's noise, if there are twice or half as many scans as there were then."""
+        """Estimates the sensor's noise, by some scans on the planes of all, if there are twice or half as many scans as then."""
         scans = len(self.log)
         if self._noise_of / 2 < scans < 2 * self._noise_of:
             return
         num_threads = resolve_num_threads(self.config.num_threads)
-        found = noise_of(self.log, self.all_sums(), self.quick, self.origin, num_threads)
-        if found is not None:
-            self.noise, self._noise_of = found, scans
+        sums = self._all_sums()
+        surfels = Surfels.of_sums(sums, num_threads)
+        asked = list(self.log.scans(every=max(1, int(sums.counts.sum()) // _NOISE_RETURNS)))
+        if asked:
+            rays = _rays_of(asked, self.config, self.origin)
+            self.noise = sensor_noise(surfels, rays, self.config.returns, num_threads)
+            self._noise_of = scans
+
+
+def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:
+    """The rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
+    static = [slice(None) if scan.standing is None else scan.standing for scan in scans]
+    intensities = [
+        scan.intensities[own] for scan, own in zip(scans, static, strict=True) if scan.intensities is not None
+    ]
+    return prepare(
+        [scan.points[own] for scan, own in zip(scans, static, strict=True)],
+        np.stack([scan.pose for scan in scans]),
+        intensities or None,
+        origin=origin,
+        whole=False,
+        **config.preparation,
+    )
+
+
+def _without_outliers(rays: Rays) -> Rays:
+    """The rays of all scans, with the intensities that can belong to the others."""
+    if rays.intensities is None:
+        return rays
+    return dataclasses.replace(rays, intensities=Plausible.of(rays.intensities).kept(rays.intensities))
+
+
+def _blocks_of_regions(blocks: Keys) -> Keys:
+    """Keys of all blocks of the regions of these blocks, ascending."""
+    bits = REGION_BITS - BLOCK_BITS
+    regions = np.unique(blocks >> bits)
+    found: Keys = ((regions << bits)[:, None] | np.arange(1 << int(bits), dtype=np.uint64)).reshape(-1)
+    return found

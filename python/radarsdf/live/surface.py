@@ -1,198 +1,169 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The surface of a map that grows: what a quick fit makes of sums, made anew only where they changed."""
+"""The surface of a map that grows: what a quick fit makes of sums, derived again only where they changed."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks
+from radarsdf._core import CellBlocks, Encoding, VertexTable
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.average import normals_at
-from radarsdf.live.distances import GrowingDistances
+from radarsdf.fitting.average import (
+    BAND_CELLS,
+    CELLS_SMOOTHED,
+    TRUNCATION_CELLS,
+    average_at_corners,
+    normals_at,
+    returns_of_means,
+)
 from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
-from radarsdf.live.regions import RegionTable, Rows, regions_of, regions_round
-from radarsdf.live.rows import ROUND, Keys, Replacement, between, changed_rows, leaves_of, shifted
+from radarsdf.live.regions import (
+    NO_KEYS,
+    REGION_BITS,
+    Keys,
+    RegionTable,
+    Rows,
+    cubes_near,
+    regions_near,
+    regions_of,
+    shifted,
+    steps_near,
+)
 from radarsdf.live.triangles import GrowingTriangles, Triangles
-from radarsdf.returns.evidence import BLOCK_BITS, Looks
+from radarsdf.returns.evidence import BLOCK_BITS, Looks, bridged, sums_round
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, planes_round, support_round
 from radarsdf.returns.sums import MeanRays, ScanSums, merged_keys
 
-_NONE = np.zeros(0, np.uint64)
-_PLANE = 9  # numbers of a surfel: centre, normal, variances
+_BLOCK_CELLS, _LARGE_CELLS = 8, 16  # edges of cubes, in which distances from changes are counted
 
 
 @dataclass(frozen=True)
 class ChangedSums:
-    """What became of the sums since the surface was derived last. Of a block, all is told anew."""
+    """The sums in which something changed since the surface was derived last."""
 
-    returns: Keys
+    blocks: Keys
     """(B,) keys of the blocks whose sums changed, ascending."""
     sums: ScanSums
-    """Of the cells of these blocks."""
-    look_blocks: Keys
-    """(L,) keys of the blocks whose looks changed, ascending."""
+    """Of all cells of the regions of these blocks."""
+    seen_blocks: Keys
+    """(L,) keys of the blocks whose visibility counts changed, ascending."""
     looks: Looks
-    """Of those of them that anything looked at."""
+    """Visibility counts of all blocks of the regions of these."""
 
 
 class GrowingSurface:
-    """What follows from sums over scans. :meth:`update` makes anew what depends on changes, and asks for nothing far from them.
+    """What follows from sums over scans: planes, ghosts, distances, triangles. :meth:`update` derives again what changes reach.
 
-    All is a function of the sums, the looks and the noise: however they came about, it has the same bits. One thread at a
-    time.
-
-    Parameters
-    ----------
-    config : FitConfig
-        Of a quick fit.
-    origin : ndarray
-        (3,) of the local frame, world, m.
+    All is a function of the sums, the visibility counts and the noise: however they came about, it has the same bits. One
+    thread at a time. `config`: of a quick fit; `origin` (3,): of the local frame, world, m.
     """
 
     def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
         self._config = config
         self._noise: SensorNoise | None = None
-        vectors, numbers = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-        # Of leaf cells with returns: sums, mean rays, normals, and the key of the first plane that the ray crosses.
+        vector, number = np.full((1, 3), np.nan, np.float32), np.zeros(1, np.float32)
+        # Leaf cells with returns: mean rays, normals, and the key of the first plane that the ray crosses.
         self._leaves = RegionTable(
-            sums=np.zeros((0, 14), np.int64),
-            scans=np.zeros(0, np.uint32),
-            points=vectors,
-            directions=vectors,
-            counts=numbers,
-            ranges_m=numbers,
-            normals=vectors,
-            first=_NONE,
+            points=vector,
+            directions=vector,
+            counts=number,
+            scans=np.zeros(1, np.uint32),
+            ranges_m=number,
+            normals=vector,
+            first=np.array([NOWHERE]),
         )
-        # Of cells of surfels. Planes are NaN without support.
+        # Cells of surfels. Planes (centre, normal, variances) are NaN without support.
         self._cells = RegionTable(
             LEAVES_PER_SURFEL,
-            moments=np.zeros((0, 13)),
-            support=np.zeros(0),
-            planes=np.zeros((0, _PLANE)),
-            passed=np.zeros(0),
-            opaque=np.zeros(0, bool),
-            behind=np.zeros(0),
-            ghosts=np.zeros(0, bool),
+            moments=np.zeros((1, 13)),
+            support=np.zeros(1),
+            planes=np.full((1, 9), np.nan),
+            passed=np.zeros(1),
+            opaque=np.zeros(1, bool),
+            behind=np.zeros(1),
+            ghosts=np.zeros(1, bool),
         )
         self._ghosts = GrowingGhosts(self._leaves, self._cells, config.leaf_size_m)
         # Of each region: returns in cells with planes, in those with flat ones, and in all, and the number of these.
         self._counts: dict[int, tuple[float, float, float, int]] = {}
-        self._distances = GrowingDistances(config)
-        # Of blocks, by the keys of their first leaf cells.
-        self._looks = RegionTable(scans=np.zeros(0, np.uint32))
+        self._crossed = RegionTable()  # leaf cells that rays cross near their returns
+        # These, and those that bridge gaps between them: distances at the corners, m, whether they change sign, evidence.
+        self.distances = RegionTable(
+            values=np.zeros((1, 8), np.float32),
+            crossed=np.zeros(1, bool),
+            information=np.zeros(1, np.float32),
+            detections=np.zeros(1, np.uint32),
+        )
+        # Blocks, by the keys of their first leaf cells.
+        self._visibility = RegionTable(scans=np.zeros(1, np.uint32))
         self._triangles = GrowingTriangles(config, origin)
 
     @property
     def num_bytes(self) -> int:
-        """Memory of what is kept, bytes."""
-        tables = (self._leaves, self._cells, self._distances, self._looks, self._triangles)
-        return sum(table.num_bytes for table in tables)
+        """Memory of all that is kept, bytes."""
+        tables = (self._leaves, self._cells, self._crossed, self.distances, self._visibility)
+        return sum(table.num_bytes for table in tables) + self._triangles.num_bytes
 
     @property
     def num_bytes_of_cell(self) -> float:
-        """Likewise, for each leaf cell with returns."""
+        """The same, for each leaf cell with returns."""
         return self.num_bytes / max(self._leaves.num_rows, 1)
 
-    @property
-    def num_leaves(self) -> int:
-        """Number of leaf cells near the surface."""
-        return self._distances.table.num_rows
-
     def update(self, changes: ChangedSums, noise: SensorNoise, num_threads: int) -> Keys:
-        """Takes changes in. Gives the keys (D,) of the blocks of the surface that were made anew, ascending."""
-        looked = self._take_looks(changes)
-        changed = self._take_sums(changes)
-        of_rays, dirty = regions_of(changed), _NONE
+        """Takes changes in. Returns the keys of the regions whose distances were derived again, ascending."""
+        seen = self._put_visibility(changes)
+        changed = self._put_sums(changes)
         if noise != self._noise:  # ghosts and evidence depend on it everywhere
-            self._noise, of_rays = noise, np.union1d(of_rays, self._leaves.regions)
-            dirty = np.unique(self._leaves.gather(of_rays)["keys"] >> BLOCK_BITS)
-        redone = _NONE
-        if len(of_rays):
+            self._noise = noise
+            changed = np.union1d(changed, self._leaves.gather(self._leaves.regions)["keys"])
+        redone = NO_KEYS
+        if len(changed):
+            of_rays = regions_of(changed)
             of_planes = np.union1d(of_rays, self._fit_planes(changed, num_threads))
-            changed = self._count_otherwise(of_rays, of_planes, changed, num_threads)
-            reached = np.union1d(dirty, self._distances.blocks_reached(changed))
-            redone = self._distances.update(reached, self._leaves, self._cells, noise, num_threads)
-        stale = np.union1d(looked, regions_of(redone << BLOCK_BITS))
-        self._triangles.cut(regions_round(stale, 1), self._distances.table, self._looks, num_threads)
+            if self._config.returns.drop_ghosts:
+                ghosts = self._ghosts.update(of_rays, of_planes, noise, num_threads)
+                near = self._leaves.gather(np.unique(self._cells.regions_of(ghosts)))["keys"]
+                changed = np.union1d(changed, near[np.isin(merged_keys(near), ghosts)])
+            changed = np.union1d(changed, self._turn(of_planes, num_threads))
+            redone = self._derive_distances(changed, noise, num_threads)
+        stale = regions_near(np.union1d(seen, redone), 1)
+        self._triangles.cut(stale, self.distances, self._visibility, num_threads)
         return redone
 
     def triangles(self) -> Triangles:
-        """All triangles, and what the returns tell of their vertices."""
+        """All triangles, with what the returns tell of their vertices."""
         none = (0.0, 0.0, 0.0, 0)
         on_planes, on_flat, returns, cells = map(sum, zip(none, *self._counts.values(), strict=True))
-        rough_share = 1 - on_flat / on_planes if on_planes else 0.0
-        return self._triangles.joined(rough_share, returns / max(cells, 1), self.num_leaves)
+        clutter_ratio = 1 - on_flat / on_planes if on_planes else 0.0
+        return self._triangles.joined(clutter_ratio, returns / max(cells, 1), self.distances.num_rows)
 
-    def _take_sums(self, changes: ChangedSums) -> Keys:
-        """The keys of the leaf cells whose sums changed, and of all that now hold returns in their blocks."""
-        regions = regions_of(changes.returns << BLOCK_BITS)
-        first, last = leaves_of(changes.returns)
-        before, after = self._leaves.gather(regions), changes.sums
-        there = between(before["keys"], first, last)
-        changed = changed_rows(
-            before["keys"][there],
-            (before["sums"][there], before["scans"][there]),
-            after.keys,
-            (after.sums, after.scans),
-        )
-        if len(changed) == 0:
-            return changed
-        means = MeanRays.of_sums(after)
-        new: Rows = vars(means) | {
-            "sums": after.sums,
-            "normals": np.full((len(after.keys), 3), np.nan, np.float32),
-            "first": np.full(len(after.keys), NOWHERE),
-        }
-        self._leaves.put(regions, Replacement.of(before["keys"], after.keys, first, last).rows(before, new))
-        self._take_moments(regions, merged_keys(first), merged_keys(last), after)
-        # Normals and planes of whole blocks are gone now, so all of their cells are to be made.
-        return np.union1d(changed, after.keys)
-
-    def _take_moments(self, regions: Keys, first: Keys, last: Keys, sums: ScanSums) -> None:
-        """The cells of surfels from each of `first` (B,) to each of `last` (B,), in these regions, become those of the sums.
-
-        What follows from moments is not made yet. How many rays pass a plane first is kept: :class:`GrowingGhosts` changes
-        it by the rays that it asks again, and does not count the others anew.
-        """
-        before = self._cells.gather(regions)
-        keys, moments = sums.merged_moments()
-        passed = np.zeros(len(keys))
-        _, kept, old = np.intersect1d(keys, before["keys"], assume_unique=True, return_indices=True)
-        passed[kept] = before["passed"][old]
-        new = {
-            "keys": keys,
-            "moments": moments,
-            "support": np.zeros(len(keys)),
-            "planes": np.full((len(keys), _PLANE), np.nan),
-            "passed": passed,
-            "opaque": np.zeros(len(keys), bool),
-            "behind": np.zeros(len(keys)),
-            "ghosts": np.zeros(len(keys), bool),
-        }
-        self._cells.put(regions, Replacement.of(before["keys"], keys, first, last).rows(before, new))
-
-    def _take_looks(self, changes: ChangedSums) -> Keys:
-        """The regions whose looks changed."""
-        blocks, new = changes.look_blocks, changes.looks
-        regions = regions_of(blocks << BLOCK_BITS)
-        before = self._looks.gather(regions)
-        rows = Replacement.of(
-            before["keys"], new.keys << BLOCK_BITS, blocks << BLOCK_BITS, blocks << BLOCK_BITS
-        )
-        self._looks.put(regions, rows.rows(before, {"keys": new.keys << BLOCK_BITS, "scans": new.scans}))
+    def _put_visibility(self, changes: ChangedSums) -> Keys:
+        """Takes visibility counts in. Returns the regions in which they changed."""
+        regions = regions_of(changes.seen_blocks << BLOCK_BITS)
+        rows = {"keys": changes.looks.keys << BLOCK_BITS, "scans": changes.looks.scans}
+        self._visibility.put(regions, rows)
         return regions
 
+    def _put_sums(self, changes: ChangedSums) -> Keys:
+        """Takes sums in. Returns the keys of the leaf cells in changed blocks that have returns, or had some."""
+        regions, sums = regions_of(changes.blocks << BLOCK_BITS), changes.sums
+        either = np.union1d(self._leaves.gather(regions)["keys"], sums.keys)
+        self._leaves.put(regions, self._leaves.carried(regions, sums.keys) | vars(MeanRays.of_sums(sums)))
+        keys, moments = sums.merged_moments()
+        self._cells.put(regions, self._cells.carried(regions, keys) | {"moments": moments})
+        found: Keys = either[np.isin(either >> BLOCK_BITS, changes.blocks)]
+        return found
+
     def _fit_planes(self, changed: Keys, num_threads: int) -> Keys:
-        """Surfels of the cells round changed ones. Gives the regions of these, ascending."""
-        near = shifted(np.unique(merged_keys(changed)), ROUND)
+        """Fits the planes of the cells near changed ones. Returns the regions of these, ascending."""
+        near = shifted(np.unique(merged_keys(changed)), steps_near(1))
         regions = np.unique(self._cells.regions_of(near))
-        cells = self._cells.gather(regions_round(regions, 1))
+        cells = self._cells.gather(regions_near(regions, 1))
         keys, moments, blocks = cells["keys"], cells["moments"], CellBlocks(cells["keys"])
         rows = blocks.rows(near, num_threads)
         rows = rows[rows >= 0]
@@ -216,21 +187,8 @@ class GrowingSurface:
             )
         return regions
 
-    def _count_otherwise(self, of_rays: Keys, of_planes: Keys, changed: Keys, num_threads: int) -> Keys:
-        """Keys of the leaf cells whose returns count otherwise than before.
-
-        These are the `changed` ones; those that became ghosts, or are none any more; and those whose planes turned.
-        `of_rays`, `of_planes`: regions in which mean rays and planes changed, ascending.
-        """
-        assert self._noise is not None
-        if self._config.returns.drop_ghosts:
-            ghosts = self._ghosts.update(of_rays, of_planes, self._noise, num_threads)
-            near_ghosts = self._leaves.gather(np.unique(self._cells.regions_of(ghosts)))["keys"]
-            changed = np.union1d(changed, near_ghosts[np.isin(merged_keys(near_ghosts), ghosts)])
-        return np.union1d(changed, self._turn(of_planes, num_threads))
-
     def _turn(self, regions: Keys, num_threads: int) -> Keys:
-        """The keys of the leaf cells in these regions whose normals differ from before."""
+        """Finds the normals of the leaf cells in these regions. Returns the keys of those that differ from before."""
         leaves = self._leaves.gather(regions)
         surfels = surfels_of(self._cells.gather(regions), self._config.leaf_size_m)
         normals = normals_at(means_of(leaves), surfels, num_threads)
@@ -239,3 +197,77 @@ class GrowingSurface:
         self._leaves.put(regions, leaves)
         found: Keys = leaves["keys"][differs]
         return found
+
+    def _derive_distances(self, changed: Keys, noise: SensorNoise, num_threads: int) -> Keys:
+        """Derives distances and evidence again where they depend on changed leaf cells. Returns the regions, ascending.
+
+        A ray counts in the cells of its band; the corners of the last one have others round them. Cells that come or go tell
+        which rays count at the corners of those round them, and smoothing carries what is known there.
+        """
+        config = self._config
+        reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(max(TRUNCATION_CELLS, BAND_CELLS)) + 1)
+        centre = regions_of(reached)
+        # Bridges depend on medians of blocks of 32 cells, and on their two ends.
+        own, around = regions_near(centre, 2), regions_near(centre, 3)
+        means, normals = self._true_returns(around)
+        before = self.distances.gather(around)["keys"]
+        crossed = self._find_crossed(centre, around, means, num_threads)
+        counts = means.counts.astype(np.float64)
+        found = bridged(crossed, means.keys, counts, config.encoding.bridge_cells, num_threads)
+        # At the rim of what was gathered, bridges lack an end.
+        leaf_keys = np.concatenate(
+            [found[np.isin(found >> REGION_BITS, own)], before[~np.isin(before >> REGION_BITS, own)]]
+        )
+        leaf_keys.sort()
+        came_or_went = np.setxor1d(leaf_keys, before, assume_unique=True)
+        reached = np.union1d(reached, cubes_near(came_or_went, _BLOCK_CELLS, 1))
+        there = regions_of(np.union1d(leaf_keys, before))
+        redone = np.intersect1d(regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED)), there)
+        # All that has a part in what their corners get: smoothing reaches no farther.
+        near = regions_near(redone, 1)
+        leaf_keys = leaf_keys[np.isin(leaf_keys >> REGION_BITS, near)]
+        here = np.isin(means.keys >> REGION_BITS, near)
+        rows = self._distances_of(leaf_keys, redone, means.select(here), normals[here], noise, num_threads)
+        self.distances.put(redone, rows)
+        return redone
+
+    def _true_returns(self, regions: Keys) -> tuple[MeanRays, NDArray[np.float32]]:
+        """Mean rays and normals of the leaf cells in these regions whose returns are no ghosts: what distances are made of."""
+        leaves, cells = self._leaves.gather(regions), self._cells.gather(regions)
+        is_true = ~cells["ghosts"][CellBlocks(cells["keys"]).rows(merged_keys(leaves["keys"]), 1)]
+        return means_of(leaves).select(is_true), leaves["normals"][is_true]
+
+    def _find_crossed(self, regions: Keys, around: Keys, means: MeanRays, num_threads: int) -> Keys:
+        """Keys of the leaf cells in `around` that rays cross near their returns: found anew in `regions`."""
+        rays = means.select(np.isin(means.keys >> REGION_BITS, regions_near(regions, 1)))
+        keys = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
+        self._crossed.put(regions, {"keys": keys})
+        found: Keys = self._crossed.gather(around)["keys"]
+        return found
+
+    def _distances_of(
+        self,
+        leaf_keys: Keys,
+        regions: Keys,
+        means: MeanRays,
+        normals: NDArray[np.float32],
+        noise: SensorNoise,
+        num_threads: int,
+    ) -> Rows:
+        """Columns of the leaf cells in these regions. `leaf_keys`, `means`, `normals`: of these and of the regions round them."""
+        config = self._config
+        own = np.isin(leaf_keys >> REGION_BITS, regions)
+        told = returns_of_means(means, noise, config.returns)
+        table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
+        distances_m = average_at_corners(table, means, told, normals, config, num_threads)
+        _, vertices = table.leaf_vertices()
+        values = distances_m[vertices[own]]
+        crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
+        information, detections = sums_round(told, leaf_keys[own], num_threads)
+        return {
+            "keys": leaf_keys[own],
+            "values": values,
+            "crossed": crossed,
+            "information": information,
+            "detections": detections,
+        }

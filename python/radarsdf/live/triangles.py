@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.regions import REGION_CELLS, RegionTable, regions_round
-from radarsdf.live.rows import Keys
+from radarsdf.live.regions import REGION_CELLS, Keys, RegionTable, regions_near
 from radarsdf.map import queries
 from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
@@ -26,21 +25,16 @@ _ON_BORDER = 1e-4  # leaf cells: vertices are at least 1e-3 from the corners of 
 
 @dataclass(frozen=True)
 class Triangles:
-    """All triangles of the surface with what decides which of them are kept."""
+    """All triangles of the surface, and what decides which of them are kept."""
 
     scene: WholeMap
     surface: Surface
     leaf_cells: int
     """Number of leaf cells near the surface."""
 
-    @property
-    def told(self) -> tuple[float, float]:
-        """The numbers that all returns give."""
-        return self.scene.rough_share, self.scene.returns_per_cell
-
 
 @dataclass(frozen=True)
-class _Piece:
+class _Part:
     vertices: NDArray[np.float64]  # (V, 3) local, m
     faces: NDArray[np.int32]  # (F, 3)
     evidence: torch.Tensor  # (V, 3) as of queries.EvidenceAt
@@ -54,63 +48,65 @@ class _Piece:
 
 
 class GrowingTriangles:
-    """Pieces by their regions. `origin` (3,): of the local frame, world, m."""
+    """Parts by their regions. `origin` (3,): of the local frame, world, m."""
 
     def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
         self._config, self._origin = config, origin
-        self._pieces: dict[int, _Piece] = {}
+        self._parts: dict[int, _Part] = {}
         self._joined: Triangles | None = None
         self.num_bytes = 0
-        """Memory of the pieces, bytes."""
+        """Memory of the parts, bytes."""
 
-    def cut(self, regions: Keys, surface: RegionTable, looks: RegionTable, num_threads: int) -> None:
-        """Makes the pieces of `regions` (R,), ascending, anew.
-
-        `surface` and `looks`: the tables of :class:`radarsdf.live.surface.GrowingSurface`.
-        """
+    def cut(self, regions: Keys, surface: RegionTable, visibility: RegionTable, num_threads: int) -> None:
+        """Cuts `regions` (R,), ascending, again, from the tables of distances and of visibility counts."""
         if len(regions) == 0:
             return
         self._joined = None
-        cut = {int(region): self._cut(surface, region, num_threads) for region in regions}
-        for region in cut:
-            if region in self._pieces:
-                self.num_bytes -= self._pieces.pop(region).num_bytes
-        found = {region: piece for region, piece in cut.items() if len(piece[1])}
+        found = {}
+        for region in regions:
+            if int(region) in self._parts:
+                self.num_bytes -= self._parts.pop(int(region)).num_bytes
+            vertices, faces = self._cut(surface, region, num_threads)
+            if len(faces):
+                found[int(region)] = vertices, faces
         if not found:
             return
-        around = regions_round(np.array(list(found), np.uint64), 1)
-        cells, blocks = surface.gather(around), looks.gather(around)
+        around = regions_near(np.array(list(found), np.uint64), 1)
+        cells, blocks = surface.gather(around), visibility.gather(around)
         of_cells = Looks(blocks["keys"] >> BLOCK_BITS, blocks["scans"]).at(cells["keys"])
         evidence = Evidence(cells["information"], cells["detections"], of_cells)
         scene = WholeMap(self._origin, self._config, 0.0, 0.0)
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         world = np.concatenate([vertices for vertices, _ in found.values()]) + self._origin
         at = queries.interpolated(evidence, cells["keys"], self._config.leaf_size_m, local(scene, world))
-        parts = torch.split(torch.stack(list(at), 1), [len(vertices) for vertices, _ in found.values()])
-        for (region, (vertices, faces)), part in zip(found.items(), parts, strict=True):
+        split = torch.split(torch.stack(list(at), 1), [len(vertices) for vertices, _ in found.values()])
+        for (region, (vertices, faces)), own in zip(found.items(), split, strict=True):
             areas_m2, border = areas_round(vertices, faces), self._border(vertices)
-            piece = self._pieces[region] = _Piece(vertices, faces, part.clone(), areas_m2, border)
-            self.num_bytes += piece.num_bytes
+            part = self._parts[region] = _Part(vertices, faces, own.clone(), areas_m2, border)
+            self.num_bytes += part.num_bytes
 
-    def joined(self, rough_share: float, returns_per_cell: float, leaf_cells: int) -> Triangles:
+    def joined(self, clutter_ratio: float, returns_per_cell: float, leaf_cells: int) -> Triangles:
         """All triangles, those of neighbours with common vertices. The first two numbers: see :class:`WholeMap`."""
-        told = rough_share, returns_per_cell
-        if self._joined is not None and self._joined.told == told:
-            return self._joined
-        pieces = [self._pieces[region] for region in sorted(self._pieces)]
-        starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-        vertices = np.concatenate([np.zeros((0, 3)), *(piece.vertices for piece in pieces)])
-        faces = [piece.faces + np.int32(start) for piece, start in zip(pieces, starts, strict=False)]
-        border = [piece.border + start for piece, start in zip(pieces, starts, strict=False)]
+        scene = WholeMap(self._origin, self._config, clutter_ratio, returns_per_cell)
+        joined = self._joined
+        if joined is not None and (joined.scene.rough_share, joined.scene.returns_per_cell) == (
+            clutter_ratio,
+            returns_per_cell,
+        ):
+            return joined
+        parts = [self._parts[region] for region in sorted(self._parts)]
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        vertices = np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)])
+        faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
+        border = [part.border + start for part, start in zip(parts, starts, strict=False)]
         rows = np.concatenate([np.zeros(0, np.int64), *border])
         # What two regions make of an edge of the lattice has the same bits.
         bits = np.ascontiguousarray(vertices[rows]).view([("", np.uint64)] * 3)[:, 0]
         _, first, which = np.unique(bits, return_index=True, return_inverse=True)
         one = np.arange(len(vertices), dtype=np.int32)
         one[rows] = rows[first][which]
-        areas_m2 = np.concatenate([np.zeros(0), *(piece.areas_m2 for piece in pieces)])
-        evidence = torch.cat([torch.zeros((0, 3)), *(piece.evidence for piece in pieces)])
-        scene = WholeMap(self._origin, self._config, *told)
+        areas_m2 = np.concatenate([np.zeros(0), *(part.areas_m2 for part in parts)])
+        evidence = torch.cat([torch.zeros((0, 3)), *(part.evidence for part in parts)])
         surface = Surface.told_by(
             scene,
             vertices,

@@ -318,7 +318,7 @@ class _Poses(TypedDict):
 
 
 class _Report(TypedDict, total=False):
-    """What :func:`radarsdf.fitting.steps.fit_rays` writes, and :func:`radarsdf.tiles.tile_fit.fit_tile`."""
+    """What :func:`radarsdf.fitting.steps.fit_rays` writes, and :func:`radarsdf.tiles.fit_tiles.fit_tile`."""
 
     __pydantic_config__ = ConfigDict(strict=True, extra="allow")  # type: ignore[misc]
 

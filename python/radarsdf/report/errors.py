@@ -17,7 +17,7 @@ from radarsdf.report.surface import colored, picture
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import resolve_num_threads
-from radarsdf.tiles.any_map import predicted
+from radarsdf.tiles.tiled_map import predicted
 
 _Floats = NDArray[np.float64]
 

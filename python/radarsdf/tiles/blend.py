@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
@@ -17,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from radarsdf._core import cell_keys
 from radarsdf.checks import positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries, storage
@@ -24,24 +26,24 @@ from radarsdf.map.contents import MapContents
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
-from radarsdf.tiles.grid import Tile
-from radarsdf.tiles.knowledge import cells_of, holds, knowledge
-from radarsdf.tiles.plan import Plan, TilePlan, failure_of, map_path
-from radarsdf.tiles.tile_fit import contents_of_tile, is_done
+from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path
 
 _Floats = NDArray[np.float64]
+_Cells = NDArray[np.int64]
+_STEPS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])
+_LEAST_KNOWN = 1e-6  # at points on the border itself, which are observed, and which were moved inwards
 MEMORY_BYTES = 1 << 30
 _OF_FEATURES = 2.4  # bytes in memory for each of the features: measured; tables of cells, evidence
 
 
 class Share(NamedTuple):
-    """What one tile adds to answers at some of N positions."""
+    """What one tile contributes at some of N positions."""
 
     tile: Tile
     contents: MapContents
     """The map of the tile."""
     rows: NDArray[np.int64]
-    """(M,) of the positions at which the tile counts."""
+    """(M,) of the positions at which the tile has a weight."""
     weights: _Floats
     """(M,) there."""
     slopes: _Floats
@@ -62,7 +64,7 @@ class Share(NamedTuple):
 
 
 class TileBlend:
-    """What the tiles of a folder say of positions in the world: an average of those that know. See :class:`TiledMap`."""
+    """The field of the tiles in a folder: the average of those that know a position. See :class:`TiledMap`."""
 
     def __init__(self, folder: str | PathLike[str], *, memory_bytes: float = MEMORY_BYTES) -> None:
         self.folder = Path(folder)
@@ -83,11 +85,9 @@ class TileBlend:
     @property
     def missing(self) -> dict[str, str]:
         """The others by name, and why their fit failed; empty if it was not tried or was killed."""
-        reasons = {}
-        for tile in self.plan.tiles:
-            if not self.has(tile.tile):
-                reasons[tile.name] = failure_of(self.folder, tile)
-        return reasons
+        return {
+            tile.name: failure_of(self.folder, tile) for tile in self.plan.tiles if not self.has(tile.tile)
+        }
 
     def has(self, tile: Tile) -> bool:
         """Whether there is such a tile, and it is done. What was found stays so for this object."""
@@ -138,7 +138,7 @@ class TileBlend:
         """The map of a tile that is done. It is read, unless it is in memory."""
         with self._lock:
             if tile not in self._held:
-                contents = contents_of_tile(self.folder, self.plan, self.plan.by_tile[tile])
+                contents = storage.load_contents(map_path(self.folder, self.plan.by_tile[tile]))
                 size = round(_OF_FEATURES * sum(p.nbytes for p in contents.field.parameters()))
                 while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
                     self._held.popitem(last=False)
@@ -154,7 +154,7 @@ class TileBlend:
         return cells[inside]
 
     def shares(self, world: _Floats) -> Iterator[Share]:
-        """What each tile adds at positions (N, 3), world, m: in ascending order, on which the bits of sums depend.
+        """The contribution of each tile at positions (N, 3), world, m: in ascending order, on which the bits of sums depend.
 
         Weights depend on the borders between tiles alone, not on what a tile observed.
         """
@@ -180,7 +180,7 @@ class TileBlend:
 
         def among(contents: MapContents, points: Tensor) -> Tensor:
             inside = queries.occupied(contents, points)
-            cells = cells_of(contents, points[inside])
+            cells = _cells_of(contents, points[inside])
             inside[inside.clone()] = torch.from_numpy(self._owners_observed(share.tile, cells))
             return inside
 
@@ -201,7 +201,7 @@ class TileBlend:
             of_owner = (owners[left, 0] == owner[0]) & (owners[left, 1] == owner[1])
             rows, left = left[of_owner], left[~of_owner]
             if self.has(owner):
-                found[rows] = holds(self.contents_of(owner), cells[rows] - self.plan.origin_cells(owner))
+                found[rows] = _holds(self.contents_of(owner), cells[rows] - self.plan.origin_cells(owner))
         return found
 
     def known_shares(self, world: _Floats, *, extrapolate: bool = False) -> Iterator[Share]:
@@ -243,7 +243,7 @@ class TileBlend:
 def averages(
     shares: Iterable[Share], count: int, of_tile: Callable[[Share], _Floats], columns: int = 1
 ) -> _Floats:
-    """(N, columns) weighted averages of what tiles say, (M, columns) each, at `count` positions. NaN without a share."""
+    """(N, columns) weighted averages of the values of tiles, (M, columns) each, at `count` positions. NaN without a share."""
     sums, totals = np.zeros((count, columns)), np.zeros(count)
     for share in shares:
         sums[share.rows] += share.weights[:, None] * of_tile(share)
@@ -254,5 +254,67 @@ def averages(
 
 
 def distance(share: Share) -> _Floats:
-    """(M, 1) the signed distance that a tile says, m."""
+    """(M, 1) the signed distance of a tile, m."""
     return queries.signed_distance(share.contents, share.local).numpy().astype(np.float64)[:, None]
+
+
+def _cells_of(contents: MapContents, points: Tensor) -> _Cells:
+    """(M, 3) the leaf cells of points (M, 3), local frame, m, from the origin of their map."""
+    size_m = contents.field.table.leaf_size_m
+    return np.floor(_places(points, size_m)).astype(np.int64)
+
+
+def _holds(contents: MapContents, cells: _Cells) -> NDArray[np.bool_]:
+    """(M,) whether a tile observed these leaf cells (M, 3), from its origin."""
+    size_m = contents.field.table.leaf_size_m
+    centres = (cells + 0.5).astype(np.float32) * np.float32(size_m)
+    # The core looks them up on all threads: queries would start threads of their own.
+    return contents.field.occupied(torch.from_numpy(centres)).numpy()
+
+
+def knowledge(
+    contents: MapContents, points: Tensor, observed: Callable[[_Cells], NDArray[np.bool_]]
+) -> tuple[_Floats, _Floats]:
+    """The factor of a tile's weight at points (M, 3), local frame, m: (M,) in [0, 1], and its derivatives (M, 3), 1/m.
+
+    It is the distance to the nearest leaf cell that another tile has observed and this one has not, in leaf cells and along
+    the axis where it is largest, at most one; 0 outside of the cells that the tile observed. `observed`: which of the cells
+    (K, 3), from the tile's origin, were observed by the tiles that they lie in, (K,) bool.
+    """
+    known, slopes = np.zeros(len(points)), np.zeros((len(points), 3))
+    inside = np.flatnonzero(queries.occupied(contents, points).numpy())
+    size_m = contents.field.table.leaf_size_m
+    place = _places(points[torch.from_numpy(inside)], size_m)
+    cell = np.floor(place)
+    _, first, of_point = np.unique(
+        cell_keys(points.numpy()[inside], size_m), return_index=True, return_inverse=True
+    )
+    cells = cell[first].astype(np.int64)
+    seen = observed(cells)[of_point]
+    inside, of_point, place, cell = inside[seen], of_point[seen], place[seen], cell[seen]
+    around = (cells[:, None, :] + _STEPS).reshape(-1, 3)
+    lacks = observed(around)
+    lacks[lacks] = ~_holds(contents, around[lacks])
+    lacks_near: NDArray[np.bool_] = lacks.reshape(-1, len(_STEPS))
+    known[inside] = 1 - queries.INWARD
+    near = np.any(lacks_near, axis=1)[of_point]
+    inside, of_point = inside[near], of_point[near]
+    below = (place - cell)[near].astype(np.float64)
+    nearest, directions = np.ones(len(inside)), np.zeros((len(inside), 3))
+    for step, lacked in zip(_STEPS, lacks_near.T, strict=True):
+        to_cell = np.where(step < 0, below, 1 - below) * (step != 0)
+        axis = to_cell.argmax(axis=1)
+        distance = to_cell.max(axis=1)
+        rows = np.flatnonzero(lacked[of_point] & (distance < nearest))
+        nearest[rows] = distance[rows]
+        directions[rows] = 0
+        directions[rows, axis[rows]] = -step[axis[rows]]
+    known[inside] = np.maximum(nearest - queries.INWARD, _LEAST_KNOWN)
+    slopes[inside] = directions / size_m
+    return known, slopes
+
+
+def _places(points: Tensor, size_m: float) -> NDArray[np.float32]:
+    """(M, 3) in leaf cells. Rounded as the core does it: in the same cell."""
+    places: NDArray[np.float32] = points.numpy() * np.float32(1 / size_m)
+    return places

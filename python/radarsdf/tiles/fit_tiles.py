@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
@@ -18,27 +19,24 @@ import torch
 
 from radarsdf.checks import are_rigid, flag, instance, one_for_each_scan, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
-from radarsdf.io.files import write_whole
+from radarsdf.fitting.steps import FitInput, fit_rays
+from radarsdf.io.files import take_lock, write_whole
 from radarsdf.io.poses.trajectory import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.returns.rays import LeftOut
 from radarsdf.tiles.drive_poses import POSES, TRAJECTORY, DrivePoses, DriveToPose
-from radarsdf.tiles.grid import TileGrid
-from radarsdf.tiles.input_digest import InputDigest
-from radarsdf.tiles.locking import LOCK, only_planner
-from radarsdf.tiles.plan import PLAN, TILES, Plan, failure_path
-from radarsdf.tiles.planning import make_plan
-from radarsdf.tiles.ray_files import SCANS_FILE
-from radarsdf.tiles.running import run_tasks
-from radarsdf.tiles.tile_fit import fit_tile, is_done
+from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, TilePlan, failure_path, is_done, map_path
+from radarsdf.tiles.planning import SCANS_FILE, InputDigest, make_plan, read_rays
+from radarsdf.tiles.tasks import run_tasks
 from radarsdf.tiles.tiled_map import TiledMap
 
 _LOG = logging.getLogger("radarsdf.tiles")
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
-_OURS = {PLAN, LOCK, POSES, TRAJECTORY, TILES, SCANS_FILE}
+_LOCK = "plan.lock"
+_OURS = {PLAN, _LOCK, POSES, TRAJECTORY, TILES, SCANS_FILE}
 
 
 def fit_tiles(
@@ -68,20 +66,20 @@ def fit_tiles(
     tile_size : float, optional
         Edge of a tile, m, moved to the next multiple of a block of ``config.lattice``. Default: 512 leaf cells.
     halo : float, optional
-        What a tile knows beyond its edges, m, likewise. Half of it overlaps with what the next tile answers. Default: 64
-        leaf cells.
+        Width of the margin round each tile whose returns it is fitted to, m, moved to a multiple of a block. Tiles overlap in
+        half of it. Default: 64 leaf cells.
     executor : concurrent.futures.Executor, optional
         What runs the fits: processes, or that of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
         By default one after another in this process.
     config : FitConfig, optional
         Settings of the fits. With an executor, each has one thread unless ``num_threads`` says otherwise.
     refine : bool
-        Whether the returns mend the poses before the plan is made, as :func:`radarsdf.refine_poses` does, window by window of
-        some hundred scans. The poses used are kept in the folder, ``poses.tum``, and their deviations become
-        ``pose_sigma_m`` and ``pose_sigma_rad`` of the maps, unless `config` states some.
+        Whether poses are refined before the plan is made, as by :func:`radarsdf.refine_poses`, in windows of some hundred
+        scans. The poses used are kept in the folder, ``poses.tum``, and their deviations become ``pose_sigma_m`` and
+        ``pose_sigma_rad`` of the maps, unless `config` states some.
     find : bool
-        Whether poses are found from the radar alone, as by :func:`radarsdf.odometry`. Those of the scans are not used. Scans
-        in a path that have no poses get some in any case. Of a drive in several pieces, the longest is used.
+        Whether poses are found from the radar alone, as by :func:`radarsdf.odometry`, and those of the scans are not used.
+        This is done for scans in a path without poses, too. Of a drive in several segments, the longest is used.
     progress : bool, optional
         Whether to show progress bars. By default only on a terminal.
 
@@ -123,9 +121,7 @@ def plan_tiles(
     find: bool = False,
     progress: bool | None = None,
 ) -> Plan:
-    """The first step of :func:`fit_tiles`: one pass over the scans, which writes the plan and the rays of each tile.
-
-    If poses are refined or found, that is a pass before it.
+    """The first step of :func:`fit_tiles`: writes the plan and the rays of each tile, in one pass over the scans.
 
     `threads`: of each fit, if the configuration does not say. Default: as many as PyTorch uses.
     """
@@ -138,28 +134,53 @@ def plan_tiles(
             msg = f"{folder} holds other files: give a new folder"
             raise ValueError(msg)
         folder.mkdir(exist_ok=True)
-        with only_planner(folder):
+        lock = take_lock(folder / _LOCK, "planned")
+        try:
             if not (folder / PLAN).is_file():  # another process may just have made it
                 shutil.rmtree(folder / TILES, ignore_errors=True)  # of a plan that was not finished
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
-                if drive is not None:
+                if drive is None:
+                    for name in (POSES, TRAJECTORY):
+                        (folder / name).unlink(missing_ok=True)
+                else:
                     poses = DrivePoses.of(drive, config, folder, progress)
                     given, config = poses.scans(given), poses.posed.config(config)
-                else:
-                    for name in (POSES, TRAJECTORY):  # likewise
-                        (folder / name).unlink(missing_ok=True)
                 plan = make_plan(given, folder, config, grid)
                 plan.save(folder)
                 return plan
-    plan = Plan.load(folder)
-    planned = DrivePoses.load(folder)
-    if (planned is None) != (drive is None):
-        msg = f"{folder} holds another plan, of poses {'as given' if planned is None else 'that were refined or found'}: give a new folder"
+        finally:
+            os.close(lock)
+    return _known_plan(folder, config, grid, drive, given)
+
+
+def _known_plan(
+    folder: Path, config: FitConfig, grid: TileGrid, drive: DriveToPose | None, given: Iterable[Scan]
+) -> Plan:
+    """The plan in a folder. Raises a ValueError if it is of other scans or settings."""
+    plan, poses = Plan.load(folder), DrivePoses.load(folder)
+    if (poses is None) != (drive is None):
+        made = "as given" if poses is None else "that were refined or found"
+        msg = f"{folder} holds another plan, of poses {made}: give a new folder"
         raise ValueError(msg)
-    if planned is None or drive is None:
-        _check_same(folder, plan, config, grid, InputDigest.of(given))
+    if poses is None or drive is None:
+        digest = InputDigest.of(given)
     else:
-        _check_same(folder, plan, planned.posed.config(config), grid, planned.digest(drive, config))
+        config, digest = poses.posed.config(config), poses.digest(drive, config)
+    if config.num_threads not in (0, plan.config.num_threads):
+        msg = f"{folder} was planned for {plan.config.num_threads} threads a tile, not {config.num_threads}"
+        raise ValueError(msg)
+    found = {
+        name: getattr(plan.config.returns, name)
+        for name in NOISE_SETTINGS
+        if getattr(config.returns, name) is None
+    }
+    ours, theirs = (settings_of_results(own) for own in (config.override(returns=found), plan.config))
+    different = [name for name in ours if ours[name] != theirs[name]]
+    different += ["tile_size"] * (grid.tile_m != plan.tile_m) + ["halo"] * (grid.halo_m != plan.halo_m)
+    different += ["scans"] * (digest != plan.input_digest)
+    if different:
+        msg = f"{folder} holds another plan: {', '.join(different)} differ; give a new folder"
+        raise ValueError(msg)
     return plan
 
 
@@ -212,6 +233,46 @@ def run_fits(
     return TiledMap(root)
 
 
+def fit_tile(folder: str, name: str, run: str = "") -> str:
+    """Fits the tile of this name, unless its map is there already, and returns the path of the map.
+
+    A task takes names and returns a name, so that it can run anywhere. `run` is anything: schedulers that keep results by
+    arguments run the task again if it differs. Raises what :func:`radarsdf.fit` raises; the reason is also in
+    ``failed.txt`` in the tile's folder.
+    """
+    del run
+    root = Path(folder)
+    plan = Plan.load(root)
+    (tile,) = (planned for planned in plan.tiles if planned.name == name)
+    path, failure = map_path(root, tile), failure_path(root, tile)
+    if not is_done(root, plan, tile):
+        try:
+            _fit(root, plan, tile)
+        except Exception as error:
+            write_whole(failure, (str(error) or type(error).__name__).encode())
+            raise
+    failure.unlink(missing_ok=True)
+    return str(path)
+
+
+def _fit(root: Path, plan: Plan, tile: TilePlan) -> None:
+    def read() -> FitInput:
+        rays, inside = read_rays(root, plan, tile)
+        return FitInput(
+            rays,
+            plan.scale,
+            inside=inside,
+            rough_share=plan.rough_share,
+            returns_per_cell=plan.returns_per_cell,
+            sensor=plan.sensor,
+            box_cells=plan.box_cells(tile.tile),
+        )
+
+    radar_map = fit_rays(read, plan.config, progress=False)
+    radar_map.report["plan"] = plan.digest
+    radar_map.save(map_path(root, tile))
+
+
 def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> TileGrid:
     lattice = config.lattice
 
@@ -257,21 +318,3 @@ class _Checked:
             raise ValueError(msg)
         for note in LeftOut(poses=bad).notes:
             _LOG.warning(note)
-
-
-def _check_same(folder: Path, plan: Plan, config: FitConfig, grid: TileGrid, digest: str) -> None:
-    known = {
-        name: getattr(plan.config.returns, name)
-        for name in NOISE_SETTINGS
-        if getattr(config.returns, name) is None
-    }
-    ours, theirs = (settings_of_results(own) for own in (config.override(returns=known), plan.config))
-    if config.num_threads not in (0, plan.config.num_threads):
-        msg = f"{folder} was planned for {plan.config.num_threads} threads a tile, not {config.num_threads}"
-        raise ValueError(msg)
-    different = [name for name in ours if ours[name] != theirs[name]]
-    different += ["tile_size"] * (grid.tile_m != plan.tile_m) + ["halo"] * (grid.halo_m != plan.halo_m)
-    different += ["scans"] * (digest != plan.input_digest)
-    if different:
-        msg = f"{folder} holds another plan: {', '.join(different)} differ; give a new folder"
-        raise ValueError(msg)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The plan of a map in tiles: one JSON file, on which all tasks agree."""
+"""The plan of a map in tiles: one JSON file, on which all tasks agree, and where the files of tiles are."""
 
 from __future__ import annotations
 
@@ -8,32 +8,139 @@ import dataclasses
 import hashlib
 import itertools
 import json
-import math
-import os
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
+from safetensors import SafetensorError
 
 from radarsdf.checks import MAX_POSITION_M
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.tensors import open_tensors
+from radarsdf.map.storage import checked_report
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.settings import by_name, settings
-from radarsdf.tiles.grid import Tile, TileGrid
 
 FORMAT = "radarsdf.tiles"
 FORMAT_VERSION = 1
 PLAN, TILES = "plan.json", "tiles"
+
+Tile = tuple[int, int]
+"""Number of a tile along x and along y. Tile (0, 0) begins where the lattice of the world does."""
+
+_Floats = NDArray[np.float64]
+_MOST_TILES = 2**31  # to either side: far beyond what a float64 of metres tells apart
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Number = Annotated[int, Field(ge=-(2**53), le=2**53)]  # of a tile or a cell
 _Length = Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
-_MAX_REASON_BYTES = 10_000
 _FromList = Field(strict=False)  # JSON has lists, not tuples
+_MAX_REASON_BYTES = 10_000
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """Squares of the horizontal plane, of any height, and a halo round each."""
+
+    tile_m: float
+    """Edge of a tile, m: a multiple of the block."""
+    halo_m: float
+    """What a tile knows beyond its edges, m: at most its edge."""
+    corner_m: float
+    """Where tile (0, 0) begins along x and along y, world, m."""
+
+    def lower_corner(self, tile: Tile) -> _Floats:
+        """(2,) where a tile begins, world, m."""
+        return self.corner_m + np.array(tile) * self.tile_m
+
+    def tiles_of(self, positions: NDArray[Any]) -> NDArray[np.int64]:
+        """(N, 2) the tile that each position (N, 3), world, m, belongs to."""
+        tiles: NDArray[np.int64] = np.floor(self._along(positions) / self.tile_m).astype(np.int64)
+        return tiles
+
+    def crossed(
+        self, ends: _Floats, others: _Floats
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Rows (M,) of segments between `ends` and `others` (N, 3), world, m, and the tiles (M, 2) whose halos they enter, once each."""
+        a, b = self._along(ends), self._along(others)
+        first = np.floor((np.minimum(a, b) - self.halo_m) / self.tile_m).astype(np.int64)
+        last = np.floor((np.maximum(a, b) + self.halo_m) / self.tile_m).astype(np.int64)
+        most = (last - first).max(axis=0, initial=-1)
+        for step in itertools.product(range(most[0] + 1), range(most[1] + 1)):
+            rows = np.flatnonzero((first + step <= last).all(axis=1))
+            tiles = first[rows] + step
+            meets = self._meets(a[rows], b[rows], tiles)
+            yield rows[meets], tiles[meets]
+
+    def _meets(self, a: _Floats, b: _Floats, tiles: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether segments, from the corner of tile (0, 0), meet the boxes of their tiles, all (M, 2), by slabs."""
+        lower = tiles * self.tile_m - self.halo_m
+        upper = (tiles + 1) * self.tile_m + self.halo_m
+        way = b - a
+        with np.errstate(divide="ignore", invalid="ignore"):
+            near, far = (lower - a) / way, (upper - a) / way
+        enter, leave = np.minimum(near, far), np.maximum(near, far)
+        along = way == 0  # parallel to the slab, and within: the tiles are those of its own limits
+        enter, leave = np.where(along, -np.inf, enter), np.where(along, np.inf, leave)
+        meets: NDArray[np.bool_] = np.maximum(enter.max(axis=1), 0) <= np.minimum(leave.min(axis=1), 1)
+        return meets
+
+    def weights(self, tile: Tile, positions: _Floats) -> tuple[_Floats, _Floats]:
+        """Weights of a tile at positions (N, 3), world, m: (N,), and the derivatives (N, 2) by x and y, 1/m.
+
+        Those of all tiles add up to one. They rise smoothly within half a halo round each edge: the outer half of a halo,
+        where a tile knows less than its owner, does not count.
+        """
+        along = self._along(positions)
+        factors, slopes = np.ones((len(positions), 2)), np.zeros((len(positions), 2))
+        for axis in range(2):
+            x = along[:, axis]
+            for edge, sign in ((tile[axis], 1.0), (tile[axis] + 1, -1.0)):
+                t = np.clip(sign * (x - edge * self.tile_m) / self.halo_m + 0.5, 0.0, 1.0)
+                rise = t * t * (3 - 2 * t)
+                slopes[:, axis] = (
+                    slopes[:, axis] * rise + factors[:, axis] * sign * 6 * t * (1 - t) / self.halo_m
+                )
+                factors[:, axis] *= rise
+        return factors[:, 0] * factors[:, 1], slopes * factors[:, ::-1]
+
+    def counting(self, positions: _Floats) -> list[Tile]:
+        """The tiles with a weight at any of the positions (N, 3), world, m, in ascending order."""
+        found: set[Tile] = set()
+        # What is no place, or too far away for a number, is in no tile.
+        is_place = (np.abs(self._along(positions)) < _MOST_TILES * self.tile_m).all(axis=1)
+        positions = positions if is_place.all() else positions[is_place]
+        if len(positions) == 0:
+            return []
+        for shift in itertools.product((-0.5, 0.5), repeat=2):
+            tiles = self.tiles_of(positions[:, :2] + np.array(shift) * self.halo_m)
+            # Neighbours in the list are mostly of one tile: what is left to sort is a thousandth.
+            changes = np.any(tiles[1:] != tiles[:-1], axis=1).nonzero()[0] + 1
+            found |= set(map(tuple, np.unique(tiles[np.append(0, changes)], axis=0).tolist()))
+        return sorted(found)
+
+    def within_half_a_halo(self, tile: Tile, positions: _Floats) -> NDArray[np.int64]:
+        """(M,) rows of positions (N, 3), world, m, at which a tile has a weight."""
+        from_corner = self._along(positions) - np.array(tile) * self.tile_m
+        half_m = self.halo_m / 2
+        return np.flatnonzero(((from_corner > -half_m) & (from_corner < self.tile_m + half_m)).all(axis=1))
+
+    def _along(self, positions: NDArray[Any]) -> _Floats:
+        """(N, 2) from the corner of tile (0, 0) to positions (N, 3), world, m."""
+        along: _Floats = positions[:, :2] - self.corner_m
+        return along
+
+
+def neighbours(tile: Tile) -> list[Tile]:
+    """A tile and its eight neighbours, in ascending order."""
+    return [(tile[0] + dx, tile[1] + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 
 
 @settings
@@ -58,18 +165,14 @@ class TilePlan:
     @property
     def name(self) -> str:
         """Of its files."""
-        return _name(self.tile)
+        return f"{self.tile[0]}_{self.tile[1]}"
 
 
 @settings
 class Plan:
-    """What the tasks have in common, and a list of tiles. Tiles are pure functions of their plan and their rays.
+    """What the tasks have in common, and a list of tiles. A map of a tile is a pure function of its plan and its rays.
 
-    Raises
-    ------
-    ValueError
-        If a value is of a wrong type or out of range, or values contradict each other. Folders are named by these
-        numbers, so nothing else must come in from a file.
+    Folders are named by these numbers, so their types are checked: nothing else must come in from a file.
     """
 
     config: FitConfig
@@ -94,33 +197,6 @@ class Plan:
     tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]
     """The tiles that own a return, in ascending order."""
 
-    def __post_init__(self) -> None:
-        lattice = self.config.lattice
-        for name in ("tile_m", "halo_m"):
-            blocks = getattr(self, name) / lattice.block_m
-            if round(blocks) < 1 or not math.isclose(blocks, round(blocks), rel_tol=1e-9):
-                msg = f"plan.{name} must be a multiple of {lattice.block_m:g} m, not {getattr(self, name)}"
-                raise ValueError(msg)
-        if self.halo_m > self.tile_m:
-            msg = f"plan.halo_m must be at most plan.tile_m, {self.tile_m}, not {self.halo_m}"
-            raise ValueError(msg)
-        if self.intensity_range is not None:
-            IntensityScale.between(self.intensity_range)
-        if any(a.tile >= b.tile for a, b in itertools.pairwise(self.tiles)):
-            msg = "plan.tiles must be in ascending order, each of them once"
-            raise ValueError(msg)
-        for planned in self.tiles:
-            corners = (*self.grid.lower_corner(planned.tile), *lattice.position(planned.origin_cells))
-            if not np.abs(corners).max() <= MAX_POSITION_M:
-                msg = f"plan.tiles: tile {planned.name} is more than {MAX_POSITION_M:g} m away"
-                raise ValueError(msg)
-            if any(cells % lattice.block_cells for cells in planned.origin_cells):
-                msg = f"plan.tiles: the origin of tile {planned.name} is not the corner of a block"
-                raise ValueError(msg)
-            if not planned.scans[0] <= planned.scans[1] < self.scans:
-                msg = f"plan.tiles: tile {planned.name} has other scans than 0 to {self.scans - 1}"
-                raise ValueError(msg)
-
     @cached_property
     def grid(self) -> TileGrid:
         """Of the tiles."""
@@ -141,11 +217,11 @@ class Plan:
         """Edge of a tile, leaf cells."""
         return round(self.tile_m / self.config.leaf_size_m)
 
-    def origin_cells(self, tile: Tile) -> np.ndarray[Any, np.dtype[np.int64]]:
+    def origin_cells(self, tile: Tile) -> NDArray[np.int64]:
         """(3,) origin of a tile's map, leaf cells of the lattice."""
         return np.array(self.by_tile[tile].origin_cells, np.int64)
 
-    def box_cells(self, tile: Tile) -> np.ndarray[Any, np.dtype[np.int64]]:
+    def box_cells(self, tile: Tile) -> NDArray[np.int64]:
         """(2, 3) first leaf cell of a tile, and the one after the last, from the origin of its map. Of any height."""
         first = np.array([*(np.array(tile) * self.tile_cells), -MAX_CELLS_FROM_ORIGIN])
         first[:2] -= self.origin_cells(tile)[:2]
@@ -153,7 +229,7 @@ class Plan:
 
     @cached_property
     def digest(self) -> str:
-        """Of all that is in the plan. Results of another plan are not taken for results of this one."""
+        """Of all that is in the plan: results of another plan are not taken for results of this one."""
         return hashlib.blake2b(self._to_json(), digest_size=16).hexdigest()
 
     def _to_json(self) -> bytes:
@@ -192,7 +268,6 @@ class Plan:
         if folder.is_dir() and not path.exists():
             msg = f"{folder} is no map: a folder that radarsdf tiles wrote has a {PLAN}"
             raise ValueError(msg)
-        path = within(folder, path)
         check_regular_file(path)
         try:
             described = by_name(json.loads(path.read_bytes()), "the plan")
@@ -202,14 +277,10 @@ class Plan:
             ):
                 msg = f"it is not a plan of format {FORMAT}, version {FORMAT_VERSION}"
                 raise ValueError(msg)
-            tiles = described.pop("tiles", None)
-            if not isinstance(tiles, list):
-                msg = f"plan.tiles must be a list, not {tiles!r:.50}"
-                raise ValueError(msg)  # noqa: TRY004 - of a file, a wrong type is a wrong value
             return cls(
-                config=FitConfig.from_dict(described.pop("config", None)),
-                sensor=Sensor.from_dict(described.pop("sensor", None)),
-                tiles=tuple(TilePlan(**by_name(planned, "a tile of the plan")) for planned in tiles),
+                config=FitConfig.from_dict(described.pop("config")),
+                sensor=Sensor.from_dict(described.pop("sensor")),
+                tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
                 **described,
             )
         except Exception as error:  # damaged files raise exceptions of many kinds
@@ -217,40 +288,19 @@ class Plan:
             raise ValueError(msg) from error
 
 
-def within(folder: Path, path: Path) -> Path:
-    """`path`, which is in the folder of a map in tiles.
-
-    The folder may be a link, and what is in it may link to other places in it. But a folder that comes from elsewhere must
-    not lead what is written or read to a file of somebody else.
-
-    Raises
-    ------
-    ValueError
-        If a link leads out of the folder.
-    """
-    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
-        msg = f"{path} is a link that leads out of {folder}, which a map in tiles must not have"
-        raise ValueError(msg)
-    return path
-
-
-def _name(tile: Tile) -> str:
-    return f"{tile[0]}_{tile[1]}"
-
-
 def folder_of(folder: Path, tile: Tile) -> Path:
     """Where the files of a tile are."""
-    return folder / TILES / _name(tile)
+    return folder / TILES / f"{tile[0]}_{tile[1]}"
 
 
 def map_path(folder: Path, tile: TilePlan) -> Path:
     """The map of a tile."""
-    return within(folder, folder_of(folder, tile.tile) / "map.safetensors")
+    return folder_of(folder, tile.tile) / "map.safetensors"
 
 
 def failure_path(folder: Path, tile: TilePlan) -> Path:
     """Why the fit of a tile failed."""
-    return within(folder, folder_of(folder, tile.tile) / "failed.txt")
+    return folder_of(folder, tile.tile) / "failed.txt"
 
 
 def failure_of(folder: Path, tile: TilePlan) -> str:
@@ -261,3 +311,26 @@ def failure_of(folder: Path, tile: TilePlan) -> str:
     with path.open("rb") as file:
         text = file.read(_MAX_REASON_BYTES).decode(errors="replace")
     return "".join(letter if letter.isprintable() else " " for letter in text).strip()
+
+
+def is_done(folder: Path, plan: Plan, tile: TilePlan) -> bool:
+    """Whether the map of a tile is there, and of this plan. Only the beginning of its file is read."""
+    try:
+        return bool(_report(map_path(folder, tile))["plan"] == plan.digest)
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError):
+        return False
+
+
+def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
+    """The report of the fit of a tile that is done, see :attr:`Map.report`, without its map. Raises a ValueError if it is damaged."""
+    path = map_path(folder, tile)
+    try:
+        return checked_report(_report(path))
+    except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+        msg = f"{path} is not a whole radarsdf map: {error}"
+        raise ValueError(msg) from error
+
+
+def _report(path: Path) -> Any:
+    with open_tensors(path, "np") as file:
+        return json.loads(file.metadata["description"])["report"]

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -20,20 +21,19 @@ from radarsdf.checks import path_of
 from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
+from radarsdf.map.radar_map import load_file
+from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import EchoesAt
 from radarsdf.tiles.blend import Share, TileBlend, averages, distance
 from radarsdf.tiles.drive_poses import DrivePoses
-from radarsdf.tiles.plan import map_path
-from radarsdf.tiles.ray_files import rays_path
-from radarsdf.tiles.tile_fit import report_of
+from radarsdf.tiles.plan import Tile, map_path, report_of
+from radarsdf.tiles.planning import rays_path
 
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.queries import CellsInBox
     from radarsdf.map.threshold import Threshold
     from radarsdf.map.view import ViewedMap
-    from radarsdf.tiles.grid import Tile
 
 _Floats = NDArray[np.float64]
 
@@ -41,15 +41,15 @@ _Floats = NDArray[np.float64]
 class TiledMap(TileBlend, Map):
     """A map in tiles, made by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
 
-    :class:`Map` says what it answers. Where tiles overlap, their answers are averaged with weights that fall smoothly
-    to zero, so that neither surface, gradient nor intensity has a seam. Tiles are read when they are asked for.
+    It has the methods of :class:`Map`. Where tiles overlap, their fields are averaged with weights that fall smoothly to zero,
+    so that neither surface, gradient nor intensity has a seam. Tiles are read when they are needed.
 
     Parameters
     ----------
     folder : path-like
         Where the plan and the maps are.
     memory_bytes : float
-        About so much memory is used for tiles. One tile at a time is always held.
+        Memory for tiles, about, bytes. One tile at a time is always held.
 
     Raises
     ------
@@ -68,7 +68,7 @@ class TiledMap(TileBlend, Map):
         )
 
     def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
-        return _opened, (str(self.folder), self.memory_bytes)
+        return partial(TiledMap, memory_bytes=self.memory_bytes), (str(self.folder),)
 
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
         positions = _contiguous(world)
@@ -139,34 +139,59 @@ class TiledMap(TileBlend, Map):
             viewpoint,
             voxel_size,
             box=box,
+            **limits,
             executor=executor,
             progress=progress,
-            **limits,
         )
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
-        from radarsdf.tiles.meshing import mesh_of  # noqa: PLC0415 - trimesh is slow to import
+        from radarsdf.tiles.mesh import mesh_of  # noqa: PLC0415 - trimesh is slow to import
 
         return mesh_of(self, voxel_size, **wanted)
 
-    def cells_round(self, lower: _Floats, upper: _Floats) -> CellsInBox:
-        from radarsdf.tiles.gridding import cells_of_tiles  # noqa: PLC0415 - it imports trimesh, which is slow
+    def cells_round(self, lower: _Floats, upper: _Floats) -> queries.CellsInBox:
+        """Each cell is that of the tile that it lies in; of a tile that is not done, unknown."""
 
-        return cells_of_tiles(self, lower, upper)
+        lattice, edge = self.config.lattice, self.plan.tile_cells
+        first = np.floor(lattice.cells(lower)).astype(np.int64)
+        last = np.floor(lattice.cells(upper)).astype(np.int64) + 1
+        shape = tuple((last - first).tolist())
+        passed, returns, observed = np.zeros(shape, np.uint8), np.zeros(shape, bool), np.zeros(shape, bool)
+        begin, end = first[:2] // edge, (last[:2] - 1) // edge
+        for tile in itertools.product(range(begin[0], end[0] + 1), range(begin[1], end[1] + 1)):
+            if not self.has(tile):
+                continue
+            own = np.array(tile) * edge
+            start = np.array([*np.maximum(own, first[:2]), first[2]])
+            stop = np.array([*np.minimum(own + edge, last[:2]), last[2]])
+            place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
+            x, y, z = (stop - start).tolist()
+            found = queries.dense_cells(
+                self.contents_of(tile), start - self.plan.origin_cells(tile), (x, y, z)
+            )
+            passed[place], returns[place], observed[place] = found
+        return queries.CellsInBox(lattice.position(first), passed, returns, observed)
 
     def echoes(self) -> EchoesAt:
-        from radarsdf.tiles.gridding import echoes_of_tiles  # noqa: PLC0415 - as above
-
-        return echoes_of_tiles(self)
+        """Each echo is that of the tile that it lies in."""
+        scale = self.intensity_scale
+        ends = (0.0, 1.0) if scale is None else (scale.low, scale.high)
+        found = []
+        for planned in self.tiles:
+            contents = self.contents_of(planned.tile)
+            echoes = contents.echoes.in_world(contents.origin, *ends)
+            cells = np.floor(self.config.lattice.cells(echoes.points)[:, :2])
+            found.append(echoes.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
+        return EchoesAt.together(found)
 
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
         return self.evidence(_contiguous(world))
 
     def _viewed_from(self, position: _Floats, range_m: float) -> ViewedMap:
-        from radarsdf.tiles.views import tiles_within, viewed_tiles  # noqa: PLC0415 - as above
+        from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
 
         # Of a pose far away from all tiles, any will do to see nothing.
-        tiles = tiles_within(self, position, range_m) or [self.tiles[0].tile]
+        tiles = self._tiles_within(position, range_m) or [self.tiles[0].tile]
         held = self._viewed
         if held is None or held[0] != tiles:
 
@@ -176,6 +201,16 @@ class TiledMap(TileBlend, Map):
             viewed = viewed_tiles(self, tiles, intensity if self.has_intensity else None)
             held = self._viewed = tiles, viewed
         return held[1]
+
+    def _tiles_within(self, position: _Floats, range_m: float) -> list[Tile]:
+        """The tiles that are done and within a horizontal range of a position (3,), world, m."""
+        found = []
+        for planned in self.plan.tiles:
+            lower = self.plan.grid.lower_corner(planned.tile)
+            nearest = np.clip(position[:2], lower, lower + self.plan.tile_m)
+            if np.linalg.norm(nearest - position[:2]) <= range_m and self.has(planned.tile):
+                found.append(planned.tile)
+        return found
 
     def export(
         self,
@@ -192,22 +227,22 @@ class TiledMap(TileBlend, Map):
         ----------
         path : path-like
             ``NAME.ply``: one file, binary, in double precision. ``NAME.json``: 3D Tiles 1.1, a GLB file for each tile in a
-            folder ``NAME`` beside it, in the frame of the world. To place it on the earth, set the ``transform`` of its root.
+            folder ``NAME`` next to it, in the frame of the world. To place it on the earth, set the ``transform`` of its root.
 
         Returns
         -------
         tuple
             Numbers of vertices and triangles.
         """
-        from radarsdf.tiles.meshing import export_mesh  # noqa: PLC0415 - as above
+        from radarsdf.tiles.mesh import export_mesh  # noqa: PLC0415 - as above
 
         return export_mesh(self, path, voxel_size, executor, progress, **limits)
 
     def threshold(
         self, voxel_size: float = queries.VOXEL_M, *, progress: bool | None = None, **limits: Any
     ) -> Threshold:
-        """What is expected of a mesh; arguments are those of :meth:`mesh`. After it or :meth:`export`, it takes no time."""
-        from radarsdf.tiles.meshing import threshold_of  # noqa: PLC0415 - as above
+        """The expected precision of a mesh; arguments are those of :meth:`mesh`. After it or :meth:`export`, it takes no time."""
+        from radarsdf.tiles.mesh import threshold_of  # noqa: PLC0415 - as above
 
         return threshold_of(self, voxel_size, None, progress, **limits)
 
@@ -228,9 +263,9 @@ class TiledMap(TileBlend, Map):
         self.plan.save(folder)  # last: without it, the folder is no map
 
     def clean(self) -> int:
-        """Removes the rays of the tiles that are done, which only their fits need, and the pieces of meshes.
+        """Removes the rays of the tiles that are done, which only their fits need, and the parts of meshes.
 
-        Without its rays, a tile cannot be fitted again, so its map is read whole before. A mesh makes its pieces again.
+        Without its rays, a tile cannot be fitted again, so its map is read whole before. A mesh makes its parts again.
         No other step may run on the folder meanwhile.
 
         Returns
@@ -245,13 +280,13 @@ class TiledMap(TileBlend, Map):
         OSError
             If a file cannot be read or removed.
         """
-        from radarsdf.tiles.pieces import pieces_in  # noqa: PLC0415 - as above
+        from radarsdf.tiles.mesh import part_files  # noqa: PLC0415 - as above
 
         freed = 0
         for tile in self.tiles:
             storage.load_contents(map_path(self.folder, tile))
             rays = rays_path(self.folder, tile.tile)
-            for path in [*pieces_in(rays.parent), *([rays] if rays.exists() else [])]:
+            for path in [*part_files(rays.parent), *([rays] if rays.exists() else [])]:
                 freed += path.stat().st_size
                 path.unlink()
         return freed
@@ -310,9 +345,43 @@ class TiledMap(TileBlend, Map):
         return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
 
+def load(path: str | PathLike[str]) -> Map:
+    """Reads a map: a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
+
+    Parameters
+    ----------
+    path : path-like
+        Written by this version.
+
+    Returns
+    -------
+    RadarMap or TiledMap
+        Its results have the same bits as those of the map that was written.
+
+    Raises
+    ------
+    ValueError
+        If it is no radarsdf map, is damaged, or comes from another version.
+    OSError
+        If it cannot be read.
+    """
+    path = path_of(path, "path")
+    return TiledMap(path) if path.is_dir() else load_file(path)
+
+
+def lacking(radar_map: Map) -> str:
+    """How many tiles a map lacks, as a phrase; empty if none."""
+    if not isinstance(radar_map, TiledMap) or not (missing := radar_map.missing):
+        return ""
+    return f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
+
+
+def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
+    """The intensities (N,) that a map predicts for rays, sensor units, and these rays: those in no tile are left out."""
+    found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)
+    known = np.isfinite(found)
+    return (rays, found) if known.all() else (rays.select(np.flatnonzero(known)), found[known])
+
+
 def _contiguous(world: Tensor) -> _Floats:
     return np.ascontiguousarray(world.double().numpy())
-
-
-def _opened(folder: str, memory_bytes: float) -> TiledMap:
-    return TiledMap(folder, memory_bytes=memory_bytes)

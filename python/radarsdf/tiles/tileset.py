@@ -8,6 +8,7 @@ Source: the Open Geospatial Consortium's "3D Tiles Specification", 22-025r4.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +19,7 @@ from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.products import turned
 from radarsdf.tiles.blend import TileBlend
-from radarsdf.tiles.grid import Tile
-from radarsdf.tiles.welding import WeldedMesh
+from radarsdf.tiles.plan import Tile
 
 with whole_import():
     import trimesh
@@ -47,21 +47,19 @@ def content_folder(path: Path) -> Path:
     return folder
 
 
-def write_tileset(city: TileBlend, path: Path, welded: WeldedMesh) -> tuple[int, int]:
+def write_tileset(
+    city: TileBlend, path: Path, meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int32]]]
+) -> tuple[int, int]:
     """Writes ``NAME.json`` and, in its :func:`content_folder`, a GLB file for each tile with triangles.
 
-    Coordinates in GLB files are float32 from the origin of the tile, and the JSON has that origin in float64: tiles far
-    from the world's origin are as precise as others. Tiles repeat the vertices on their borders.
-
-    Returns
-    -------
-    tuple
-        Numbers of vertices and triangles.
+    `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. Coordinates in GLB files are float32 from the origin
+    of the tile, and the JSON has that origin in float64: tiles far from the world's origin are as precise as others. Returns
+    the numbers of vertices and triangles; vertices on borders are in both tiles.
     """
     folder = content_folder(path)
     leaves: dict[Tile, _Node] = {}
     num_vertices = num_faces = 0
-    for planned, (vertices, faces) in zip(city.tiles, welded.pieces(), strict=True):
+    for planned, (vertices, faces) in zip(city.tiles, meshes, strict=True):
         if len(faces):
             name, origin = f"{planned.name}.glb", city.config.lattice.position(planned.origin_cells)
             write_whole(folder / name, _glb(vertices - origin, faces))

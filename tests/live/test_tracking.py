@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
-from radarsdf.live.following import Lost
+from radarsdf.live.tracking import Lost
 from radarsdf.poses.rigid import aligned
 
 from ..poses.drift import first
@@ -66,15 +66,21 @@ def _folded(speeds, most_mps):
     return speeds if np.isinf(most_mps) else (speeds + most_mps) % (2 * most_mps) - most_mps
 
 
-def test_scans_go_on_from_given_poses(drive):
+@pytest.mark.parametrize("with_doppler", [True, False])
+def test_scans_go_on_from_given_poses(drive, with_doppler):
     scans, motion = drive
     live = LiveMap(SETTINGS)
-    for i in range(20):
+    with pytest.raises(ValueError, match="a pose, or a time"):
+        live.integrate(scans.points[0])
+    for i in range(13):
         pose = scans.poses[i] if i < 10 else None
-        done = live.integrate(
-            scans.points[i], pose, doppler_mps=motion.doppler_mps[i], time_s=motion.times_s[i]
-        )
-    assert np.linalg.norm(done.pose[:3, 3] - scans.poses[19, :3, 3]) < 0.1
+        speeds = motion.doppler_mps[i] if with_doppler else None
+        done = live.integrate(scans.points[i], pose, doppler_mps=speeds, time_s=motion.times_s[i])
+    assert np.linalg.norm(done.pose[:3, 3] - scans.poses[12, :3, 3]) < 0.1
+    without_times = LiveMap(SETTINGS)
+    without_times.integrate(scans.points[0], scans.poses[0])
+    with pytest.raises(Lost, match="none with a time"):  # the next one does not begin at the origin again
+        follow(without_times, scans, motion, [1])
 
 
 def test_what_cannot_be_followed_is_refused_and_leaves_nothing(drive):
@@ -90,8 +96,6 @@ def test_what_cannot_be_followed_is_refused_and_leaves_nothing(drive):
         add(live, i)
         with pytest.raises(ValueError, match="must be later"):
             add(live, i)
-        with pytest.raises(ValueError, match="a pose, or a time"):
-            add(live, i, time_s=None)
     noise = np.random.default_rng(0).uniform(-30, 30, (2000, 3))
     with pytest.raises(Lost, match="nowhere near"):  # a scan of clutter, after a gap in time
         add(live, 8, points=noise, doppler_mps=None, time_s=motion.times_s[8] + 3)
@@ -146,20 +150,3 @@ def test_the_next_scan_is_placed_where_the_map_has_the_others(drive, tmp_path):
     live.remove("bad")
     done = follow(live, scans, motion, [13])
     assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[13])[:3, 3]) < 0.1
-
-
-def test_a_map_without_times_does_not_begin_at_the_origin_again(drive):
-    scans, motion = drive
-    live = LiveMap(SETTINGS)
-    live.integrate(scans.points[0], scans.poses[0])
-    with pytest.raises(Lost, match="none with a time"):
-        follow(live, scans, motion, [1])
-
-
-def test_given_poses_are_no_steps_without_information(drive):
-    scans, motion = drive
-    live = LiveMap(SETTINGS)
-    for i in range(13):
-        pose = scans.poses[i] if i < 12 else None
-        done = live.integrate(scans.points[i], pose, time_s=motion.times_s[i])
-    assert np.linalg.norm(done.pose[:3, 3] - scans.poses[12, :3, 3]) < 0.1

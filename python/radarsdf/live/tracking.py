@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Where a scan without a pose is: on the planes of the last ones, near where its Doppler or the motion so far lead."""
+"""Places scans without poses on the planes of the last ones, near where their Doppler or the motion so far lead."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.live.scan_log import LoggedScan, ScanId, ScanLog
+from radarsdf.live.store import LoggedScan, ScanId, ScanLog
 from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
 from radarsdf.poses.drive import LEAST_TOLD, Drive, followed, rates_of
 from radarsdf.poses.motion import Rate
@@ -24,15 +24,15 @@ from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begun
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
-_STEPS = 100  # of the motion so far, that habits are learnt from
-_START = 8  # scans of a start, of which all are placed again once 2, 4 and 8 are there
-_HABITS = 2  # steps before a start that make it none: how the sensor moves is known
+_STEPS = 100  # of the motion so far, from which the usual motion is learnt
+_START = 8  # scans of a start, all of which are placed again once 2, 4 and 8 are there
+_KNOWN_STEPS = 2  # before a start that make it none: how the sensor moves is known
 _CLEAR = 5.0  # standard errors by which more returns agree if the Doppler has the other sign
 _CHANCE = (
     0.25  # share of the returns of a sparse radar that agree at a wrong pose, at most about: 0.13 to 0.27
 )
 _MOVES = 5.0  # standard deviations of a velocity that is not zero
-_TOLD_STEPS = 10  # over which it is asked whether returns alone tell how the sensor moves
+_TOLD_STEPS = 10  # over which returns alone must tell how the sensor moves
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
 
 
@@ -48,11 +48,12 @@ class Step:
     logged: LoggedScan
     """With its time. Where the map has it now, `found` says."""
     velocity: SensorVelocity | None
+    """By its Doppler. None: it gives none."""
     found: Tracked
     given: bool = True
-    """Whether the pose was given, so that it is not found anew."""
+    """Whether the pose was given, and is not found again."""
     sign: int = 0
-    """Of the Doppler, as it was known then: -1 if it is positive as the sensor comes nearer, 0 if that is not known."""
+    """Of the Doppler, as known then: -1 if it is positive as the sensor comes nearer, 0 if that is not known."""
 
     @property
     def time_s(self) -> float:
@@ -62,19 +63,14 @@ class Step:
 
     @property
     def scan(self) -> Floats:
-        """(N, 3) of the returns that stand still, sensor frame, m."""
+        """(N, 3) static returns, sensor frame, m."""
         points, static = self.logged.points, self.logged.standing
         return np.ascontiguousarray(points if static is None else points[static], np.float64)
-
-    @property
-    def measured(self) -> bool:
-        """Whether its Doppler gives a velocity."""
-        return self.velocity is not None and self.velocity.found
 
     @cached_property
     def moves(self) -> bool:
         """Whether its Doppler does not show that the sensor stands."""
-        if self.velocity is None or not self.velocity.found:
+        if self.velocity is None:
             return True
         v, covariance = self.velocity.velocity_mps, self.velocity.covariance + LEAST_MPS**2 * np.eye(3)
         return float(np.einsum("i,i->", v, np.linalg.solve(covariance, v))) > _MOVES**2
@@ -82,7 +78,7 @@ class Step:
 
 @dataclass
 class Follower:
-    """Follows the sensor. The map owns the poses: they are asked for before each scan. A scan that is refused leaves no trace."""
+    """Tracks the sensor. The map owns the poses: they are read before each scan. A scan that is refused leaves no trace."""
 
     config: FitConfig
     num_threads: int
@@ -98,7 +94,7 @@ class Follower:
 
         Raises a ValueError if it is late, Lost if it is nowhere near.
         """
-        self._ask(log)
+        self._synchronise(log)
         new = Step(scan_id, logged, self._velocity(logged), begun(np.eye(4)), given=False)
         if not self._steps:
             if len(log):
@@ -111,10 +107,17 @@ class Follower:
             raise ValueError(msg)
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
-        by_doppler = new.measured and (found[-1].sign != 0 or not new.moves)
-        missing = "its pose" if by_doppler else "its pose, or its Doppler (doppler_mps)"
-        if logged.doppler_mps is not None and not by_doppler:
-            why = "its sign is not known yet" if new.measured else "the last two scans agree on no velocity"
+        by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
+        if by_doppler:
+            missing = "its pose"
+        elif logged.doppler_mps is None:
+            missing = "its pose, or its Doppler (doppler_mps)"
+        else:
+            why = (
+                "the last two scans agree on no velocity"
+                if new.velocity is None
+                else "its sign is not known yet"
+            )
             missing = f"its pose. {NOT_USED}: {why}"
         if any(step.found.piece for step in found):
             msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places: give {missing}"
@@ -126,7 +129,7 @@ class Follower:
         return found
 
     def keep(self, found: list[Step]) -> None:
-        """The scans that :meth:`seek` found are in the map: the next one is looked for from them."""
+        """Goes on from the scans that :meth:`seek` found: they are in the map."""
         if len(found) == 1:
             self._add(found[0])
         else:
@@ -134,12 +137,12 @@ class Follower:
             self._begin([*(step for step in self._steps if step.scan_id not in again), *found])
 
     def place(self, scan_id: ScanId, logged: LoggedScan) -> None:
-        """A scan came with its pose. It is only looked at once one comes without."""
+        """Notes a scan that came with its pose. It is processed once one comes without."""
         if logged.time_s is not None:
             self._given.append((scan_id, logged))
 
-    def _ask(self, log: ScanLog) -> None:
-        """Takes the poses of the map, if scans were moved or taken out."""
+    def _synchronise(self, log: ScanLog) -> None:
+        """Reads the poses of the map: scans may have been moved or taken out."""
         steps = {step.scan_id: now for step in self._steps if (now := _now(step, log)) is not None}
         if len(steps) < len(self._steps) or not all(map(operator.is_, steps.values(), self._steps)):
             self._begin(list(steps.values()))
@@ -172,13 +175,13 @@ class Follower:
             self._tracker.keep(step.scan, step.found)
 
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
-        """By the Doppler of a scan. None: it has none."""
+        """By the Doppler of a scan. None: it gives none."""
         if logged.doppler_mps is None:
             return None
         others = [step.logged.doppler_mps for step in list(self._steps)[-WINDOW:]]
-        return sensor_velocities(
-            [logged.points], [logged.doppler_mps], [speeds for speeds in others if speeds is not None]
-        )[0]
+        known = [speeds for speeds in others if speeds is not None]
+        found = sensor_velocities([logged.points], [logged.doppler_mps], known)[0]
+        return found if found.found else None
 
     def _next(self, new: Step, sign: int) -> Step:
         """A scan, from the one before it."""
@@ -199,36 +202,40 @@ class Follower:
         return dataclasses.replace(new, found=found, sign=sign)
 
     def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
-        """By their Doppler. None: one of the last two has none."""
-        if not all(step.measured for step in steps[-2:]):
+        """By their Doppler. None: one of the last two gives none."""
+        if any(step.velocity is None for step in steps[-2:]):
             return None
         mean, covariance = np.zeros((len(steps), 3)), np.tile(np.eye(3), (len(steps), 1, 1))
         for i, step in enumerate(steps):
-            if step.velocity is not None and step.velocity.found:
+            if step.velocity is not None:
                 mean[i] = step.velocity.velocity_mps
                 covariance[i] = step.velocity.covariance + LEAST_MPS**2 * np.eye(3)
         mean, covariance, _ = upright(mean, covariance)
-        known = [step for step in [*self._steps, steps[-1]] if step.measured]
-        speeds = np.array([step.velocity.velocity_mps for step in known if step.velocity is not None])
-        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (known[-1].time_s - known[0].time_s)
+        known = [
+            (step.time_s, step.velocity.velocity_mps)
+            for step in [*self._steps, steps[-1]]
+            if step.velocity is not None
+        ]
+        speeds = np.array([velocity_mps for _, velocity_mps in known])
+        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (known[-1][0] - known[0][0])
         static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
         return _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
 
     def _start(self, log: ScanLog, new: Step, sign: int) -> list[Step] | None:
-        """The first scans anew, as odometry finds them, once more are there. None: the next scan follows from those before."""
+        """The first scans placed again by odometry, once more are there. None: the next scan follows from those before."""
         steps = [*self._steps, new]
         fixed = [i for i, step in enumerate(steps) if step.given or log.entry(step.scan_id) is None][:-1]
         first = max(fixed, default=0)
         moving = [i for i in range(first, len(steps)) if steps[i].moves]
         first = max([first, len(steps) - _START, *(i - 1 for i in moving[:1])])
-        count, sign_open = len(moving), sign == 0 and new.measured
-        due = count & (count - 1) == 0 and (sign_open or (first < _HABITS and count <= _START))
+        count, sign_open = len(moving), sign == 0 and new.velocity is not None
+        due = count & (count - 1) == 0 and (sign_open or (first < _KNOWN_STEPS and count <= _START))
         due = due or (sign_open and count <= _START / 2)
         if not new.moves or not due:
             return None
         sign, tracked = self._followed(steps[first:], sign)
-        if first >= _HABITS and first == len(steps) - 2:  # it only needed the sign
+        if first >= _KNOWN_STEPS and first == len(steps) - 2:  # it only needed the sign
             return [self._next(new, sign)]
         frame = steps[first].found.pose
         both = np.kron(np.eye(2), frame[:3, :3])
