@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Any scans for a fit and its estimate, and any arrays for the functions on lattices and meshes.
 
-As in `test_arguments`; `python -m bench.stress arguments` tries more.
+As in `test_arguments`.
 """
 
 from __future__ import annotations

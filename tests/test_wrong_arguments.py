@@ -13,7 +13,7 @@ import radarsdf
 from radarsdf import FitConfig, io, simulate
 from radarsdf.evaluation import adjacent_angles, holdout, surface_metrics
 
-from bench.stress import samples
+from . import samples
 
 PACKAGE = Path(radarsdf.__file__).parent
 NO_PATH = (None, b"a", 2.5)

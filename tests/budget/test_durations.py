@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a fit has to do is counted as it is done; how long that takes is for `python -m bench.stress durations`."""
+"""What a fit has to do is counted as it is done; how long that takes is for `python -m bench.estimates durations`."""
 
 from __future__ import annotations
 

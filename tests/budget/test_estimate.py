@@ -18,8 +18,8 @@ from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
 from radarsdf.returns.rays import prepare
 
+from bench.estimates import peak_of_a_fit
 from bench.growth.street import street
-from bench.stress.memory import peak_of_a_fit
 
 from ..warm_python import warm_python
 
@@ -163,7 +163,7 @@ def test_the_command_says_it_in_one_line(scene, tmp_path, capsys):
 @LINUX
 def test_memory_does_not_grow_with_the_fits():
     code = """
-from bench.stress.memory import memory_of_fits
+from bench.estimates import memory_of_fits
 found = memory_of_fits(48)  # what freed memory the allocator keeps varies by ten megabytes in the first of them
 assert max(found[32:]) - max(found[4:32]) < 5, found
 """

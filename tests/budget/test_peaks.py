@@ -9,7 +9,7 @@ import sys
 import pytest
 from radarsdf import FitConfig
 
-from bench.stress.memory import peak_of_a_fit
+from bench.estimates import peak_of_a_fit
 
 from ..warm_python import warm_python
 

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
 """Rounding errors of the kernels against float64, and where very large, very small and infinite numbers go.
-
-`python -m bench.stress kernels` does the same on batches of up to a million points.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import numpy as np
 import pytest
 from radarsdf import _core
 
-from bench.stress import kernels as stress
+from . import rounding as stress
 
 DTYPES = [np.float32, np.float64]
 interpolation_case = functools.cache(stress.interpolation_case)  # of all instruction sets

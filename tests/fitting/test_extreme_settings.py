@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Training at the edges of its settings: every number stays finite. `python -m bench.stress training` takes longer."""
+"""Training at the edges of its settings: every number stays finite."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from radarsdf import FitConfig
 from radarsdf.field.losses import sdf_loss
 from radarsdf.fitting.stopping import DivergenceWatch
 
-from bench.stress.training import CASES, fitted, free_and_solid
+from .extreme import CASES, fitted, free_and_solid
 
 
 @pytest.mark.parametrize("name", CASES)

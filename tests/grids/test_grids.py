@@ -12,6 +12,8 @@ from radarsdf.cli import main
 from radarsdf.grids.costmap import Wheels
 from radarsdf.grids.grid import Grid
 
+from bench.kinds import KINDS
+
 BOX = [[5.0, -5.03, -1.57], [22.0, 4.97, 4.43]]
 
 
@@ -46,7 +48,7 @@ def test_probabilities_agree_with_the_states(sharp_map):
 
 def test_a_voxel_that_a_surface_grazes_is_not_free():
     """No return is in it, for they were moved onto the surface, and rays pass it above the ground often enough."""
-    drive = radarsdf.simulate.KINDS["tunnel"](seed=5, frames=12)
+    drive = KINDS["tunnel"](seed=5, frames=12)
     config = radarsdf.FitConfig(num_threads=1)
     radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
     # The ground is the border of two voxels.
@@ -58,7 +60,7 @@ def test_a_voxel_that_a_surface_grazes_is_not_free():
 
 def test_seven_scans_from_one_place_free_what_is_before_a_facade():
     """Rays that graze the ground pass cells that the field alone would put a cell behind it: it is longer than the distance."""
-    drive = radarsdf.simulate.KINDS["facade"](seed=5, frames=21)
+    drive = KINDS["facade"](seed=5, frames=21)
     config = radarsdf.FitConfig(num_threads=1)
     radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
     grid = radar_map.grid([[5, 0, -1], [25, 14.5, 5]], 0.2)

@@ -21,7 +21,7 @@ pytest.importorskip("rosbags", reason="the extra ros is not installed")
 import lz4.frame  # of rosbags
 from rosbags.rosbag2 import Reader
 
-from bench.reading.bag_writing import KINDS, BagWriter
+from .bag_writing import KINDS, BagWriter
 
 START_S = 1_700_000_000.0
 TIMES_S = START_S + np.arange(5) * 0.1

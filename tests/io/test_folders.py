@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds.reading import read_columns
 
-from bench.paper.scenes import load_scene
+from bench.scenes import load_scene
 
 START_S = 1706001766.0
 TURN_LEFT = np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # by 90 degrees about z, qx qy qz qw

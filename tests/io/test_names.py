@@ -17,7 +17,8 @@ from radarsdf.io.files import in_utf8
 from radarsdf.io.meshes import read_mesh
 from radarsdf.io.scans import Scans
 
-from bench.stress import readers, samples
+from .. import samples
+from . import readers
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names are text elsewhere")
 

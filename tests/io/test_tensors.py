@@ -15,8 +15,7 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.tiles.plan import Plan, map_path
 from radarsdf.tiles.tile_fit import contents_of_tile
 
-from bench.stress import samples
-
+from .. import samples
 from ..conftest import ground_and_wall
 from ..tiles.conftest import CONFIG
 

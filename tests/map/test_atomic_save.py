@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
 """A map's file while its writer is killed or the disk is full: the old map or the new one.
-
-`python -m bench.stress save` kills more often.
 """
 
 from __future__ import annotations
@@ -14,10 +12,9 @@ import sys
 import pytest
 import radarsdf
 
-from bench.stress import samples
-from bench.stress.save import kill_savers
-
+from .. import samples
 from ..warm_python import warm_python
+from .savers import kill_savers
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
 

@@ -10,7 +10,7 @@ from radarsdf.budget.schedule import Schedule, seen_jointly
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.widths import intensity_widths, sdf_widths, weights_of
 
-# Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.stress durations`
+# Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.estimates durations`
 # measures fits and prints them. The estimates of twenty fits were 0.65 to 1.24 times their processor time.
 SECONDS = {
     "return": 1.7e-06,

@@ -25,7 +25,7 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.threads import resolve_num_threads
 
 # Bytes. Measured as peaks of fits of 1e4 to 3e6 returns of a street, over the memory of the process before
-# the fit; `python -m bench.stress memory` repeats it, and a test checks it.
+# the fit; `python -m bench.estimates memory` repeats it, and a test checks it.
 _ALWAYS = 35e6  # code that the fit loads, stacks and arenas of the threads
 _PER_RETURN = 30.0
 _PER_INTENSITY = 20.0

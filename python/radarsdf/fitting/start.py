@@ -25,7 +25,7 @@ from radarsdf.returns.rays import Rays
 from radarsdf.returns.surfels import Surfels
 
 # Iterations of smoothing. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
-# many 0.0 to 0.3 worse. See bench/history/live.md.
+# many 0.0 to 0.3 worse.
 _SMOOTHINGS = 24
 
 

@@ -11,7 +11,8 @@ from radarsdf._core import CellBlocks, bridge_cells
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.returns.support import support_at
 
-# Measured on simulated and real scans; see bench/history/surface.md.
+# Measured: bridges gain 1 to 4 points of F-score on every tenth scan of simulated scenes, nothing on dense ones, and change
+# drives by -1.3 to +0.8.
 # Share of the median support of the block. Returns with less are too often false to tell where a surface goes on.
 _MIN_SUPPORT = 0.5
 # Mean support of the two ends of a bridge, at most. A surface crosses about nine of the 27 cells. With one

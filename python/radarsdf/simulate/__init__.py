@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Simulated radar scans of worlds whose true surface is known.
 
-`SCENES` holds the ready-made simulations by name, `KINDS` those of places of many kinds. `simulate` scans your own `Scene` with a `RadarSensor`.
+`SCENES` holds the ready-made simulations by name. `simulate` scans your own `Scene` with a `RadarSensor`.
 
 Examples
 --------
@@ -13,7 +13,6 @@ Examples
 """
 
 from .drift import drifted
-from .kinds import KINDS
 from .legs import Leg, LegDrive, drive_legs
 from .materials import Material
 from .measured_imu import measured_imu
@@ -26,7 +25,6 @@ from .terrain import Terrain
 from .worlds import SCENES, astyx, hugin, oculii, wall
 
 __all__ = [
-    "KINDS",
     "SCENES",
     "Box",
     "CornerReflector",
