@@ -15,8 +15,7 @@ from radarsdf.checks import whole_number
 from radarsdf.simulate import Box, RadarSensor, Scene, Simulation, Terrain, materials, simulate
 from radarsdf.simulate.materials import Material
 from radarsdf.simulate.radar import generator
-from radarsdf.simulate.site import Path, Site, vary
-from radarsdf.simulate.trajectory import along_path
+from radarsdf.simulate.scenes import Path, Site, along_path, vary
 
 __all__ = ["KINDS", "Kind"]
 

@@ -95,7 +95,7 @@ def closed_folder(request, tmp_path):
 def test_a_folder_in_which_nothing_can_be_written(
     scans_file, map_file, tmp_path, capsys, monkeypatch, closed_folder, command, outputs
 ):
-    monkeypatch.setattr("radarsdf.simulate.worlds.hugin", lambda **_: pytest.fail("the work began"))
+    monkeypatch.setattr("radarsdf.simulate.scenes.hugin", lambda **_: pytest.fail("the work began"))
     words = {"fit": [scans_file, *FAST], "mesh": [map_file], "demo": ["--frames", 4, *FAST]}[command]
     for option, where in outputs.items():
         folder = tmp_path if where == "open" else closed_folder
