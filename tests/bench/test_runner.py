@@ -191,11 +191,3 @@ def test_a_scene_without_intensities_or_truth_stays_in_the_tables(tmp_path):
         assert "no intensities" in run(tmp_path, experiment, str(path))[0]
     for experiment in ("surface", "ranges", "calibration"):
         assert "no ground truth" in run(tmp_path, experiment, str(path))[0]
-
-
-@pytest.mark.parametrize(
-    "words", [["surface", "nowhere"], ["curve", "wall", "--set", "nonsense=1"], ["nonsense"]]
-)
-def test_what_does_not_exist_is_refused(tmp_path, words):
-    with pytest.raises(SystemExit):
-        runner.main("bench.paper", EXPERIMENTS, [*words, "--out", str(tmp_path)])

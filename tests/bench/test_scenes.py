@@ -7,13 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
-from scipy.spatial import cKDTree
 
 from bench.scenes import load_scene
-
-from ..conftest import recorded_scans
 
 
 @pytest.fixture(scope="module")
@@ -63,22 +60,3 @@ def test_file(frames, every, tmp_path):
     assert_array_equal(scene.intensities[1], [1, 2, 3])
     assert_array_equal(scene.ground_truth, np.float32([[10, 0, 0.9]]))
     assert len(load_scene(str(tmp_path / "street.npz"), frames=3)) == 3
-
-
-@pytest.mark.parametrize(("name", "frames"), [("r0144_0167", 24), ("r0133_0142", 10)])
-def test_recorded_file(name, frames):
-    path = recorded_scans(name)
-    scene = load_scene(str(path))
-    arrays = np.load(path)
-    assert (len(scene), scene.holdout_every, scene.max_range_m) == (frames, 5, 60.0)
-    assert sum(map(len, scene.points)) == arrays["static"].sum()
-    assert sum(map(len, scene.intensities)) == arrays["static"].sum()
-    lidar = read_scans(path).ground_truth
-    assert 0.05 * len(lidar) < len(scene.ground_truth) < 0.9 * len(lidar)
-    world = np.concatenate(
-        [p @ T[:3, :3].T + T[:3, 3] for p, T in zip(scene.points, scene.poses, strict=True)]
-    )
-    assert cKDTree(world).query(scene.ground_truth)[0].max() < 1.0 + 1e-4
-    train, test = scene.split()
-    assert len(test) == -(-frames // 5)
-    assert len(train) + len(test) == frames
