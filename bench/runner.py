@@ -96,7 +96,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "type": float, "nargs": 2, "metavar": ("M", "DEG"), "default": (0.0, 0.0), "help": "random walk of the poses, a step"
     },
     "refine": {"action": "store_true", "help": "refine the poses of both days"},
-    "seeds": {"type": int, "nargs": "+", "help": "seeds of simulated scenes"},
+    "seeds": {"type": int, "nargs": "*", "help": "seeds of simulated scenes"},
 }  # fmt: skip
 
 
@@ -124,7 +124,8 @@ def main(
         for known, own in experiments.items():
             _add_options(commands.add_parser(known, help=own.title, description=own.title), own)
         options = parser.parse_args(words)
-        name, experiment = options.experiment, experiments[options.experiment]
+        name = f"{module.rpartition('.')[2]}-{options.experiment}"
+        experiment = experiments[options.experiment]
     options.cases = options.cases or list(experiment.cases)
     options.out.mkdir(parents=True, exist_ok=True)
     try:

@@ -35,15 +35,15 @@ def test_a_street_has_its_returns_and_its_length(count, size_m, frames):
 
 def test_quick_fits_give_a_table(tmp_path):
     main("bench.growth", EXPERIMENTS, ["fits", "--quick", "--threads", "2", "--out", str(tmp_path)])
-    values = json.loads((tmp_path / "fits.json").read_text())
+    values = json.loads((tmp_path / "growth-fits.json").read_text())
     geometry, both = values["rows"]
     assert geometry["right"] > 0.8
     assert both["mae"] < 3
     assert geometry["peak_mb"] > geometry["before_mb"]
     assert geometry["training_s"] < geometry["wall_s"]
     assert values["command"].startswith("python -m bench.growth fits")
-    assert "| leaf cells" in (tmp_path / "fits.md").read_text(encoding="utf-8")
-    assert (tmp_path / "fits.png").stat().st_size > 1000
+    assert "| leaf cells" in (tmp_path / "growth-fits.md").read_text(encoding="utf-8")
+    assert (tmp_path / "growth-fits.png").stat().st_size > 1000
 
 
 def test_a_map_of_another_street_is_refused():

@@ -35,7 +35,7 @@ def peers(monkeypatch):
 
 def run(tmp_path, *words):
     runner.main("bench.paper", EXPERIMENTS, [*words, "--quick", "--out", str(tmp_path)])
-    stem = tmp_path / words[0]
+    stem = tmp_path / f"paper-{words[0]}"
     return stem.with_suffix(".md").read_text(encoding="utf-8"), json.loads(
         stem.with_suffix(".json").read_text()
     )
@@ -140,7 +140,7 @@ def test_curve_has_budgets_settings_and_peers_by_turns(tmp_path):
     ]
     assert [row["method"] for row in values["rows"]] == 2 * methods
     assert values["rows"][3]["seconds"] == 4.0  # of the scans that are not held out
-    assert (tmp_path / "curve.png").stat().st_size > 1000
+    assert (tmp_path / "paper-curve.png").stat().st_size > 1000
 
 
 @pytest.mark.usefixtures("peers")
