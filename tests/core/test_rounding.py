@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Rounding errors of the kernels against float64, and where very large, very small and infinite numbers go.
-"""
+"""Rounding errors of the kernels against float64, and where very large, very small and infinite numbers go."""
 
 from __future__ import annotations
 

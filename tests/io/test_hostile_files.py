@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between.
-"""
+"""Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between."""
 
 from __future__ import annotations
 

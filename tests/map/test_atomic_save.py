@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A map's file while its writer is killed or the disk is full: the old map or the new one.
-"""
+"""A map's file while its writer is killed or the disk is full: the old map or the new one."""
 
 from __future__ import annotations
 
