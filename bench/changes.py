@@ -15,19 +15,17 @@ import dataclasses
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.changes.changes import UNSEEN, Changes
 from radarsdf.poses.posed import pose_sigmas
-from radarsdf.simulate import KINDS, Box, Scene, Simulation, drifted, materials, simulate
+from radarsdf.simulate import Box, Scene, Simulation, drifted, materials, simulate
 from scipy.spatial.transform import Rotation
 
-from bench.paper.report import ROOT
-from bench.rows import kept
+from bench.kinds import KINDS
+from bench.runner import Column, Experiment, Row, main
 
 Floats = NDArray[np.float64]
 
@@ -51,63 +49,35 @@ class Change:
     after: Box | None
 
 
-def main() -> None:
-    """Print and keep a row for each scene, and one for each size and change."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kinds", nargs="*", default=list(KINDS), metavar="KIND")
-    parser.add_argument("--seed", type=int, default=31)
-    parser.add_argument(
-        "--drift",
-        type=float,
-        nargs=2,
-        default=(0.0, 0.0),
-        metavar=("M", "DEG"),
-        help="walk of a step's poses",
-    )
-    parser.add_argument(
-        "--refine", action="store_true", help="refine the poses of both days, as `radarsdf fit --refine` does"
-    )
-    parser.add_argument("--out", type=Path, default=ROOT / "bench_results", help="folder of the rows")
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    found: dict[tuple[str, float], list[float]] = {}
-    kept(scenes(options, found), "bench.changes", options.out / "changes_scenes.json")
-    kept(sizes(found), "bench.changes", options.out / "changes_sizes.json")
+COLUMNS = {
+    "false_share": Column("false area, %", 100, 3),
+    "precision": Column("precision"),
+    "recall": Column("recall"),
+    "found": Column("a fifth found"),
+}
 
 
-def scenes(
-    options: argparse.Namespace, found: dict[tuple[str, float], list[float]]
-) -> Iterator[dict[str, Any]]:
-    """A row for each kind of scene, without changes and with them. `found` gets the recalls."""
-    for kind in options.kinds:
+def rows(options: argparse.Namespace) -> Iterator[Row]:
+    """For each kind of scene a row without changes and one with them, and for each cube a row with its recall."""
+    for kind in options.cases:
         first = KINDS[kind](seed=options.seed)
         rng = np.random.default_rng([options.seed, len(kind)])
         ways = first.poses, other_way(first.poses, rng)
         for changes in ([], cubes(first, rng)):
             compared = compare(first, ways, changes, options)
             false_m2, seen_m2, true_m2 = areas(compared, changes)
-            yield {
-                "scene": kind,
-                "seed": options.seed,
-                "drift": " ".join(f"{step:g}" for step in options.drift) + ", refined" * options.refine,
-                "cubes": len(changes),
-                "false area, %": f"{100 * false_m2 / seen_m2:.3f}",
-                "precision": f"{true_m2 / (true_m2 + false_m2):.2f}" if true_m2 + false_m2 > 0 else "",
+            row: Row = {
+                "part": "scenes",
+                "name": f"{kind}, {len(changes)} cubes",
+                "false_share": false_m2 / seen_m2,
             }
+            if true_m2 + false_m2 > 0:
+                row["precision"] = true_m2 / (true_m2 + false_m2)
+            yield row
             for change in changes:
-                found.setdefault((change.kind, change.size_m), []).extend(recalls(compared, change))
-
-
-def sizes(found: dict[tuple[str, float], list[float]]) -> Iterator[dict[str, Any]]:
-    """A row for each change and size of a cube."""
-    for (kind, size_m), shares in sorted(found.items()):
-        yield {
-            "change": kind,
-            "edge, m": size_m,
-            "mean recall": f"{np.mean(shares):.2f}",
-            "a fifth found": f"{np.mean(np.array(shares) > _FOUND):.2f}",
-            "surfaces": len(shares),
-        }
+                for share in recalls(compared, change):
+                    name = f"{change.kind}, {change.size_m:g} m"
+                    yield {"part": "cubes", "name": name, "recall": share, "found": float(share > _FOUND)}
 
 
 def other_way(poses: Floats, rng: np.random.Generator) -> Floats:
@@ -189,7 +159,7 @@ def compare(
             given = refined.poses
             config = config.override(returns={"pose_sigma_m": sigma_m, "pose_sigma_rad": sigma_rad})
         maps.append(radarsdf.fit(scans.points, given, scans.intensities, config=config))
-    return radarsdf.compare(*maps)
+    return radarsdf.compare(maps[0], maps[1])
 
 
 def areas(found: Changes, changes: list[Change]) -> tuple[float, float, float]:
@@ -220,5 +190,16 @@ def recalls(found: Changes, change: Change) -> list[float]:
     return shares
 
 
+EXPERIMENT = Experiment(
+    "Changes between two drives",
+    rows,
+    tuple(KINDS),
+    ("seed", "drift", "refine"),
+    {"seed": 31},
+    COLUMNS,
+    ("part",),
+    ("name",),
+)
+
 if __name__ == "__main__":
-    main()
+    main("bench.changes", EXPERIMENT)

@@ -77,25 +77,6 @@ class Surface:
         shape = (-1, NUM_LEVELS, 12)
         return np.stack(rows, 1).reshape(shape), np.stack(weights, 1).astype(np.float32).reshape(shape)
 
-    def dense_planes(self):
-        """The features as images (8, H, W) of the whole scene, one for each level and plane, 0 where there are none.
-
-        With each image come the lower and the upper corner of its vertices, in lattice coordinates of its level.
-        """
-        leaf = self._leaf_cells()
-        rows, _ = self.rows_and_weights(((leaf - _BIAS + 0.5) * LEAF_M).astype(np.float32))
-        planes = []
-        for level in range(NUM_LEVELS):
-            for p, axes in enumerate(PLANES):
-                cells = (leaf >> level)[:, axes]
-                lower, upper = cells.min(0), cells.max(0) + 1
-                plane = torch.zeros(FEATURE_DIM, *(upper - lower + 1))
-                for corner in range(4):
-                    i, j = (cells - lower + [corner & 1, corner >> 1]).T
-                    plane[:, i, j] = self.features[rows[:, level, 4 * p + corner]].T
-                planes.append((plane, lower - (_BIAS >> level), upper - (_BIAS >> level)))
-        return planes
-
     def _leaf_cells(self):
         return self.table.leaf_cells().astype(np.int64) + _BIAS
 
@@ -114,11 +95,6 @@ def surface():
     table = VertexTable(keys, LEAF_M, NUM_LEVELS)
     generator = torch.Generator().manual_seed(0)
     return Surface(table, torch.randn(table.num_rows, FEATURE_DIM, generator=generator))
-
-
-@pytest.fixture(scope="session")
-def dense_planes(surface):
-    return surface.dense_planes()
 
 
 @dataclass(frozen=True)

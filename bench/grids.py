@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import radarsdf
 import torch
 from numpy.typing import NDArray
 from radarsdf.grids.grid import Grid
-from radarsdf.simulate import KINDS, SCENES, Simulation
+from radarsdf.simulate import SCENES, Simulation
 
-from bench.rows import kept
-from bench.timing import timed
+from bench.kinds import KINDS
+from bench.measure import timed
+from bench.runner import Experiment, Row, main
 
 Floats = NDArray[np.float64]
 
@@ -31,6 +30,7 @@ _SENSOR_ABOVE_M = 3.5  # over the lower face of the box
 _PLACE_M = 0.05  # at most one place in each cube of this edge: places are even over the surface
 _RAYS = 10_000  # a round from a pose
 _DISTANCES = 20_000
+_PLACES = 100_000  # of a scene, at most
 
 
 def box_of(drive: Simulation) -> Floats:
@@ -94,22 +94,22 @@ def distances(grid: Grid, drive: Simulation, rng: np.random.Generator) -> dict[s
     }
 
 
-def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Iterator[Row]:
     """A row for each scene."""
-    torch.set_num_threads(options.threads)
-    kinds = dict(KINDS) | dict(SCENES)
-    for name in options.scenes or kinds:
-        drive = kinds[name](seed=options.seed, frames=8 if options.quick else None)
+    threads = options.threads[0]
+    torch.set_num_threads(threads)
+    for name in options.cases:
+        drive = (dict(SCENES) | dict(KINDS))[name](seed=options.seed, frames=8 if options.quick else None)
         rng = np.random.default_rng(options.seed)
-        config = radarsdf.FitConfig(num_threads=options.threads)
+        config = radarsdf.FitConfig(num_threads=threads)
         if options.quick:
-            config = radarsdf.FitConfig.quick(num_threads=options.threads, returns={"passages": True})
+            config = radarsdf.FitConfig.quick(num_threads=threads, returns={"passages": True})
         with timed() as fitting:
             radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
         box = box_of(drive)
         with timed() as gridding:
             grid = radarsdf.grid(radar_map, box, VOXEL_M)
-        places = seen_places(drive, box, options.places, rng)
+        places = seen_places(drive, box, _PLACES, rng)
         yield {
             "scene": name,
             "places": len(places),
@@ -120,18 +120,13 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         }
 
 
-def main() -> None:
-    """Print the table, and keep it."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", nargs="*", metavar="SCENE")
-    parser.add_argument("--seed", type=int, default=161)
-    parser.add_argument("--places", type=int, default=100_000, help="of each scene, at most")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="few scans and places: does it run?")
-    parser.add_argument("--out", type=Path, default=Path("bench_results/grids.json"))
-    options = parser.parse_args()
-    kept(rows(options), "bench.grids", options.out)
-
+EXPERIMENT = Experiment(
+    "Occupied places that grids call free, and errors of their distances",
+    rows,
+    (*SCENES, *KINDS),
+    ("seed", "threads"),
+    {"seed": 161},
+)
 
 if __name__ == "__main__":
-    main()
+    main("bench.grids", EXPERIMENT)

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Configurations of fits by their names, and changes of them as nested dicts: put together, and as words."""
+"""Presets by name, and changes of their settings as nested dicts."""
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterable
 from typing import Any
 
 from radarsdf import FitConfig
-from radarsdf.cli.options import setting_of
 
 Changes = dict[str, Any]
-"""Settings of the top of a `FitConfig`, and for each group a dict of those of its settings that change; goes through JSON."""
+"""Top-level settings of a `FitConfig`, and for each group a dict of its settings that change; goes through JSON."""
 
 PRESETS = {"default": FitConfig(), "quick": FitConfig.quick(), "paper": FitConfig.paper()}
 
@@ -28,5 +28,33 @@ def merged(*changes: Changes) -> Changes:
 
 
 def parsed(words: Iterable[str]) -> Changes:
-    """Of words such as ``training.joint=False``, as ``--set`` of radarsdf takes them."""
-    return merged(*map(setting_of, words))
+    """Changes from words such as ``training.joint=False``. Those of ``mesh.`` are arguments of a mesh.
+
+    Raises
+    ------
+    ValueError
+        If a word has no ``=``, or `FitConfig` has no such setting.
+    """
+    found: Changes = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals:
+            msg = f"expected NAME=VALUE, not {word}"
+            raise ValueError(msg)
+        try:
+            value = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            value = text
+        group, dot, setting = name.partition(".")
+        found = merged(found, {group: {setting: value}} if dot else {name: value})
+    FitConfig().override(**{name: value for name, value in found.items() if name != "mesh"})
+    return found
+
+
+def words_of(changes: Changes) -> str:
+    """Changes as words; those of :func:`parsed`."""
+    words = []
+    for name, value in changes.items():
+        of_group = value if isinstance(value, dict) else {"": value}
+        words += [f"{name}.{setting}={own}".replace(".=", "=") for setting, own in of_group.items()]
+    return ", ".join(words)

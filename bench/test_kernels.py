@@ -17,7 +17,7 @@ import torch
 from radarsdf._core import CellSet, VertexTable
 from radarsdf.field import kernels
 
-from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, PLANES, surface_points
+from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, surface_points
 
 
 class Differentiated:
@@ -62,29 +62,6 @@ def embedding_bag(surface, batch, _fixture):
         return out.view(len(batch.rows), -1)
 
     return Differentiated([surface.features], function), [surface.features]
-
-
-def grid_sample(_surface, batch, fixture):
-    """Dense planes over the whole scene, without a table."""
-    planes, grids = [], []
-    for i, (plane, lower, upper) in enumerate(fixture("dense_planes")):
-        u = batch.points.numpy()[:, PLANES[i % 3]].astype(np.float64) / (LEAF_M * 2 ** (i // 3))
-        u = 2 * (u - lower) / (upper - lower) - 1
-        grids.append(torch.from_numpy(u[None, :, None, ::-1].astype(np.float32)))
-        planes.append(plane[None])
-
-    def function(*planes):
-        sums = []
-        for level in range(NUM_LEVELS):
-            of_level = slice(3 * level, 3 * level + 3)
-            parts = [
-                torch.nn.functional.grid_sample(plane, grid, align_corners=True)
-                for plane, grid in zip(planes[of_level], grids[of_level], strict=True)
-            ]
-            sums.append(parts[0] + parts[1] + parts[2])
-        return torch.cat(sums, 1)[0, :, :, 0].T
-
-    return Differentiated(planes, function), planes
 
 
 class Roofline:
@@ -133,7 +110,6 @@ FORWARD = {
     "ours, look-up included": ours,
     "indexing": indexing,
     "embedding_bag": embedding_bag,
-    "grid_sample, dense": grid_sample,
 }
 ROOFLINE = {"roofline": roofline_way(0, "copies")}
 # The best scheme depends on the number of threads, and on the number of rows for each point.

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Speed of marching cubes against other programs on the same float32 samples, on one thread unless the case says more.
 
-Groups: two fields; lattice and extraction of a shell; a real map by its cells and by its whole box; the same surface in
-eight times the volume. Each case checks the number of triangles or the area of its mesh, so that a wrong result cannot
+Groups: two fields; lattice and extraction of a shell; a real map by its cells. Each case checks the number of triangles or the area of its mesh, so that a wrong result cannot
 be the fastest. Each program has its usual outputs: VTK float32 points and int64 cells, scikit-image also normals and
 values, PyMCubes float64 and int64. Ours are float64 and int32.
 """
@@ -16,7 +15,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.map.marching_cubes import extract_cells, marching_cubes, mesh_components, sparse_lattice
+from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
 
 
 def sphere_256():
@@ -61,34 +60,6 @@ def field_group(field):
 def test_dense(benchmark, field, threads):
     benchmark.group = field_group(field)
     vertices, faces = benchmark(marching_cubes, field[0], num_threads=threads)
-    check_mesh(vertices, faces, field)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("part", ["forward", "backward"])
-def test_dense_gradient(benchmark, field, part, threads):
-    """Of a tensor that requires a gradient: the mesh with the vertices' edges; the gradient by the samples."""
-    benchmark.group = f"{part} of {field_group(field)}"
-    samples = torch.from_numpy(field[0]).requires_grad_()
-    vertices, faces = marching_cubes(samples, num_threads=threads)
-    check_mesh(vertices.detach().numpy(), faces.numpy(), field)
-    if part == "forward":
-        benchmark(marching_cubes, samples, num_threads=threads)
-        return
-    weights = torch.ones_like(vertices)
-    (grad,) = benchmark(torch.autograd.grad, vertices, samples, weights, retain_graph=True)
-    # The samples beside the surface have a gradient, unless their vertices are kept away from them or cancel out.
-    beside = np.zeros(field[0].shape, bool)
-    for axis in range(3):
-        cut = np.diff(field[0] > 0, axis=axis)
-        beside |= np.insert(cut, 0, False, axis) | np.insert(cut, cut.shape[axis], False, axis)
-    assert 0.9 * beside.sum() < (grad != 0).sum() <= beside.sum()
-
-
-def test_dense_masked(benchmark, field):
-    benchmark.group = field_group(field)
-    mask = np.ones(field[0].shape, dtype=bool)
-    vertices, faces = benchmark(marching_cubes, field[0], mask=mask, num_threads=1)
     check_mesh(vertices, faces, field)
 
 
@@ -186,7 +157,6 @@ class MapLattice:
     cells: np.ndarray  # (M, 3) voxels
     values: np.ndarray  # signed distances at the corners, m, in the order of sparse_lattice
     volume: np.ndarray  # signed distances in the whole box, m; 1 outside the map
-    mask: np.ndarray  # where `volume` is in the map
     lower: np.ndarray  # (3,) lattice coordinates of the lower corner of the box
 
     @cache  # noqa: B019 - the fixture makes only one
@@ -218,11 +188,9 @@ def map_lattice():
         values = radar_map.field.sdf(torch.from_numpy(points)).numpy()
     lower = corners.min(0)
     shape = corners.max(0) - lower + 1
-    volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)
-    at = tuple((corners - lower).T)
-    volume[at], mask[at] = values, True
-    # The mask admits no cells outside the map: a leaf cell has 2 x 2 x 2 voxels, whose common corner no other cell has.
-    return MapLattice(cells, values, volume, mask, lower)
+    volume = np.ones(shape, np.float32)
+    volume[tuple((corners - lower).T)] = values
+    return MapLattice(cells, values, volume, lower)
 
 
 def map_group(lattice):
@@ -243,16 +211,6 @@ def test_map_by_cells(benchmark, map_lattice, threads):
     check_map(vertices, faces, map_lattice.crossed_edges(of_cells=True))
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_map_by_its_box(benchmark, map_lattice, threads):
-    benchmark.group = map_group(map_lattice)
-    vertices, faces = benchmark(
-        marching_cubes, map_lattice.volume, mask=map_lattice.mask, num_threads=threads
-    )
-    benchmark.extra_info["distances"] = map_lattice.volume.size
-    check_map(vertices, faces, map_lattice.crossed_edges(of_cells=True))
-
-
 @FLYING_EDGES
 def test_map_vtk_flying_edges(benchmark, map_lattice, backend, threads):
     """VTK has no mask, so its mesh also has a surface at the border of the map."""
@@ -266,47 +224,3 @@ def check_map(vertices, faces, crossed_edges):
     assert np.array_equal(np.unique(faces), np.arange(len(vertices)))
     # A closed surface has twice as many triangles as vertices. Borders reduce the number, handles increase it.
     assert 1.2 * len(vertices) < len(faces) < 2.1 * len(vertices)
-
-
-RADIUS, HALF = 80, 96  # of a sphere and its volume, samples
-SPHERE_FACES = 243_272  # V - E + F = 2, where V is the number of edges that change sign
-
-
-@pytest.mark.parametrize("times", [1, 8])
-def test_dense_in_a_larger_volume(benchmark, times):
-    benchmark.group = "one sphere, in 1 and 8 times the volume"
-    half = HALF * round(times ** (1 / 3))
-    axis = np.arange(-half, half, dtype=np.float32)
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)
-    volume = np.sqrt(x * x + y * y + z * z) - np.float32(RADIUS + 0.3)
-    _, faces = benchmark(marching_cubes, volume, num_threads=1)
-    assert len(faces) == SPHERE_FACES
-
-
-@pytest.mark.parametrize("times", [1, 8])
-def test_sparse_in_a_larger_volume(benchmark, times):
-    """The eight octants of the sphere are moved apart: the surface stays as large."""
-    benchmark.group = "one sphere, in 1 and 8 times the volume"
-    axis = np.arange(-HALF, HALF - 1, dtype=np.int32)
-    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    cells = cells[np.abs(np.linalg.norm(cells + 0.5, axis=1) - (RADIUS + 0.3)) < 2]
-    apart = HALF * (round(times ** (1 / 3)) - 1)
-    cells += np.where(cells < 0, -apart, apart).astype(np.int32)
-    _, corners, cell_corners = sparse_lattice(cells)
-    octant = np.zeros(corners.shape, np.int32)
-    octant[cell_corners] = np.where(cells < 0, -apart, apart)[:, None]  # octants share no corner once apart
-    values = (np.linalg.norm(corners - octant, axis=1) - (RADIUS + 0.3)).astype(np.float32)
-
-    def run():
-        _, corners, cell_corners = sparse_lattice(cells, num_threads=1)
-        return extract_cells(corners, values, cell_corners, num_threads=1)
-
-    _, faces = benchmark(run)
-    assert len(faces) == SPHERE_FACES
-
-
-def test_components(benchmark):
-    vertices, faces = marching_cubes(gyroid_192())
-    _, sizes = benchmark(mesh_components, faces, len(vertices))
-    assert sizes.sum() == len(faces)
-    assert sizes.max() == len(faces) - 2  # the other components are one triangle at each of two corners

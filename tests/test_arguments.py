@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Any arguments for the public functions: an answer with the properties that are stated, or a ValueError or TypeError.
 
-The same examples on every run; `python -m bench.stress arguments --count 5000` tries other ones, and more of them.
+The same examples on every run; RADARSDF_EXAMPLES=5000 tries more of them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from radarsdf.io.npz import read_scans
 from radarsdf.map.marching_cubes import marching_cubes
 from radarsdf.returns.rays import prepare
 
-from bench.stress import samples
+from . import samples
 
 EXAMPLES = int(os.environ.get("RADARSDF_EXAMPLES", "0"))
 

@@ -16,7 +16,7 @@ from radarsdf.evaluation import (
     surface_metrics,
 )
 
-from bench.stress import samples
+from . import samples
 
 NO_PATH = (None, b"a", 2.5)
 NO_ARRAY = ("a", {}, [[1], [2, 3]], np.array([1, {}], object), 1j)

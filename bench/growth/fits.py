@@ -1,80 +1,63 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Time and memory of whole fits, over returns, length of the scene, threads, and with or without intensities."""
+"""Time and memory of fits, of parts of them, and of the refinement of poses. Each row is measured in a new process, on Linux."""
 
 from __future__ import annotations
 
+import argparse
+import itertools
+from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import radarsdf
-import radarsdf.fitting.fit  # else the first fit would import it, in what is measured
+import radarsdf.fitting.fit
+import radarsdf.poses.refine  # like fitting.fit: else the first call would import it, in what is measured
 from radarsdf import FitConfig, RadarMap
+from radarsdf._core import count_looks
+from radarsdf.fitting.average import near_leaf_keys
+from radarsdf.poses.rigid import steps, turned_by
+from radarsdf.returns.ghosts import find_ghosts
+from radarsdf.returns.noise import sensor_noise
+from radarsdf.returns.planes import Surfels
+from radarsdf.returns.rays import prepare
 
-from bench.memory import memory_bytes
-from bench.timing import timed
+from bench.growth.street import Street, street
+from bench.measure import in_new_process, measured, memory_bytes, timed
+from bench.paper.poses import walked
+from bench.runner import Column, Row, figure, groups
 
-from .street import Street, street
-
-_RETURNS = (10**4, 10**5, 10**6, 10**7)
-_SIZES_M = (50.0, 500.0, 5000.0)
-_SIZE_M = 500.0  # while the returns vary
-_COUNT = 10**6  # while the size varies
 _OFF_M = 0.2  # distance to the surface of the points at which the sign of the SDF is checked
 _LEAST_RIGHT = 0.6
 
-COLUMNS = (
-    ("returns", "returns", ","),
-    ("size_m", "length, m", ",.0f"),
-    ("threads", "threads", "d"),
-    ("intensities", "intensities", ""),
-    ("wall_s", "wall, s", ".2f"),
-    ("cpu_s", "processor, s", ".2f"),
-    ("peak_mb", "peak, MB", ".0f"),
-    ("before_mb", "before the fit, MB", ".0f"),
-    ("prepare_s", "prepare, s", ".2f"),
-    ("ghosts_s", "ghosts, s", ".2f"),
-    ("occupied_cells_s", "cells, s", ".2f"),
-    ("start_s", "start, s", ".2f"),
-    ("training_s", "training, s", ".2f"),
-    ("leaf_cells", "leaf cells", ","),
-    ("map_mb", "map, MB", ".1f"),
-    ("right", "correct signs", ".1%"),
-    ("mae", "MAE, dB", ".2f"),
-)
+FIT_COLUMNS = {
+    "wall_s": Column("time, s"),
+    "cpu_s": Column("processor, s"),
+    "peak_mb": Column("peak, MB", digits=0),
+    "before_mb": Column("before the fit, MB", digits=0),
+    "prepare_s": Column("prepare, s"),
+    "ghosts_s": Column("ghosts, s"),
+    "occupied_cells_s": Column("cells, s"),
+    "start_s": Column("start, s"),
+    "training_s": Column("training, s"),
+    "leaf_cells": Column("leaf cells", digits=0),
+    "map_mb": Column("map, MB", digits=1),
+    "right": Column("correct signs, %", 100, 1),
+    "mae": Column("MAE, dB"),
+}
 
 
-def cases(
-    *, quick: bool, returns: list[int], sizes_m: list[float], threads: list[int], every: bool
-) -> list[dict[str, Any]]:
-    """Arguments of `row`: either returns or size varies, or with `every` all their combinations."""
-    if quick:
-        counts_and_sizes = {(returns[0] if returns else 10**4, sizes_m[0] if sizes_m else 50.0): None}
-    elif every:
-        counts_and_sizes = dict.fromkeys(
-            (count, size_m) for count in returns or _RETURNS for size_m in sizes_m or _SIZES_M
-        )
-    else:
-        counts_and_sizes = dict.fromkeys(
-            [(count, _SIZE_M) for count in returns or _RETURNS]
-            + [(_COUNT, size_m) for size_m in sizes_m or _SIZES_M]
-        )
-    return [
-        {
-            "returns": count,
-            "size_m": size_m,
-            "threads": number,
-            "intensities": intensities,
-            "quick": quick,
-        }
-        for count, size_m in counts_and_sizes
-        for intensities in (False, True)
-        for number in (threads or ([2] if quick else [1, 2]))
-    ]
+def fits(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each number of returns, length of the street and number of threads, without and with intensities."""
+    returns, sizes_m = ([10**4], [50.0]) if options.quick else (options.returns, options.sizes)
+    for count, size_m, threads in itertools.product(returns, sizes_m, options.threads):
+        for intensities in (False, True):
+            case = {"returns": count, "size_m": size_m, "threads": threads, "intensities": intensities}
+            yield case | in_new_process("bench.growth.fits:fit_row", *case.values(), options.quick)
 
 
-def row(*, returns: int, size_m: float, threads: int, intensities: bool, quick: bool) -> dict[str, Any]:
+def fit_row(returns: int, size_m: float, threads: int, intensities: bool, quick: bool) -> Row:
     """Time, memory and stages of one fit, and the errors of its map.
 
     Raises
@@ -85,28 +68,21 @@ def row(*, returns: int, size_m: float, threads: int, intensities: bool, quick: 
     scans = street(returns, size_m)
     short = {"sdf_iterations": 60, "intensity_iterations": 120} if quick else {}
     config = FitConfig(num_threads=threads).override(training=short)
-    before = memory_bytes("VmHWM")
+    before_mb = memory_bytes("VmHWM") / 1e6
+    values = scans.intensities if intensities else None
     with timed() as taken:
-        radar_map = radarsdf.fit(
-            scans.points,
-            scans.poses,
-            scans.intensities if intensities else None,
-            config=config,
-            progress=False,
-        )
-    found = {
-        **asdict(taken),
-        "peak_mb": memory_bytes("VmHWM") / 1e6,
-        "before_mb": before / 1e6,
-    }
+        radar_map = radarsdf.fit(scans.points, scans.poses, values, config=config, progress=False)
+    row: Row = {"wall_s": taken.wall_s, "cpu_s": taken.cpu_s}
+    row |= {"peak_mb": memory_bytes("VmHWM") / 1e6, "before_mb": before_mb}
     report = radar_map.report
     if report["returns"] != returns:
         msg = f"{report['returns']} returns were fitted, not {returns}"
         raise RuntimeError(msg)
-    return found | report | {"map_mb": radar_map.nbytes / 1e6} | _errors(radar_map, scans)
+    row |= {key: report.get(key) for key in FIT_COLUMNS if key in report}
+    return row | {"map_mb": radar_map.nbytes / 1e6} | map_errors(radar_map, scans)
 
 
-def _errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
+def map_errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
     """Share of correct signs in front of and behind the true surface, and the error of the intensity on it.
 
     Raises
@@ -141,3 +117,114 @@ def _errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
             msg = f"the error of the intensity is {errors['mae']:.2f} dB, that of a constant {spread:.2f} dB"
             raise RuntimeError(msg)
     return errors
+
+
+def draw_fits(rows: list[Row], path: Path) -> None:
+    """Draw seconds and peak memory over the number of returns."""
+    with figure(path, columns=2, size=(4.6, 3.8)) as (axes,):
+        for ax, (key, label, factor) in zip(
+            axes, (("wall_s", "time, s", 1), ("peak_mb", "memory, GB", 1e-3)), strict=True
+        ):
+            for (size_m, threads, both), own in groups(rows, "size_m", "threads", "intensities").items():
+                points = sorted((row["returns"], factor * row[key]) for row in own)
+                name = f"{size_m:g} m, {threads} threads, {'with' if both else 'without'} intensities"
+                ax.loglog(*zip(*points, strict=True), "o-", ms=4, label=name)
+            ax.set(xlabel="returns", ylabel=label)
+
+
+SURFEL_COLUMNS = {
+    "ghosts_cpu_s": Column("ghosts: processor, s"),
+    "ghosts_wall_s": Column("time, s"),
+    "ghosts_grown_mb": Column("MB", digits=0),
+    "looks_cpu_s": Column("visibility counts: processor, s"),
+    "looks_wall_s": Column("time, s "),
+    "looks_grown_mb": Column("MB ", digits=0),
+    "ghosts": Column("ghosts", digits=0),
+    "leaf_cells": Column("leaf cells", digits=0),
+}
+
+
+def surfels(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each number of returns: the ghost search and the visibility counts. The street grows with the returns."""
+    for count, threads in itertools.product([10**5] if options.quick else options.returns, options.threads):
+        yield {"returns": count, "threads": threads} | in_new_process(
+            "bench.growth.fits:surfel_row", count, threads
+        )
+
+
+def surfel_row(returns: int, threads: int) -> Row:
+    """Time and growth of the peak memory of the ghost search and of the visibility counts.
+
+    Raises
+    ------
+    RuntimeError
+        If the number of ghosts, or of cells that were seen, is implausible.
+    """
+    scans = street(returns)
+    rays = prepare(scans.points, scans.poses)
+    del scans
+    config = FitConfig()
+    with measured() as of_ghosts:
+        surfels = Surfels.of(rays, config.leaf_size_m, threads)
+        noise = sensor_noise(surfels, rays, config.returns)
+        is_ghost = find_ghosts(surfels, rays, noise, threads)[surfels.cells_at(rays.points, threads)]
+    leaf_keys = near_leaf_keys(rays.select(~is_ghost), config, threads)
+    columns = rays.points, rays.directions, rays.ranges_m, rays.scans
+    with measured() as of_looks:
+        counts = count_looks(leaf_keys, config.leaf_size_m, *columns, threads)
+    # A tenth of the returns within 70 m are ghosts, and every cell is near a return.
+    if not 0.02 * returns < is_ghost.sum() < 0.15 * returns or not (counts > 0).mean() > 0.9:
+        msg = f"{is_ghost.sum()} ghosts of {returns} returns, {(counts > 0).mean():.0%} of the cells seen"
+        raise RuntimeError(msg)
+    row: Row = {"ghosts": int(is_ghost.sum()), "leaf_cells": len(leaf_keys)}
+    for name, taken in (("ghosts", of_ghosts), ("looks", of_looks)):
+        row |= {f"{name}_{key}": value for key, value in asdict(taken).items()}
+    return row
+
+
+_APART_M = 500.0  # from a copy to the next: they have no returns in common
+_WALK = 0.02, 0.1  # m and degrees a step
+POSE_COLUMNS = {
+    "returns": Column("returns", digits=0),
+    "wall_s": Column("time, s"),
+    "cpu_s": Column("processor, s"),
+    "grown_mb": Column("grown by, MB", digits=0),
+    "rounds": Column("rounds", digits=0),
+    "given_deg": Column("a step given, °", digits=3),
+    "found_deg": Column("a step refined, °", digits=3),
+}
+
+
+def poses(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each number of scans: `refine_poses` of a drive, and of copies of it one after another."""
+    for count, threads in itertools.product((40,) if options.quick else (120, 1200, 9960), options.threads):
+        yield {"scans": count, "threads": threads} | in_new_process(
+            "bench.growth.fits:pose_row", count, threads
+        )
+
+
+def pose_row(scans: int, threads: int) -> Row:
+    """Time and growth of the peak memory of `refine_poses`, of poses that drift.
+
+    Raises
+    ------
+    RuntimeError
+        If the poses are not improved.
+    """
+    drive = radarsdf.simulate.hugin(seed=1)
+    copies = -(-scans // len(drive.poses))
+    points = (drive.points * copies)[:scans]
+    true = np.tile(drive.poses, (copies, 1, 1))[:scans]
+    true[:, 0, 3] += _APART_M * (np.arange(scans) // len(drive.poses))
+    given = walked(true, *_WALK, 0)
+    with measured() as taken:
+        refined = radarsdf.refine_poses(points, given, config=FitConfig(num_threads=threads))
+    given_deg, found_deg = (
+        float(np.degrees(np.sqrt((turned_by(steps(true), steps(poses)) ** 2).mean())))
+        for poses in (given, refined.poses)
+    )
+    if not refined.improved or found_deg >= given_deg:
+        msg = f"steps turn by {found_deg:.3f} and not {given_deg:.3f}°: {refined.report['verdict']}"
+        raise RuntimeError(msg)
+    row: Row = {"returns": sum(map(len, points)), "rounds": refined.report["rounds"]}
+    return row | asdict(taken) | {"given_deg": given_deg, "found_deg": found_deg}

@@ -1,90 +1,118 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""F-score of the growing map after each tenth of a drive, beside fits of the same scans.
-
-`all` is without the rule that leaves improbable surface out: what is missing there is missing in the surface itself.
-"""
+"""Surface and intensities of live maps, compared with fits of the same scans."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 import radarsdf
+from numpy.typing import NDArray
 from radarsdf import FitConfig, LiveMap
-from radarsdf.evaluation import surface_metrics
-from radarsdf.simulate import Simulation
+from radarsdf.evaluation import holdout, surface_metrics
+from radarsdf.poses.rigid import aligned
 
-from bench.live.rates import scans_of
-from bench.paper.scenes import Scene, load_scene
-from bench.timing import timed
+from bench.measure import timed
+from bench.paper.poses import walked
+from bench.runner import Row
+from bench.scenes import Scene, load_scene
 
 _FINE_M = 0.1  # voxels of a fit; those of a live map are its leaf cells
+_HELD_OUT_EVERY = 5
 
 
-def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """A row for each scene and tenth. A case may be a file of recorded scans with ground truth."""
+def _scenes(options: argparse.Namespace) -> Iterator[tuple[Scene, FitConfig]]:
+    for spec in options.cases:
+        scene = load_scene(spec, seed=options.seed, frames=12 if options.quick else None)
+        yield scene, scene.config("default", num_threads=options.threads[0])
+
+
+def _f_percent(mesh: Any, scene: Scene, options: argparse.Namespace) -> float:
     samples = 20_000 if options.quick else 300_000
-    for name in options.cases or ["hugin", "oculii", "wall"]:
-        drive = drive_of(name, options)
-        scans, config = drive.scans, drive.config
-        assert scans.ground_truth is not None
-        assert scans.intensities is not None
+    assert scene.ground_truth is not None
+    return 100 * surface_metrics(mesh, scene.ground_truth, samples=samples)["f_score_all"]
+
+
+def accuracy(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each scene and tenth of its scans: F-scores of the growing map and of a fit.
+
+    `all` is without the rule that leaves improbable surface out: what is missing there is missing in the surface itself.
+    """
+    for scene, config in _scenes(options):
+        assert scene.intensities is not None
         live = LiveMap(config)
-        done = 0
-        for tenth in (5, 10) if options.quick else options.tenths:
-            end = max(2, len(scans) * tenth // 10)
-            for i in range(done, end):
-                live.integrate(scans.points[i], scans.poses[i], scans.intensities[i])
-            done = end
+        for tenth in (5, 10) if options.quick else range(1, 11):
+            end = max(2, len(scene) * tenth // 10)
+            for i in range(len(live), end):
+                live.integrate(scene.points[i], scene.poses[i], scene.intensities[i])
+            part = scene.first(end)
             fitted = radarsdf.fit(
-                scans.points[:end],
-                scans.poses[:end],
-                scans.intensities[:end],
-                config=config,
+                part.points, part.poses, part.intensities, config=config, origin=live.origin, progress=False
+            )
+            meshes = {
+                "live, F %": live.mesh(),
+                "fit": fitted.mesh(_FINE_M, progress=False),
+                "live, all": live.mesh(min_confidence=0),
+                "fit, all": fitted.mesh(_FINE_M, min_confidence=0, progress=False),
+            }
+            found = {name: round(_f_percent(mesh, scene, options), 2) for name, mesh in meshes.items()}
+            yield {"scene": scene.name, "scans": end, **found}
+
+
+def intensities(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each scene: MAE at the returns of every fifth scan, which is held out, where all maps answer."""
+    for scene, config in _scenes(options):
+        train, test = holdout(len(scene), _HELD_OUT_EVERY)
+        known = scene._select(train)
+        assert known.intensities is not None
+        live = LiveMap(config)
+        for points, pose, values in zip(known.points, known.poses, known.intensities, strict=True):
+            live.integrate(points, pose, values)
+        maps: dict[str, Any] = {"live": live.map()}
+        for name, reflectance in (("fit", "both"), ("fit, closed form", "closed-form")):
+            maps[name] = radarsdf.fit(
+                known.points,
+                known.poses,
+                known.intensities,
+                config=config.override(networks={"reflectance": reflectance}),
                 origin=live.origin,
                 progress=False,
             )
-            with timed() as taken:
-                grown = live.mesh()
-            meshes = (
-                grown,
-                fitted.mesh(_FINE_M, progress=False),
-                live.mesh(min_confidence=0),
-                fitted.mesh(_FINE_M, min_confidence=0, progress=False),
-            )
-            kept, of_fit, whole, whole_of_fit = (
-                100 * surface_metrics(mesh, scans.ground_truth, samples=samples)["f_score_all"]
-                for mesh in meshes
-            )
-            yield {
-                "scene": drive.name,
-                "tenths": tenth,
-                "scans": end,
-                "live, F %": round(kept, 2),
-                "fit": round(of_fit, 2),
-                "live less fit": round(kept - of_fit, 2),
-                "live, all": round(whole, 2),
-                "fit, all": round(whole_of_fit, 2),
-                "live less fit, all": round(whole - whole_of_fit, 2),
-                "mesh, ms": round(1e3 * taken.cpu_s),
-            }
+        x, sensors, measured = scene._select(test).world_returns()
+        errors: NDArray[Any] = np.array(
+            [np.abs(own.intensity(x, sensors) - measured) for own in maps.values()]
+        )
+        everywhere = np.isfinite(errors).all(axis=0)
+        means = zip(maps, errors[:, everywhere].mean(axis=1), strict=True)
+        yield {"scene": scene.name, "returns": int(everywhere.sum())} | {
+            f"{name}, dB": round(float(value), 3) for name, value in means
+        }
 
 
-class Drive(NamedTuple):
-    """Scans with what they show, and settings with the ranges of the recorded ones."""
+def loops(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each scene: a drifted drive, corrected by `refine_poses` and `move_all`, and a map of true poses."""
+    for scene, config in _scenes(options):
+        given = walked(scene.poses, 0.02, 0.1, options.seed)
 
-    name: str
-    scans: Simulation | Scene
-    config: FitConfig
+        def grown(poses: Any, scene: Scene = scene, config: FitConfig = config) -> LiveMap:
+            live = LiveMap(config)
+            for points, pose in zip(scene.points, poses, strict=True):
+                live.integrate(points, pose)
+            return live
 
-
-def drive_of(name: str, options: argparse.Namespace) -> Drive:
-    """A simulated scene, or a file of recorded scans with ground truth."""
-    config = FitConfig(num_threads=options.threads)
-    if not Path(name).is_file():
-        return Drive(name, scans_of(name, options.seed, options.quick), config)
-    scene = load_scene(name)
-    return Drive(scene.name, scene, config.override(returns=scene.ranges))
+        live = grown(aligned(given, scene.poses))
+        before = _f_percent(live.mesh(), scene, options)
+        refined = radarsdf.refine_poses(scene.points, given, config=config)
+        with timed() as taken:
+            # Returns do not determine where the whole is: that is not judged.
+            live.move_all(dict(zip(live.scan_ids, aligned(refined.poses, scene.poses), strict=True)))
+        yield {
+            "scene": scene.name,
+            "drifted, F %": round(before, 2),
+            "moved": round(_f_percent(live.mesh(), scene, options), 2),
+            "true poses": round(_f_percent(grown(scene.poses).mesh(), scene, options), 2),
+            "move_all, s": round(taken.cpu_s, 2),
+        }

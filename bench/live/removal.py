@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans that are taken out, or moved, in random order: bits and time."""
+"""Scans that are removed, or moved, in random order: bits and time."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 import radarsdf
 from radarsdf import FitConfig, LiveMap
 
-from bench.rows import quantile
-from bench.timing import timed
+from bench.measure import timed
+from bench.runner import Row, quantile
 
 _SCANS = 1000
 
 
-def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def removal(options: argparse.Namespace) -> Iterator[Row]:
     """A row for each scene and operation."""
     count = 40 if options.quick else _SCANS
-    for name in options.cases or ["hugin", "oculii"]:
+    for name in options.cases:
         yield from _rows(name, count, options)
 
 
-def _rows(name: str, count: int, options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def _rows(name: str, count: int, options: argparse.Namespace) -> Iterator[Row]:
     scans = radarsdf.simulate.SCENES[name](seed=options.seed, frames=count)
     rng = np.random.default_rng(options.seed)
     chosen = rng.permutation(count)[: count // 10].tolist()
@@ -35,7 +35,7 @@ def _rows(name: str, count: int, options: argparse.Namespace) -> Iterator[dict[s
     poses[chosen] = moved[chosen]
 
     def grown(numbers: Iterable[int], poses: Any) -> tuple[LiveMap, list[float]]:
-        live = LiveMap(FitConfig(num_threads=options.threads), origin=np.zeros(3))
+        live = LiveMap(FitConfig(num_threads=options.threads[0]), origin=np.zeros(3))
         return live, _times(
             numbers,
             lambda i: live.integrate(scans.points[i], poses[i], scans.intensities[i], scan_id=i),
@@ -51,7 +51,7 @@ def _rows(name: str, count: int, options: argparse.Namespace) -> Iterator[dict[s
     yield _row(name, "remove", remove_ms, integrate_ms, state(live) == state(other))
 
 
-def _row(name: str, what: str, ms: list[float], integrate_ms: list[float], equal: bool) -> dict[str, Any]:
+def _row(name: str, what: str, ms: list[float], integrate_ms: list[float], equal: bool) -> Row:
     return {
         "scene": name,
         "operation": what,

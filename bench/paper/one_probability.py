@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Fits the numbers of `Map.confidence` and of what surface covers anew, and judges them, leaving out whole kinds of scenes.
+"""Fit the coefficients of `Map.confidence` and of the truth that surface covers, and judge them with whole kinds left out.
 
     python -m bench.paper.one_probability [FILE.npz …] [--presets quick default] [--seed 141] [--judge 391]
 
@@ -23,14 +23,14 @@ from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Limits, Tally, areas_round
-from radarsdf.simulate import KINDS, SCENES
+from radarsdf.simulate import SCENES
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from .experiment import fit
-from .report import markdown
-from .scenes import VOXEL_M, Scene, load_scene
-from .truth import truth_of
+from bench.kinds import KINDS
+from bench.runner import markdown
+from bench.scenes import VOXEL_M, Scene, load_scene
+from bench.truth import truth_of
 
 FloatArray = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ class Example:
     @classmethod
     def of(cls, kind: str, scene: Scene, preset: str, part: str) -> Example:
         config = scene.config(preset)
-        contents = fit(scene.without_intensities(), config)._contents
+        contents = scene.without_intensities().fit(config)._contents
         surface = Surface.of(contents, VOXEL_M[preset])
         mesh = surface.part(contents.origin, np.ones(len(surface.faces), bool))
         assert scene.ground_truth is not None
@@ -163,22 +163,7 @@ def judged(example: Example, others: list[Example]) -> list[str]:
 
 
 def logistic_regression(columns: FloatArray, shares: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted maximum likelihood, by Newton's method.
-
-    Parameters
-    ----------
-    columns : (N, K) float64
-        Regressors. One of them is constant.
-    shares : (N,) float64
-        What is to be predicted, in [0, 1].
-    weights : (N,) float64
-        Weight of each row.
-
-    Returns
-    -------
-    (K,) float64
-        Numbers whose sum, times the columns, is the logit of the probability.
-    """
+    """Coefficients (K,) of regressors (N, K) for shares (N,) in [0, 1]: weighted maximum likelihood, by Newton's method."""
     numbers = np.zeros(columns.shape[1])
     for _ in range(_STEPS):
         p = expit(columns @ numbers)

@@ -4,84 +4,79 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import time
-from collections.abc import Iterable
-from functools import partial
-from pathlib import Path
+import itertools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import radarsdf
-from radarsdf.evaluation import intensity_metrics, surface_metrics, trajectory_metrics
-from radarsdf.poses.rigid import aligned
-from radarsdf.simulate import SCENES, measured_motion
+from numpy.typing import NDArray
+from radarsdf.evaluation import surface_metrics, trajectory_metrics
+from radarsdf.poses.rigid import aligned, moved
+from radarsdf.simulate import drifted, measured_motion
+from scipy.spatial.transform import Rotation, Slerp
 
-from .broken_poses import BREAKAGES, Poses
-from .experiment import Experiment, Options, Row, Task, fit, groups, mean_and_deviation, panels, world_returns
-from .report import markdown
-from .scenes import Scene, load_scene
+from bench.measure import timed
+from bench.paper.reflectance import errors_of
+from bench.paper.surface import samples_of
+from bench.runner import Column, Row
+from bench.scenes import Scene, chosen_scenes
+
+Poses = NDArray[np.float64]
+
+COLUMNS = {
+    "f_given": Column("F given, %"),
+    "f_found": Column("F found, %"),
+    "f_true": Column("F true, %"),
+    "mae_found": Column("intensity, dB"),
+    "mae_true": Column("intensity true, dB"),
+    "given_cm": Column("given, cm"),
+    "found_cm": Column("found, cm"),
+    "given_deg": Column("given, °"),
+    "found_deg": Column("found, °"),
+    "relative_percent": Column("relative, %"),
+    "deg_per_m": Column("°/m"),
+    "nees": Column("NEES / 3"),
+    "taken": Column("taken"),
+    "pieces": Column("segments"),
+    "seconds": Column("s"),
+}
 
 _SOURCES = ("returns and Doppler", "returns, Doppler, gyroscope", "returns alone")
-_COLUMNS = (
-    ("f_given", "F given, %"),
-    ("f_found", "F found, %"),
-    ("f_true", "F true, %"),
-    ("mae_found", "intensity, dB"),
-    ("mae_true", "intensity true, dB"),
-    ("given_cm", "given, cm"),
-    ("found_cm", "found, cm"),
-    ("given_deg", "given, °"),
-    ("found_deg", "found, °"),
-    ("relative_percent", "relative, %"),
-    ("deg_per_m", "°/m"),
-    ("nees", "NEES / 3"),
-    ("taken", "taken"),
-    ("pieces", "pieces"),
-    ("seconds", "s"),
-)
 
 
-def tasks(scene: Scene, options: Options) -> list[Task]:
-    """One task for each repetition, each with another seed of the scene: of a recorded scene, of the breakages."""
-    return [Task(f"{scene.name}: {k}", partial(_rows, scene, options, k)) for k in range(options.repetitions)]
-
-
-def _rows(scene: Scene, options: Options, repetition: int) -> Iterable[Row]:
-    seed = repetition
-    if scene.simulation is not None:
-        seed += scene.simulation.seed
-        if repetition:
-            scene = load_scene(scene.name, frames=len(scene), seed=seed)
-    true = scene.poses
-    base = {"scene": scene.name, "seed": seed} | _map_errors(scene, true, "true", options)
-    names = ("none", "walk of 0.02 m, 0.1°") if options.quick else tuple(BREAKAGES)
-    rows = []
-    for name in names:
-        given = BREAKAGES[name](true, seed)
-        row = base | _trajectory_errors(given, true, "given")
-        row |= _map_errors(scene, aligned(given, true), "given", options)
-        for source, measured in _measured(scene):
-            found = radarsdf.refine_poses(scene.points, given, **measured)
-            row |= {
-                "poses": name + source,
-                "taken": float(found.improved),
-                "seconds": found.report["seconds"],
-            }
-            row |= _trajectory_errors(found.poses, true, "found", found.covariance)
-            rows.append(row | _map_errors(scene, aligned(found.poses, true), "found", options))
-    return rows + [base | row for row in _odometry_rows(scene, seed, options)]
+def poses(options: argparse.Namespace) -> Iterator[Row]:
+    """Rows for each scene, breakage of its poses and odometry; repetitions have other seeds of the scene or breakage."""
+    for scene, repetition in itertools.product(list(chosen_scenes(options)), range(options.repetitions)):
+        own, seed = scene.repeated(repetition), options.seed + repetition
+        base = {"scene": scene.name, "seed": seed} | _map_errors(own, own.poses, "true", options)
+        for name in ("none", "walk of 0.02 m, 0.1°") if options.quick else BREAKAGES:
+            given = BREAKAGES[name](own.poses, seed)
+            row = base | _trajectory_errors(given, own.poses, "given")
+            row |= _map_errors(own, aligned(given, own.poses), "given", options)
+            for source, measured in _measured(own):
+                found = radarsdf.refine_poses(own.points, given, **measured)
+                row |= {
+                    "poses": name + source,
+                    "taken": float(found.improved),
+                    "seconds": found.report["seconds"],
+                }
+                row |= _trajectory_errors(found.poses, own.poses, "found", found.covariance)
+                yield row | _map_errors(own, aligned(found.poses, own.poses), "found", options)
+        for row in _odometry_rows(own, seed, options):
+            yield base | row
 
 
 def _measured(scene: Scene) -> list[tuple[str, dict[str, Any]]]:
-    """What refinement is given besides returns, and how the rows are then named: nothing, and what was recorded."""
+    """What refinement gets besides returns, and how the rows are then named: nothing, and what was recorded."""
     if scene.doppler_mps is None or scene.times_s is None:
         return [("", {})]
     return [("", {}), (", Doppler", {"doppler_mps": scene.doppler_mps, "times_s": scene.times_s})]
 
 
-def _odometry_rows(scene: Scene, seed: int, options: Options) -> Iterable[Row]:
-    true = scene.poses
+def _odometry_rows(scene: Scene, seed: int, options: argparse.Namespace) -> Iterator[Row]:
     if scene.simulation is not None:
         motion = measured_motion(scene.simulation, seed=seed)
         times_s, doppler, rates = motion.times_s, motion.doppler_mps, motion.angular_velocity
@@ -93,23 +88,22 @@ def _odometry_rows(scene: Scene, seed: int, options: Options) -> Iterable[Row]:
         gyroscope = rates if "gyroscope" in name else None
         if "gyroscope" in name and gyroscope is None:
             continue
-        row: Row = {"poses": name}
-        begin = time.perf_counter()
         try:
-            found = radarsdf.odometry(
-                scene.points,
-                doppler_mps=None if name == "returns alone" else doppler,
-                times_s=times_s,
-                angular_velocity=gyroscope,
-            )
+            with timed() as taken:
+                found = radarsdf.odometry(
+                    scene.points,
+                    doppler_mps=None if name == "returns alone" else doppler,
+                    times_s=times_s,
+                    angular_velocity=gyroscope,
+                )
         except ValueError as error:
-            yield row | {"why_not": str(error)}
+            yield {"poses": name, "why_not": str(error)}
             continue
-        row |= {"seconds": time.perf_counter() - begin, "pieces": float(found.report["pieces"])}
+        row: Row = {"poses": name, "seconds": taken.wall_s, "pieces": float(found.report["pieces"])}
         part = found.longest_piece()
-        row |= _trajectory_errors(found.poses[part], true[part], "found", found.covariance[part])
+        row |= _trajectory_errors(found.poses[part], scene.poses[part], "found", found.covariance[part])
         if found.report["pieces"] == 1:
-            row |= _map_errors(scene, aligned(found.poses, true), "found", options)
+            row |= _map_errors(scene, aligned(found.poses, scene.poses), "found", options)
         yield row
 
 
@@ -146,71 +140,67 @@ def _nees(poses: Poses, true: Poses, covariance: np.ndarray) -> float | None:
     return float(squares.mean() / 3)
 
 
-def _map_errors(scene: Scene, poses: Poses, name: str, options: Options) -> Row:
+def _map_errors(scene: Scene, poses: Poses, name: str, options: argparse.Namespace) -> Row:
     """F-score with nothing discarded, and the error of held-out intensities, of quick maps with these poses."""
     if scene.ground_truth is None:
         return {}
     config = scene.config("quick")
     whole = radarsdf.fit(scene.points, poses, config=config, progress=False)
     metrics = surface_metrics(
-        whole.mesh(), scene.ground_truth, box=scene.box, samples=min(options.samples, 1_000_000)
+        whole.mesh(), scene.ground_truth, box=scene.box, samples=samples_of(options, 1_000_000)
     )
     row: Row = {f"f_{name}": 100 * metrics["f_score_all"]}
     if scene.intensities is None or name == "given":
         return row
     train, test = dataclasses.replace(scene, poses=poses).split()
-    points, sensors, measured = world_returns(test)
-    predicted = fit(train, config).intensity(points, sensors, extrapolate=True)
-    return row | {f"mae_{name}": intensity_metrics(predicted, measured)["mae"]}
+    return row | {f"mae_{name}": errors_of(train.fit(config), test)["mae"]}
 
 
-def table(rows: list[Row]) -> str:
-    """Means and deviations over the seeds, for each scene and each kind of poses."""
-    parts = []
-    for (scene,), own in groups(rows, "scene").items():
-        cells = []
-        for (poses,), same in groups(own, "poses").items():
-            refused = sum("why_not" in row for row in same)
-            name = f"{poses} (refused: {refused} of {len(same)})" if refused else str(poses)
-            cells.append([name, *(mean_and_deviation(same, key) for key, _ in _COLUMNS)])
-        seeds = len({row["seed"] for row in own})
-        parts += [
-            f"### {scene}, {seeds} seeds",
-            markdown(["poses", *(label for _, label in _COLUMNS)], cells),
-        ]
-    return "\n\n".join(parts)
+_STEP_S = 0.1  # between two scans, for what is late
 
 
-def plot(rows: list[Row], path: Path) -> None:
-    """F-scores less those of the true poses, as given and as found."""
-    for ax, own in panels(path, [row for row in rows if row.get("f_found") is not None], "scene"):
-        kinds = groups(own, "poses")
-        places = np.arange(len(kinds))
-        for key, mark in (("f_given", "x"), ("f_found", "o")):
-            values: list[Any] = [
-                [row[key] - row["f_true"] for row in same if row.get(key) is not None]
-                for same in kinds.values()
-            ]
-            for place, of_kind in zip(places, values, strict=True):
-                ax.plot(
-                    of_kind,
-                    [place] * len(of_kind),
-                    mark,
-                    ms=4,
-                    color="C1" if mark == "x" else "C0",
-                    alpha=0.7,
-                )
-        ax.set_yticks(places, [str(name) for (name,) in kinds])
-        ax.invert_yaxis()
-        ax.set(xlabel="F-score less that of true poses, points (x given, o found)")
-        ax.grid(alpha=0.3)
+def walked(poses: Poses, sigma_m: float, sigma_deg: float, seed: int, yaw_deg: float = 0.0) -> Poses:
+    """A random walk, with a bias in yaw."""
+    return drifted(poses, sigma_m, np.radians(sigma_deg), seed, np.radians(yaw_deg))
 
 
-EXPERIMENT = Experiment(
-    "Poses that are refined, and poses from the radar alone",
-    tuple(SCENES),
-    tasks,
-    table,
-    plot,
-    repetitions=10,
-)
+def jumped(poses: Poses, jump_m: float, jump_deg: float, seed: int) -> Poses:
+    """All poses after the middle are elsewhere, as when odometry begins anew."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(0, 1, 3)
+    jump = np.concatenate([jump_m * direction / np.linalg.norm(direction), [0, 0, np.radians(jump_deg)]])
+    found = poses.copy()
+    middle = len(poses) // 2
+    found[middle:] = (
+        moved(poses[middle : middle + 1], jump[None])[0] @ np.linalg.inv(poses[middle]) @ found[middle:]
+    )
+    return found
+
+
+def stale(poses: Poses) -> Poses:
+    """Every second pose is the one before, as of a slow source without interpolation."""
+    return poses[np.arange(len(poses)) // 2 * 2]
+
+
+def late(poses: Poses, late_s: float) -> Poses:
+    """The poses of a clock that is late, of scans ten times a second."""
+    times = _STEP_S * np.arange(len(poses))
+    asked = np.clip(times - late_s, 0, times[-1])
+    found = poses.copy()
+    found[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(asked).as_matrix()
+    for axis in range(3):
+        found[:, axis, 3] = np.interp(asked, times, poses[:, axis, 3])
+    return found
+
+
+BREAKAGES: dict[str, Callable[[Poses, int], Poses]] = {
+    "none": lambda poses, _: poses,
+    "walk of 0.01 m, 0.05°": lambda poses, seed: walked(poses, 0.01, 0.05, seed),
+    "walk of 0.02 m, 0.1°": lambda poses, seed: walked(poses, 0.02, 0.1, seed),
+    "walk of 0.05 m, 0.25°": lambda poses, seed: walked(poses, 0.05, 0.25, seed),
+    "walk of 0.02 m, 0.05°, yaw 0.2° a step": lambda poses, seed: walked(poses, 0.02, 0.05, seed, 0.2),
+    "a jump of 0.5 m, 2°": lambda poses, seed: jumped(poses, 0.5, 2.0, seed),
+    "every second pose stale": lambda poses, _: stale(poses),
+    "0.05 s late": lambda poses, _: late(poses, 0.05),
+}
+"""What is done to true poses, by name; the second argument is a seed."""

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.memory import memory_bytes
-from bench.timing import timed
+from bench.measure import memory_bytes, timed
 
 
 @dataclass(frozen=True)

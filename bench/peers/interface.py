@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from bench.measure import ROOT, failure
 from bench.settings import Changes, merged
 
-ROOT = Path(__file__).resolve().parents[2]
 PYTHON = [sys.executable]
 """The command that runs a peer, unless that needs another Python."""
 VDBFUSION_ENVIRONMENT = ROOT / "build" / "peers" / "vdbfusion"
@@ -127,24 +127,11 @@ def reconstruct(
     queries: tuple[np.ndarray, np.ndarray] | None = None,
     timeout_s: float = 3600.0,
 ) -> Reconstruction:
-    """Run a peer on scans.
+    """Run one of `PEERS` on scans.
 
-    Parameters
-    ----------
-    peer
-        One of `PEERS`.
-    points
-        F arrays (N_i, 3), sensor frame, m.
-    poses
-        (F, 4, 4) T_world_sensor, m.
-    intensities
-        F arrays (N_i,), sensor units. Only peers with `Peer.intensities` get them.
-    min_range_m, max_range_m
-        Nearer and farther returns are dropped, for all peers.
-    queries
-        Points (N, 3) and sensor positions (N, 3), world frame, m, for which intensities are predicted.
-    timeout_s
-        The peer is stopped after this time, and has no result.
+    Points are F arrays (N_i, 3), sensor frame, m; poses (F, 4, 4) T_world_sensor; intensities F arrays (N_i,), which only peers
+    with `Peer.intensities` get. Nearer and farther returns than the ranges are dropped, for all peers. Queries are points (N, 3)
+    and sensor positions (N, 3), world frame, m, for which intensities are predicted. After the timeout a peer has no result.
     """
     python, why_not = _interpreter(peer.needs)
     if python is None:
@@ -215,11 +202,3 @@ def _interpreter(needs: str) -> tuple[list[str] | None, str]:
         why_not = failure(done)
     hint = INSTALL.get(needs)
     return None, f"{why_not} ({hint})" if hint else why_not
-
-
-def failure(done: subprocess.CompletedProcess[str]) -> str:
-    """The reason why a process failed, in one line."""
-    if done.returncode < 0:
-        return f"killed by signal {-done.returncode}" + (" (out of memory?)" if done.returncode == -9 else "")
-    lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-    return lines[-1]

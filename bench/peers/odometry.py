@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Odometry beside that of others on the same scans: `python -m bench.peers.odometry`.
+"""Odometry compared with that of others on the same scans: `python -m bench.peers.odometry [FILE.npz ...]`.
 
 `kiss-icp` and `small_gicp` come from their wheels (`python -m bench.peers.install odometry`). Both are made for lidars, so that
 each has several edges of voxels; the best of each drive counts, which is chosen by the true poses: a favour.
@@ -9,7 +9,7 @@ each has several edges of voxels; the best of each drive counts, which is chosen
 from __future__ import annotations
 
 import argparse
-import os
+import itertools
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from radarsdf.evaluation import trajectory_metrics
 from radarsdf.simulate import SCENES, measured_motion
 
-from bench.rows import kept
-
-from .interface import ODOMETRY_ENVIRONMENT, ROOT, failure
+from bench.measure import ROOT, failure
+from bench.peers.interface import ODOMETRY_ENVIRONMENT
+from bench.runner import Experiment, Row, main
 
 _VOXELS_M = (0.5, 1.0, 2.0)
 _PEERS = ("kiss-icp", "small_gicp")
@@ -61,18 +61,18 @@ def simulated(seeds: Iterable[int]) -> Iterator[Drive]:
             )
 
 
-def recorded(folder: Path) -> Iterator[Drive]:
-    """Of each .npz with times and Doppler. Their poses are those of a lidar."""
-    for path in sorted(folder.glob("*.npz")):
-        scans = radarsdf.io.read_scans(path)
-        if scans.times_s is not None and scans.doppler_mps is not None:
-            yield Drive(path.stem, scans.points, scans.poses, scans.times_s, scans.doppler_mps, None)
+def recorded(path: Path) -> Drive:
+    """An .npz with times and Doppler, and the poses of a lidar."""
+    scans = radarsdf.io.read_scans(path)
+    assert scans.times_s is not None
+    assert scans.doppler_mps is not None
+    return Drive(path.stem, scans.points, scans.poses, scans.times_s, scans.doppler_mps, None)
 
 
-def rows(drives: Iterable[Drive]) -> Iterator[dict[str, str]]:
-    """A row for each drive: positions in % of the way, steps of 10 to 50 % of the way in % of them, and degrees per metre."""
-    for drive in drives:
-        row = {"drive": drive.name, "scans": str(len(drive.points))}
+def rows(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each drive: positions in % of the path, steps of 10 to 50 % of it in % of them, and degrees per metre."""
+    for drive in itertools.chain(map(recorded, map(Path, options.cases)), simulated(options.seeds)):
+        row: Row = {"drive": drive.name, "scans": len(drive.points)}
         for name, given in _OURS.items():
             row[name] = _ours(drive, **given)
         for name in _PEERS:
@@ -146,25 +146,7 @@ def _words(errors: tuple[float, float, float]) -> str:
     return f"{errors[0]:.2f}; {errors[1]:.2f}; {errors[2]:.3f}"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="*", default=[91, 92, 93], help="of the simulated drives")
-    parser.add_argument(
-        "--recorded",
-        type=Path,
-        default=Path(os.environ.get("RADARSDF_DATA", ".")) / "astyx",
-        metavar="FOLDER",
-        help="recorded drives, .npz; default: astyx in $RADARSDF_DATA",
-    )
-    parser.add_argument("-o", "--out", type=Path, default=ROOT / "build" / "odometry_peers.json")
-    options = parser.parse_args()
-
-    def drives() -> Iterator[Drive]:
-        yield from recorded(options.recorded)
-        yield from simulated(options.seeds)
-
-    kept(rows(drives()), "bench.peers.odometry", options.out)
-
+EXPERIMENT = Experiment("Odometry", rows, options=("seeds",), defaults={"seeds": [91, 92, 93]})
 
 if __name__ == "__main__":
-    main()
+    main("bench.peers.odometry", EXPERIMENT)

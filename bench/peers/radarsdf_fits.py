@@ -11,8 +11,8 @@ import radarsdf
 import radarsdf.fitting.fit  # else the first fit and the first mesh would import these, in the measured time
 import radarsdf.map.mesh
 
+from bench.measure import timed
 from bench.settings import PRESETS
-from bench.timing import timed
 
 from .child import Made, ScanArrays
 

@@ -5,12 +5,11 @@
 from __future__ import annotations
 
 import numpy as np
-import radarsdf
 from radarsdf.changes.changes import GONE, SAME, ChangedSurface, Changes
 from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
 
-from bench.changes import Change, areas, cubes, other_way, recalls, sizes
+from bench.changes import Change, areas, recalls
 
 
 def surface(places, kinds):
@@ -31,30 +30,3 @@ def test_recall_is_on_the_cube_and_false_area_away_from_it():
     np.testing.assert_allclose(recalls(found, cube), [1 / 2], rtol=1e-5)
     false, seen, near = (area / 0.005 for area in areas(found, [cube]))  # triangles
     np.testing.assert_allclose([false, seen, near], [1, 4, 2], rtol=1e-5)
-    assert next(sizes({("moved", 1.0): [0.1, 0.5]}))["a fifth found"] == "0.50"
-
-
-def test_the_second_way_and_the_cubes_are_elsewhere():
-    drive = radarsdf.simulate.KINDS["slope"](frames=8)
-    rng = np.random.default_rng(1)
-    way = other_way(drive.poses, rng)
-    off_m = np.linalg.norm(way[:, :3, 3] - drive.poses[:, :3, 3], axis=1)
-    assert off_m.min() > 0.01
-    np.testing.assert_allclose(np.linalg.det(way[:, :3, :3]), 1)
-    changes = cubes(drive, rng)
-    assert {change.kind for change in changes} <= {
-        "put in",
-        "taken out",
-        "moved",
-        "repainted",
-        "patch repainted",
-    }
-    painted = [change for change in changes if "repainted" in change.kind]
-    assert painted
-    for change in painted:
-        np.testing.assert_array_equal(change.before.center, change.after.center)
-        assert abs(change.before.material.reflectivity_db - change.after.material.reflectivity_db) == 6
-    assert len(changes) > 3
-    for change in changes:
-        box = change.before or change.after
-        assert np.linalg.norm(drive.poses[:, :2, 3] - box.center[:2], axis=1).min() > change.size_m

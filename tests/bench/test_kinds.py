@@ -1,39 +1,45 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The table of kinds: F-scores of all methods, and confidence beside the truth."""
+"""Scenes of each kind are what their name says, and their radars and drives differ."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
-from bench.paper.kinds import table
-
-from .test_paper import peers, run
-
-__all__ = ["peers"]
+from bench.kinds import KINDS
 
 
-@pytest.mark.usefixtures("peers")
-def test_each_kind_has_scores_and_a_calibration(tmp_path):
-    written, values = run(tmp_path, "kinds", "wall", "--peers", "BPA", "Poisson", "--repetitions", "1")
-    ball, _, *judged = values["rows"]
-    assert 0 <= ball["f_score_all"] <= 1
-    assert "- wall, Poisson: Open3D is not here" in written
-    assert [row["method"] for row in judged] == ["radarsdf, confidence", "radarsdf, quick, confidence"]
-    for row in judged:
-        assert row["num_points"] > 1000
-        assert 0 < row["true_share"] < 1
-        assert row["auc"] > 0.5
+@pytest.fixture(scope="module")
+def scenes():
+    return {name: make(seed=3, frames=2) for name, make in KINDS.items()}
 
 
-def test_a_mean_is_over_kinds_that_all_methods_have():
-    def row(scene, method, score):
-        return {"scene": scene, "method": method, "repetition": 0, "f_score_all": score}
+def ranges_up(simulation):
+    """Distance straight up from each sensor to the first surface, m."""
+    at = simulation.poses[:, :3, 3]
+    return simulation.scene.raycast(at, np.tile([0.0, 0.0, 1.0], (len(at), 1)), 100.0).range_m
 
-    rows = [row("hall", "A", 0.5), row("hall", "B", 0.7), row("yard", "A", 0.7), row("yard", "B", 0.8)]
-    mean = "| mean of kinds | 60.0 | **75.0** |"
-    assert mean in " ".join(table(rows).split())
-    rows += [row("forest", "A", 0.1), {"scene": "forest", "method": "B", "why_not": "it crashed"}]
-    found = table(rows)
-    assert mean in " ".join(found.split())
-    assert "- forest, B: it crashed" in found
+
+def test_returns_labelled_surface_are_near_one_and_others_are_not(scenes):
+    for name, simulation in scenes.items():
+        surface = simulation.is_surface()
+        distance_m = np.abs(simulation.scene.signed_distance(simulation.world_points()))
+        assert np.median(distance_m[surface]) < 0.15, name
+        assert surface.mean() > 0.5, name
+        if (~surface).sum() > 20:
+            assert np.median(distance_m[~surface]) > 2 * np.median(distance_m[surface]), name
+
+
+def test_what_is_enclosed_has_a_roof(scenes):
+    roofed = {name for name, simulation in scenes.items() if np.isfinite(ranges_up(simulation)).all()}
+    assert {"hall", "tunnel"} <= roofed
+    assert not roofed & {"yard", "slope", "facade", "car_park", "fences"}
+
+
+def test_a_seed_gives_the_same_bits_and_another_seed_another_scene(scenes):
+    again, other = (KINDS["hall"](seed=seed, frames=2) for seed in (3, 4))
+    assert_array_equal(again.world_points(), scenes["hall"].world_points())
+    assert_array_equal(again.ground_truth, scenes["hall"].ground_truth)
+    assert len(other.world_points()) != len(again.world_points())

@@ -5,27 +5,14 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 
 import numpy as np
 import pytest
 import radarsdf
 
-from bench.peers import interface
 from bench.peers.interface import PEERS, Peer, reconstruct
 
-from ..warm_python import warm_python
-
 OURS = PEERS["radarsdf"].with_changes(training={"sdf_iterations": 60}, mesh={"min_component_triangles": 20})
-
-
-@pytest.fixture(scope="module", autouse=True)
-def warm():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(interface, "PYTHON", warm_python())
-        interface._interpreter.cache_clear()
-        yield
-    interface._interpreter.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -44,34 +31,6 @@ def usual(scans):
     """Ours without intensities, in spite of being given them and asked for them."""
     queries = queries_of(scans.points, scans.poses)
     return reconstruct(OURS, scans.points, scans.poses, scans.intensities, queries=queries)
-
-
-def test_the_paper_s_methods_are_there_in_its_order():
-    assert list(PEERS)[:5] == ["α-shapes", "BPA", "Poisson", "VDBFusion", "SHINE (octree)"]
-
-
-def test_changes_of_a_group_leave_its_other_settings():
-    peer = PEERS["SHINE (octree)"].with_changes(encoding={"num_levels": 2}, seed=1, mesh={"voxel_size": 0.3})
-    assert peer.options["changes"] == {
-        "encoding": {"kind": "octree", "fourier_count": 0, "num_levels": 2},
-        "training": {"learning_rate": 1e-2},
-        "seed": 1,
-    }
-    published = {"min_confidence": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
-    assert peer.options["mesh"] == {"voxel_size": 0.3, **published}
-    assert "num_levels" not in PEERS["SHINE (octree)"].options["changes"]["encoding"]
-
-
-def test_the_published_mesh_leaves_out_what_was_published():
-    meshes = {name: peer.options["mesh"] for name, peer in PEERS.items() if "mesh" in peer.options}
-    published = {name for name, mesh in meshes.items() if "min_component_triangles" in mesh}
-    assert published == {"SHINE (octree)", "3QFP", "3QFPI"}
-    assert meshes["radarsdf, quick"] == {"voxel_size": 0.2}
-
-
-def test_the_mesh_s_arguments_arrive(scans):
-    done = reconstruct(OURS.with_changes(mesh={"min_component_triangles": 10**9}), scans.points, scans.poses)
-    assert done.why_not == "the mesh has no triangles"
 
 
 def test_far_from_the_origin_the_same_mesh_comes_out_there(scans, usual):
@@ -105,18 +64,6 @@ def test_intensities_are_predicted_at_queries_in_the_world(scans, usual):
     assert usual.intensity is None
 
 
-def test_ranges_are_cut_for_all(scans):
-    done = reconstruct(OURS, scans.points, scans.poses, min_range_m=50.0)
-    assert done.mesh is None
-    assert done.why_not == "no returns within the ranges"
-
-
-def test_a_scan_without_returns_in_range_is_left_out(scans):
-    points = [np.zeros((4, 3), np.float32), *scans.points[1:]]
-    done = reconstruct(OURS, points, scans.poses)
-    assert done.mesh is not None, done.why_not
-
-
 @pytest.mark.parametrize(
     ("peer", "why_not"),
     [
@@ -138,12 +85,6 @@ def test_a_peer_that_cannot_run_says_why(scans, peer, why_not):
     done = reconstruct(peer, scans.points, scans.poses)
     assert done.mesh is None
     assert why_not in done.why_not
-
-
-def test_a_peer_that_takes_too_long_is_stopped(scans):
-    done = reconstruct(OURS, scans.points, scans.poses, timeout_s=0.01)
-    assert done.mesh is None
-    assert "no result after" in done.why_not
 
 
 @pytest.mark.parametrize("name", ["α-shapes", "BPA", "VDBFusion"])

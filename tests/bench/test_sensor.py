@@ -5,19 +5,75 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from radarsdf.simulate import SCENES, simulate
 from scipy.spatial import cKDTree
 
-from bench.sensor import __main__ as command
-from bench.sensor.astyx import EXPECTED, FITTED, KEPT_ASIDE, medians, misfits
-from bench.sensor.drives import Drive, recorded, with_lidar
-from bench.sensor.figures import deviation, figures, plane_errors
+from bench.sensor import Drive, deviation, figures, medians, plane_errors, recorded, with_lidar
 
 from ..conftest import recorded_scans
+
+FITTED = ("r0144_0167", "r0009_0024", "r0057_0068", "r0133_0142")
+
+
+class Expected(NamedTuple):
+    """A figure of the recorded drives, and the factor up to which a simulated one may differ."""
+
+    value: float
+    factor: float
+
+
+EXPECTED = {
+    "returns per scan": Expected(1930, 1.25),
+    "returns per scan 10-20": Expected(461, 1.6),
+    "returns per scan 20-30": Expected(311, 1.6),
+    "returns per scan 30-45": Expected(436, 1.6),
+    "returns per scan 45-60": Expected(267, 1.6),
+    "median distance m 10-20": Expected(0.179, 1.5),
+    "median distance m 20-30": Expected(0.273, 1.5),
+    "median distance m 30-45": Expected(0.532, 1.6),
+    "median distance m 45-60": Expected(1.01, 1.6),
+    "share farther than 0.4 m 10-20": Expected(0.177, 1.4),
+    "share farther than 0.4 m 20-30": Expected(0.341, 1.4),
+    "share farther than 0.4 m 30-45": Expected(0.594, 1.4),
+    "share farther than 0.4 m 45-60": Expected(0.725, 1.4),
+    "share farther than 1 m 10-20": Expected(0.0222, 1.6),
+    "share farther than 1 m 20-30": Expected(0.0899, 1.6),
+    "share farther than 1 m 30-45": Expected(0.289, 1.6),
+    "share farther than 1 m 45-60": Expected(0.476, 1.6),
+    "distance, strong / weak 10-20": Expected(0.762, 1.5),
+    "distance, strong / weak 20-30": Expected(0.682, 1.5),
+    "distance, strong / weak 30-45": Expected(0.730, 1.5),
+    "false returns seen again 20-30": Expected(0.108, 1.5),
+    "false returns seen again 30-45": Expected(0.210, 1.5),
+    "false returns seen again 45-60": Expected(0.308, 1.5),
+    "deviation beam m 10-20": Expected(0.130, 1.25),
+    "deviation beam m 20-30": Expected(0.167, 1.25),
+    "deviation beam m 30-45": Expected(0.185, 1.25),
+    "deviation beam m 45-60": Expected(0.195, 1.25),
+    "deviation beam, strong / weak 10-20": Expected(0.659, 1.2),
+    "deviation beam, strong / weak 30-45": Expected(0.698, 1.2),
+    "deviation azimuth rad 10-20": Expected(0.00783, 1.6),
+    "deviation azimuth rad 20-30": Expected(0.00680, 1.6),
+    "deviation azimuth rad 30-45": Expected(0.0111, 1.6),
+    "deviation elevation rad 10-20": Expected(0.0253, 1.25),
+    "deviation elevation rad 20-30": Expected(0.0205, 1.25),
+    "deviation elevation rad 30-45": Expected(0.0143, 1.25),
+}
+
+
+def misfits(found: list[dict[str, float]]) -> dict[str, float]:
+    """Simulated over expected figure, of those figures that differ by more than their factor or that are missing."""
+    ratios = {name: own / EXPECTED[name].value for name, own in medians(found).items() if name in EXPECTED}
+    return {
+        name: ratio
+        for name, ratio in ratios.items()
+        if not 1 / EXPECTED[name].factor <= ratio <= EXPECTED[name].factor
+    }
+
 
 SEEDS = (1, 2)
 
@@ -38,10 +94,8 @@ def test_the_simulation_is_as_noisy_as_the_drives(simulations):
     ("changes", "seed", "what_fails", "is_too_large"),
     [
         ({"sigma_elevation_rad": 0.004}, 1, "deviation elevation rad 10-20", False),  # as in azimuth
-        ({"sigma_range_per_m": 0.0}, 1, "deviation beam m 45-60", False),
         ({"weak_noise": 0.0}, 2, "deviation beam, strong / weak 30-45", True),
         ({"phantoms_per_scan": 0.0}, 1, "share farther than 1 m 30-45", False),
-        ({"phantom_lasting_share": 0.0}, 1, "false returns seen again 20-30", False),
         ({"sidelobe_share": 0.3}, 2, "share farther than 1 m 10-20", True),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
@@ -62,27 +116,6 @@ def test_the_expected_figures_are_those_of_the_drives():
     measured = medians([figures(recorded(recorded_scans(name))) for name in FITTED])
     for name, expected in EXPECTED.items():
         assert measured[name] == pytest.approx(expected.value, rel=0.01), name
-
-
-def test_the_drive_kept_aside_has_the_same_noise_in_elevation_and_more_false_returns():
-    """Too few planes tell its noise along the beam and in azimuth. Its false returns are up to 3.2 times as many."""
-    found = figures(recorded(recorded_scans(KEPT_ASIDE)))
-    for name, expected in EXPECTED.items():
-        ratio = found[name] / expected.value
-        if not name.startswith(("deviation", "distance", "false")):
-            assert 0.4 < ratio < 3.3, name
-        elif np.isfinite(ratio):
-            assert 0.7 < ratio < 1.5, name
-
-
-def test_the_lidar_of_a_simulation_does_not_depend_on_the_radar():
-    usual = SCENES["astyx"](seed=0, frames=2)
-    sensor = replace(usual.sensor, weak_noise=0.0)
-    changed = simulate(usual.scene, sensor, usual.poses, name=usual.name, seed=0)
-    own, taken = with_lidar(changed), with_lidar(changed, same_lidar=with_lidar(usual))
-    assert np.array_equal(own.lidar, taken.lidar)
-    assert np.array_equal(own.lidar_frame, taken.lidar_frame)
-    assert np.array_equal(own.points, taken.points)
 
 
 def test_plane_errors_are_those_along_the_normal_of_a_plane():
@@ -106,11 +139,3 @@ def test_deviation_ignores_a_background():
     errors = np.concatenate([rng.normal(0, 0.1, 2000), rng.uniform(-1.5, 1.5, 1000)])
     assert deviation(errors, 1.5) == pytest.approx(0.1, rel=0.08)
     assert np.isnan(deviation(errors[:10], 1.5))
-
-
-def test_the_command_prints_a_row_for_each_figure(monkeypatch, capsys):
-    monkeypatch.setitem(SCENES, "astyx", partial(SCENES["astyx"], frames=4))
-    command.main([str(recorded_scans(KEPT_ASIDE)), "--seeds", "0"])
-    said = capsys.readouterr().out
-    assert "| returns per scan 10-20 " in said
-    assert "| deviation elevation, strong / weak 45-60 " in said

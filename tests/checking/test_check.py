@@ -15,8 +15,9 @@ from radarsdf.checking.recording import Recording
 from radarsdf.io import Scans
 from radarsdf.simulate import drifted
 
-from bench.breakages.__main__ import slow
 from tests.conftest import recorded_file
+
+from .breakages import slow
 
 
 def test_scans_are_taken_as_they_are():

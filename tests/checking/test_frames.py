@@ -12,8 +12,9 @@ from radarsdf.checking.frames import FULL, check_frames
 from radarsdf.checking.recording import Recording
 from scipy.spatial.transform import Rotation
 
-from bench.breakages.__main__ import slow
 from tests.conftest import recorded_file, recorded_scans
+
+from .breakages import slow
 
 _CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 

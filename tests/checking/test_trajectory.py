@@ -11,7 +11,7 @@ from radarsdf.checking.check import check_cheaply
 from radarsdf.checking.recording import Recording
 from radarsdf.checking.trajectory import check_jumps
 
-from bench.breakages.__main__ import slow
+from .breakages import slow
 
 
 @pytest.fixture(scope="module")

@@ -123,7 +123,7 @@ def test_what_cannot_be_written(clouds, scans_file, tmp_path_factory, capsys):
 
 def test_several_topics_of_a_bag(tmp_path):
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
-    from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - it takes rosbags
+    from tests.io.bag_writing import BagWriter  # noqa: PLC0415 - it takes rosbags
 
     with BagWriter(tmp_path / "a.bag", "ros1") as bag:
         for time_s in (100.0, 100.1, 100.2):

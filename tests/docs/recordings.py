@@ -76,7 +76,7 @@ def _kitti(folder, drive, scale):
 
 
 def _bag(path, drive):
-    from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - it needs rosbags, an extra
+    from tests.io.bag_writing import BagWriter  # noqa: PLC0415 - it needs rosbags, an extra
 
     T_base_radar = np.eye(4)
     T_base_radar[:3, 3] = [1.0, 0.0, 0.5]

@@ -17,7 +17,7 @@ from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
 from radarsdf.returns.rays import prepare
 
-from bench.stress.memory import peak_of_a_fit
+from bench.estimates import peak_of_a_fit
 
 from ..settings import grouped
 from ..warm_python import warm_python

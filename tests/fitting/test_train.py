@@ -18,7 +18,7 @@ from radarsdf.fitting.sampling import RaySampler
 from radarsdf.fitting.train import LossHistory
 from radarsdf.returns.rays import prepare
 
-from bench.stress.training import CASES, fitted, free_and_solid
+from .extreme import CASES, fitted, free_and_solid
 
 NONE = torch.zeros(1)
 

@@ -11,6 +11,8 @@ from radarsdf.cli import main
 from radarsdf.grids.costmap import Wheels
 from radarsdf.grids.grid import Grid
 
+from bench.kinds import KINDS
+
 BOX = [[5.0, -5.03, -1.57], [22.0, 4.97, 4.43]]
 
 
@@ -36,7 +38,7 @@ def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
 
 def test_a_voxel_that_a_surface_grazes_is_not_free():
     """No return is in it, for they were moved onto the surface, and rays pass it above the ground often enough."""
-    drive = radarsdf.simulate.KINDS["tunnel"](seed=5, frames=12)
+    drive = KINDS["tunnel"](seed=5, frames=12)
     config = radarsdf.FitConfig(num_threads=1)
     radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
     # The ground is the border of two voxels.

@@ -13,8 +13,7 @@ from ..conftest import pose
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
-from bench.reading.bag_writing import BagWriter
-
+from .bag_writing import BagWriter
 from .test_bags import MOUNTING, START_S, moved, odometry
 
 TIMES_S = START_S + np.arange(10) * 0.1

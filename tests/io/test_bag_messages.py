@@ -16,8 +16,7 @@ pytest.importorskip("rosbags", reason="the extra ros is not installed")
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
 
-from bench.reading.bag_writing import BagWriter
-
+from .bag_writing import BagWriter
 from .test_bags import MOUNTING, START_S, TIMES_S, check, columns, moved, odometry, tree
 
 FLAGS = [

@@ -16,7 +16,7 @@ from ..conftest import pose
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
 
-from bench.reading.bag_writing import KINDS, BagWriter
+from .bag_writing import KINDS, BagWriter
 
 START_S = 1_700_000_000.0
 TIMES_S = START_S + np.arange(5) * 0.1

@@ -173,7 +173,7 @@ def bag_columns(i):
 
 def test_ntu4dradlm(tmp_path):
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
-    from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - it takes rosbags
+    from .bag_writing import BagWriter  # noqa: PLC0415 - it takes rosbags
 
     folder = tmp_path / "cp"
     folder.mkdir()
@@ -198,7 +198,7 @@ def test_ntu4dradlm(tmp_path):
 @pytest.mark.parametrize("kind", ["ros1"])
 def test_viking_hill(tmp_path, kind):
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
-    from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - it takes rosbags
+    from .bag_writing import BagWriter  # noqa: PLC0415 - it takes rosbags
 
     folder = tmp_path / "viking"
     folder.mkdir()

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between.
-
-`python -m bench.stress files --count 100000` does the same for longer.
-"""
+"""Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between."""
 
 from __future__ import annotations
 
@@ -21,8 +18,9 @@ import radarsdf
 import torch
 from radarsdf.io.npz import read_scans
 
-from bench.stress import files, samples
-from bench.stress.mutations import boundaries
+from .. import samples
+from . import hostile_files as files
+from .mutations import boundaries
 
 FILES = 120
 

@@ -21,7 +21,7 @@ MOUNTING = pose([0.1, 0.2, 0.3], np.pi / 2)  # T_imu_radar
 def a_bag(folder, kind="ros1", *, stamps=True, topics=("/imu",), force=True, transforms=False):
     """Four scans and an IMU, which is recorded four measurements at a time, 0.05 s late."""
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
-    from bench.reading.bag_writing import BagWriter  # noqa: PLC0415 - an extra
+    from .bag_writing import BagWriter  # noqa: PLC0415 - an extra
 
     path = folder / ("drive.bag" if kind == "ros1" else "drive")
     cloud = {name: np.ones(3, np.float32) for name in ("x", "y", "z", "doppler")}

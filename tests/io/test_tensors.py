@@ -15,8 +15,7 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.map.storage import load_contents
 from radarsdf.tiles.plan import Plan, map_path
 
-from bench.stress import samples
-
+from .. import samples
 from ..conftest import ground_and_wall
 from ..tiles.conftest import CONFIG
 

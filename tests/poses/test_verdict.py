@@ -8,13 +8,14 @@ import json
 
 import numpy as np
 import pytest
-import radarsdf
 from radarsdf import RefinedPoses
 from radarsdf.map.storage import checked_report
 from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.posed import way_of
 from radarsdf.poses.verdict import Verdict
 from radarsdf.returns.noise import SensorNoise
+
+from bench.kinds import KINDS
 
 
 def test_one_thing_that_moves_does_not_call_poses_improved():
@@ -26,7 +27,7 @@ def test_one_thing_that_moves_does_not_call_poses_improved():
 
 
 def test_scans_on_top_of_each_other_do_not_agree_better():
-    drive = radarsdf.simulate.KINDS["tunnel"](seed=8, frames=30)
+    drive = KINDS["tunnel"](seed=8, frames=30)
     returns = SensorReturns.of(drive.points, 0.1, None)
     held = np.random.default_rng(0).random(len(returns)) < 0.2
     for share in (0.0, 0.3, 0.6):  # of the distance driven

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from radarsdf import FitConfig
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 
-from bench.paper.experiment import world_returns
-from bench.paper.scenes import VOXEL_M, Scene, load_scene
+from bench.scenes import VOXEL_M, Scene, load_scene
 
 from ..conftest import recorded_scans
 
@@ -230,7 +229,7 @@ def measure(
     if len(mesh.faces):
         surface = surface_metrics(mesh, scene.ground_truth, samples=MESH_SAMPLES)
         f_score, outliers = 100 * surface["f_score_all"], 100 * surface["outlier_ratio"]
-    x, sensors, measured = world_returns(test)
+    x, sensors, measured = test.world_returns()
     mae = (
         intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)["mae"]
         if intensities

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.viewing.page import drawn, open_page, why_no_browser
+from tests.view.page import drawn, open_page, why_no_browser
 
 pytestmark = pytest.mark.skipif(why_no_browser() is not None, reason=str(why_no_browser()))
 

@@ -24,13 +24,6 @@ def deviations(sensor, distance_m):
     return points.std(axis=0)
 
 
-def test_azimuth_and_elevation_have_a_noise_each():
-    sensor = replace(PENCIL, sigma_azimuth_rad=0.004, sigma_elevation_rad=0.012)
-    _, left_m, up_m = deviations(sensor, 20.0)
-    assert left_m == pytest.approx(0.08, rel=0.03)
-    assert up_m == pytest.approx(0.24, rel=0.03)
-
-
 @pytest.mark.parametrize(("distance_m", "expected_m"), [(3.0, 0.0501), (40.0, 0.0640), (80.0, 0.0943)])
 def test_the_noise_along_the_beam_grows_with_the_range(distance_m, expected_m):
     sensor = replace(PENCIL, max_range_m=100.0, sigma_range_m=0.05, sigma_range_per_m=0.001)
@@ -70,12 +63,6 @@ def test_side_lobes_keep_range_and_azimuth_and_add_returns():
     assert np.abs(own[:, None] - range_and_azimuth).max(axis=2).min(axis=1).max() < 1e-4
     drop_db = np.median(clean.intensities) - np.median(scan.intensities[false])
     assert drop_db == pytest.approx(5.0, abs=0.2)
-
-
-def test_the_loss_by_range_is_that_of_the_receiver():
-    sensor = replace(PENCIL, gain_db=100.0, range_loss_db=8.0)
-    near, far = (np.median(sensor.scan(wall_ahead(x, MATT), np.eye(4)).intensities) for x in (3.0, 30.0))
-    assert near - far == pytest.approx(8.0, abs=0.01)
 
 
 def test_clutter_lies_where_its_share_says():
@@ -133,14 +120,3 @@ def test_lasting_phantoms_stay_at_their_places_in_the_world(share, seed, least, 
     second = phantoms(sensor.scan(scene, there, seed=seed, frame=1)) + there[:3, 3]
     assert len(first) == pytest.approx(2000, rel=0.4)
     assert least <= np.mean(cKDTree(first).query(second)[0] < 1e-3) <= most
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["sigma_range_per_m", "weak_noise", "clutter_power_db", "sidelobe_loss_db", "clutter_near_share",
-     "phantoms_per_scan", "phantom_lasting_share",
-     "phantom_depth", "range_loss_db", "sidelobe_share", "sidelobe_fov_rad"],
-)  # fmt: skip
-def test_impossible_settings_are_refused_by_name(name):
-    with pytest.raises(ValueError, match=name):
-        sim.RadarSensor(**{name: -0.5})

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Tiles on dask.distributed: the same bits, and what was done is kept. `bench.tiles kills` kills real workers."""
+"""Tiles on dask.distributed: the same bits, and what was done is kept."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ import radarsdf
 from radarsdf.tiles.plan import map_path
 from radarsdf.tiles.tasks import cluster_executor
 
-from bench.tiles.kills import bits_of, cluster_in
-
+from .cluster import bits_of, cluster_in
 from .conftest import CONFIG, TILE_M
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 pytest.importorskip("viser", reason="the extra view is not installed")
 
-from bench.viewing.page import camera_of, drawn, open_page, pixel_of, why_no_browser
+from .page import camera_of, drawn, open_page, pixel_of, why_no_browser
 
 pytestmark = pytest.mark.skipif(why_no_browser() is not None, reason=str(why_no_browser()))
 

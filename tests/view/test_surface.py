@@ -41,7 +41,7 @@ def test_a_map_without_a_surface_here(sharp_map):
 
 def test_a_glb_has_the_colors_that_were_given():
     pytest.importorskip("viser", reason="the extra view is not installed")
-    from bench.viewing.client import Glb  # noqa: PLC0415 - which needs it
+    from .client import Glb  # noqa: PLC0415 - which needs it
 
     colors = np.array([[0, 0, 0], [43, 20, 133], [249, 237, 82], [255, 255, 255]], np.uint8)
     data = glb(SQUARE, TWO, colors)

@@ -28,7 +28,7 @@ pytest.importorskip("viser", reason="the extra view is not installed")
 
 from viser import ClientHandle
 
-from bench.viewing.client import Glb, PlainClient, is_mesh
+from .client import Glb, PlainClient, is_mesh
 
 CLOUD = "/surface/cloud"
 

@@ -121,7 +121,7 @@ class PlacedMap:
                 continue
             x = own[rows]
             cells = self.radar_map.cells_round(x.min(axis=0) - 2 * leaf_m, x.max(axis=0) + 2 * leaf_m)
-            # The core counts up to seven scans for a cell: counts up to 63 tell no more (bench/history/changes.md).
+            # The core counts up to seven scans for a cell: counts up to 63 tell no more.
             near = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
             places = np.floor((x - cells.corner) / leaf_m).astype(np.int64)
             found[rows] = np.rint(near[tuple(places.T)]) / _CELLS_ALONG_RAY

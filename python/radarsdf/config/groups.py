@@ -4,8 +4,8 @@
 
 "3QFP" (ICRA 2024) and "3QFPI" (Neural Surface and Reflectance Modelling from 3D Radar Data) are the papers
 and their published settings for radar. "Measured" means measured on simulated and real scans;
-``bench/history/surface.md`` has the figures. Lengths that end in ``_cells`` are in leaf cells: for another scale of
-scene, only `leaf_size_m` has to change.
+``docs/defaults.md`` has what it is worth. Lengths that end in ``_cells`` are in leaf cells: for another scale of scene, only
+`leaf_size_m` has to change.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ TRUNCATION_CELLS = 3.0
 """Distances are truncated here, and a ray counts up to this far before and behind its return, leaf cells (VDBFusion: 3
 voxels). Measured: 4 and 5 are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real ones."""
 # Iterations of smoothing. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
-# many 0.0 to 0.3 worse. See bench/history/live.md.
+# many 0.0 to 0.3 worse.
 _SMOOTHINGS = 24
 CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
 """Leaf cells, along each axis, over which :func:`average_at_corners` carries what is known."""

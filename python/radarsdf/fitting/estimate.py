@@ -32,7 +32,7 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import resolve_num_threads
 
-# Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.stress durations`
+# Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.estimates durations`
 # measures fits and prints them. The estimates of twenty fits were 0.65 to 1.24 times their processor time.
 SECONDS = {
     "return": 1.7e-06,
@@ -46,7 +46,7 @@ _SECONDS_OF_FREE_SPACE = 1e-6  # a return
 _SHARED = ("encoded number", "multiplication")  # done by all threads; one thread does the other kinds
 
 # Bytes. Measured as peaks of fits of 1e4 to 3e6 returns of a street, over the memory of the process before
-# the fit; `python -m bench.stress memory` repeats it.
+# the fit; `python -m bench.estimates memory` repeats it.
 _ALWAYS = 35e6  # code that the fit loads, stacks and arenas of the threads
 _PER_RETURN = 30.0
 _PER_INTENSITY = 20.0

@@ -142,7 +142,7 @@ def support_at(
     return np.minimum(sums[:, 0], _MOST)
 
 
-# Measured on simulated and real scans; see bench/history/surface.md.
+# Measured on simulated and real scans.
 # Share of the median support of the block. Returns with less are too often false to tell where a surface goes on.
 _MIN_SUPPORT = 0.5
 # Mean support of the two ends of a bridge, at most. A surface crosses about nine of the 27 cells. With one

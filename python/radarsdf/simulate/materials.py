@@ -53,53 +53,25 @@ class Material:
     mirror_loss_db: float = np.inf  # loss of a wave mirrored by the surface [dB], >= 0; inf: no ghosts
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         for field in dataclasses.fields(self):
             if field.name != "name":
                 number(getattr(self, field.name), field.name)
-        if not 0 <= self.specular <= 1:
-            msg = f"specular must be in [0, 1], not {self.specular}"
-            raise ValueError(msg)
-        if not (self.lobe_width_rad > 0 and self.looks > 0):
-            msg = "lobe_width_rad and looks must be positive"
+        if not (0 <= self.specular <= 1 and self.lobe_width_rad > 0 and self.looks > 0):
+            msg = f"specular must be in [0, 1], lobe_width_rad and looks must be positive: {self}"
             raise ValueError(msg)
         if not (self.texture_db >= 0 and self.mirror_loss_db >= 0):
             msg = "texture_db and mirror_loss_db must not be negative"
             raise ValueError(msg)
 
     def lobe_db(self, cos_incidence: FloatArray) -> FloatArray:
-        """Change of the echo with the angle of incidence.
-
-        Parameters
-        ----------
-        cos_incidence : (N,) float64
-            Cosine of the angle between the surface normal and the direction back to the sensor.
-
-        Returns
-        -------
-        (N,) float64
-            dB, 0 at normal incidence.
-        """
+        """Change of the echo, dB, with the cosine (N,) of the angle of incidence; 0 at normal incidence."""
         cos = np.clip(cos_incidence, 1e-3, 1.0)
         specular = np.exp(-0.5 * (np.arccos(cos) / self.lobe_width_rad) ** 2)
         lobe: FloatArray = 10 * np.log10((1 - self.specular) * cos**2 + self.specular * specular + 1e-6)
         return lobe
 
     def echo_db(self, points: FloatArray, cos_incidence: FloatArray) -> FloatArray:
-        """Echo of the surface without the loss by range: reflectivity, texture and lobe.
-
-        Parameters
-        ----------
-        points : (N, 3) float64
-            Hits on the surface, world frame, m.
-        cos_incidence : (N,) float64
-            As in `lobe_db`.
-
-        Returns
-        -------
-        (N,) float64
-            dB.
-        """
+        """Echo (N,), dB, of hits (N, 3), world frame, m, without the loss by range: reflectivity, texture and lobe."""
         texture = np.sin(points @ _TEXTURE_WAVES.T).mean(axis=1)
         echo: FloatArray = self.reflectivity_db + self.texture_db * texture + self.lobe_db(cos_incidence)
         return echo

@@ -15,7 +15,7 @@ from scipy.special import gammaincinv
 
 from radarsdf.checks import number, whole_number
 
-from .scene import Hits, Scene
+from .world import Hits, Scene
 
 __all__ = ["Origin", "RadarSensor", "Scan", "generator"]
 
@@ -59,17 +59,13 @@ class Scan(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """The N beams of a scan and their first hits."""
-
     origin: FloatArray  # (3,) world, m
     directions: FloatArray  # (N, 3) world, unit
     angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
     hits: Hits
 
 
-class _Echoes(NamedTuple):
-    """Candidates of returns, before detection."""
-
+class _Echoes(NamedTuple):  # candidates of returns, before detection
     range_m: FloatArray  # (N,)
     angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
     power_db: FloatArray  # (N,) with speckle
@@ -117,7 +113,7 @@ class RadarSensor:
     sigma_power_db: float = 1.0  # standard deviation of the receiver's noise, besides speckle [dB]
     gain_db: float = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
     range_loss_db: float = (
-        40.0  # loss of power by a tenfold range, less if the receiver makes up for it [dB], >= 0
+        40.0  # loss of power by a tenfold range, less if the receiver compensates [dB], >= 0
     )
     threshold_db: float = 64.0  # weaker returns are not detected [dB]
     floor_db: float = -np.inf  # lower limit of the intensities, to which weaker ones are clipped [dB]
@@ -137,54 +133,32 @@ class RadarSensor:
     sidelobe_loss_db: float = 0.0  # loss of such an echo [dB], >= 0
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         whole_number(self.beams, "beams", 1, _MAX_BEAMS)
         for field in dataclasses.fields(self):
             value = number(getattr(self, field.name), field.name)
             if abs(value) > _LARGEST and not (field.name == "floor_db" and value == -np.inf):
                 msg = f"{field.name} must be within {_LARGEST:g}, not {value}"
                 raise ValueError(msg)
-        if 0 < self.step_db < 1 / _LARGEST:
-            msg = f"step_db must be 0 or at least {1 / _LARGEST:g}, not {self.step_db}"
-            raise ValueError(msg)
-        if not (0 < self.azimuth_fov_rad <= 2 * np.pi and 0 < self.elevation_fov_rad <= np.pi):
-            msg = "the field of view must be within (0, 2π] in azimuth and (0, π] in elevation"
-            raise ValueError(msg)
-        if not 0 < self.sidelobe_fov_rad <= np.pi:
-            msg = f"sidelobe_fov_rad must be within (0, π], not {self.sidelobe_fov_rad}"
-            raise ValueError(msg)
-        if not 0 < self.min_range_m < self.max_range_m < np.inf:
-            msg = f"need 0 < min_range_m < max_range_m, not {self.min_range_m} and {self.max_range_m}"
-            raise ValueError(msg)
-        for name in _NOT_NEGATIVE:
-            if getattr(self, name) < 0:
-                msg = f"{name} must not be negative, not {getattr(self, name)}"
+        rules = [
+            ("azimuth_fov_rad must be in (0, 2π]", 0 < self.azimuth_fov_rad <= 2 * np.pi),
+            ("elevation_fov_rad must be in (0, π]", 0 < self.elevation_fov_rad <= np.pi),
+            ("sidelobe_fov_rad must be in (0, π]", 0 < self.sidelobe_fov_rad <= np.pi),
+            ("min_range_m must be in (0, max_range_m)", 0 < self.min_range_m < self.max_range_m),
+            ("step_db must be 0 or at least 1e-9", self.step_db == 0 or self.step_db >= 1 / _LARGEST),
+            (
+                "saturation_db must be above threshold_db and floor_db",
+                self.saturation_db > max(self.threshold_db, self.floor_db),
+            ),
+            *((f"{name} must not be negative", getattr(self, name) >= 0) for name in _NOT_NEGATIVE),
+            *((f"{name} must be in [0, 1]", 0 <= getattr(self, name) <= 1) for name in _SHARES),
+        ]
+        for rule, holds in rules:
+            if not holds:
+                msg = f"{rule}, not {getattr(self, rule.split()[0])}"
                 raise ValueError(msg)
-        for name in _SHARES:
-            if not 0 <= getattr(self, name) <= 1:
-                msg = f"{name} must be in [0, 1], not {getattr(self, name)}"
-                raise ValueError(msg)
-        if not self.saturation_db > max(self.threshold_db, self.floor_db):
-            msg = "saturation_db must be above threshold_db and floor_db"
-            raise ValueError(msg)
 
     def scan(self, scene: Scene, T_world_sensor: FloatArray, seed: int = 0, frame: int = 0) -> Scan:
-        """Scan a scene once.
-
-        Parameters
-        ----------
-        scene : Scene
-            The world.
-        T_world_sensor : (4, 4) float64
-            Pose of the sensor, m.
-        seed, frame : int
-            Seed and number of the scan. Together they determine all its random numbers.
-
-        Returns
-        -------
-        Scan
-            Detected returns, in random order.
-        """
+        """Scan a scene once, from the pose `T_world_sensor` (4, 4), m. Seed and frame determine all random numbers."""
         angles = self._beam_angles(generator(seed, frame, _BEAMS))
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
         directions = unit_vectors(angles) @ R.T
@@ -202,31 +176,14 @@ class RadarSensor:
             for kind, echoes in candidates.items()
         ]
         order = generator(seed, frame, _ORDER).permutation(sum(len(scan.points) for scan in scans))
-        return Scan(
-            np.concatenate([scan.points for scan in scans])[order],
-            np.concatenate([scan.intensities for scan in scans])[order],
-            np.concatenate([scan.noiseless_intensities for scan in scans])[order],
-            np.concatenate([scan.origin_kind for scan in scans])[order],
-        )
+        return Scan(*(np.concatenate(columns)[order] for columns in zip(*scans, strict=True)))
 
     def echo_power_db(
         self, scene: Scene, origins: FloatArray, directions: FloatArray, hits: Hits
     ) -> FloatArray:
-        """Received power of surface hits by the radar equation, without speckle.
+        """Received power (N,), dB, of surface hits by the radar equation: no speckle, not clipped; -inf where there is no hit.
 
-        Parameters
-        ----------
-        scene : Scene
-            The world.
-        origins, directions : (3,) or (N, 3), and (N, 3) float64
-            Origins and unit directions of the rays, world frame, m.
-        hits : Hits
-            Hits of these rays in the scene.
-
-        Returns
-        -------
-        (N,) float64
-            dB, neither clipped nor rounded; -inf where there is no hit.
+        Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m.
         """
         hit = hits.primitive >= 0
         range_m = np.where(hit, hits.range_m, 1.0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from radarsdf.checks import check_poses, instance, whole_number
 
 from .radar import Origin, RadarSensor, generator, unit_vectors
-from .scene import Scene
+from .world import Scene
 
 __all__ = ["Lidar", "Simulation", "simulate"]
 

@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Memory and time of fits against their estimates: `python -m bench.estimates memory|durations`, on Linux.
+
+`durations` ends with the constants of `radarsdf.fitting.estimate`, calibrated on this machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import radarsdf
+import radarsdf.fitting.fit  # else the first fit would import it, in what is measured
+from radarsdf import Estimate, FitConfig
+from radarsdf.fitting import estimate as model
+from radarsdf.fitting.schedule import Schedule
+from scipy.optimize import nnls
+
+from bench.growth.street import street
+from bench.measure import in_new_process, measured, memory_bytes, timed
+from bench.runner import Column, Experiment, Row, main
+from bench.settings import PRESETS, Changes, merged, words_of
+
+MEMORY_CASES: list[tuple[int, bool, Changes]] = [
+    (10_000, True, {}),
+    (100_000, False, {}),
+    (100_000, True, {}),
+    (100_000, True, {"training": {"batch_size": 65536, "intensity_batch_size": 65536}}),
+    (300_000, True, {"encoding": {"kind": "octree"}}),
+    (1_000_000, True, {"returns": {"drop_ghosts": False}, "leaf_size_m": 0.8}),
+    (1_000_000, True, {}),
+    (3_000_000, False, {}),
+    (3_000_000, True, {}),
+]
+"""Returns, whether with intensities, settings."""
+_FEW: Changes = {"training": {"sdf_iterations": 20, "intensity_iterations": 24, "batch_size": 16384}}
+"""Enough iterations for the peak: pages of zeros take no memory until the training writes to them."""
+
+
+def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
+    scans = street(count)
+    return scans.points, scans.poses, scans.intensities if with_intensities else None
+
+
+def memory(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each case: growth of the peak memory, and its estimate."""
+    for count, with_intensities, changes in MEMORY_CASES[: 1 if options.quick else None]:
+        estimate, peak = peak_of_a_fit(count, with_intensities, changes)
+        row: Row = {"returns": count, "intensities": with_intensities, "settings": words_of(changes)}
+        row |= {"measured": peak / 1e6, "estimated": estimate.peak_memory_bytes / 1e6}
+        yield row | {"ratio": estimate.peak_memory_bytes / peak}
+
+
+def peak_of_a_fit(
+    count: int, with_intensities: bool, changes: Changes, python: Sequence[str] = (sys.executable,)
+) -> tuple[Estimate, float]:
+    """The estimate, and the measured growth of the peak memory, bytes, in a new process, whose command begins with `python`."""
+    case = count, with_intensities, merged(_FEW, changes)
+    values, peak = in_new_process("bench.estimates:measured_peak", *case, python=python)
+    return Estimate(**values), peak
+
+
+def measured_peak(count: int, with_intensities: bool, changes: Changes) -> tuple[dict[str, Any], float]:
+    """The fields of the estimate, and the growth of the peak memory of this process, bytes."""
+    scans, config = _street(count, with_intensities), FitConfig().override(**changes)
+    estimate = radarsdf.estimate(*scans, config=config)
+    with measured() as taken:
+        radarsdf.fit(*scans, config=config, progress=False)
+    return vars(estimate), 1e6 * taken.grown_mb
+
+
+def memory_of_fits(count: int) -> list[float]:
+    """Resident memory of this process, MB, after each of `count` small fits with a query and a mesh."""
+    scans, config = (
+        _street(2000, True),
+        FitConfig().override(training={"sdf_iterations": 6, "intensity_iterations": 12, "batch_size": 1024}),
+    )
+    found = []
+    for _ in range(count):
+        radar_map = radarsdf.fit(*scans, config=config, progress=False)
+        radar_map.sdf(np.zeros((10_000, 3)))
+        radar_map.mesh(0.2, progress=False)
+        found.append(memory_bytes("VmRSS") / 1e6)
+    return found
+
+
+_SHORT: Changes = {"training": {"sdf_iterations": 100, "intensity_iterations": 300}}
+_WIDE: Changes = {"networks": {"sdf_hidden": (128, 128), "intensity_hidden": (128, 128, 128)}}
+_LARGE: Changes = {"training": {"batch_size": 32768, "intensity_batch_size": 32768}}
+DURATION_CASES: list[tuple[int, bool, str, Changes]] = [
+    (10_000, True, "default", {}),
+    (30_000, False, "default", {}),
+    (30_000, True, "default", {"num_threads": 1}),
+    (30_000, True, "default", {"training": {"joint": False}}),
+    (30_000, True, "default", _SHORT | {"encoding": {"kind": "octree"}}),
+    (30_000, True, "default", _SHORT | _WIDE),
+    (30_000, True, "default", _SHORT | {"encoding": {"num_levels": 6, "fourier_count": 16}}),
+    (30_000, True, "default", merged(_SHORT, _LARGE)),
+    (10_000, True, "paper", _SHORT),
+    (100_000, False, "paper", _SHORT | {"num_threads": 1}),
+    (100_000, True, "default", {}),
+    (100_000, False, "default", {"num_threads": 1}),
+    (100_000, False, "quick", {}),
+    (300_000, False, "default", {"training": {"sdf_iterations": 300}}),
+    (300_000, False, "default", {"training": {"sdf_iterations": 50, "row_updates": False}}),
+    (300_000, False, "quick", {"num_threads": 1}),
+    (1_000_000, False, "quick", {}),
+    (1_000_000, False, "default", {"training": {"sdf_iterations": 100}, "returns": {"drop_ghosts": False}}),
+    (1_000_000, True, "default", _SHORT),
+    (1_000_000, False, "default", {"training": {"sdf_iterations": 20}, "leaf_size_m": 0.8, "num_threads": 1}),
+]
+"""Number of returns, with intensities or without, preset, settings."""
+
+
+def durations(options: argparse.Namespace) -> Iterator[Row]:
+    """A row for each case: time of a fit, and its estimate; then a row for each constant, calibrated anew."""
+    shares = []
+    for count, with_intensities, preset, changes in DURATION_CASES[: 1 if options.quick else None]:
+        fits = [
+            in_new_process("bench.estimates:measured_duration", count, with_intensities, preset, changes)
+            for _ in range(options.repetitions)
+        ]
+        wall_s, cpu_s = (min(fit[key] for fit in fits) for key in ("wall_s", "cpu_s"))
+        row: Row = {
+            "returns": count,
+            "intensities": with_intensities,
+            "settings": f"{preset} {words_of(changes)}",
+        }
+        yield row | {
+            "measured": wall_s,
+            "estimated": fits[0]["estimated_s"],
+            "ratio": fits[0]["estimated_s"] / wall_s,
+        }
+        shares.append([fits[0]["work"][kind] / cpu_s for kind in model.SECONDS])
+    # Non-negative least squares of the relative errors.
+    scale = np.max(shares, axis=0).clip(1e-30)
+    found, _ = nnls(np.array(shares) / scale, np.ones(len(shares)))
+    for kind, seconds in zip(model.SECONDS, (found / scale).tolist(), strict=True):
+        yield {"part": "constants", "constant": kind, "now": model.SECONDS[kind], "anew": seconds}
+
+
+def measured_duration(count: int, with_intensities: bool, preset: str, changes: Changes) -> Row:
+    """Estimated time of a fit, amounts of work as of `durations.work_of`, and times of this process."""
+    returns, config = _street(count, with_intensities), PRESETS[preset].override(**changes)
+    estimate = radarsdf.estimate(*returns, config=config)
+    of_scene: dict[str, Any] = {"returns": estimate.returns, "with_intensity": with_intensities}
+    schedule = Schedule.of(config, surface_returns=estimate.returns, vertices=estimate.vertices, **of_scene)
+    work = model.work_of(config, schedule, cells=estimate.leaf_cells, rows=estimate.vertices, **of_scene)
+    # A small fit first: the estimate does not include what PyTorch sets up in its first steps.
+    tiny = FitConfig().override(training={"sdf_iterations": 5, "intensity_iterations": 10})
+    radarsdf.fit(*_street(2000, True), config=tiny, progress=False)
+    with timed() as taken:
+        radarsdf.fit(*returns, config=config, progress=False)
+    return {"estimated_s": estimate.seconds, "work": work, "wall_s": taken.wall_s, "cpu_s": taken.cpu_s}
+
+
+_LINES = ("returns", "intensities", "settings")
+_RATIO = {"ratio": Column("estimated / measured")}
+
+EXPERIMENTS = {
+    "memory": Experiment(
+        "Memory of fits",
+        memory,
+        columns={"measured": Column("MB", digits=0), "estimated": Column("estimated, MB", digits=0)} | _RATIO,
+        lines=_LINES,
+    ),
+    "durations": Experiment(
+        "Time of fits",
+        durations,
+        options=("repetitions",),
+        defaults={"repetitions": 2},
+        columns={"measured": Column("s"), "estimated": Column("estimated, s"), **_RATIO}
+        | {"now": Column("now, ns", 1e9, 3), "anew": Column("calibrated, ns", 1e9, 3)},
+        tables=("part",),
+        lines=(*_LINES, "constant"),
+    ),
+}
+
+if __name__ == "__main__":
+    main("bench.estimates", EXPERIMENTS)

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""How far points of a mesh are from the true surface: from simulated solids exactly, from lidar points by planes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from radarsdf.simulate import Scene as World
+from scipy.spatial import cKDTree
+
+from bench.scenes import Scene
+
+FloatArray = NDArray[np.float64]
+
+REACH_M = 1.0
+"""Errors along the normal are looked for up to here."""
+
+_STARTS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.0)  # of the reach
+_LIDAR_SIGMA_M = 0.03  # range accuracy of a VLP-16, by its data sheet; also that of other lidars of its time
+_PIECES_M = (0.2, 0.4)  # radii of pieces of the lidar's surface; the first that is flat counts
+_PIECE_RAD = 0.04  # and this share of the range: two of 16 rings are 0.035 of it apart
+_PIECE_POINTS = 10
+_MOST_POINTS = 1000  # of a piece; more change nothing
+_THICKNESS_M = 0.06
+_THIN = 0.1  # variance across a flat piece, as a share of the lesser one along it
+_WIDE = 0.03  # the lesser variance along a piece, as a share of its radius squared. A single ring is a line
+_LEAST_COS = 0.5  # a surface whose normal is farther than 60 degrees from that of the mesh is another one
+_SLACK_M = 1e-6  # rounding of distances
+
+
+class Truth(NamedTuple):
+    """The true surface near N points."""
+
+    distance_m: FloatArray  # (N,) to the nearest surface or lidar point in any direction
+    error_m: (
+        FloatArray  # (N,) along the normal, positive in front of the surface; NaN where no surface is met
+    )
+    sigma_m: FloatArray  # (N,) standard error of the truth itself
+
+
+def truth_of(scene: Scene, x: FloatArray, normals: FloatArray) -> Truth:
+    """The true surface near points `x` (N, 3) of a mesh, with unit normals (N, 3) towards free space; world frame, m.
+
+    Raises
+    ------
+    ValueError
+        If the scene has neither a simulation nor ground truth.
+    """
+    if scene.simulation is not None:
+        world = scene.simulation.scene
+        distance_m, error_m = np.abs(world.signed_distance(x)), along_normals(world, x, normals)
+        # Beyond an edge, a ray misses the surface beside it and meets one that lies far behind.
+        error_m[_LEAST_COS * np.abs(error_m) > distance_m + _SLACK_M] = np.nan
+        return Truth(distance_m, error_m, np.zeros(len(x)))
+    if scene.ground_truth is None or len(scene.ground_truth) == 0:
+        msg = "the scene has no ground truth"
+        raise ValueError(msg)
+    distance_m, nearest = cKDTree(scene.ground_truth).query(x)
+    error_m = to_planes(scene.ground_truth, nearest, x, normals, scene.poses[:, :3, 3])
+    return Truth(distance_m, error_m, np.full(len(x), _LIDAR_SIGMA_M))
+
+
+def along_normals(world: World, x: FloatArray, normals: FloatArray) -> FloatArray:
+    """Signed distances (N,), m, to the nearest surface that faces the same way, along the normals, both ways.
+
+    Rays are cast against the normals, from the points and from places in front of them. A ray from inside a solid
+    would meet surfaces that are hidden in others, so only places in free space count. NaN without a surface within
+    `REACH_M`.
+    """
+    error_m = np.full(len(x), np.nan)
+    for share in _STARTS:
+        ahead_m = share * REACH_M
+        origins = x + ahead_m * normals
+        rows = np.flatnonzero(world.signed_distance(origins) > 0)
+        hits = world.raycast(origins[rows], -normals[rows], ahead_m + REACH_M)
+        found = hits.range_m - ahead_m
+        nearer = np.isfinite(found) & ~(np.abs(error_m[rows]) <= np.abs(found))
+        error_m[rows[nearer]] = found[nearer]
+    return error_m
+
+
+def to_planes(
+    lidar: FloatArray, nearest: NDArray[np.int64], x: FloatArray, normals: FloatArray, sensors: FloatArray
+) -> FloatArray:
+    """Signed distances (N,), m, along the normals to the planes through pieces of the lidar's surface.
+
+    A piece is the points round the lidar point `nearest` (N,) to each point. Far from the `sensors` (F, 3) rings lie
+    far apart, so there pieces may be larger. NaN where none is flat and wide, or it faces elsewhere, or its plane is
+    farther than `REACH_M`.
+    """
+    centres, which = np.unique(nearest, return_inverse=True)
+    tree = cKDTree(lidar)
+    far_m = _PIECE_RAD * cKDTree(sensors).query(lidar[centres])[0]
+    plane, middle = np.full((2, len(centres), 3), np.nan)
+    for i, centre in enumerate(centres):
+        for radius_m in (*_PIECES_M, max(far_m[i], _PIECES_M[-1])):
+            found = _flat_piece(lidar, tree.query_ball_point(lidar[centre], radius_m), radius_m)
+            if found is not None:
+                middle[i], plane[i] = found
+                break
+    cosine = np.einsum("ij,ij->i", plane[which], normals)
+    across = np.einsum("ij,ij->i", plane[which], x - middle[which])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error_m: FloatArray = across / cosine
+        error_m[~((np.abs(cosine) >= _LEAST_COS) & (np.abs(error_m) <= REACH_M))] = np.nan
+    return error_m
+
+
+def _flat_piece(lidar: FloatArray, rows: list[int], radius_m: float) -> tuple[FloatArray, FloatArray] | None:
+    """Centre (3,) and normal (3,) of the points, or None if they are few, a line, or not flat."""
+    if len(rows) < _PIECE_POINTS:
+        return None
+    piece = lidar[rows[:: 1 + len(rows) // _MOST_POINTS]]
+    middle = piece.mean(axis=0)
+    spread = piece - middle
+    variances, directions = np.linalg.eigh(spread.T @ spread / (len(piece) - 1))
+    thin = variances[0] < min(_THICKNESS_M**2, _THIN * variances[1])
+    return (middle, directions[:, 0]) if thin and variances[1] > _WIDE * radius_m**2 else None

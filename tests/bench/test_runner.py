@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The runner writes the rows of each experiment, and tables of them; what has no result says why."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from radarsdf import FitConfig
+
+from bench import runner
+from bench.paper.__main__ import EXPERIMENTS
+from bench.peers.interface import Reconstruction
+from bench.runner import Column, Experiment
+from bench.scenes import load_scene
+from bench.settings import parsed, words_of
+
+
+@pytest.fixture
+def peers(monkeypatch):
+    """A peer that answers at once with a surface of its own, and one that cannot."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+
+    def reconstruct(peer, points, poses, *_args, **_ranges):
+        assert len(points) == len(poses)
+        if peer.name == "Poisson":
+            return Reconstruction(None, "Open3D is not here")
+        return Reconstruction(mesh, "", 1.0 + len(points), peak_bytes=10**8, map_bytes=1000 * len(points))
+
+    monkeypatch.setattr("bench.paper.surface.reconstruct", reconstruct)
+
+
+def run(tmp_path, *words):
+    runner.main("bench.paper", EXPERIMENTS, [*words, "--quick", "--out", str(tmp_path)])
+    stem = tmp_path / f"paper-{words[0]}"
+    return stem.with_suffix(".md").read_text(encoding="utf-8"), json.loads(
+        stem.with_suffix(".json").read_text()
+    )
+
+
+def shown(rows, **layout):
+    experiment = Experiment("", lambda _: rows, **layout)
+    return [" ".join(line.split()) for line in runner.tables(experiment, rows).splitlines()]
+
+
+SCORES = [
+    {"kind": k, "method": m, "f": f}
+    for k, m, f in (("a", "x", 0.5), ("a", "y", 0.7), ("b", "x", 0.7), ("b", "y", 0.6))
+]
+F = {"f": Column("F, %", 100, 1, "highest"), "absent": Column("absent")}
+
+
+def test_repetitions_are_a_mean_and_a_deviation():
+    assert shown(SCORES, columns=F)[2:] == ["| x | 60.0 ± 14.1 |", "| y | **65.0 ± 7.1** |"]
+    assert shown(SCORES, columns=F, median=True)[2] == "| x | 60.0 |"
+
+
+def test_values_side_by_side_have_their_best_in_each_line_and_a_mean_of_complete_lines():
+    rows = [
+        *SCORES,
+        {"kind": "c", "method": "x", "f": 0.1},
+        {"kind": "c", "method": "y", "why_not": "it crashed"},
+    ]
+    lines = shown(rows, columns=F, lines=("kind",), across="method", mean_line=True)
+    assert lines[0] == "| kind | F, %, x | F, %, y |"
+    assert lines[2:6] == [
+        "| a | 50.0 | **70.0** |",
+        "| b | **70.0** | 60.0 |",
+        "| c | **10.0** | – |",
+        "| mean | 60.0 | **65.0** |",
+    ]
+    assert lines[-1] == "- c: it crashed"
+
+
+def test_without_columns_the_keys_are_the_headings():
+    assert shown([{"scans": 3, "p50, ms": 1.5}])[0::2] == ["| scans | p50, ms |", "| 3 | 1.5 |"]
+
+
+def test_json_has_no_infinity(tmp_path):
+    runner.write_json(
+        tmp_path / "x.json", {"a": np.array([1.0, np.nan]), "b": np.float32(0.1), "c": np.int64(3)}
+    )
+    assert json.loads((tmp_path / "x.json").read_text()) == {"a": [1.0, None], "b": 0.1, "c": 3}
+
+
+def test_settings_are_words():
+    changes = parsed(["training.joint=False", "encoding.kind=octree", "mesh.voxel_size=0.2", "seed=3"])
+    assert changes == {
+        "training": {"joint": False},
+        "encoding": {"kind": "octree"},
+        "mesh": {"voxel_size": 0.2},
+        "seed": 3,
+    }
+    assert words_of(changes) == "training.joint=False, encoding.kind=octree, mesh.voxel_size=0.2, seed=3"
+    with pytest.raises(ValueError, match="nonsense"):
+        parsed(["nonsense=1"])
+    assert FitConfig().override(effort=1.0) == FitConfig()
+
+
+@pytest.mark.usefixtures("peers")
+def test_surface(tmp_path):
+    meshes = tmp_path / "meshes"
+    table, values = run(tmp_path, "surface", "wall", "--peers", "BPA", "Poisson", "--meshes", str(meshes))
+    assert sorted(path.name for path in meshes.iterdir()) == [
+        "wall, 4 scans, BPA.ply",
+        "wall, 4 scans, BPA.png",
+    ]
+    ball, poisson = values["rows"]
+    assert ball["seconds"] == 5.0
+    assert 0 <= ball["f_score"] <= 1
+    assert ball["samples"] == 100_000
+    assert poisson["why_not"] == "Open3D is not here"
+    assert "- Poisson: Open3D is not here" in table
+    for key in ("command", "commit", "processor", "threads"):
+        assert values[key], key
+
+
+@pytest.mark.usefixtures("peers")
+def test_map_size_of_the_octree_is_the_reference(tmp_path):
+    table, values = run(tmp_path, "map-size", "wall", "--frames", "10")
+    sizes = {(row["method"], row["scans"]): row["bytes"] for row in values["rows"]}
+    assert sizes["3QFPI", "10 scans"] < sizes["SHINE (octree)", "10 scans"]
+    assert sizes["radarsdf", "1 scans"] < sizes["radarsdf", "10 scans"]
+    assert sizes["VDBFusion", "10 scans"] == 10_000
+    assert "of the octree, %, 10 scans" in table
+
+
+@pytest.mark.usefixtures("peers")
+def test_curve_has_budgets_settings_and_peers_by_turns(tmp_path):
+    words = ("curve", "wall", "--peers", "BPA", "radarsdf", "--repetitions", "2", "--samples", "1000")
+    _, values = run(tmp_path, *words, "--set", "encoding.kind=octree", "encoding.num_levels=2")
+    methods = [
+        "radarsdf, × 1/16",
+        "radarsdf, intensities, × 1/16",
+        "encoding.kind=octree, encoding.num_levels=2",
+        "BPA",
+    ]
+    assert [row["method"] for row in values["rows"]] == 2 * methods
+    assert values["rows"][3]["seconds"] == 4.0  # of the scans that are not held out
+    assert (tmp_path / "paper-curve.png").stat().st_size > 1000
+
+
+@pytest.mark.usefixtures("peers")
+def test_kinds_have_scores_and_a_calibration(tmp_path):
+    table, values = run(tmp_path, "kinds", "wall", "--peers", "BPA", "Poisson")
+    assert "- wall: Open3D is not here" in table
+    judged = [row for row in values["rows"] if "auc" in row]
+    assert [row["method"] for row in judged] == ["radarsdf", "radarsdf, quick"]
+    assert all(0 < row["true_share"] < 1 and row["auc"] > 0.5 for row in judged)
+
+
+def test_calibration_has_all_parts(tmp_path):
+    table, values = run(tmp_path, "calibration", "wall", "--samples", "3000", "--set", "mesh.voxel_size=0.2")
+    assert {row["variant"] for row in values["rows"]} == {"defaults", "mesh.voxel_size=0.2"}
+    for heading in ("by uncertainty", "by range, m", "by scans", "by confidence", "ENCE", "30 or more"):
+        assert heading in table, heading
+
+
+def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
+    few = {"training": {"sdf_iterations": 5, "intensity_iterations": 5}}  # enough to differ
+    monkeypatch.setattr("bench.scenes.QUICK", few)
+    neighbours, *ours = run(tmp_path, "intensity", "wall", "--base", "default", "--repetitions", "2")[1][
+        "rows"
+    ]
+    assert neighbours["method"] == "kNN"
+    assert neighbours["noise_floor"] > 1
+    assert ours[0]["mae"] != ours[1]["mae"]
+    rows = run(tmp_path, "ablation", "wall", "--repetitions", "1")[1]["rows"]
+    assert len({row["mae"] for row in rows}) == len(rows) == 5  # each variant really changes the fit
+    table, values = run(tmp_path, "views", "wall", "--base", "default", "--frames", "20")
+    assert (
+        len(values["rows"]) == 8
+    )  # with and without direction, measured and noiseless, at the reflector and elsewhere
+    assert "### wall, at the reflector" in table
+    rows = run(tmp_path, "poses", "wall", "--repetitions", "1", "--frames", "8", "--samples", "1e4")[1][
+        "rows"
+    ]
+    assert {"none", "walk of 0.02 m, 0.1°", "returns alone"} <= {row["poses"] for row in rows}
+
+
+@pytest.mark.usefixtures("peers")
+def test_a_scene_without_intensities_or_truth_stays_in_the_tables(tmp_path):
+    scans = load_scene("wall", frames=4)
+    frame = np.repeat(np.arange(4), [len(p) for p in scans.points])
+    path = tmp_path / "bare.npz"
+    np.savez(path, points=np.concatenate(scans.points), frame=frame, poses=scans.poses)
+    for experiment in ("intensity", "ablation", "views"):
+        assert "no intensities" in run(tmp_path, experiment, str(path))[0]
+    for experiment in ("surface", "ranges", "calibration"):
+        assert "no ground truth" in run(tmp_path, experiment, str(path))[0]
