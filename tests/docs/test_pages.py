@@ -19,7 +19,7 @@ PAGES = sorted(
     for page in (ROOT / "docs").rglob("*.md")
     if not page.read_text(encoding="utf-8").startswith("<!-- the text of")
 )
-NEEDS = {"five_minutes": "matplotlib", "your_own_scans": "rosbags", "what_the_map_tells": "trimesh"}
+NEEDS = {"five_minutes": "matplotlib", "your_own_scans": "rosbags", "queries": "trimesh"}
 RECORDINGS = {"five_minutes": write_demo, "your_own_scans": write_recordings}
 RUN = {"python", "sh", "console"}
 TEXT = {"{toctree}", "{eval-rst}", "text"}
