@@ -55,7 +55,8 @@ def test_blocks_run(page, tmp_path, monkeypatch):
             else:
                 run_console(block, environment)
         except Exception as error:
-            raise AssertionError(f"{page.name}, line {block.line}: {error}") from error
+            msg = f"{page.name}, line {block.line}: {error}"
+            raise AssertionError(msg) from error
 
 
 @pytest.mark.parametrize(
