@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A folder of point clouds with a file of poses, as many recordings are kept.
+"""Read a folder of point clouds with a pose file, check and fit it.
 
     python examples/folder.py [FOLDER]
 
-The same on the command line: radarsdf check drive poses.tum, then radarsdf fit drive poses.tum -o map.safetensors.
+On the command line: radarsdf check drive poses.tum; radarsdf fit drive poses.tum -o map.safetensors.
 """
 
 import sys
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 
 def record(folder: Path) -> tuple[Path, Path]:
-    """Write what a driver would: a PCD file a scan, named by its time, and poses as TUM has them."""
+    """Write a recording: one PCD file for each scan, named by its time, and poses in TUM format."""
     drive = radarsdf.simulate.hugin(frames=12)
     clouds = folder / "drive"
     clouds.mkdir(exist_ok=True)
@@ -37,10 +37,10 @@ def record(folder: Path) -> tuple[Path, Path]:
 
 
 def main(folder: Path) -> None:
-    """Read, check, fit."""
+    """Read, check and fit the recording."""
     clouds, poses = record(folder)
-    scans = radarsdf.io.read(clouds, poses)  # fields={"intensity": "power"}, were the names strange
-    for note in scans.notes:  # what was assumed, what was left out
+    scans = radarsdf.io.read(clouds, poses)  # fields={"intensity": "power"} for unusual names
+    for note in scans.notes:  # assumptions, and what was skipped
         print(note)
     print(f"{len(scans)} scans from {scans.times_s[0]:.1f} to {scans.times_s[-1]:.1f} s")
     errors = [finding for finding in radarsdf.check(scans) if finding.severity == "error"]

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A map that grows in the callback of a driver, while another thread reads it.
+"""Update a live map in a driver callback while another thread reads it.
 
-With ROS 2, the callback is that of a subscription; nothing else changes:
+    python examples/live.py
+
+With ROS 2, the callback belongs to a subscription:
 
     class Mapper(rclpy.node.Node):
         def __init__(self):
@@ -26,20 +28,20 @@ import radarsdf
 
 drive = radarsdf.simulate.oculii(seed=5, frames=40)
 given = drive.poses.copy()
-given[:, :3, 3] += 0.02 * np.arange(len(given))[:, None] * [0.2, 1.0, 0.5]  # as of poses that drift
+given[:, :3, 3] += 0.02 * np.arange(len(given))[:, None] * [0.2, 1.0, 0.5]  # drifting poses
 live = radarsdf.LiveMap()
 done = threading.Event()
 
 
 def on_scan(i: int) -> None:
-    """What a driver calls with each scan."""
+    """Integrate a scan. A driver calls this."""
     integrated = live.integrate(drive.points[i], given[i], drive.intensities[i])
     if i % 10 == 0:
         print(f"scan {integrated.scan_id}: {len(integrated.blocks)} blocks changed")
 
 
 def watch() -> None:
-    """A planner, or a viewer: it never sees half a scan, and the driver does not wait for it."""
+    """Mesh the map repeatedly, as a planner or viewer does. It never sees a partial scan and never blocks the driver."""
     while not done.wait(0.2):
         print(f"{len(live.mesh().faces)} triangles of {len(live)} scans")
 
@@ -49,7 +51,7 @@ watcher.start()
 for i in range(len(drive)):
     on_scan(i)
 
-# A loop closed: scans move to better poses, all at once.
+# A loop closure: move all scans to refined poses at once.
 refined = radarsdf.refine_poses(drive.points, given)
 changed = live.move_all(dict(zip(live.scan_ids, refined.poses, strict=True)))
 done.set()

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the radar would see from where it never was, and how near that is to a scan that the fit did not see.
+"""Predict a scan from another pose, and compare a predicted scan with a held-out one.
 
     python examples/novel_views.py [FOLDER]
 
-It needs the extra `plot`. The same on the command line: radarsdf render map.safetensors --pose 5 0 1.5 -o view.png.
+Requires the extra `plot`. On the command line: radarsdf render map.safetensors --pose 5 0 1.5 -o view.png.
 """
 
 import sys
@@ -19,7 +19,7 @@ HELD_OUT = 10
 
 
 def main(folder: Path) -> None:
-    """Leave a scan out, predict it, and look aside by 30 degrees."""
+    """Hold out a scan, predict it, and predict another one turned by 30 degrees."""
     drive = radarsdf.simulate.hugin(frames=20)
     kept = [i for i in range(len(drive)) if i != HELD_OUT]
     radar_map = radarsdf.fit(
@@ -31,7 +31,9 @@ def main(folder: Path) -> None:
     distance_m, nearest = cKDTree(view.points).query(drive.points[HELD_OUT])
     error_db = np.abs(view.intensities[nearest] - drive.intensities[HELD_OUT])
     print(f"{len(view)} returns predicted, {len(drive.points[HELD_OUT])} measured")
-    print(f"median distance {np.median(distance_m):.2f} m, of intensities {np.median(error_db):.1f} dB")
+    print(
+        f"median distance {np.median(distance_m):.2f} m, median intensity error {np.median(error_db):.1f} dB"
+    )
     measured = np.column_stack([drive.points[HELD_OUT], drive.intensities[HELD_OUT]])
     save_view_picture(folder / "view.png", [view], [measured])
 
@@ -39,7 +41,7 @@ def main(folder: Path) -> None:
     aside = T_world_sensor @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     returns = radar_map.render(aside, noise=True, seed=1)
     radarsdf.io.write_cloud(folder / "aside.ply", returns.scans)  # world frame
-    print(f"{len(returns)} returns, turned by 30 degrees, in aside.ply")
+    print(f"wrote {len(returns)} returns, turned by 30 degrees, to aside.ply")
 
 
 if __name__ == "__main__":

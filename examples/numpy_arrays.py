@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Your own arrays: scans, poses and intensities in, a mesh, distances and predicted intensities out.
+"""Fit a map to NumPy arrays, query it, and write a mesh.
 
 python examples/numpy_arrays.py [FOLDER]
 """
@@ -13,7 +13,7 @@ import radarsdf
 
 
 def my_scans() -> tuple[list[np.ndarray], np.ndarray, list[np.ndarray]]:
-    """Put your own data here. A simulated drive stands for it.
+    """Return the scans to map. Replace the simulated drive by your data.
 
     Returns
     -------
@@ -26,9 +26,9 @@ def my_scans() -> tuple[list[np.ndarray], np.ndarray, list[np.ndarray]]:
 
 
 def main(folder: Path) -> None:
-    """Fit, ask, and write what a viewer of meshes shows."""
+    """Check, fit, query, and write mesh and map to a folder."""
     points, poses, intensities = my_scans()
-    for finding in radarsdf.check(points, poses, intensities):  # frames, units, clocks; empty is best
+    for finding in radarsdf.check(points, poses, intensities):  # errors in frames, units or clocks
         print(finding)
 
     radar_map = radarsdf.fit(points, poses, intensities)
@@ -37,11 +37,11 @@ def main(folder: Path) -> None:
     mesh = radar_map.mesh(voxel_size=0.2, viewpoint=poses[0, :3, 3])
     at = np.stack([mesh.vertices[0] + 0.1 * mesh.vertex_normals[0], poses[0, :3, 3]])  # world, m
     near, at_sensor = radar_map.sdf(at)
-    print(f"signed distance {near:.2f} m before the surface, positive in free space")
-    print(f"{at_sensor} m at the sensor: no return is near")
+    print(f"signed distance 0.1 m before the surface: {near:.2f} m, positive in free space")
+    print(f"signed distance at the sensor: {at_sensor} m, not observed")
 
     dB = mesh.vertex_attributes["intensity"]
-    print(f"{len(mesh.faces)} triangles; intensities from the first pose {dB.min():.0f} to {dB.max():.0f} dB")
+    print(f"{len(mesh.faces)} triangles; intensities {dB.min():.0f} to {dB.max():.0f} dB from the first pose")
     radarsdf.io.write_mesh(folder / "mesh.ply", mesh)
     radar_map.save(folder / "map.safetensors")
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans, poses and the map in the viewer of rerun. It needs the extra `rerun`.
+"""Log scans, poses and the map to the rerun viewer. Requires the extra `rerun`.
 
-python examples/rerun_logging.py [FOLDER]      # writes drive.rrd; rerun drive.rrd shows it
+python examples/rerun_logging.py [FOLDER]      # then: rerun drive.rrd
 """
 
 import sys
@@ -15,7 +15,7 @@ from radarsdf.map.colors import intensity_colors
 
 
 def main(folder: Path) -> None:
-    """Log a drive scan by scan, and the surface that comes of it."""
+    """Log a drive scan by scan, and the mesh fitted to it."""
     drive = radarsdf.simulate.hugin(frames=12)
     radar_map = radarsdf.fit(drive.points, drive.poses, drive.intensities)
     mesh = radar_map.mesh(0.2, viewpoint=drive.poses[0, :3, 3])
@@ -44,7 +44,7 @@ def main(folder: Path) -> None:
         static=True,
     )
     rr.disconnect()
-    print(f"{len(drive)} scans and {len(mesh.faces)} triangles in {folder / 'drive.rrd'}")
+    print(f"{len(drive)} scans and {len(mesh.faces)} triangles logged to {folder / 'drive.rrd'}")
 
 
 if __name__ == "__main__":

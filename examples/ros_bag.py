@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A ROS 2 bag without ROS: written here by rosbags, then read and fitted. It needs the extra `ros`.
+"""Write a ROS 2 bag with rosbags, then read and fit it. Requires the extra `ros`, but not ROS.
 
     python examples/ros_bag.py [FOLDER]
 
-The same on the command line: radarsdf fit drive_bag -o map.safetensors.
+On the command line: radarsdf fit drive_bag -o map.safetensors.
 """
 
 import sys
@@ -20,18 +20,18 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def make(name: str, *values: object) -> object:
-    """A message of ROS."""
+    """Return a ROS message."""
     return STORE.types[name](*values)
 
 
 def header(time_ns: int, frame: str) -> object:
-    """A stamp and a frame."""
+    """Return a header with a stamp and a frame."""
     stamp = make("builtin_interfaces/msg/Time", time_ns // 10**9, time_ns % 10**9)
     return make("std_msgs/msg/Header", stamp, frame)
 
 
 def cloud(time_ns: int, points: np.ndarray, power_db: np.ndarray) -> object:
-    """A PointCloud2 with the fields x, y, z and power."""
+    """Return a PointCloud2 with the fields x, y, z and power."""
     rows = np.column_stack([points, power_db]).astype("<f4")
     fields = [
         make("sensor_msgs/msg/PointField", n, 4 * i, 7, 1) for i, n in enumerate(("x", "y", "z", "power"))
@@ -42,7 +42,7 @@ def cloud(time_ns: int, points: np.ndarray, power_db: np.ndarray) -> object:
 
 
 def transform(time_ns: int, T_world_sensor: np.ndarray) -> object:
-    """A message of TF: map -> radar."""
+    """Return a TF message for map -> radar."""
     position = make("geometry_msgs/msg/Vector3", *T_world_sensor[:3, 3].tolist())
     x_y_z_w = Rotation.from_matrix(T_world_sensor[:3, :3]).as_quat().tolist()
     moved = make("geometry_msgs/msg/Transform", position, make("geometry_msgs/msg/Quaternion", *x_y_z_w))
@@ -51,7 +51,7 @@ def transform(time_ns: int, T_world_sensor: np.ndarray) -> object:
 
 
 def record(bag: Path) -> None:
-    """Ten scans a second, and the pose of each."""
+    """Write a bag of scans at 10 Hz, with their poses."""
     drive = radarsdf.simulate.hugin(frames=12)
     with rosbag2.Writer(bag, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         topics = {"/radar": "sensor_msgs/msg/PointCloud2", "/tf": "tf2_msgs/msg/TFMessage"}
@@ -64,11 +64,11 @@ def record(bag: Path) -> None:
 
 
 def main(folder: Path) -> None:
-    """Write a bag, read it, fit it."""
+    """Write a bag, read it and fit a map."""
     bag = folder / "drive_bag"
-    if not bag.exists():  # rosbags replaces none
+    if not bag.exists():  # rosbags does not overwrite bags
         record(bag)
-    scans = radarsdf.io.read(bag)  # topic="/radar", pose_topic="/tf", were there several
+    scans = radarsdf.io.read(bag)  # topic="/radar", pose_topic="/tf" if there are several
     print(f"{len(scans)} scans; {scans.notes[0]}")
     radar_map = radarsdf.fit(scans, config=radarsdf.FitConfig(effort=0.5))
     print(radar_map)

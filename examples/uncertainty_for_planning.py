@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How far a path keeps from the nearest surface that is certain, and from everything that may be one.
+"""Compute the clearance of a path from certain surfaces and from all possible ones.
 
     python examples/uncertainty_for_planning.py
 
-A planner wants both: what is surely there, to localise and to dock, and what may be there, to keep clear of.
+A planner needs both: certain surfaces to localise and dock, possible ones to avoid collisions.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ PROBABLE = 0.8
 
 
 def clearance(path: np.ndarray, mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from each point of a path (N, 3) to a surface, m, and the standard error of that surface, m."""
+    """Return the distance from each point of a path (N, 3) to a mesh, and the standard error of its surface, m."""
     centres = mesh.triangles_center
     distance_m, triangle = cKDTree(centres).query(path)
     vertices = mesh.faces[triangle]
@@ -25,7 +25,7 @@ def clearance(path: np.ndarray, mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.n
 
 
 def main() -> None:
-    """Fit a drive and look at the way that the sensor took, 3 m to the left."""
+    """Fit a drive, and check a path 3 m to the left of the sensor's trajectory."""
     drive = radarsdf.simulate.hugin(frames=20)
     radar_map = radarsdf.fit(drive.points, drive.poses)
 
@@ -35,10 +35,10 @@ def main() -> None:
         f"{every.area:.0f} m² of surface, {certain.area:.0f} m² within {CERTAIN_M} m and with {PROBABLE:.0%}"
     )
 
-    path = drive.poses[:, :3, 3] + drive.poses[:, :3, 1] * 3.0  # y of the sensor's frame is left
+    path = drive.poses[:, :3, 3] + drive.poses[:, :3, 1] * 3.0  # the sensor's y axis points left
     to_any, error_any = clearance(path, every)
     to_certain, error_certain = clearance(path, certain)
-    safe = np.maximum(to_any - 2 * error_any, 0)  # two standard errors nearer than it looks
+    safe = np.maximum(to_any - 2 * error_any, 0)  # conservative by two standard errors
     print("  x     y    any surface, less 2σ   certain surface ± σ")
     for i in range(0, len(path), 4):
         x, y, _ = path[i]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The files that the pages speak of, of a short simulated drive."""
+"""Write the files that the pages use, from a short simulated drive."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FRAMES = 12
 
 
 def write_demo(folder: Path) -> None:
-    """The scans that `radarsdf demo` writes, but fewer."""
+    """Write the scans of `radarsdf demo`, but fewer."""
     drive = radarsdf.simulate.hugin(frames=_FRAMES)
     (folder / "radarsdf_demo").mkdir()
     scans = radarsdf.io.Scans(drive.points, drive.poses, drive.intensities)
@@ -24,7 +24,7 @@ def write_demo(folder: Path) -> None:
 
 
 def write_recordings(folder: Path) -> None:
-    """A drive as a folder of PCD, as KITTI has it in millimetres, and as a bag of ROS 2, whole and cut off."""
+    """Write a drive as a PCD folder, in KITTI format in millimetres, and as a ROS 2 bag, complete and truncated."""
     drive = radarsdf.simulate.hugin(frames=_FRAMES)
     _pcd(folder / "drive", drive)
     _tum(folder / "drive.tum", drive.poses)
@@ -55,7 +55,7 @@ def _tum(path, poses):
 
 
 def _kitti(folder, drive, scale):
-    """The poses are those of a camera: P with T_world_sensor = inv(Tr) P Tr, relative to the first scan."""
+    """Poses P are those of a camera: T_world_sensor = inv(Tr) P Tr, relative to the first scan."""
     clouds = folder / "velodyne"
     clouds.mkdir(parents=True)
     Tr = np.eye(4)
@@ -91,7 +91,7 @@ def _bag(path, drive):
 
 
 def _cut_off(bag, cut):
-    """A copy of a bag whose recording ended in the middle."""
+    """Copy a bag and truncate its recording."""
     cut.mkdir()
     for file in bag.iterdir():
         data = file.read_bytes()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The figures of the pages are drawn by code that runs."""
+"""`docs/draw.py` draws all figures, and the pages show them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
-def test_all_figures_are_drawn(tmp_path):
+def test_figures_are_drawn_and_shown(tmp_path):
     pytest.importorskip("matplotlib")
     code = runpy.run_path(str(DOCS / "draw.py"))
-    code["SIZE"].update(width=240, height=112)  # most of the time is that of pixels
+    code["SIZE"].update(width=240, height=112)  # most of the time is spent on pixels
     code["draw"](tmp_path, frames=6)
     drawn = {path.name for path in tmp_path.iterdir()}
     assert drawn == {path.name for path in (DOCS / "figures").iterdir()}
