@@ -253,7 +253,7 @@ def test_intensity_metrics(predicted, measured):
     queries=arrays(2, 3),
     keywords=st.fixed_dictionaries(
         {},
-        optional={"k": THINGS, "candidates": THINGS, "distance_scale_m": THINGS, "angle_scale_rad": THINGS},
+        optional={"k": THINGS, "candidates": THINGS},
     ),
 )
 def test_nearest_neighbours(points, sensors, intensities, queries, keywords):

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 import torch
 from radarsdf import _core
-from radarsdf.evaluation import CALIBRATION_PROTOCOL, INTENSITY_PROTOCOL, PROTOCOL
+from radarsdf.evaluation.calibration import CALIBRATION_PROTOCOL
+from radarsdf.evaluation.intensity import INTENSITY_PROTOCOL
+from radarsdf.evaluation.surface import PROTOCOL
 
 ROOT = Path(__file__).resolve().parents[2]
 

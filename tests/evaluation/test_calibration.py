@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from radarsdf.evaluation import CALIBRATION_PROTOCOL, confidence_metrics, uncertainty_metrics
+from radarsdf.evaluation import confidence_metrics, uncertainty_metrics
 
 LEVELS = {"coverage_50": 0.5, "coverage_68": 0.68, "coverage_90": 0.9, "coverage_95": 0.95}
 WITHOUT_UNIT = (*LEVELS, "ence", "z_mean", "z_rms", "worst_decile_factor")
@@ -26,7 +26,6 @@ def drawn(count=100_000, seed=0):
 def test_perfect_uncertainties():
     error_m, uncertainty_m = drawn()
     m = uncertainty_metrics(error_m, uncertainty_m)
-    assert m["protocol"] == CALIBRATION_PROTOCOL
     for name, level in LEVELS.items():
         assert m[name] == pytest.approx(level, abs=0.005), name
     assert m["ence"] < 0.02
@@ -102,7 +101,6 @@ def test_perfect_confidences():
     rng = np.random.default_rng(0)
     confidence = rng.random(100_000)
     m = confidence_metrics(confidence, rng.random(100_000) < confidence)
-    assert m["protocol"] == CALIBRATION_PROTOCOL
     assert sum(m["bin_count"]) == m["num_points"] == 100_000
     np.testing.assert_allclose(m["bin_confidence"], np.arange(0.05, 1, 0.1), atol=0.005)
     np.testing.assert_allclose(m["bin_true_share"], m["bin_confidence"], atol=0.02)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf.evaluation import (
-    PROTOCOL,
     KNNIntensity,
     format_metrics,
     holdout,
@@ -59,7 +58,7 @@ def by_definition(samples, ground_truth):
 def test_shifted_plane(shift, right, outlier_ratio, offset):
     # Lidar lies 2 cm apart: a sample is at most 1.4 cm aside, which lengthens its distance by less than 1 %.
     m = surface_metrics(plane(shift, offset=offset), grid(offset=offset), samples=200_000)
-    assert m["protocol"] == PROTOCOL
+    assert m["protocol"] == "radarsdf-surface-1"
     for name in ("accuracy_ratio", "completion_ratio", "precision", "f_score", "f_score_all"):
         assert m[name] == right, name
     assert m["outlier_ratio"] == outlier_ratio
@@ -214,9 +213,7 @@ def test_knn_is_the_weighted_mean_it_says():
     rng = np.random.default_rng(1)
     points, sensors, intensity = scene(300, rng)
     x, at, _ = scene(20, rng)
-    knn = KNNIntensity(
-        points, sensors, intensity, candidates=12, k=5, distance_scale_m=0.2, angle_scale_rad=0.3
-    )
+    knn = KNNIntensity(points, sensors, intensity, candidates=12, k=5)
     expected = []
     for q, s in zip(x, at, strict=True):
         d = np.linalg.norm(points - q, axis=1)
@@ -224,7 +221,7 @@ def test_knn_is_the_weighted_mean_it_says():
         u, v = q - s, points[near] - sensors[near]
         angle = np.arccos(v @ u / np.linalg.norm(v, axis=1) / np.linalg.norm(u))
         best = np.argsort(angle)[:5]
-        weight = 1 / ((d[near][best] + 0.2) * (angle[best] + 0.3))
+        weight = 1 / ((d[near][best] + 0.1) * (angle[best] + 0.1))
         expected.append(np.average(intensity[near][best], weights=weight))
     np.testing.assert_allclose(knn.predict(x, at), expected, rtol=1e-9)
 
@@ -275,5 +272,3 @@ def test_knn_with_few_returns_and_bad_input():
         KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0, 56.0])
     with pytest.raises(ValueError, match="k <= candidates"):
         KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0], candidates=4, k=5)
-    with pytest.raises(ValueError, match="scale"):
-        KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0], angle_scale_rad=0.0)
