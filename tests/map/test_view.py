@@ -109,7 +109,7 @@ def test_memory_that_is_not_there_is_said_before_the_work(sharp_map, monkeypatch
     unseen = pickle.loads(pickle.dumps(sharp_map))  # whose surface has yet to be made for rays
     with pytest.raises(MemoryError, match="would take about"):
         unseen.render(POSE)
-    assert "_traced" not in vars(unseen)
+    assert "_viewed" not in vars(unseen)
 
 
 def test_noise_only_if_asked_and_from_its_own_generator(sharp_map, view):

@@ -253,17 +253,11 @@ def test_leaf_keys_that_are_damaged_are_refused(copy):
             radarsdf.load(copy).num_cells  # noqa: B018 - it reads
 
 
-def test_each_field_of_a_report_is_checked(copy):
-    tile = Plan.load(copy).tiles[0]
-    report = report_of(copy, tile)
+def test_what_others_read_of_a_report_has_its_type(copy):
+    report = report_of(copy, Plan.load(copy).tiles[0])
     assert checked_report(report) == report
-    for name in report:
-        for wild in (None, 1.5j, [1, "x"], {"a": []}, -1, 10**400):
-            with pytest.raises(ValueError, match="report"):
-                checked_report(report | {name: wild})
-    with pytest.raises(ValueError, match="do not fit together"):
-        checked_report(report | {"iterations_done": {"other": 1}})
-    for wild in WILD:
-        if not isinstance(wild, dict):
-            with pytest.raises(ValueError, match="the report must be a mapping"):
-                checked_report(wild)
+    for name in ("noise", "losses", "skipped"):
+        with pytest.raises(ValueError, match=f"report.{name}"):
+            checked_report(report | {name: 3})
+    with pytest.raises(ValueError, match="the report must be a mapping"):
+        checked_report([])

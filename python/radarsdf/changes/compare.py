@@ -25,7 +25,6 @@ from radarsdf.changes.changes import (
     Changes,
 )
 from radarsdf.changes.probability import (
-    REACH_CELLS,
     Errors,
     Floats,
     PlacedMap,
@@ -133,7 +132,7 @@ def compare(
     )
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
-    if differences is not None and differences.other_units is None:
+    if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
         appeared = _repainted(appeared, differences.apart_from(np.concatenate(changed)))
     surfaces = [surface if corners is None else _inside(corners, surface) for surface in (gone, appeared)]
@@ -163,7 +162,7 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     other = other_map.evidence(vertices, own.normals)
     own_sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
     sigma_m = np.hypot(own_sigma_m, other.sigma_m)
-    return Side(vertices, own_map.faces, own, other, sigma_m, REACH_CELLS * other_map.leaf_m)
+    return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
 def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
@@ -249,7 +248,7 @@ def _report(
     alignment: Alignment,
     share: float,
     errors: Errors,
-    differences: Differences | None,
+    differences: Differences | str,
 ) -> dict[str, Any]:
     """See :attr:`Changes.report`."""
     areas = dict.fromkeys((NAMES[kind] for kind in CHANGED), 0.0)
@@ -259,9 +258,10 @@ def _report(
         compared += float(face_m2[of_faces != UNSEEN].sum())
         for kind in CHANGED:
             areas[NAMES[kind]] += float(face_m2[of_faces == kind].sum())
-    words, offset = "Reflectance was not compared: a map has no intensities, or they share no view.", None
-    if differences is not None:
-        words, offset = differences.words, None if differences.other_units else differences.offset
+    words, offset = differences, None
+    if isinstance(differences, Differences):
+        offset = differences.offset
+        words = f"All returns of the later drive are {offset:+.1f} stronger, sensor units: that is no change of a place."
     return {
         "alignment": alignment.words,
         "areas_m2": areas,

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
 from scipy.special import betaln, expit, gammaln, stdtr
 
 from radarsdf.map.map import Map
@@ -23,8 +25,9 @@ from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
 
-REACH_CELLS = 2.0
-"""A field knows distances about so far from its surface: returns scatter into the next cells."""
+_REACH_CELLS = (
+    2.0  # a field knows distances about so far from its surface: returns scatter into the next cells
+)
 PARALLEL = np.cos(np.pi / 4)
 """Least cosine between normals of surfaces that are about parallel: one that moved still is."""
 _BLOCK_M = 32.0  # cells are looked up in blocks, so that few are in memory
@@ -84,6 +87,21 @@ class PlacedMap:
     def leaf_m(self) -> float:
         """Edge of a leaf cell, m."""
         return self.radar_map.config.leaf_size_m
+
+    @property
+    def reach_m(self) -> float:
+        """So far from its surface the map knows distances, m."""
+        return _REACH_CELLS * self.leaf_m
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.vertices)
+
+    def nearest(self, x: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+        """Of places (N, 3), world of the map, m: distances (N,) of the nearest vertices, m, their rows, and distances from their planes."""
+        near_m, rows = self._tree.query(x)
+        away = x - self.vertices[rows]
+        return near_m, rows, np.einsum("ni,ni->n", away, self.normals[rows])
 
     def to_own(self, x: Floats) -> Floats:
         """Places (N, 3) of the common frame in the world of the map."""
@@ -181,7 +199,7 @@ class Side:
     sigma_m: (
         Floats  # (V,) standard error of the distance between both surfaces, with that of the alignment, m
     )
-    reach_m: float  # So far from its surface the other map knows distances, m
+    reach_m: float  # see :attr:`PlacedMap.reach_m`, of the other map
 
     @property
     def observed(self) -> NDArray[np.bool_]:

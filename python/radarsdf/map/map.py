@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -107,10 +107,6 @@ class Map(MapParts):
     uncertainty is NaN and the confidence 0.
     """
 
-    @overload
-    def sdf(self, x: Tensor, *, extrapolate: bool = False) -> Tensor: ...
-    @overload
-    def sdf(self, x: ArrayLike, *, extrapolate: bool = False) -> NDArray[Any]: ...
     def sdf(self, x: Any, *, extrapolate: bool = False) -> Any:
         """Signed distance to the surface.
 
@@ -138,10 +134,6 @@ class Map(MapParts):
         world, answer = _as_positions(x)
         return answer(self._sdf(world, extrapolate))
 
-    @overload
-    def gradient(self, x: Tensor, *, extrapolate: bool = False) -> Tensor: ...
-    @overload
-    def gradient(self, x: ArrayLike, *, extrapolate: bool = False) -> NDArray[Any]: ...
     def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
         """Gradient of the signed distance.
 
@@ -166,10 +158,6 @@ class Map(MapParts):
         world, answer = _as_positions(x)
         return answer(self._gradient(world, extrapolate))
 
-    @overload
-    def observed(self, x: Tensor) -> Tensor: ...
-    @overload
-    def observed(self, x: ArrayLike) -> NDArray[np.bool_]: ...
     def observed(self, x: Any) -> Any:
         """Whether positions lie in a leaf cell of the map, or on its border.
 
@@ -194,10 +182,6 @@ class Map(MapParts):
         world, answer = _as_positions(x)
         return answer(self._observed(world))
 
-    @overload
-    def uncertainty(self, x: Tensor) -> Tensor: ...
-    @overload
-    def uncertainty(self, x: ArrayLike) -> NDArray[Any]: ...
     def uncertainty(self, x: Any) -> Any:
         """Standard error of the surface's position, from the noise of the returns near each position.
 
@@ -223,10 +207,6 @@ class Map(MapParts):
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[1])
 
-    @overload
-    def confidence(self, x: Tensor) -> Tensor: ...
-    @overload
-    def confidence(self, x: ArrayLike) -> NDArray[Any]: ...
     def confidence(self, x: Any) -> Any:
         """Probability that there is a surface, from the returns near each position and the scans that reached it.
 
@@ -257,12 +237,6 @@ class Map(MapParts):
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[2])
 
-    @overload
-    def intensity(self, x: Tensor, sensor_positions: Tensor, *, extrapolate: bool = False) -> Tensor: ...
-    @overload
-    def intensity(
-        self, x: ArrayLike, sensor_positions: ArrayLike, *, extrapolate: bool = False
-    ) -> NDArray[Any]: ...
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
         """Intensity of the return that a sensor would get from each position.
 

@@ -113,7 +113,7 @@ def _pieces(
     settings = PieceSettings(
         divides(voxel_size, city.config.leaf_size_m),
         None if box is None else tuple(tuple(corner) for corner in check_box(box).tolist()),
-        limits.of_triangles,
+        limits.max_uncertainty,
     )
     tiles = [tile for tile in city.tiles if not piece_path(city, tile.tile, settings).is_file()]
     if executor is None:  # what this map holds in memory serves all tiles

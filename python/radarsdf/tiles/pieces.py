@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.mesh import Surface, crossed, renumbered
-from radarsdf.map.threshold import TALLY_NUMBERS, TriangleLimits
+from radarsdf.map.threshold import TALLY_NUMBERS
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile, neighbours
@@ -38,8 +38,8 @@ class PieceSettings:
     """Along the edge of a leaf cell."""
     box: tuple[tuple[float, ...], ...] | None
     """Lower and upper corner, world, m."""
-    limits: TriangleLimits
-    """What is left out of the mesh of a tile. All else depends on the other tiles."""
+    max_uncertainty: float
+    """m. What else is left out of a mesh depends on the other tiles."""
 
     def to_json(self) -> str:
         """For arguments of tasks. :meth:`from_json` is its inverse."""
@@ -189,7 +189,7 @@ def piece_of(city: TileBlend, tile: Tile, settings: PieceSettings) -> Piece:
         num_threads=threads,
     )
     surface = Surface.told_by(city.any_contents, vertices, faces, city.evidence(vertices), len(cells))
-    kept, faces = renumbered(len(vertices), faces[surface.allowed(settings.limits)])
+    kept, faces = renumbered(len(vertices), faces[surface.allowed(settings.max_uncertainty)])
     vertices = vertices[kept]
     rows, edges = _border(config.lattice.cells(vertices) * steps, city.plan.tile_cells * steps)
     return Piece(

@@ -4,16 +4,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.budget.estimate import check_views
-from radarsdf.map import queries
 from radarsdf.map.mesh import Surface
-from radarsdf.map.threshold import Limits
-from radarsdf.map.view import TracedSurface, ViewedMap
+from radarsdf.map.view import ViewedMap
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.grid import Tile
 from radarsdf.tiles.pieces import PieceSettings, piece_of
@@ -44,7 +43,7 @@ def viewed_tiles(
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(config.max_memory_bytes, cells=cells)
     origin = config.lattice.position(city.plan.origin_cells(tiles[0]))
-    everything = PieceSettings(1, None, {})
+    everything = PieceSettings(1, None, math.inf)
     pieces = [piece_of(city, tile, everything) for tile in tiles]
     before = np.cumsum([0, *[len(piece.vertices) for piece in pieces]])
     together = np.concatenate([piece.vertices for piece in pieces])
@@ -58,20 +57,15 @@ def viewed_tiles(
         city.evidence(vertices),
         cells,
     )
-    traced = TracedSurface.of_surface(
-        surface,
-        Limits.of(config.leaf_size_m),
-        lambda points: city.evidence(points + origin),
-    )
 
     def local_intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
         assert intensity is not None
         return intensity(points + origin, position + origin).astype(np.float32)
 
-    return ViewedMap(
-        traced,
+    return ViewedMap.of_surface(
+        surface,
+        city.any_contents,
         origin,
-        queries.roughness(city.any_contents),
+        lambda points: city.evidence(points + origin),
         None if intensity is None else local_intensity,
-        config.max_memory_bytes,
     )
