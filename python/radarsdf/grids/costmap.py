@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from os import PathLike
 from typing import Annotated, NamedTuple
@@ -126,8 +125,8 @@ def flat_grid(columns: Columns, lower_m: float, upper_m: float) -> FlatGrid:
     height, _ = _ground(columns)
     if not np.isfinite(height).any():
         msg = (
-            f"no column of the grid shows ground between z = {columns.origin[2]:.2f} and {columns.top_m:.2f} m: choose a box "
-            "that reaches from below the ground to two voxels or more above it"
+            f"no column shows ground between z = {columns.origin[2]:.2f} and {columns.top_m:.2f} m: choose a box from below the "
+            "ground to two voxels or more above it"
         )
         raise ValueError(msg)
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
@@ -189,11 +188,7 @@ def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float3
     safe = np.where(fits[..., None, None], normal, np.eye(3))
     plane = np.linalg.solve(safe, right[..., None])[..., 0]
     residual = np.abs(stack - np.einsum("ka,xya->kxy", design, plane))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # columns without a height
-        step = np.nanmax(residual, axis=0)
+    step = np.fmax.reduce(residual, axis=0)
     slope = np.arctan(np.hypot(plane[..., 1], plane[..., 2]))
-    return (
-        np.where(fits, slope, np.nan).astype(np.float32),
-        np.where(fits, step, np.nan).astype(np.float32),
-    )
+    slope, step = (np.where(fits, values, np.nan).astype(np.float32) for values in (slope, step))
+    return slope, step

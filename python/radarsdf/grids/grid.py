@@ -117,7 +117,7 @@ class Grid:
         ValueError
             If `x` is not (N, 3).
         """
-        positions = np.asarray(real_array(x, "positions"), np.float64)
+        positions = real_array(x, "positions")
         if positions.ndim != 2 or positions.shape[1] != 3:
             msg = f"positions must have shape (N, 3), not {positions.shape}"
             raise ValueError(msg)
