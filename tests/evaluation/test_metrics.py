@@ -53,7 +53,7 @@ def by_definition(samples, ground_truth):
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (5e5, 5.4e6, 120.0)], ids=["local", "UTM"])
 @pytest.mark.parametrize(
-    ("shift", "right", "outlier_ratio"), [(0.1, 1.0, 0.0), (0.3, 0.0, 0.0), (0.5, 0.0, 1.0), (-0.5, 0.0, 1.0)]
+    ("shift", "right", "outlier_ratio"), [(0.1, 1.0, 0.0), (0.3, 0.0, 0.0), (-0.5, 0.0, 1.0)]
 )
 def test_shifted_plane(shift, right, outlier_ratio, offset):
     # Lidar lies 2 cm apart: a sample is at most 1.4 cm aside, which lengthens its distance by less than 1 %.
@@ -163,14 +163,11 @@ def test_angles_without_a_distribution_are_none_not_nan():
     ("mesh", "truth", "kwargs", "message"),
     [
         (trimesh.Trimesh(), grid(step=1.0), {}, "no surface"),
-        (trimesh.Trimesh([[0, 0, 0]] * 3, [[0, 1, 2]], process=False), grid(step=1.0), {}, "no surface"),
         (plane(), np.zeros((0, 3)), {}, "no ground-truth points"),
         (plane(), grid(step=1.0), {"box": [[9, 9, 9], [10, 10, 10]]}, "points in the box"),
         (plane(9.0), grid(step=1.0), {"box": [[0, 0, -1], [4, 4, 1]]}, "no surface in the box"),
-        (plane(), grid(step=1.0), {"box": [[0, 0, 1], [4, 4, 1]]}, "lower corner"),
         (plane(), grid(step=1.0)[:, :2], {}, r"ground_truth must be \(N, 3\)"),
         (plane(), np.full((3, 3), np.nan), {}, "finite"),
-        (plane(), grid(step=1.0), {"samples": 0}, "positive"),
         (plane(), grid(step=1.0), {"truncation_m": 0.0}, "positive"),
     ],
 )
@@ -226,26 +223,9 @@ def test_knn_is_the_weighted_mean_it_says():
     np.testing.assert_allclose(knn.predict(x, at), expected, rtol=1e-9)
 
 
-def seen(kind, rng, scans=24, returns=400):
-    """Returns of scans along y: points, sensors, intensities and scan numbers.
-
-    "fine": the intensity changes within centimetres, so the nearest returns are the best ones. "view": it changes with
-    the angle of view alone.
-    """
-    points = np.column_stack([rng.uniform(0, 3, (scans * returns, 2)), np.zeros(scans * returns)])
-    number = np.repeat(np.arange(scans), returns)
-    sensors = np.column_stack([np.full(len(points), 1.5), number - scans / 2, np.full(len(points), 6.0)])
-    if kind == "fine":
-        intensity = 60 + 10 * np.sin(30 * points[:, 0]) * np.sin(30 * points[:, 1])
-    else:
-        view = (points - sensors) / np.linalg.norm(points - sensors, axis=1, keepdims=True)
-        intensity = 60 + 10 * np.sin(3 * view[:, 1])
-    return points, sensors, intensity + rng.normal(0, 1, len(points)), number
-
-
 def test_the_choice_is_that_of_an_inner_hold_out():
-    points, sensors, intensity, number = seen("view", np.random.default_rng(1), scans=6, returns=60)
-    number = number * 7 - 3  # any numbers
+    points, sensors, intensity = scene(360, np.random.default_rng(1))
+    number = np.repeat(np.arange(6) * 7 - 3, 60)  # any numbers
     test = np.isin(number, holdout(number, 3)[1])
     errors = {}
     for candidates in (1, 2, 4, 8, 16, 32, 64, 128):  # 240 returns remain

@@ -56,7 +56,7 @@ def write_grid(path: str | PathLike[str], arrays: dict[str, Any], points: NDArra
     elif target.suffix == ".bt":
         write_whole(target, _octree(state, arrays["origin"], arrays["voxel_size"]))
     else:
-        known = state[state >= 0]
+        known = state[state >= 0].astype(np.uint8)
         colors = dict(zip(("red", "green", "blue"), _COLORS[known].T, strict=True))
         values = {"probability": arrays["probability"][state >= 0], "state": known}
         rows = records(dict(zip("xyz", points.T, strict=True)) | values | colors)
