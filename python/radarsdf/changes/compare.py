@@ -29,7 +29,6 @@ from radarsdf.changes.probability import (
     Floats,
     PlacedMap,
     Side,
-    errors_of,
     posterior,
     share_of_changes,
 )
@@ -123,7 +122,7 @@ def compare(
     alignment = align(earlier, later) if align_frames else Alignment()
     later = later.at(alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
-    errors = errors_of(sides)
+    errors = Errors.of(sides)
     log_odds = [side.log_odds(errors) for side in sides]
     share = share_of_changes(np.concatenate([absent for absent, _ in log_odds]))
     gone, appeared = (

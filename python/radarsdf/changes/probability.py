@@ -157,8 +157,11 @@ class Errors:
     scale: float  # by how much they are larger than the standard errors say
 
     @classmethod
-    def of(cls, distance_m: Floats, sigma_m: Floats, reach_m: Floats) -> Errors:
-        """The errors that make distances (N,) most likely, if an unknown share of them is of other surfaces within reach (N,)."""
+    def of(cls, sides: Sequence[Side]) -> Errors:
+        """The errors that make the distances most likely, if an unknown share of them is of other surfaces within reach."""
+        known = [side.distances() for side in sides]
+        distance_m, sigma_m = (np.concatenate(columns) for columns in zip(*known, strict=True))
+        reach_m = np.repeat([side.reach_m for side in sides], [len(found) for found, _ in known])
         some = slice(None, None, -(-len(distance_m) // _MOST_DISTANCES) or 1)
         distance_m, sigma_m, reach_m = distance_m[some], sigma_m[some], reach_m[some]
         if len(distance_m) == 0:
@@ -231,14 +234,6 @@ class Side:
         shifted[observed] = errors.log_spread(distance_m, sigma_m, -reach_m, reach_m) - same
         absent[observed] += errors.log_spread(distance_m, sigma_m, 0.0, reach_m) - same
         return absent, shifted
-
-
-def errors_of(sides: Sequence[Side]) -> Errors:
-    """The errors of the distances between two maps."""
-    known = [side.distances() for side in sides]
-    reaches_m = [np.full(len(found[0]), side.reach_m) for side, found in zip(sides, known, strict=True)]
-    distance_m, sigma_m = (np.concatenate(columns) for columns in zip(*known, strict=True))
-    return Errors.of(distance_m, sigma_m, np.concatenate(reaches_m))
 
 
 def _passed(own: PlaceEvidence, other: PlaceEvidence) -> Floats:

@@ -102,8 +102,8 @@ def uncertainty_metrics(
 
     Notes
     -----
-    Points of equal uncertainty share their mean squared error, so the order of the points does not matter. Neighbouring points
-    of a surface have correlated errors, so numbers of one surface scatter more than those of independent errors.
+    Points of equal uncertainty share their mean squared error, so the order of the points does not matter. Errors of
+    neighbouring points of a surface are correlated, so numbers of one surface scatter more.
 
     Examples
     --------

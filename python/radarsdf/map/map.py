@@ -116,7 +116,7 @@ class Map(MapParts):
         x : (N, 3) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to evaluate the field where nothing was observed, too. Neither its sign nor its size means anything there.
+            Whether to evaluate the field where nothing was observed, too. Its values mean nothing there.
 
         Returns
         -------
