@@ -100,11 +100,7 @@ def wall_alone(maps):
     return before, replace(after, faces=after.faces[along < 0.15])
 
 
-@pytest.mark.parametrize(
-    "shift_m",
-    [(0.3, 0.15, 0.03), (-0.7, 0.5, 0.1)],
-    ids=str,
-)
+@pytest.mark.parametrize("shift_m", [(0.3, 0.15, 0.03), (-0.7, 0.5, 0.1)], ids=str)
 def test_a_wall_is_aligned_along_its_normal_and_left_along_itself(wall_alone, shift_m):
     before, after = wall_alone
     found = align(before, replace(after, vertices=after.vertices + shift_m))

@@ -28,9 +28,7 @@ def box(center, more_db=0.0):
 @pytest.fixture(scope="module")
 def drives():
     """A drive past a wall with three boxes, one without changes, and one after two were repainted."""
-    return drives_past(
-        *([box(STRONGER, more), box(WEAKER, -more), box(KEPT)] for more in (0.0, STRONGER_DB)),
-    )
+    return drives_past(*([box(STRONGER, more), box(WEAKER, -more), box(KEPT)] for more in (0.0, STRONGER_DB)))
 
 
 def on_box(surface, center):

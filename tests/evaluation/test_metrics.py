@@ -8,13 +8,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.evaluation import (
-    KNNIntensity,
-    format_metrics,
-    holdout,
-    intensity_metrics,
-    surface_metrics,
-)
+from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
 from scipy.spatial import cKDTree
 
 

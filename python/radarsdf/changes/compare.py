@@ -24,14 +24,7 @@ from radarsdf.changes.changes import (
     ChangedSurface,
     Changes,
 )
-from radarsdf.changes.probability import (
-    Errors,
-    Floats,
-    PlacedMap,
-    Side,
-    posterior,
-    share_of_changes,
-)
+from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.changes.reflectance import Differences
 from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig

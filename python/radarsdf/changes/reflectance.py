@@ -10,13 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.changes.probability import (
-    Floats,
-    PlacedMap,
-    odds_of_differences,
-    posterior,
-    share_of_changes,
-)
+from radarsdf.changes.probability import Floats, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.products import turned
 from radarsdf.returns.echoes import PLACE_CELLS, EchoesAt, rows_of_views
 

@@ -287,12 +287,7 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 
 
 def _first_surface(
-    surface: ViewedMap,
-    R: _Floats,
-    position: _Floats,
-    sensor: Sensor,
-    azimuth: _Floats,
-    elevation: _Floats,
+    surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, azimuth: _Floats, elevation: _Floats
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Range and intensity (E, A) of what each beam first meets, NaN where that is nothing."""
     shape = (len(elevation), len(azimuth))
