@@ -219,18 +219,17 @@ def _check_common(
         msg = f"the maps have no surface in common: they are of other places, or in other frames. {alignment.words}"
         raise ValueError(msg)
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
-    levels = [np.abs(side.own.normals[:, 2]) >= _LEVEL for side in sides]
-    for name, chosen in (("level", levels), ("steep", [~level for level in levels])):
+    for name, is_level in (("level", True), ("steep", False)):
         changed, agree = [], []
-        for side, mask, of_side in zip(sides, chosen, kinds, strict=True):
+        for side, of_side in zip(sides, kinds, strict=True):
+            mask = (np.abs(side.own.normals[:, 2]) >= _LEVEL) == is_level
             changed.append(int((mask & (of_side > SAME)).sum()))
             agree.append(int((mask & side.agree(errors, _AGREEING_SIGMAS) & (of_side == SAME)).sum()))
         if sum(changed) > _MOST_CHANGED * seen and all(a > b for a, b in zip(changed, agree, strict=True)):
-            shares = [f"{a / (a + b):.0%}" for a, b in zip(changed, agree, strict=True)]
+            shares = " and ".join(f"{a / (a + b):.0%}" for a, b in zip(changed, agree, strict=True))
             msg = (
-                f"the maps do not fit together: of the {name} surfaces that both saw, {shares[0]} of the earlier and {shares[1]} of "
-                f"the later map would have changed. {alignment.words} Give maps of one place, whose frames are at most some metres "
-                "and degrees apart, with poses that do not drift"
+                f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. {alignment.words} "
+                "Give maps of one place, whose frames are at most some metres and degrees apart, with poses that do not drift"
             )
             raise ValueError(msg)
 

@@ -15,7 +15,7 @@ from radarsdf.products import turned
 from radarsdf.returns.echoes import PLACE_CELLS, EchoesAt, rows_of_views
 
 _OTHER_UNITS = 1.7  # ratio of spreads: half decibels and decibels differ by 2
-_FEWEST_VIEWS = 10
+_FEWEST_VIEWS = 100  # fewer say little about units
 
 
 @dataclass(frozen=True)

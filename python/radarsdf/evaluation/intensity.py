@@ -106,10 +106,11 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
         numbers = np.arange(whole_number(frames, "frames", 0, _MAX_FRAMES))
     else:
         real_array(frames, "frames")
-        numbers = np.unique(np.asarray(frames))
-        if numbers.size and (numbers.dtype.kind not in "iu" or numbers[-1] > np.iinfo(np.int64).max):
+        numbers = np.asarray(frames)
+        if numbers.size and (numbers.dtype.kind not in "iu" or numbers.max() > np.iinfo(np.int64).max):
             msg = "frames must be a number of scans or integer frame numbers"
             raise ValueError(msg)
+        numbers = np.unique(numbers)
     if every < 2 or numbers.size < 2:
         msg = f"cannot hold out every {every}th of {numbers.size} scans: at least one must remain to train on"
         raise ValueError(msg)
