@@ -22,7 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from radarsdf import _core
-from radarsdf.evaluation import CALIBRATION_PROTOCOL, INTENSITY_PROTOCOL, PROTOCOL
+from radarsdf.evaluation.calibration import CALIBRATION_PROTOCOL
+from radarsdf.evaluation.intensity import INTENSITY_PROTOCOL
+from radarsdf.evaluation.surface import PROTOCOL
 
 from bench.measure import ROOT
 from bench.settings import parsed

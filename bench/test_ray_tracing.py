@@ -13,7 +13,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.map.view import TracedSurface
+from radarsdf.map.view import ViewedMap
 
 RAYS = (600, 2000)  # elevations, azimuths
 
@@ -30,7 +30,7 @@ def scene():
 def test_first_hits(benchmark, scene, threads, order):
     benchmark.group = f"{RAYS[0] * RAYS[1]:,} rays through a map, {order}"
     radar_map, pose = scene
-    surface = TracedSurface.of(radar_map._contents)
+    surface = ViewedMap.of(radar_map._contents)
     low, high = np.transpose([radar_map.sensor.elevation_rad, radar_map.sensor.azimuth_rad])
     axes = [np.linspace(*limits) for limits in zip(low, high, RAYS, strict=True)]
     elevation, azimuth = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))

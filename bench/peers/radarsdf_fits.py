@@ -34,7 +34,8 @@ def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], mesh: di
 
     def intensity(points: np.ndarray, sensors: np.ndarray) -> np.ndarray:
         # Held-out returns may lie where the map observed nothing; the nearest neighbours answer there, too.
-        return radar_map.intensity(points, sensors, extrapolate=True)
+        predicted: np.ndarray = radar_map.intensity(points, sensors, extrapolate=True)
+        return predicted
 
     answers = intensity if radar_map.has_intensity else None
     return Made(surface.vertices, surface.faces, radar_map.nbytes, report, answers)

@@ -100,11 +100,7 @@ def wall_alone(maps):
     return before, replace(after, faces=after.faces[along < 0.15])
 
 
-@pytest.mark.parametrize(
-    "shift_m",
-    [(-0.3, 0, 0), (0, 0, 0.1), (0.3, 0.15, 0.03), (-0.7, 0.5, 0.1)],
-    ids=str,
-)
+@pytest.mark.parametrize("shift_m", [(0.3, 0.15, 0.03), (-0.7, 0.5, 0.1)], ids=str)
 def test_a_wall_is_aligned_along_its_normal_and_left_along_itself(wall_alone, shift_m):
     before, after = wall_alone
     found = align(before, replace(after, vertices=after.vertices + shift_m))
@@ -121,14 +117,13 @@ def test_frames_are_kept_that_surfaces_do_not_show_to_be_apart(wall_alone, shift
     np.testing.assert_array_equal(found.T_before_after, np.eye(4))
 
 
-@pytest.mark.parametrize("align_frames", [True, False])
-def test_a_map_without_a_surface_is_refused_by_name(maps, align_frames):
+def test_a_map_without_a_surface_is_refused_by_name(maps):
     two = [np.array([[5.0, 0, 0], [5.0, 0.3, 0.1]])]
     with pytest.raises(ValueError, match="after has no surface"):
-        radarsdf.compare(maps[0], two, [np.eye(4)], align_frames=align_frames)
+        radarsdf.compare(maps[0], two, [np.eye(4)])
     empty = radarsdf.fit(two, [np.eye(4)], config=QUICK)
     with pytest.raises(ValueError, match="before has no surface"):
-        radarsdf.compare(empty, maps[0], align_frames=align_frames)
+        radarsdf.compare(empty, maps[0])
 
 
 @pytest.mark.parametrize(

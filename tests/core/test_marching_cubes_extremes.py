@@ -119,9 +119,6 @@ def test_topology_of_any_spacing(field, characteristic, spacing):
 def test_positions_that_float64_cannot_hold_are_refused():
     with pytest.raises(ValueError, match="beyond float64"):
         marching_cubes(noise(0), spacing=(1e308, 1, 1))
-    _, corners, cells = sparse_lattice([[2**30, 0, 0]])
-    with pytest.raises(ValueError, match="beyond float64"):
-        extract_cells(corners, np.arange(8.0), cells, 3.5, spacing=(1e300, 1, 1))
 
 
 def test_far_from_the_origin_vertices_keep_apart_as_far_as_the_docstring_says():

@@ -8,14 +8,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.evaluation import (
-    PROTOCOL,
-    KNNIntensity,
-    format_metrics,
-    holdout,
-    intensity_metrics,
-    surface_metrics,
-)
+from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
 from scipy.spatial import cKDTree
 
 
@@ -54,12 +47,12 @@ def by_definition(samples, ground_truth):
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (5e5, 5.4e6, 120.0)], ids=["local", "UTM"])
 @pytest.mark.parametrize(
-    ("shift", "right", "outlier_ratio"), [(0.1, 1.0, 0.0), (0.3, 0.0, 0.0), (0.5, 0.0, 1.0), (-0.5, 0.0, 1.0)]
+    ("shift", "right", "outlier_ratio"), [(0.1, 1.0, 0.0), (0.3, 0.0, 0.0), (-0.5, 0.0, 1.0)]
 )
 def test_shifted_plane(shift, right, outlier_ratio, offset):
     # Lidar lies 2 cm apart: a sample is at most 1.4 cm aside, which lengthens its distance by less than 1 %.
     m = surface_metrics(plane(shift, offset=offset), grid(offset=offset), samples=200_000)
-    assert m["protocol"] == PROTOCOL
+    assert m["protocol"] == "radarsdf-surface-1"
     for name in ("accuracy_ratio", "completion_ratio", "precision", "f_score", "f_score_all"):
         assert m[name] == right, name
     assert m["outlier_ratio"] == outlier_ratio
@@ -164,14 +157,11 @@ def test_angles_without_a_distribution_are_none_not_nan():
     ("mesh", "truth", "kwargs", "message"),
     [
         (trimesh.Trimesh(), grid(step=1.0), {}, "no surface"),
-        (trimesh.Trimesh([[0, 0, 0]] * 3, [[0, 1, 2]], process=False), grid(step=1.0), {}, "no surface"),
         (plane(), np.zeros((0, 3)), {}, "no ground-truth points"),
         (plane(), grid(step=1.0), {"box": [[9, 9, 9], [10, 10, 10]]}, "points in the box"),
         (plane(9.0), grid(step=1.0), {"box": [[0, 0, -1], [4, 4, 1]]}, "no surface in the box"),
-        (plane(), grid(step=1.0), {"box": [[0, 0, 1], [4, 4, 1]]}, "lower corner"),
         (plane(), grid(step=1.0)[:, :2], {}, r"ground_truth must be \(N, 3\)"),
         (plane(), np.full((3, 3), np.nan), {}, "finite"),
-        (plane(), grid(step=1.0), {"samples": 0}, "positive"),
         (plane(), grid(step=1.0), {"truncation_m": 0.0}, "positive"),
     ],
 )
@@ -214,9 +204,7 @@ def test_knn_is_the_weighted_mean_it_says():
     rng = np.random.default_rng(1)
     points, sensors, intensity = scene(300, rng)
     x, at, _ = scene(20, rng)
-    knn = KNNIntensity(
-        points, sensors, intensity, candidates=12, k=5, distance_scale_m=0.2, angle_scale_rad=0.3
-    )
+    knn = KNNIntensity(points, sensors, intensity, candidates=12, k=5)
     expected = []
     for q, s in zip(x, at, strict=True):
         d = np.linalg.norm(points - q, axis=1)
@@ -224,31 +212,14 @@ def test_knn_is_the_weighted_mean_it_says():
         u, v = q - s, points[near] - sensors[near]
         angle = np.arccos(v @ u / np.linalg.norm(v, axis=1) / np.linalg.norm(u))
         best = np.argsort(angle)[:5]
-        weight = 1 / ((d[near][best] + 0.2) * (angle[best] + 0.3))
+        weight = 1 / ((d[near][best] + 0.1) * (angle[best] + 0.1))
         expected.append(np.average(intensity[near][best], weights=weight))
     np.testing.assert_allclose(knn.predict(x, at), expected, rtol=1e-9)
 
 
-def seen(kind, rng, scans=24, returns=400):
-    """Returns of scans along y: points, sensors, intensities and scan numbers.
-
-    "fine": the intensity changes within centimetres, so the nearest returns are the best ones. "view": it changes with
-    the angle of view alone.
-    """
-    points = np.column_stack([rng.uniform(0, 3, (scans * returns, 2)), np.zeros(scans * returns)])
-    number = np.repeat(np.arange(scans), returns)
-    sensors = np.column_stack([np.full(len(points), 1.5), number - scans / 2, np.full(len(points), 6.0)])
-    if kind == "fine":
-        intensity = 60 + 10 * np.sin(30 * points[:, 0]) * np.sin(30 * points[:, 1])
-    else:
-        view = (points - sensors) / np.linalg.norm(points - sensors, axis=1, keepdims=True)
-        intensity = 60 + 10 * np.sin(3 * view[:, 1])
-    return points, sensors, intensity + rng.normal(0, 1, len(points)), number
-
-
 def test_the_choice_is_that_of_an_inner_hold_out():
-    points, sensors, intensity, number = seen("view", np.random.default_rng(1), scans=6, returns=60)
-    number = number * 7 - 3  # any numbers
+    points, sensors, intensity = scene(360, np.random.default_rng(1))
+    number = np.repeat(np.arange(6) * 7 - 3, 60)  # any numbers
     test = np.isin(number, holdout(number, 3)[1])
     errors = {}
     for candidates in (1, 2, 4, 8, 16, 32, 64, 128):  # 240 returns remain
@@ -275,5 +246,3 @@ def test_knn_with_few_returns_and_bad_input():
         KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0, 56.0])
     with pytest.raises(ValueError, match="k <= candidates"):
         KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0], candidates=4, k=5)
-    with pytest.raises(ValueError, match="scale"):
-        KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0], angle_scale_rad=0.0)

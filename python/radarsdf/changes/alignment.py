@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from radarsdf._core import LocalPlanes
 from radarsdf.changes.probability import (
     PARALLEL,
-    REACH_CELLS,
     Floats,
     PlacedMap,
     odds_of_differences,
@@ -35,9 +33,8 @@ _ITERATIONS = 15
 _MOST_POINTS = 10_000  # of the later surface
 _PATCH_M = 4.0  # edge of a patch, whose errors are correlated
 _BY_CHANCE = 1e-3  # significance level
-_UNSURE_CELLS = (
-    0.5  # standard error, in leaf cells, from which on an axis is not determined: fields reach two cells
-)
+# Standard error, in leaf cells, from which on an axis is not determined: fields reach two cells.
+_UNSURE_CELLS = 0.5
 _FIXED = 1e8  # information of what stays as given, 1/m²
 _ALIKE_CELLS = 0.25  # surfaces that are nearer lie on each other
 _SEARCH_CELLS = 8.0  # edge of the cells of a search, in leaf cells
@@ -72,20 +69,20 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     It starts from the given frames, and from where a search by planes finds significantly more agreement. The verdict is on
     the offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
     """
-    if min(len(placed.faces) for placed in (before, after)) < CELLS_OF_SURFACE:
+    if min(len(before.faces), len(after.faces)) < CELLS_OF_SURFACE:
         return Alignment()
-    surface, target = _Surface.of(after), _Target(before, cKDTree(before.vertices))
+    surface = _Surface.of(after)
 
     def far(pose: Floats) -> Floats:
         """(N,) logarithms of the distances between the surfaces, about equal where they lie on each other."""
-        near_m, _, distance_m = target.nearest(_placed(surface.points, pose))
-        distance_m = np.where(near_m <= target.reach_m, distance_m, near_m)
+        near_m, _, distance_m = before.nearest(_placed(surface.points, pose))
+        distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
         found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
         return found
 
-    as_given, (pose, covariance, unsure) = far(np.eye(4)), _determined(target, surface, np.eye(4))
+    as_given, (pose, covariance, unsure) = far(np.eye(4)), _determined(before, surface, np.eye(4))
     left = far(pose)
-    other = _determined(target, surface, _searched(before, surface))
+    other = _determined(before, surface, _searched(before, surface))
     if Verdict.by_groups(left - far(other[0]), surface.patches).improved:
         pose, covariance, unsure = other
         left = far(pose)
@@ -114,6 +111,7 @@ class _Surface:
     sigma_m: Floats  # (N,) standard errors, m
     patches: NDArray[np.int64]  # (N,) number of the patch of each
     centre: Floats  # (3,) m
+    radius_m: float  # root mean square distance of the points from the centre
 
     @classmethod
     def of(cls, placed: PlacedMap) -> _Surface:
@@ -128,12 +126,9 @@ class _Surface:
         normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
         sigma_m = np.einsum("nk,nk->n", shares, placed.sigma_m[corners])
         patches = np.unique(np.floor(points / _PATCH_M), axis=0, return_inverse=True)[1].ravel()
-        return cls(points, normals, sigma_m, patches, points.mean(axis=0))
-
-    @property
-    def radius_m(self) -> float:
-        """Root mean square distance from the centre, m."""
-        return float(np.sqrt(((self.points - self.centre) ** 2).sum(axis=1).mean()))
+        centre = points.mean(axis=0)
+        radius_m = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
+        return cls(points, normals, sigma_m, patches, centre, radius_m)
 
     def offset(self, pose: Floats) -> Floats:
         """(6,) by how far a pose (4, 4) moves the centre, m, and its rotation vector, rad."""
@@ -145,25 +140,6 @@ class _Surface:
         found: Floats = moved(np.eye(4)[None], offset[None])[0]
         found[:3, 3] += self.centre - np.einsum("ij,j->i", found[:3, :3], self.centre)
         return found
-
-
-@dataclass(frozen=True)
-class _Target:
-    """The earlier surface as planes at its vertices."""
-
-    placed: PlacedMap
-    tree: cKDTree
-
-    @property
-    def reach_m(self) -> float:
-        """From farther away, a point is on another surface, m."""
-        return REACH_CELLS * self.placed.leaf_m
-
-    def nearest(self, points: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
-        """Of points (N, 3): (N,) distances of the nearest vertices, m, their rows, and (N,) distances from their planes, m."""
-        near_m, rows = self.tree.query(points)
-        away = points - self.placed.vertices[rows]
-        return near_m, rows, np.einsum("ni,ni->n", away, self.placed.normals[rows])
 
 
 def _searched(before: PlacedMap, surface: _Surface) -> Floats:
@@ -186,26 +162,26 @@ def _searched(before: PlacedMap, surface: _Surface) -> Floats:
     return surface.pose(offsets[((offsets / _APART) ** 2).sum(axis=1).argmin()])
 
 
-def _determined(target: _Target, surface: _Surface, start: Floats) -> tuple[Floats, Floats, Floats]:
+def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, Floats]:
     """The pose that fits the surfaces, its covariance, and axes (6, K) that they do not determine: there it stays as given."""
     information = np.diag(_APART**-2.0)
-    pose, covariance = _settled(target, surface, start, information)
+    pose, covariance = _settled(before, surface, start, information)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
     variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
-    most = (_UNSURE_CELLS * target.placed.leaf_m) ** 2
+    most = (_UNSURE_CELLS * before.leaf_m) ** 2
     unsure = axes[:, variances > most]
     if unsure.size:
         offset = surface.offset(pose) * lever_m
         offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
         fixed = unsure * lever_m[:, None]
         information += _FIXED * np.einsum("ik,jk->ij", fixed, fixed)
-        pose, _ = _settled(target, surface, surface.pose(offset / lever_m), information)
+        pose, _ = _settled(before, surface, surface.pose(offset / lever_m), information)
     # Errors of normals would make larger ones errors of all surfaces.
     covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
     return pose, covariance / np.outer(lever_m, lever_m), unsure
 
 
-def _settled(target: _Target, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
+def _settled(before: PlacedMap, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
     """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change.
 
     Errors of the normals of both maps are independent: products of normals of different maps tell along which axes surfaces
@@ -216,19 +192,16 @@ def _settled(target: _Target, surface: _Surface, pose: Floats, prior: Floats) ->
     for _ in range(_ITERATIONS):
         there, own = _placed(surface.points, pose), turned(surface.normals, pose[:3, :3])
         offset = surface.offset(pose)
-        near_m, rows, distance_m = target.nearest(there)
-        normals = target.placed.normals[rows]
-        sigma_m = np.hypot(surface.sigma_m, target.placed.sigma_m[rows])
-        known = (near_m <= target.reach_m) & np.isfinite(sigma_m)
+        near_m, rows, distance_m = before.nearest(there)
+        normals = before.normals[rows]
+        sigma_m = np.hypot(surface.sigma_m, before.sigma_m[rows])
+        known = (near_m <= before.reach_m) & np.isfinite(sigma_m)
         known &= np.einsum("ni,ni->n", normals, own) >= PARALLEL
         if known.sum() < CELLS_OF_SURFACE:
             break
-        distance_m, sigma_m, arms = (
-            distance_m[known],
-            sigma_m[known],
-            there[known] - surface.centre - offset[:3],
-        )
-        odds = odds_of_differences(distance_m, sigma_m, target.reach_m)
+        distance_m, sigma_m = distance_m[known], sigma_m[known]
+        arms = there[known] - surface.centre - offset[:3]
+        odds = odds_of_differences(distance_m, sigma_m, before.reach_m)
         weights = (1 - posterior(odds, share_of_changes(odds))) / sigma_m**2
         of_target, of_own = _jacobian(arms, normals[known]), _jacobian(arms, own[known])
         slope = np.einsum("ni,n,nj->ij", of_own, weights, of_target)

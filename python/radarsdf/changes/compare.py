@@ -24,16 +24,7 @@ from radarsdf.changes.changes import (
     ChangedSurface,
     Changes,
 )
-from radarsdf.changes.probability import (
-    REACH_CELLS,
-    Errors,
-    Floats,
-    PlacedMap,
-    Side,
-    errors_of,
-    posterior,
-    share_of_changes,
-)
+from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.changes.reflectance import Differences
 from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
@@ -124,7 +115,7 @@ def compare(
     alignment = align(earlier, later) if align_frames else Alignment()
     later = later.at(alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
-    errors = errors_of(sides)
+    errors = Errors.of(sides)
     log_odds = [side.log_odds(errors) for side in sides]
     share = share_of_changes(np.concatenate([absent for absent, _ in log_odds]))
     gone, appeared = (
@@ -133,7 +124,7 @@ def compare(
     )
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
-    if differences is not None and differences.other_units is None:
+    if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
         appeared = _repainted(appeared, differences.apart_from(np.concatenate(changed)))
     surfaces = [surface if corners is None else _inside(corners, surface) for surface in (gone, appeared)]
@@ -163,7 +154,7 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     other = other_map.evidence(vertices, own.normals)
     own_sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
     sigma_m = np.hypot(own_sigma_m, other.sigma_m)
-    return Side(vertices, own_map.faces, own, other, sigma_m, REACH_CELLS * other_map.leaf_m)
+    return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
 def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
@@ -228,18 +219,17 @@ def _check_common(
         msg = f"the maps have no surface in common: they are of other places, or in other frames. {alignment.words}"
         raise ValueError(msg)
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
-    levels = [np.abs(side.own.normals[:, 2]) >= _LEVEL for side in sides]
-    for name, chosen in (("level", levels), ("steep", [~level for level in levels])):
+    for name, is_level in (("level", True), ("steep", False)):
         changed, agree = [], []
-        for side, mask, of_side in zip(sides, chosen, kinds, strict=True):
+        for side, of_side in zip(sides, kinds, strict=True):
+            mask = (np.abs(side.own.normals[:, 2]) >= _LEVEL) == is_level
             changed.append(int((mask & (of_side > SAME)).sum()))
             agree.append(int((mask & side.agree(errors, _AGREEING_SIGMAS) & (of_side == SAME)).sum()))
         if sum(changed) > _MOST_CHANGED * seen and all(a > b for a, b in zip(changed, agree, strict=True)):
-            shares = [f"{a / (a + b):.0%}" for a, b in zip(changed, agree, strict=True)]
+            shares = " and ".join(f"{a / (a + b):.0%}" for a, b in zip(changed, agree, strict=True))
             msg = (
-                f"the maps do not fit together: of the {name} surfaces that both saw, {shares[0]} of the earlier and {shares[1]} of "
-                f"the later map would have changed. {alignment.words} Give maps of one place, whose frames are at most some metres "
-                "and degrees apart, with poses that do not drift"
+                f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. {alignment.words} "
+                "Give maps of one place, whose frames are at most some metres and degrees apart, with poses that do not drift"
             )
             raise ValueError(msg)
 
@@ -249,7 +239,7 @@ def _report(
     alignment: Alignment,
     share: float,
     errors: Errors,
-    differences: Differences | None,
+    differences: Differences | str,
 ) -> dict[str, Any]:
     """See :attr:`Changes.report`."""
     areas = dict.fromkeys((NAMES[kind] for kind in CHANGED), 0.0)
@@ -259,9 +249,10 @@ def _report(
         compared += float(face_m2[of_faces != UNSEEN].sum())
         for kind in CHANGED:
             areas[NAMES[kind]] += float(face_m2[of_faces == kind].sum())
-    words, offset = "Reflectance was not compared: a map has no intensities, or they share no view.", None
-    if differences is not None:
-        words, offset = differences.words, None if differences.other_units else differences.offset
+    words, offset = differences, None
+    if isinstance(differences, Differences):
+        offset = differences.offset
+        words = f"All returns of the later drive are {offset:+.1f} stronger, sensor units: that is no change of a place."
     return {
         "alignment": alignment.words,
         "areas_m2": areas,

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
 from scipy.special import betaln, expit, gammaln, stdtr
 
 from radarsdf.map.map import Map
@@ -23,8 +25,9 @@ from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
 
-REACH_CELLS = 2.0
-"""A field knows distances about so far from its surface: returns scatter into the next cells."""
+_REACH_CELLS = (
+    2.0  # a field knows distances about so far from its surface: returns scatter into the next cells
+)
 PARALLEL = np.cos(np.pi / 4)
 """Least cosine between normals of surfaces that are about parallel: one that moved still is."""
 _BLOCK_M = 32.0  # cells are looked up in blocks, so that few are in memory
@@ -85,6 +88,21 @@ class PlacedMap:
         """Edge of a leaf cell, m."""
         return self.radar_map.config.leaf_size_m
 
+    @property
+    def reach_m(self) -> float:
+        """So far from its surface the map knows distances, m."""
+        return _REACH_CELLS * self.leaf_m
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.vertices)
+
+    def nearest(self, x: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+        """Of places (N, 3), world of the map, m: distances (N,) of the nearest vertices, m, their rows, and distances from their planes."""
+        near_m, rows = self._tree.query(x)
+        away = x - self.vertices[rows]
+        return near_m, rows, np.einsum("ni,ni->n", away, self.normals[rows])
+
     def to_own(self, x: Floats) -> Floats:
         """Places (N, 3) of the common frame in the world of the map."""
         return turned(x - self.T_common_map[:3, 3], self.T_common_map[:3, :3].T)
@@ -139,8 +157,11 @@ class Errors:
     scale: float  # by how much they are larger than the standard errors say
 
     @classmethod
-    def of(cls, distance_m: Floats, sigma_m: Floats, reach_m: Floats) -> Errors:
-        """The errors that make distances (N,) most likely, if an unknown share of them is of other surfaces within reach (N,)."""
+    def of(cls, sides: Sequence[Side]) -> Errors:
+        """The errors that make the distances most likely, if an unknown share of them is of other surfaces within reach."""
+        known = [side.distances() for side in sides]
+        distance_m, sigma_m = (np.concatenate(columns) for columns in zip(*known, strict=True))
+        reach_m = np.repeat([side.reach_m for side in sides], [len(found) for found, _ in known])
         some = slice(None, None, -(-len(distance_m) // _MOST_DISTANCES) or 1)
         distance_m, sigma_m, reach_m = distance_m[some], sigma_m[some], reach_m[some]
         if len(distance_m) == 0:
@@ -181,7 +202,7 @@ class Side:
     sigma_m: (
         Floats  # (V,) standard error of the distance between both surfaces, with that of the alignment, m
     )
-    reach_m: float  # So far from its surface the other map knows distances, m
+    reach_m: float  # see :attr:`PlacedMap.reach_m`, of the other map
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -213,14 +234,6 @@ class Side:
         shifted[observed] = errors.log_spread(distance_m, sigma_m, -reach_m, reach_m) - same
         absent[observed] += errors.log_spread(distance_m, sigma_m, 0.0, reach_m) - same
         return absent, shifted
-
-
-def errors_of(sides: Sequence[Side]) -> Errors:
-    """The errors of the distances between two maps."""
-    known = [side.distances() for side in sides]
-    reaches_m = [np.full(len(found[0]), side.reach_m) for side, found in zip(sides, known, strict=True)]
-    distance_m, sigma_m = (np.concatenate(columns) for columns in zip(*known, strict=True))
-    return Errors.of(distance_m, sigma_m, np.concatenate(reaches_m))
 
 
 def _passed(own: PlaceEvidence, other: PlaceEvidence) -> Floats:

@@ -5,24 +5,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.changes.probability import (
-    Floats,
-    PlacedMap,
-    odds_of_differences,
-    posterior,
-    share_of_changes,
-)
+from radarsdf.changes.probability import Floats, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.products import turned
 from radarsdf.returns.view_statistics import PLACE_CELLS, EchoesAt, rows_of_views
 
-_SAME_UNITS = np.sqrt(2)  # units differ by factors of 2 at least, as half decibels and decibels do
-_FEWEST_VIEWS = 10
+_OTHER_UNITS = 1.7  # ratio of spreads: half decibels and decibels differ by 2
+_FEWEST_VIEWS = 100  # fewer say little about units
 
 
 @dataclass(frozen=True)
@@ -37,10 +30,9 @@ class _Means:
         """Some (K,) of them."""
         return _Means(self.points[chosen], self.values[chosen], self.variances[chosen])
 
-    def near(self, x: Floats, reach_m: float) -> _Near:
-        """The means within reach of places (V, 3)."""
-        tree = cKDTree(self.points)
-        near = cKDTree(x).sparse_distance_matrix(tree, reach_m, output_type="coo_matrix")
+    def near(self, x: Floats, reach_m: float) -> tuple[Floats, Floats, Floats, Floats]:
+        """Of those within reach of places (V, 3): weighted mean (NaN without any), its standard error, χ² and degrees of freedom."""
+        near = cKDTree(x).sparse_distance_matrix(cKDTree(self.points), reach_m, output_type="coo_matrix")
 
         def total(values: Floats) -> Floats:
             found: Floats = np.bincount(near.row, values[near.col], len(x)).astype(np.float64)
@@ -51,21 +43,8 @@ class _Means:
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = total(weights * self.values) / weight
             chi2 = total(weights * self.values**2) - weight * mean**2
-            return _Near(
-                mean,
-                1 / np.sqrt(weight),
-                np.nan_to_num(chi2),
-                np.maximum(total(np.ones(len(weights))) - 1, 0),
-            )
-
-
-class _Near(NamedTuple):
-    """Statistics of the means near V places."""
-
-    mean: Floats  # (V,) weighted by their variances. NaN where there are none.
-    sigma: Floats  # (V,) its standard error, if nothing but the numbers of returns made them differ
-    chi2: Floats  # (V,) their squared deviations over their variances
-    freedom: Floats  # (V,) its expectation then: degrees of freedom
+            freedom = np.maximum(total(np.ones(len(weights))) - 1, 0)
+            return mean, 1 / np.sqrt(weight), np.nan_to_num(chi2), freedom
 
 
 @dataclass(frozen=True)
@@ -77,29 +56,17 @@ class Differences:
     offset: float  # by so much more all returns are stronger, sensor units
     reach_m: float  # means that are so close to a place belong to it, m
     width: float  # of the range of intensities, sensor units
-    other_units: float | None
-    """How many times as widely the later intensities spread, if the two days are in different units. None: they are not."""
-
-    @property
-    def words(self) -> str:
-        """What all places have in common, in one sentence."""
-        if self.other_units is not None:
-            return (
-                "Reflectance was not compared: at the same places and from the same views, the intensities of the later map spread "
-                f"{self.other_units:.3g} times as widely, so they are in other units."
-            )
-        return f"All returns of the later drive are {self.offset:+.1f} stronger, sensor units: that is no change of a place."
 
     @classmethod
-    def of(cls, before: PlacedMap, after: PlacedMap) -> Differences | None:
-        """Of two maps. None: they have no view in common, or no intensities.
+    def of(cls, before: PlacedMap, after: PlacedMap) -> Differences | str:
+        """Of two maps; or why they cannot be compared.
 
         What both maps expect is subtracted from both days: so views may differ a little within what counts as one.
         """
         scales = [scale for p in (before, after) if (scale := p.radar_map.intensity_scale) is not None]
         days = [_placed(placed) for placed in (before, after)]
         if len(scales) < len(days) or not all(len(day.counts) for day in days):
-            return None
+            return "Reflectance was not compared: a map has no intensities."
         leaf_m = max(before.leaf_m, after.leaf_m)
         points, directions, ranges_m, counts, intensities = (
             np.concatenate([getattr(day, name) for day in days])
@@ -121,8 +88,14 @@ class Differences:
             )
         both = (sums[0][0] > 0) & (sums[1][0] > 0)
         if not both.any():
-            return None
+            return "Reflectance was not compared: the maps share no view."
         first, second = (summed[:, both] for summed in sums)
+        spreads = [np.subtract(*np.percentile(day[2] / day[0], [95, 5])) for day in (first, second)]
+        if both.sum() > _FEWEST_VIEWS and max(spreads) > _OTHER_UNITS * min(spreads):
+            return (
+                f"Reflectance was not compared: from the same views, intensities of the earlier map spread over {spreads[0]:.3g}, "
+                f"of the later one over {spreads[1]:.3g}, so they are in other units."
+            )
         values = second[1] / second[0] - first[1] / first[0]
         offset = float(np.median(values))
         between = _Means(
@@ -132,8 +105,7 @@ class Differences:
         )
         within = [_left_of(day, expected[number][later == bool(number)]) for number, day in enumerate(days)]
         width = max(scale.high - scale.low for scale in scales)
-        other_units = _ratio_of_units(first[2] / first[0], second[2] / second[0])
-        return cls(between, within, offset, PLACE_CELLS * leaf_m, width, other_units)
+        return cls(between, within, offset, PLACE_CELLS * leaf_m, width)
 
     def apart_from(self, changed: Floats) -> Differences:
         """Without those near places (C, 3) that changed otherwise: the returns of one day are of what is not there on the other."""
@@ -149,32 +121,17 @@ class Differences:
         returns explain, on one day or in how far they changed, errors are as much larger (Birge's ratio): at edges, near
         mirrors, in thickets. What is repainted changes alike from all views.
         """
-        between = self.between.near(x, self.reach_m)
+        mean, sigma, chi2_between, freedom_between = self.between.near(x, self.reach_m)
         days = [means.near(x, self.reach_m) for means in self.within]
-        chi2, freedom = (np.sum([getattr(day, name) for day in days], axis=0) for name in ("chi2", "freedom"))
-        known = counting & np.isfinite(between.mean)
-        changed = np.zeros(len(x))
-        of_day, of_change = chi2 / np.maximum(freedom, 1), between.chi2 / np.maximum(between.freedom, 1)
+        chi2, freedom = (np.sum([day[column] for day in days], axis=0) for column in (2, 3))
+        of_day, of_change = chi2 / np.maximum(freedom, 1), chi2_between / np.maximum(freedom_between, 1)
         ratio = np.sqrt(np.maximum(np.maximum(of_day, of_change), 1))
-        sigma = (between.sigma * ratio)[known]
+        known = counting & np.isfinite(mean)
         # A change is as likely by any difference that the range of intensities has room for.
-        odds = odds_of_differences(between.mean[known], sigma, self.width)
+        odds = odds_of_differences(mean[known], (sigma * ratio)[known], self.width)
+        changed = np.zeros(len(x))
         changed[known] = posterior(odds, share_of_changes(odds))
-        return between.mean, changed
-
-
-def _ratio_of_units(earlier: Floats, later: Floats) -> float | None:
-    """How many times as widely the later of two intensities (G,) of the same views spread, if that is no noise. None: they agree.
-
-    Noise lowers the slope of either on the other, so one that is still above the limit is of the units. Linear powers have long
-    tails, which are clipped.
-    """
-    x, y = (np.clip(values, *np.percentile(values, [5, 95])) for values in (earlier, later))
-    (var_x, cov), (_, var_y) = np.cov(x, y, bias=True)
-    if len(x) <= _FEWEST_VIEWS:
-        return None
-    error = np.sqrt(max(var_x * var_y - cov**2, 0) / len(x))
-    return float(np.sqrt(var_y / var_x)) if cov - 3 * error > _SAME_UNITS * min(var_x, var_y) > 0 else None
+        return mean, changed
 
 
 def _placed(placed: PlacedMap) -> EchoesAt:

@@ -8,29 +8,12 @@ The functions take meshes and arrays, not maps, so they measure the results of o
 
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 
-from .calibration import (
-    CALIBRATION_PROTOCOL,
-    ConfidenceMetrics,
-    UncertaintyMetrics,
-    confidence_metrics,
-    uncertainty_metrics,
-)
-from .intensity import INTENSITY_PROTOCOL, IntensityMetrics, KNNIntensity, holdout, intensity_metrics
-from .surface import (
-    PROTOCOL,
-    SurfaceMetrics,
-    adjacent_angles,
-    format_metrics,
-    gamma_from_moments,
-    surface_metrics,
-)
-from .trajectory import TRAJECTORY_PROTOCOL, TrajectoryMetrics, trajectory_metrics
+from .calibration import ConfidenceMetrics, UncertaintyMetrics, confidence_metrics, uncertainty_metrics
+from .intensity import IntensityMetrics, KNNIntensity, holdout, intensity_metrics
+from .surface import SurfaceMetrics, adjacent_angles, format_metrics, gamma_from_moments, surface_metrics
+from .trajectory import TrajectoryMetrics, trajectory_metrics
 
 __all__ = [
-    "CALIBRATION_PROTOCOL",
-    "INTENSITY_PROTOCOL",
-    "PROTOCOL",
-    "TRAJECTORY_PROTOCOL",
     "ConfidenceMetrics",
     "IntensityMetrics",
     "KNNIntensity",

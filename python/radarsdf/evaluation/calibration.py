@@ -12,12 +12,11 @@ from scipy.special import ndtri
 
 from radarsdf.checks import real_array, whole_number
 
-CALIBRATION_PROTOCOL = "radarsdf-calibration-1"
-"""Name and version of the definitions in this module. It changes when the meaning of a number changes."""
+CALIBRATION_PROTOCOL = "radarsdf-calibration-1"  # changes when the meaning of a number changes
 
-_FloatArray = NDArray[np.float64]
+_Floats = NDArray[np.float64]
 _DECILES = 10
-_MOST_M, _LEAST_M = 1e12, 1e-12  # squares, and ratios of two such lengths squared, are far from overflow
+_LEAST_M, _MOST_M = 1e-12, 1e12  # squares, and ratios of two such lengths squared, are far from overflow
 _LEAST_SHARE = 0.01  # of the points. The share of true ones among fewer says little
 
 
@@ -103,8 +102,8 @@ def uncertainty_metrics(
 
     Notes
     -----
-    Points of equal uncertainty share their mean squared error, so the order of the points does not matter. Neighbouring points
-    of a surface have correlated errors, so numbers of one surface scatter more than those of independent errors.
+    Points of equal uncertainty share their mean squared error, so the order of the points does not matter. Errors of
+    neighbouring points of a surface are correlated, so numbers of one surface scatter more.
 
     Examples
     --------
@@ -116,18 +115,11 @@ def uncertainty_metrics(
     (2.0, 1.0)
     """
     whole_number(bins, "bins", 1)
-    error, sigma = real_array(error_m, "error_m"), real_array(uncertainty_m, "uncertainty_m")
-    if error.ndim != 1 or error.shape != sigma.shape:
-        msg = f"error_m {error.shape} and uncertainty_m {sigma.shape} must both be (N,)"
-        raise ValueError(msg)
-    if (np.abs(error) > _MOST_M).any():
-        msg = f"error_m must be within {_MOST_M:g} m, or NaN"
-        raise ValueError(msg)
-    if ((sigma > _MOST_M) | (sigma < _LEAST_M)).any():
-        msg = f"uncertainty_m must be {_LEAST_M:g} to {_MOST_M:g} m, or NaN"
+    error, sigma = _paired(error_m, "error_m", uncertainty_m, "uncertainty_m")
+    if (np.abs(error) > _MOST_M).any() or ((sigma > _MOST_M) | (sigma < _LEAST_M)).any():
+        msg = f"error_m must be within {_MOST_M:g} m, uncertainty_m {_LEAST_M:g} to {_MOST_M:g} m, or NaN"
         raise ValueError(msg)
     known = ~(np.isnan(error) | np.isnan(sigma))
-    num_unknown = int(np.count_nonzero(~known))
     error, sigma = error[known], sigma[known]
     if len(error) < max(bins, _DECILES):
         msg = f"{len(error)} points are too few for {max(bins, _DECILES)} bins"
@@ -157,7 +149,7 @@ def uncertainty_metrics(
         worst_decile_factor=float(np.maximum(ratio, 1 / ratio).max()),
         deciles_in_order=bool((np.diff(decile_measured) >= 0).all()),
         num_points=len(error),
-        num_unknown=num_unknown,
+        num_unknown=int(np.count_nonzero(~known)),
     )
 
 
@@ -201,10 +193,7 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike, *, bins: int =
     (0.2, 0.75)
     """
     whole_number(bins, "bins", 1)
-    p, truth = real_array(confidence, "confidence"), real_array(is_true, "is_true")
-    if p.ndim != 1 or p.shape != truth.shape:
-        msg = f"confidence {p.shape} and is_true {truth.shape} must both be (N,)"
-        raise ValueError(msg)
+    p, truth = _paired(confidence, "confidence", is_true, "is_true")
     if ((p < 0) | (p > 1)).any():
         msg = "confidence must be in [0, 1], or NaN"
         raise ValueError(msg)
@@ -212,7 +201,6 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike, *, bins: int =
         msg = "is_true must be True or False"
         raise ValueError(msg)
     known = ~np.isnan(p)
-    num_unknown = int(np.count_nonzero(~known))
     p, truth = p[known], truth[known]
     if len(p) == 0:
         msg = "no point has a confidence"
@@ -236,19 +224,28 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike, *, bins: int =
         auc=_auc(p, truth == 1),
         true_share=float(truth.mean()),
         num_points=len(p),
-        num_unknown=num_unknown,
+        num_unknown=int(np.count_nonzero(~known)),
     )
 
 
-def _coverage(z: _FloatArray, probability: float) -> float:
+def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[_Floats, _Floats]:
+    """Two arguments as arrays (N,)."""
+    first, second = real_array(a, name_a), real_array(b, name_b)
+    if first.ndim != 1 or first.shape != second.shape:
+        msg = f"{name_a} {first.shape} and {name_b} {second.shape} must both be (N,)"
+        raise ValueError(msg)
+    return first, second
+
+
+def _coverage(z: _Floats, probability: float) -> float:
     return float(np.mean(np.abs(z) <= ndtri((1 + probability) / 2)))
 
 
-def _root_mean_square(values: _FloatArray) -> float:
+def _root_mean_square(values: _Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _by_uncertainty(error: _FloatArray, sigma: _FloatArray, bins: int) -> tuple[_FloatArray, _FloatArray]:
+def _by_uncertainty(error: _Floats, sigma: _Floats, bins: int) -> tuple[_Floats, _Floats]:
     """Root mean squares (bins,) of uncertainties and errors, in equally filled bins of ascending uncertainty."""
     levels, level, count = np.unique(sigma, return_inverse=True, return_counts=True)
     squared_error = np.bincount(level, error**2) / count
@@ -259,7 +256,7 @@ def _by_uncertainty(error: _FloatArray, sigma: _FloatArray, bins: int) -> tuple[
     return predicted, measured
 
 
-def _auc(p: _FloatArray, truth: NDArray[np.bool_]) -> float | None:
+def _auc(p: _Floats, truth: NDArray[np.bool_]) -> float | None:
     """Area under the receiver operating characteristic, by ranks. Equal values count as half."""
     num_true = int(np.count_nonzero(truth))
     num_false = len(p) - num_true

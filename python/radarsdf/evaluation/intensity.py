@@ -5,24 +5,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from functools import partial
 from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.checks import MAX_POSITION_M, positive, real_array, refuse_masked, whole_number
+from radarsdf.checks import MAX_POSITION_M, real_array, refuse_masked, whole_number
 from radarsdf.threads import resolve_num_threads
 
-INTENSITY_PROTOCOL = "radarsdf-intensity-1"
-"""Name and version of the definitions in `intensity_metrics`. It changes when the meaning of a number changes."""
+INTENSITY_PROTOCOL = "radarsdf-intensity-1"  # changes when the meaning of a number changes
 
+_Floats = NDArray[np.float64]
 _MAX_FRAMES = 10**8  # 58 days at 20 Hz; a larger number is a mistake and would fill the memory
 _MAX_INTENSITY = 1e100  # a sum of as many intensities as fit in memory stays finite
 _CHUNK = 1 << 21  # candidates at a time, of all queries together: about 130 MB
+_DISTANCE_M, _ANGLE_RAD = 0.1, 0.1  # noise of the returns: smaller differences hardly change a weight
 _KS = (1, 2, 4, 8, 16, 32)
-_MAX_CANDIDATES = 256
+_CANDIDATES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+_MAX_QUERIES = 20_000  # held-out returns that are predicted to choose between them, evenly spread
 
 
 class IntensityMetrics(TypedDict):
@@ -104,16 +105,12 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
     if isinstance(frames, (int, np.integer)):
         numbers = np.arange(whole_number(frames, "frames", 0, _MAX_FRAMES))
     else:
-        refuse_masked(frames, "frames")
         real_array(frames, "frames")
         numbers = np.asarray(frames)
-        numbers = np.unique(numbers) if numbers.dtype.kind in "iu" else numbers
-    if numbers.ndim != 1 or not (numbers.size == 0 or np.issubdtype(numbers.dtype, np.integer)):
-        msg = "frames must be a number of scans or integer frame numbers"
-        raise ValueError(msg)
-    if numbers.size and numbers[-1] > np.iinfo(np.int64).max:
-        msg = "frame numbers must fit int64"
-        raise ValueError(msg)
+        if numbers.size and (numbers.dtype.kind not in "iu" or numbers.max() > np.iinfo(np.int64).max):
+            msg = "frames must be a number of scans or integer frame numbers"
+            raise ValueError(msg)
+        numbers = np.unique(numbers)
     if every < 2 or numbers.size < 2:
         msg = f"cannot hold out every {every}th of {numbers.size} scans: at least one must remain to train on"
         raise ValueError(msg)
@@ -125,8 +122,7 @@ class KNNIntensity:
     """Intensity from the nearest returns seen from a similar direction: the paper's baseline.
 
     The search takes the `candidates` returns that are nearest in space, and of these the `k` with the most similar
-    viewing direction. Their intensities are averaged with the weights
-    1 / ((distance + distance_scale_m) · (angle + angle_scale_rad)).
+    viewing direction. Their intensities are averaged with the weights 1 / ((distance + 0.1 m) · (angle + 0.1 rad)).
 
     Parameters
     ----------
@@ -137,11 +133,7 @@ class KNNIntensity:
     intensities : (N,) array_like
         Sensor units.
     candidates, k : int
-        Sizes of the two selections, 1 ≤ k ≤ candidates.
-    distance_scale_m, angle_scale_rad : float
-        Noise of the returns: smaller differences hardly change a weight.
-    num_threads : int
-        Threads of the search; 0 means as many as PyTorch uses.
+        Sizes of the two selections, 1 ≤ k ≤ candidates; at most the number of returns is taken.
 
     Raises
     ------
@@ -171,34 +163,24 @@ class KNNIntensity:
         *,
         candidates: int = 20,
         k: int = 16,
-        distance_scale_m: float = 0.1,
-        angle_scale_rad: float = 0.1,
-        num_threads: int = 0,
     ) -> None:
-        points, directions = _rays(points_world, sensor_positions)
-        values = real_array(intensities, "intensities")
+        points, self._directions = _rays(points_world, sensor_positions)
+        self._values = real_array(intensities, "intensities")
         if len(points) == 0:
             msg = "the baseline needs at least one return"
             raise ValueError(msg)
-        if values.shape != (len(points),) or not (np.abs(values) <= _MAX_INTENSITY).all():
-            msg = f"intensities must be ({len(points)},) and finite, but have shape {values.shape}"
+        if self._values.shape != (len(points),) or not (np.abs(self._values) <= _MAX_INTENSITY).all():
+            msg = f"intensities must be ({len(points)},) and finite, but have shape {self._values.shape}"
             raise ValueError(msg)
-        whole_number(k, "k", 1)
-        whole_number(candidates, "candidates", 1)
-        if not k <= candidates:
+        if whole_number(k, "k", 1) > whole_number(candidates, "candidates", 1):
             msg = f"1 <= k <= candidates is needed, not k={k}, candidates={candidates}"
             raise ValueError(msg)
-        positive(distance_scale_m, "distance_scale_m")
-        positive(angle_scale_rad, "angle_scale_rad")
-        self._directions, self._values = directions, values
         self._origin = points.mean(axis=0)
         self._tree = cKDTree(points - self._origin)
         self.candidates = min(candidates, len(points))
-        """Number of returns that are nearest in space, of which `k` are chosen; at most the number of returns."""
+        """Number of returns that are nearest in space, of which `k` are chosen."""
         self.k = min(k, len(points))
         """Number of returns whose intensities are averaged."""
-        self._scales = distance_scale_m, angle_scale_rad
-        self._num_threads = whole_number(num_threads, "num_threads", 0)
 
     @classmethod
     def chosen(
@@ -209,10 +191,6 @@ class KNNIntensity:
         scans: ArrayLike,
         *,
         every: int = 5,
-        max_queries: int = 20_000,
-        distance_scale_m: float = 0.1,
-        angle_scale_rad: float = 0.1,
-        num_threads: int = 0,
     ) -> KNNIntensity:
         """Make the baseline with the `candidates` and `k` that are best for these training scans.
 
@@ -222,14 +200,12 @@ class KNNIntensity:
 
         Parameters
         ----------
-        points_world, sensor_positions, intensities, distance_scale_m, angle_scale_rad, num_threads
+        points_world, sensor_positions, intensities
             As for the class. Give the training scans only: a choice that sees the evaluation is not fair.
         scans : (N,) array_like
             Scan number of each return, integers. Whole scans are held out, since returns of one scan share view and noise.
         every : int
             Distance between held-out scans, at least 2; see :func:`holdout`.
-        max_queries : int
-            Held-out returns that are predicted at most, evenly spread.
 
         Returns
         -------
@@ -245,16 +221,12 @@ class KNNIntensity:
         -----
         On three simulated scenes and five real drives the error is at most 0.6 % above that of the best choice.
         """
-        make = partial(
-            cls, distance_scale_m=distance_scale_m, angle_scale_rad=angle_scale_rad, num_threads=num_threads
-        )
-        whole = make(points_world, sensor_positions, intensities)
+        whole = cls(points_world, sensor_positions, intensities)
         refuse_masked(scans, "scans")
         numbers = np.asarray(scans)
         if numbers.shape != whole._values.shape or not np.issubdtype(numbers.dtype, np.integer):
             msg = f"scans must be ({len(whole._values)},) integers, not {numbers.shape} {numbers.dtype}"
             raise ValueError(msg)
-        whole_number(max_queries, "max_queries", 1)
         whole_number(every, "every", 2)
         if numbers.min() == numbers.max():
             return whole
@@ -262,12 +234,12 @@ class KNNIntensity:
         points, directions = _rays(points_world, sensor_positions)
         sensors = np.broadcast_to(real_array(sensor_positions, "sensor positions"), points.shape)
         asked = np.flatnonzero(test)
-        asked = asked[np.linspace(0, len(asked) - 1, min(max_queries, len(asked))).astype(np.int64)]
-        inner = make(points[~test], sensors[~test], whole._values[~test], candidates=_MAX_CANDIDATES)
+        asked = asked[np.linspace(0, len(asked) - 1, min(_MAX_QUERIES, len(asked))).astype(np.int64)]
+        inner = cls(points[~test], sensors[~test], whole._values[~test], candidates=_CANDIDATES[-1])
         k, candidates = inner._best(points[asked] - inner._origin, directions[asked], whole._values[asked])
-        return make(points_world, sensor_positions, intensities, candidates=candidates, k=k)
+        return cls(points_world, sensor_positions, intensities, candidates=candidates, k=k)
 
-    def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> _Floats:
         """Predict the intensity of returns.
 
         Parameters
@@ -297,11 +269,9 @@ class KNNIntensity:
             predicted[part] = (weight * values).sum(axis=1) / weight.sum(axis=1)
         return predicted
 
-    def _best(
-        self, points: NDArray[np.float64], directions: NDArray[np.float64], measured: NDArray[np.float64]
-    ) -> tuple[int, int]:
+    def _best(self, points: _Floats, directions: _Floats, measured: _Floats) -> tuple[int, int]:
         """The `k` and the `candidates`, of those that this search has, with the least error at these returns."""
-        sizes = [2**i for i in range(_MAX_CANDIDATES.bit_length()) if 2**i <= self.candidates]
+        sizes = [size for size in _CANDIDATES if size <= self.candidates]
         errors = {(k, size): 0.0 for size in sizes for k in _KS if k <= size}
         for part in self._parts(len(points)):
             angle, weight, values = self._nearest(points[part], directions[part])
@@ -320,20 +290,17 @@ class KNNIntensity:
         step = max(1, _CHUNK // self.candidates)
         return (slice(start, start + step) for start in range(0, queries, step))
 
-    def _nearest(
-        self, points: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _nearest(self, points: _Floats, directions: _Floats) -> tuple[_Floats, _Floats, _Floats]:
         """Angle, weight and intensity of the candidates of each point, the nearest first, each (M, candidates)."""
         ranks = np.arange(1, self.candidates + 1)  # with k=1 as a number, the result would lose a dimension
-        workers = resolve_num_threads(self._num_threads)
-        distance, index = self._tree.query(points, k=ranks, workers=workers)
+        distance, index = self._tree.query(points, k=ranks, workers=resolve_num_threads(0))
         chord = np.linalg.norm(self._directions[index] - directions[:, None], axis=2)
         angle = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))  # accurate at small angles, unlike arccos
-        weight = 1.0 / ((distance + self._scales[0]) * (angle + self._scales[1]))
+        weight = 1.0 / ((distance + _DISTANCE_M) * (angle + _ANGLE_RAD))
         return angle, weight, self._values[index]
 
 
-def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[_Floats, _Floats]:
     """Points (N, 3) and the unit vectors (N, 3) from the sensor to each, after checks of both arguments."""
     x, s = real_array(points, "points"), real_array(sensors, "sensor positions")
     if x.ndim != 2 or x.shape[1] != 3 or s.shape not in {x.shape, (3,)}:

@@ -21,8 +21,7 @@ from .intensity import IntensityMetrics
 if TYPE_CHECKING:
     import trimesh
 
-PROTOCOL = "radarsdf-surface-1"
-"""Name and version of the definitions in `surface_metrics`. It changes when the meaning of a number changes."""
+PROTOCOL = "radarsdf-surface-1"  # changes when the meaning of a number changes
 
 _CHUNK = 500_000  # samples at a time. Bounds the memory; the protocol's random numbers depend on it
 _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in float64 over an edge of 1 cm
@@ -123,21 +122,25 @@ def surface_metrics(
     `samples`.
     """
     whole_number(samples, "samples", 1)
-    positive(threshold_m, "threshold_m")
-    positive(outlier_m, "outlier_m")
-    positive(truncation_m, "truncation_m")
+    for name, value in (
+        ("threshold_m", threshold_m),
+        ("outlier_m", outlier_m),
+        ("truncation_m", truncation_m),
+    ):
+        positive(value, name)
     seed, num_threads = whole_number(seed, "seed", 0), whole_number(num_threads, "num_threads", 0)
     corners = None if box is None else check_box(box)
+    in_the_box = "" if corners is None else " in the box"
     points = _in_box(positions(ground_truth, "ground_truth"), corners)
     if len(points) == 0:
-        msg = "there are no ground-truth points" + ("" if corners is None else " in the box")
+        msg = f"there are no ground-truth points{in_the_box}"
         raise ValueError(msg)
     digest = hashlib.sha256(points.tobytes()).hexdigest()
     # From here on relative to the mean: differences of large coordinates would lose digits.
     origin = points.mean(axis=0)
     points = points - origin
-    vertices = _vertices(mesh) - origin
-    faces = _faces(mesh)
+    vertices, faces = _triangles(mesh)
+    vertices = vertices - origin
     if corners is not None:
         corners = corners - origin
 
@@ -158,7 +161,7 @@ def surface_metrics(
         right += int(np.count_nonzero(distance < threshold_m))
         _shorten(completion, points, block, workers)
     if total == 0:
-        msg = "the mesh has no surface" + ("" if corners is None else " in the box")
+        msg = f"the mesh has no surface{in_the_box}"
         raise ValueError(msg)
 
     accuracy_ratio = right_kept / kept if kept else 0.0
@@ -213,7 +216,7 @@ def adjacent_angles(mesh: trimesh.Trimesh, *, box: ArrayLike | None = None) -> N
     ValueError
         If a vertex is not finite or the box has a wrong shape.
     """
-    vertices, faces = _vertices(mesh), _faces(mesh)
+    vertices, faces = _triangles(mesh)
     if len(faces) == 0:
         return np.zeros(0)
     origin = vertices.mean(axis=0)
@@ -275,12 +278,12 @@ def format_metrics(metrics: SurfaceMetrics | IntensityMetrics) -> str:
     variance = _number(s["gamma_variance"], " rad²", digits=3)
     of = f"{s['num_mesh_samples']} mesh samples and {s['num_ground_truth']} ground-truth points"
     rows = {
-        "accuracy": f"error {_number(s['accuracy_error_m'], ' cm', 100)}  ratio {_percent(s['accuracy_ratio'])}"
-        f"  outliers beyond {s['outlier_m']:g} m {_percent(s['outlier_ratio'])}",
+        "accuracy": f"error {_number(s['accuracy_error_m'], ' cm', 100)}  ratio {_number(s['accuracy_ratio'], ' %', 100)}"
+        f"  outliers beyond {s['outlier_m']:g} m {_number(s['outlier_ratio'], ' %', 100)}",
         "completion": f"error {_number(s['completion_error_m'], ' cm', 100)}"
-        f"  ratio {_percent(s['completion_ratio'])}",
-        "F-score": f"{_percent(s['f_score'])}  with nothing discarded {_percent(s['f_score_all'])}"
-        f" (precision {_percent(s['precision'])})",
+        f"  ratio {_number(s['completion_ratio'], ' %', 100)}",
+        "F-score": f"{_number(s['f_score'], ' %', 100)}  with nothing discarded {_number(s['f_score_all'], ' %', 100)}"
+        f" (precision {_number(s['precision'], ' %', 100)})",
         "angles": f"gamma shape {shape}  mean {mean}  variance {variance}",
         "protocol": f"{s['protocol']}  threshold {s['threshold_m']:g} m  {of} ({s['ground_truth_sha256'][:12]})",
     }
@@ -291,30 +294,25 @@ def _number(value: float | None, unit: str, factor: float = 1.0, digits: int = 2
     return "undefined" if value is None else f"{value * factor:.{digits}f}{unit}"
 
 
-def _percent(ratio: float) -> str:
-    return _number(ratio, " %", 100)
-
-
 def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
 
 
-def _vertices(mesh: trimesh.Trimesh) -> _Points:
+def _triangles(mesh: trimesh.Trimesh) -> tuple[_Points, NDArray[np.int64]]:
+    """Vertices (V, 3), world, m, and faces (F, 3) of a mesh of any program."""
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         msg = f"mesh must have vertices and faces, not be {mesh!r:.50}"
         raise TypeError(msg)
-    return positions(mesh.vertices, "mesh.vertices")
-
-
-def _faces(mesh: trimesh.Trimesh) -> NDArray[np.int64]:
-    faces = np.asarray(mesh.faces)
-    if faces.size and (faces.dtype.kind not in "iu" or faces.ndim != 2 or faces.shape[1] != 3):
-        msg = f"mesh.faces must be (F, 3) integers, not {faces.shape} {faces.dtype}"
+    vertices, faces = positions(mesh.vertices, "mesh.vertices"), np.asarray(mesh.faces)
+    if faces.size == 0:
+        return vertices, np.zeros((0, 3), np.int64)
+    shaped = faces.dtype.kind in "iu" and faces.ndim == 2 and faces.shape[1] == 3
+    if not (shaped and 0 <= faces.min() <= faces.max() < len(vertices)):
+        msg = (
+            f"mesh.faces must be (F, 3) rows of the {len(vertices)} vertices, not {faces.shape} {faces.dtype}"
+        )
         raise ValueError(msg)
-    if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
-        msg = f"mesh.faces must be rows of the {len(mesh.vertices)} vertices"
-        raise ValueError(msg)
-    return faces.astype(np.int64).reshape(-1, 3)
+    return vertices, faces.astype(np.int64)
 
 
 def _in_box(points: _Points, corners: _Points | None) -> _Points:

@@ -4,23 +4,19 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict
+from typing import Literal, TypedDict, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_poses, positive, real_array
 from radarsdf.poses.rigid import Floats, aligned, between, nearest_rotation, placed, steps, turned_by
 
-TRAJECTORY_PROTOCOL = "radarsdf-trajectory-1"
-"""Name and version of the definitions in `trajectory_metrics`."""
-
 Alignment = Literal["positions", "poses", "first", "none"]
 
-_ALIGNMENTS = ("positions", "poses", "first", "none")
-_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)  # of the length, where it is shorter than KITTI's
-_KITTI_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+_SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # of the length, where it is shorter than KITTI's
+_KITTI_M = np.arange(100.0, 900.0, 100.0)
 
 
 class TrajectoryMetrics(TypedDict):
@@ -88,19 +84,24 @@ def trajectory_metrics(
     >>> round(metrics["relative_ratio"], 3), round(metrics["step_m"], 3)
     (0.02, 0.02)
     """
-    if align not in _ALIGNMENTS:
-        msg = f"align must be one of {', '.join(_ALIGNMENTS)}, not {align!r:.50}"
+    if align not in get_args(Alignment):
+        msg = f"align must be one of {', '.join(get_args(Alignment))}, not {align!r:.50}"
         raise ValueError(msg)
     true = check_poses(real_array(true_poses, "true_poses"))
     found = check_poses(poses, len(true))
-    at = _brought(found, true, align)
+    at = _aligned(found, true, align)
     true_steps = steps(true)
     off = between(true_steps, steps(found))
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])
-    lengths = _lengths(distance_m[-1], lengths_m)
+    if lengths_m is not None:
+        lengths = np.atleast_1d(real_array(lengths_m, "lengths_m"))
+        for length in lengths:
+            positive(length, "lengths_m")
+    else:
+        lengths = _KITTI_M if distance_m[-1] >= _KITTI_M[-1] else distance_m[-1] * _SHARES
     ratio, rad_per_m = _relative(found, true, distance_m, lengths)
     return TrajectoryMetrics(
-        protocol=TRAJECTORY_PROTOCOL,
+        protocol="radarsdf-trajectory-1",  # changes when the meaning of a number changes
         align=align,
         num_poses=len(true),
         length_m=float(distance_m[-1]),
@@ -114,7 +115,8 @@ def trajectory_metrics(
     )
 
 
-def _brought(poses: Floats, true: Floats, align: Alignment) -> Floats:
+def _aligned(poses: Floats, true: Floats, align: Alignment) -> Floats:
+    """The poses (F, 4, 4) after one rigid motion of the whole; see `trajectory_metrics`."""
     if align == "poses":
         return aligned(poses, true)
     whole = np.eye(4)
@@ -126,14 +128,6 @@ def _brought(poses: Floats, true: Floats, align: Alignment) -> Floats:
         whole = placed(whole, poses, true)
     found: Floats = np.einsum("ij,fjk->fik", whole, poses)
     return found
-
-
-def _lengths(length_m: float, lengths_m: ArrayLike | None) -> Floats:
-    if lengths_m is None:
-        return np.array(_KITTI_M) if length_m >= _KITTI_M[-1] else length_m * np.array(_SHARES)
-    return np.array(
-        [positive(length, "lengths_m") for length in np.atleast_1d(real_array(lengths_m, "lengths_m"))]
-    )
 
 
 def _relative(
@@ -158,5 +152,5 @@ def _angles(motions: Floats) -> Floats:
     return found
 
 
-def _rms(values: NDArray[np.float64]) -> float:
+def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else 0.0

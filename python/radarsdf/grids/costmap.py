@@ -4,10 +4,9 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from os import PathLike
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,9 @@ from pydantic import Field
 from radarsdf.checks import number
 from radarsdf.grids.files import write_map_server
 from radarsdf.settings import settings
+
+if TYPE_CHECKING:
+    from radarsdf.grids.grid import Grid
 
 LETHAL = 100
 """Cost of a column that no wheel can enter, as in ROS."""
@@ -81,34 +83,14 @@ class FlatGrid:
         write_map_server(path, self.state, self.origin, self.cell_size)
 
 
-class Columns(NamedTuple):
-    """What is read of a grid, arrays (X, Y, Z)."""
-
-    origin: NDArray[np.float64]  # (3,) world, m
-    voxel_size: float  # m
-    occupied: NDArray[np.bool_]
-    free: NDArray[np.bool_]
-    distance_m: NDArray[np.float32]
-
-    @property
-    def z(self) -> NDArray[np.float64]:
-        """(Z,) heights of the voxels' centres, world, m."""
-        return np.asarray(self.origin[2] + (np.arange(self.occupied.shape[2]) + 0.5) * self.voxel_size)
-
-    @property
-    def top_m(self) -> float:
-        """Upper border, world, m."""
-        return float(self.origin[2] + self.occupied.shape[2] * self.voxel_size)
-
-
-def costmap(columns: Columns, wheels: Wheels) -> Costmap:
+def costmap(grid: Grid, wheels: Wheels) -> Costmap:
     """See :meth:`Grid.costmap`."""
-    height, clearance = _ground(columns)
+    height, clearance = _ground(grid)
     # A column of walls alone has no ground, but nothing can stand there.
-    blocked = np.isnan(height) & columns.occupied.any(axis=2)
+    blocked = np.isnan(height) & grid.occupied.any(axis=2)
     with np.errstate(invalid="ignore"):
         blocked |= clearance < wheels.clearance_m
-    slope, step = _planes(height, columns.voxel_size)
+    slope, step = _planes(height, grid.voxel_size)
     effort = np.fmax(slope / wheels.max_slope_rad, step / wheels.max_step_m)
     cost = np.full(height.shape, -1, np.int8)
     known = np.isfinite(effort)
@@ -117,45 +99,51 @@ def costmap(columns: Columns, wheels: Wheels) -> Costmap:
     return Costmap(height, slope, step, clearance, cost)
 
 
-def flat_grid(columns: Columns, lower_m: float, upper_m: float) -> FlatGrid:
+def flat_grid(grid: Grid, lower_m: float, upper_m: float) -> FlatGrid:
     """See :meth:`Grid.flat`."""
     lower_m, upper_m = number(lower_m, "lower_m"), number(upper_m, "upper_m")
     if lower_m >= upper_m:
         msg = f"upper_m must be above lower_m, {lower_m}, not {upper_m}"
         raise ValueError(msg)
-    height, _ = _ground(columns)
+    height, _ = _ground(grid)
+    top_m = float(grid.origin[2] + grid.shape[2] * grid.voxel_size)
     if not np.isfinite(height).any():
         msg = (
-            f"no column of the grid shows ground between z = {columns.origin[2]:.2f} and {columns.top_m:.2f} m: choose a box "
-            "that reaches from below the ground to two voxels or more above it"
+            f"no column shows ground between z = {grid.origin[2]:.2f} and {top_m:.2f} m: choose a box from below the "
+            "ground to two voxels or more above it"
         )
         raise ValueError(msg)
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
     nearest = distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
     base = height[tuple(nearest)]
-    above = columns.z - base[..., None]
-    half = columns.voxel_size / 2
+    above = _z(grid) - base[..., None]
+    half = grid.voxel_size / 2
     # Whole voxels: one that only reaches into the heights from below may be of the ground.
     between = (above - half >= lower_m) & (above - half < upper_m)
-    occupied = (columns.occupied & between).any(axis=2)
-    free = np.where(between, columns.free, True).all(axis=2) & between.any(axis=2)
+    occupied = (grid.occupied & between).any(axis=2)
+    free = np.where(between, grid.free, True).all(axis=2) & between.any(axis=2)
     # A column whose heights reach out of the box is free only as far as the box is known.
-    free &= base + upper_m <= columns.top_m + half
+    free &= base + upper_m <= top_m + half
     state = np.full(height.shape, -1, np.int8)
     state[free], state[occupied] = 0, 1
-    return FlatGrid(columns.origin[:2].copy(), columns.voxel_size, state)
+    return FlatGrid(grid.origin[:2].copy(), grid.voxel_size, state)
 
 
-def _ground(columns: Columns) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _z(grid: Grid) -> NDArray[np.float64]:
+    """(Z,) heights of the voxels' centres, world, m."""
+    return np.asarray(grid.origin[2] + (np.arange(grid.shape[2]) + 0.5) * grid.voxel_size)
+
+
+def _ground(grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Heights of the ground (X, Y), world, m, and the room above it, m. NaN in columns without.
 
     The ground of a column is the lowest surface on which the signed distance rises upwards. Its height is where the
     distance is zero, interpolated between the voxels above and below.
     """
-    size, z = columns.voxel_size, columns.z
+    size, z = grid.voxel_size, _z(grid)
     # Above the uppermost voxels nothing is known.
-    lower, occupied = columns.distance_m, np.pad(columns.occupied, ((0, 0), (0, 0), (0, 1)))
+    lower, occupied = grid.distance_m, np.pad(grid.occupied, ((0, 0), (0, 0), (0, 1)))
     upper = np.concatenate([lower[..., 1:], np.full_like(lower[..., :1], np.nan)], axis=2)
     with np.errstate(invalid="ignore"):
         up = (lower <= 0) & (upper > 0) & (occupied[..., :-1] | occupied[..., 1:])
@@ -166,7 +154,7 @@ def _ground(columns: Columns) -> tuple[NDArray[np.float32], NDArray[np.float32]]
     height = np.where(found, z[first] + share * size, np.nan).astype(np.float32)
     # Not the voxels of the ground itself, which are one or two.
     above = np.arange(len(z)) > np.asarray(first + 2)[..., None]
-    hanging: NDArray[np.bool_] = columns.occupied & above & found[..., None]
+    hanging: NDArray[np.bool_] = grid.occupied & above & found[..., None]
     lowest = hanging.argmax(axis=2)
     room = np.where(hanging.any(axis=2), z[lowest] - size / 2 - height, np.inf)
     clearance = np.where(found, room, np.nan).astype(np.float32)
@@ -189,11 +177,7 @@ def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float3
     safe = np.where(fits[..., None, None], normal, np.eye(3))
     plane = np.linalg.solve(safe, right[..., None])[..., 0]
     residual = np.abs(stack - np.einsum("ka,xya->kxy", design, plane))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # columns without a height
-        step = np.nanmax(residual, axis=0)
+    step = np.fmax.reduce(residual, axis=0)
     slope = np.arctan(np.hypot(plane[..., 1], plane[..., 2]))
-    return (
-        np.where(fits, slope, np.nan).astype(np.float32),
-        np.where(fits, step, np.nan).astype(np.float32),
-    )
+    slope, step = (np.where(fits, values, np.nan).astype(np.float32) for values in (slope, step))
+    return slope, step

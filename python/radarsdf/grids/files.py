@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,9 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
 from radarsdf.io.files import check_outputs, write_whole
+from radarsdf.io.npz import write_arrays
+from radarsdf.io.ply import ply_header, records
 
-_SUFFIXES = (".npz", ".ply", ".bt")
 _PIXELS = {-1: 205, 0: 254, 1: 0}  # as map_saver writes unknown, free and occupied
 _COLORS = np.array([[70, 150, 220], [220, 90, 40]], np.uint8)  # of free and occupied
 _LEVELS = 16  # of OctoMap's octree
@@ -26,21 +26,21 @@ _FREE, _OCCUPIED, _INNER = 1, 2, 3
 
 def check_grid_path(path: Path) -> None:
     """Raise a ValueError for a suffix that :meth:`Grid.save` does not write."""
-    _check_suffix(path, _SUFFIXES)
+    _check_suffix(path, ".npz", ".ply", ".bt")
 
 
 def check_arrays_path(path: Path | None) -> None:
     """Raise a ValueError for a path that is not one of arrays. None: there is none."""
     if path is not None:
-        _check_suffix(path, (".npz",))
+        _check_suffix(path, ".npz")
 
 
 def check_flat_path(path: Path) -> None:
     """Raise a ValueError for a path that :meth:`FlatGrid.save` does not take."""
-    _check_suffix(path, (".yaml",))
+    _check_suffix(path, ".yaml")
 
 
-def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
+def _check_suffix(path: Path, *suffixes: str) -> None:
     if path.suffix not in suffixes:
         msg = f"{path} must end in {', '.join(suffixes)}"
         raise ValueError(msg)
@@ -50,18 +50,18 @@ def write_grid(path: str | PathLike[str], arrays: dict[str, Any], points: NDArra
     """Write the arrays of a :class:`Grid`, by the suffix. `points` (N, 3): centres of the voxels that are known, world, m."""
     target = path_of(path, "path")
     check_grid_path(target)
-    state, probability = arrays["state"], arrays["probability"]
-    origin, voxel_m = arrays["origin"], arrays["voxel_size"]
-    match target.suffix:
-        case ".npz":
-            buffer = io.BytesIO()
-            np.savez_compressed(buffer, **arrays)
-            content = buffer.getvalue()
-        case ".ply":
-            content = _ply(points, state[state >= 0], probability[state >= 0], voxel_m)
-        case _:
-            content = _octree(state, origin, voxel_m)
-    write_whole(target, content)
+    state = arrays["state"]
+    if target.suffix == ".npz":
+        write_arrays(target, arrays, compressed=True)
+    elif target.suffix == ".bt":
+        write_whole(target, _octree(state, arrays["origin"], arrays["voxel_size"]))
+    else:
+        known = state[state >= 0].astype(np.uint8)
+        colors = dict(zip(("red", "green", "blue"), _COLORS[known].T, strict=True))
+        values = {"probability": arrays["probability"][state >= 0], "state": known}
+        rows = records(dict(zip("xyz", points.T, strict=True)) | values | colors)
+        comment = f"centres of voxels of {arrays['voxel_size']:.9g} m; state 0: free, 1: occupied"
+        write_whole(target, ply_header(rows.dtype, len(rows), comment=comment) + rows.tobytes())
 
 
 def write_map_server(
@@ -85,27 +85,6 @@ def write_map_server(
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
     write_whole(target, text.encode())
-
-
-def _ply(
-    points: NDArray[np.float64], state: NDArray[np.int8], probability: NDArray[np.float32], voxel_m: float
-) -> bytes:
-    row = np.dtype(
-        [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("probability", "<f4"), ("state", "i1")]
-        + [(color, "u1") for color in ("red", "green", "blue")]
-    )
-    rows = np.zeros(len(points), row)
-    rows["x"], rows["y"], rows["z"] = points.T
-    rows["probability"], rows["state"] = probability, state
-    rows["red"], rows["green"], rows["blue"] = _COLORS[state].T
-    types = {"<f8": "double", "<f4": "float", "|i1": "char", "|u1": "uchar"}
-    fields = "".join(f"property {types[row[name].str]} {name}\n" for name in row.names or ())
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"comment centres of voxels of {voxel_m:.9g} m; state 0: free, 1: occupied\n"
-        f"element vertex {len(rows)}\n{fields}end_header\n"
-    )
-    return header.encode() + rows.tobytes()
 
 
 # OctoMap's binary format: a header of text and, from the root on, two bytes for each inner node: two bits for each of its

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import path_of, real_array
-from radarsdf.grids.costmap import Columns, Costmap, FlatGrid, Wheels, costmap, flat_grid
+from radarsdf.grids.costmap import Costmap, FlatGrid, Wheels, costmap, flat_grid
 from radarsdf.grids.files import check_arrays_path, write_grid
 from radarsdf.io.npz import write_arrays
 
@@ -117,7 +117,7 @@ class Grid:
         ValueError
             If `x` is not (N, 3).
         """
-        positions = np.asarray(real_array(x, "positions"), np.float64)
+        positions = real_array(x, "positions")
         if positions.ndim != 2 or positions.shape[1] != 3:
             msg = f"positions must have shape (N, 3), not {positions.shape}"
             raise ValueError(msg)
@@ -154,7 +154,7 @@ class Grid:
         Costmap
             Arrays (X, Y).
         """
-        return costmap(self._columns, Wheels() if wheels is None else wheels)
+        return costmap(self, Wheels() if wheels is None else wheels)
 
     def flat(self, lower_m: float = 0.3, upper_m: float = 2.0) -> FlatGrid:
         """The grid in two dimensions that ROS's map_server reads, of what is between two heights above the ground.
@@ -175,11 +175,7 @@ class Grid:
         ValueError
             If the heights are not ascending, or no column of the grid shows ground.
         """
-        return flat_grid(self._columns, lower_m, upper_m)
-
-    @property
-    def _columns(self) -> Columns:
-        return Columns(self.origin, self.voxel_size, self.occupied, self.free, self.distance_m)
+        return flat_grid(self, lower_m, upper_m)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the grid to a file. An old one is replaced only once the new one is complete.

@@ -168,14 +168,9 @@ class _Planes:
     def of(cls, radar_map: Map, x: NDArray[np.float64]) -> _Planes:
         """The planes at positions (N, 3), world, m."""
         distance_m, normals = radar_map.tangent_planes(x)
-        unknown = np.isnan(distance_m)
         sigma_m = np.nan_to_num(radar_map.uncertainty(x), nan=radar_map.config.leaf_size_m).astype(np.float64)
-        return cls(
-            distance_m.astype(np.float32),
-            normals,
-            sigma_m,
-            np.where(unknown, 0, radar_map.confidence(x)).astype(np.float64),
-        )
+        confidence = np.where(np.isnan(distance_m), 0, radar_map.confidence(x)).astype(np.float64)
+        return cls(distance_m.astype(np.float32), normals, sigma_m, confidence)
 
     def before(self, limit_m: float) -> NDArray[np.float64]:
         """(N,) probability that the surface is there, and nearer than a limit or that the position is behind it."""

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -100,17 +100,14 @@ class Map(MapParts):
 
     Queries take world coordinates, m, as array_like or CPU tensors of shape (N, 3), and return the same kind: float64 for
     float64 input and lists, float32 otherwise. Coordinates are converted to the local frame in float64, so large
-    ones such as UTM lose no precision. Several threads may query a map at once, and a map can be pickled.
+    ones such as UTM lose no precision. A wrong shape is a ValueError; a TypeError, what are no real numbers, or a tensor on another
+    device. Several threads may query a map at once, and a map can be pickled.
 
     A map knows the leaf cells near returns, see :meth:`observed`. Elsewhere, free space included, and at positions that are
     not finite, the signed distance, its gradient and the intensity are NaN. Without returns near a position, the
     uncertainty is NaN and the confidence 0.
     """
 
-    @overload
-    def sdf(self, x: Tensor, *, extrapolate: bool = False) -> Tensor: ...
-    @overload
-    def sdf(self, x: ArrayLike, *, extrapolate: bool = False) -> NDArray[Any]: ...
     def sdf(self, x: Any, *, extrapolate: bool = False) -> Any:
         """Signed distance to the surface.
 
@@ -119,7 +116,7 @@ class Map(MapParts):
         x : (N, 3) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to evaluate the field where nothing was observed, too. Neither its sign nor its size means anything there.
+            Whether to evaluate the field where nothing was observed, too. Its values mean nothing there.
 
         Returns
         -------
@@ -127,21 +124,10 @@ class Map(MapParts):
             Signed distance, m: positive in free space, zero on the surface, negative behind it. NaN where `x` was not
             :meth:`observed`, or is not finite. It is learnt along the sensor's rays, so it exceeds the Euclidean distance where
             they meet the surface at a grazing angle.
-
-        Raises
-        ------
-        ValueError
-            If `x` is not (N, 3).
-        TypeError
-            If `x` are not real numbers, or are a tensor on another device.
         """
         world, answer = _as_positions(x)
         return answer(self._sdf(world, extrapolate))
 
-    @overload
-    def gradient(self, x: Tensor, *, extrapolate: bool = False) -> Tensor: ...
-    @overload
-    def gradient(self, x: ArrayLike, *, extrapolate: bool = False) -> NDArray[Any]: ...
     def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
         """Gradient of the signed distance.
 
@@ -157,19 +143,10 @@ class Map(MapParts):
         (N, 3) ndarray or Tensor
             Derivatives along x, y and z of the world, pointing to free space. The norm is about 1 where rays met the surface at a
             right angle, and larger where they grazed it. NaN where :meth:`sdf` is.
-
-        Raises
-        ------
-        ValueError, TypeError
-            As for :meth:`sdf`.
         """
         world, answer = _as_positions(x)
         return answer(self._gradient(world, extrapolate))
 
-    @overload
-    def observed(self, x: Tensor) -> Tensor: ...
-    @overload
-    def observed(self, x: ArrayLike) -> NDArray[np.bool_]: ...
     def observed(self, x: Any) -> Any:
         """Whether positions lie in a leaf cell of the map, or on its border.
 
@@ -185,19 +162,10 @@ class Map(MapParts):
         (N,) ndarray of bool or Tensor
             Where it is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN. False for positions that are not
             finite.
-
-        Raises
-        ------
-        ValueError, TypeError
-            As for :meth:`sdf`.
         """
         world, answer = _as_positions(x)
         return answer(self._observed(world))
 
-    @overload
-    def uncertainty(self, x: Tensor) -> Tensor: ...
-    @overload
-    def uncertainty(self, x: ArrayLike) -> NDArray[Any]: ...
     def uncertainty(self, x: Any) -> Any:
         """Standard error of the surface's position, from the noise of the returns near each position.
 
@@ -214,19 +182,10 @@ class Map(MapParts):
             range. The floor, which no number of returns reduces, is 0.05 leaf cells, and up to 1.1 more the higher the clutter
             ratio (:attr:`rough_share`). NaN where there are no returns near `x`, or `x` is not finite. Errors of the poses
             count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of the :class:`FitConfig` state them.
-
-        Raises
-        ------
-        ValueError, TypeError
-            As for :meth:`sdf`.
         """
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[1])
 
-    @overload
-    def confidence(self, x: Tensor) -> Tensor: ...
-    @overload
-    def confidence(self, x: ArrayLike) -> NDArray[Any]: ...
     def confidence(self, x: Any) -> Any:
         """Probability that there is a surface, from the returns near each position and the scans that reached it.
 
@@ -257,12 +216,6 @@ class Map(MapParts):
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[2])
 
-    @overload
-    def intensity(self, x: Tensor, sensor_positions: Tensor, *, extrapolate: bool = False) -> Tensor: ...
-    @overload
-    def intensity(
-        self, x: ArrayLike, sensor_positions: ArrayLike, *, extrapolate: bool = False
-    ) -> NDArray[Any]: ...
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
         """Intensity of the return that a sensor would get from each position.
 
@@ -287,9 +240,7 @@ class Map(MapParts):
         Raises
         ------
         ValueError
-            If the map has no intensities, or for wrong shapes.
-        TypeError
-            As for :meth:`sdf`.
+            If the map has no intensities.
         """
         if not self.has_intensity:
             msg = "this map was fitted without intensities"
@@ -499,33 +450,24 @@ class Map(MapParts):
 
 
 def _as_positions(x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
-    """`x` as a tensor (N, 3), and a function that gives results the kind and precision of `x`.
-
-    With `rows`, a single position (3,) is repeated so many times.
-    """
+    """`x` as a tensor (N, 3), and a function that gives results the kind and precision of `x`; `rows`: (3,) is repeated so often."""
     is_tensor = isinstance(x, Tensor)
-    if is_tensor and (x.device.type != "cpu" or x.layout != torch.strided):
-        msg = f"positions must be a dense tensor on the CPU, not {x.layout} on {x.device}"
-        raise TypeError(msg)
-    # Read-only arrays are copied, because PyTorch warns of them.
-    world = (
-        x.detach()
-        if is_tensor
-        else torch.from_numpy(np.require(real_array(x, "positions"), requirements=["C", "W"]))
-    )
-    dtype = x.dtype if is_tensor else getattr(x, "dtype", None)
+    if is_tensor:
+        if x.device.type != "cpu" or x.layout != torch.strided or x.is_complex():
+            msg = f"positions must be real numbers in a dense tensor on the CPU, not {x.dtype} {x.layout} on {x.device}"
+            raise TypeError(msg)
+        world = x.detach()
+    else:  # read-only arrays are copied, because PyTorch warns of them
+        world = torch.from_numpy(np.require(real_array(x, "positions"), requirements=["C", "W"]))
     if rows is not None and world.shape == (3,):
         world = world.expand(rows, 3)
-    if world.is_complex():
-        msg = "positions must be real numbers"
-        raise TypeError(msg)
     if world.ndim != 2 or world.shape[1] != 3 or (rows is not None and len(world) != rows):
         msg = f"positions must have shape (N, 3), not {tuple(world.shape)}"
         raise ValueError(msg)
+    keep_double = getattr(x, "dtype", None) in (torch.float64, np.dtype(np.float64), None)
 
     def answer(result: Tensor) -> Any:
         if result.dtype != torch.bool:
-            keep_double = dtype in (torch.float64, np.dtype(np.float64), None)
             result = result.double() if keep_double else result.float()
         return result if is_tensor else result.numpy()
 

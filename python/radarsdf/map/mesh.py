@@ -21,7 +21,7 @@ from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.threshold import LIMITS, Limits, Tally, Threshold, TriangleLimits, areas_round
+from radarsdf.map.threshold import Limits, Tally, Threshold, areas_round
 from radarsdf.memory import check_mesh
 from radarsdf.returns.intensities import IntensityScale
 
@@ -100,18 +100,14 @@ class Surface:
             cells_searched,
         )
 
-    def allowed(self, limits: TriangleLimits) -> NDArray[np.bool_]:
-        """(F,) faces that pass every per-triangle limit."""
-        within = np.ones(len(self.vertices), bool)
-        for name, value in limits.items():
-            limit = LIMITS[name]
-            within &= limit.keeps(getattr(self, limit.column), value)
-        return with_all(within, self.faces)
+    def allowed(self, max_uncertainty: float, min_confidence: float = 0.0) -> NDArray[np.bool_]:
+        """(F,) faces whose three vertices are within these limits."""
+        certain = np.nan_to_num(self.uncertainty_m, nan=np.inf) <= max_uncertainty
+        return with_all(certain & (self.confidence >= min_confidence), self.faces)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
         """(F,) faces that a mesh keeps."""
-        min_confidence = self.threshold(limits).min_confidence
-        kept = self.allowed(limits.of_triangles | {"min_confidence": min_confidence})
+        kept = self.allowed(limits.max_uncertainty, self.threshold(limits).min_confidence)
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))

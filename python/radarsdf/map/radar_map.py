@@ -24,7 +24,7 @@ from radarsdf.returns.view_statistics import EchoesAt
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.view import TracedSurface, ViewedMap
+    from radarsdf.map.view import ViewedMap
 
 
 class RadarMap(Map):
@@ -83,16 +83,13 @@ class RadarMap(Map):
         )
 
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
-        from radarsdf.map.view import ViewedMap  # noqa: PLC0415 - trimesh is slow to import
-
-        return ViewedMap.of(self._contents, self._traced)
+        return self._viewed
 
     @cached_property
-    def _traced(self) -> TracedSurface:
-        """The surface as rays meet it."""
-        from radarsdf.map.view import TracedSurface  # noqa: PLC0415 - trimesh is slow to import
+    def _viewed(self) -> ViewedMap:
+        from radarsdf.map.view import ViewedMap  # noqa: PLC0415 - trimesh is slow to import
 
-        return TracedSurface.of(self._contents)
+        return ViewedMap.of(self._contents)
 
     def save(self, path: str | PathLike[str]) -> None:
         storage.save_contents(self._contents, path)

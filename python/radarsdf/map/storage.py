@@ -7,13 +7,12 @@ from __future__ import annotations
 import json
 import math
 from os import PathLike
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
-from pydantic import Field as Limited
 from safetensors import SafetensorError
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
@@ -281,87 +280,29 @@ def _damaged(path: str | PathLike[str]) -> ValueError:
     )
 
 
-# The report of a fit
-
-_Count = Annotated[int, Limited(ge=0, le=2**53)]
-_Finite = Annotated[float, Limited(ge=0, allow_inf_nan=False)]
-_Position = Annotated[
-    list[Annotated[float, Limited(allow_inf_nan=False)]], Limited(min_length=3, max_length=3)
-]
-_MOST_SECONDS = 1e12
-
-
-class _Noise(TypedDict):
-    range_m: _Finite
-    azimuth_rad: _Finite
-    elevation_rad: _Finite
-
-
-class _History(TypedDict):
-    iterations: list[_Count]
-    losses: list[float]  # of a fit that diverged, not all are finite
-    seconds: list[_Finite]
-
-
-class _Poses(TypedDict):
-    """What :func:`radarsdf.poses.posed.way_of` writes."""
-
-    verdict: str
-    improved: bool | None
-    step_m: _Finite | None
-    step_rad: _Finite | None
-    scans: list[_Count]
-    before: list[_Position] | None
-    after: list[_Position]
-    sigma_m: list[_Finite]
-    sigma_rad: list[_Finite]
-
-
 class _Report(TypedDict, total=False):
-    """What :func:`radarsdf.fitting.steps.fit_rays` writes, and :func:`radarsdf.tiles.fit_tiles.fit_tile`."""
+    """What others read of :attr:`Map.report`, which :func:`radarsdf.fitting.steps.fit_rays` writes."""
 
     __pydantic_config__ = ConfigDict(strict=True, extra="allow")  # type: ignore[misc]
 
-    scans: _Count
-    returns: _Count
-    returns_used: _Count
-    ghosts: _Count
-    movers: _Count
-    wild_intensities: _Count
-    noise: _Noise
-    leaf_cells: _Count
-    vertices: _Count
-    iterations: dict[str, _Count]
-    iterations_done: dict[str, _Count]
+    noise: dict[str, float]
+    iterations: dict[str, int]
     losses: dict[str, float]
-    loss_history: dict[str, _History]
+    loss_history: dict[str, dict[str, list[float]]]
     skipped: list[str]
-    skipped_s: list[Annotated[float, Limited(allow_inf_nan=False)] | None]
     plan: str
-    poses: _Poses
+    poses: dict[str, str | bool | float | list[float] | list[list[float]] | None]
 
 
 _REPORT: TypeAdapter[Any] = TypeAdapter(_Report)
 
 
 def checked_report(report: Any) -> dict[str, Any]:
-    """The report of a fit, from JSON: what others rely on has its type. Other names that end in ``_s`` are seconds."""
+    """The report of a fit, from JSON. A ValueError if parts that others read are of other types."""
     try:
-        checked: dict[str, Any] = _REPORT.validate_python(by_name(report, "the report"))
+        _REPORT.validate_python(by_name(report, "the report"))
     except ValidationError as error:
         msg = f"report.{first_wrong(error)}"
         raise ValueError(msg) from None
-    for name in checked.keys() - {"skipped_s"}:
-        value = checked[name]
-        if name.endswith("_s") and not (isinstance(value, float) and 0 <= value < _MOST_SECONDS):
-            msg = f"report.{name:.50} must be seconds, not {value!r:.50}"
-            raise ValueError(msg)
-    poses = [value for value in checked.get("poses", {}).values() if isinstance(value, list)]
-    histories = [list(history.values()) for history in checked.get("loss_history", {}).values()]
-    skipped = [checked.get("skipped", []), checked.get("skipped_s", [])]
-    together = all(len({len(column) for column in columns}) == 1 for columns in [skipped, *histories])
-    if poses:
-        together &= len({len(column) for column in poses}) == 1 and len(poses[0]) > 0
-    known = checked.get("iterations_done", {}).keys() <= checked.get("iterations", {}).keys()
-    _check(together and known, "parts of the report do not fit together")
-    return checked
+    found: dict[str, Any] = report
+    return found

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass
 from typing import Any, NamedTuple
 
@@ -19,78 +19,42 @@ Floats = NDArray[np.float64]
 
 _BINS = 1000  # of the confidences from 0 to 1
 _SCALARS = 3
-TALLY_NUMBERS = 3 * _BINS + _SCALARS
-"""Numbers of a :class:`Tally`."""
+TALLY_NUMBERS = 3 * _BINS + _SCALARS  # of a :class:`Tally`
 _COMPONENT_TRIANGLES = 30  # of the smallest component that is kept, in voxels of VOXEL_M
 
 
-class Limit(NamedTuple):
-    """A limit of a mesh on its vertices: an argument of `Map.mesh`. A triangle is kept if its three vertices are within it."""
-
-    column: str  # attribute of `Surface` that is compared, (V,)
-    keeps: Callable[[NDArray[np.float32], float], NDArray[np.bool_]]  # which of its values are within, (V,)
-    lowest: float
-    highest: float
-    default: float | None  # None: `Tally.threshold` finds it from the whole surface
-
-
-LIMITS = {
-    "max_uncertainty": Limit(
-        "uncertainty_m",
-        lambda values, limit: np.nan_to_num(values, nan=np.inf) <= limit,
-        lowest=0.0,
-        highest=math.inf,
-        default=math.inf,
-    ),
-    "min_confidence": Limit(
-        "confidence",
-        lambda values, limit: values >= limit,
-        lowest=0.0,
-        highest=1.0,
-        default=None,
-    ),
-}
-
-TriangleLimits = dict[str, float]
-"""Values of limits, by the names of `LIMITS`, that do not depend on the rest of the surface: a tile applies these alone."""
-
-
 class Limits(NamedTuple):
-    """All limits of a mesh; see :meth:`Map.mesh`."""
+    """Which triangles a mesh keeps; see :meth:`Map.mesh`."""
 
     min_confidence: float | None  # None: that of the highest expected F-score
-    of_triangles: TriangleLimits
+    max_uncertainty: float  # m
     min_component_triangles: int
 
     @classmethod
     def of(
-        cls, voxel_m: float, *, min_component_triangles: int | None = None, **given: float | None
+        cls,
+        voxel_m: float,
+        *,
+        min_confidence: float | None = None,
+        max_uncertainty: float | None = None,
+        min_component_triangles: int | None = None,
     ) -> Limits:
         """The arguments of :meth:`Map.mesh`, checked, with defaults filled in."""
-        if unknown := given.keys() - LIMITS.keys():
-            msg = f"a mesh has no limit {', '.join(sorted(unknown))}"
-            raise TypeError(msg)
-        found = {name: _checked(name, given.get(name)) for name in LIMITS}
-        min_confidence = found.pop("min_confidence")
+        if (
+            min_confidence is not None
+            and not 0 <= (min_confidence := number(min_confidence, "min_confidence")) <= 1
+        ):
+            msg = f"min_confidence must be in [0, 1], not {min_confidence}"
+            raise ValueError(msg)
+        max_uncertainty = number(math.inf if max_uncertainty is None else max_uncertainty, "max_uncertainty")
+        if max_uncertainty < 0:
+            msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
+            raise ValueError(msg)
         if min_component_triangles is None:
             # In larger voxels fewer, of more area.
             min_component_triangles = round(_COMPONENT_TRIANGLES * min(1.0, VOXEL_M / voxel_m))
-        return cls(
-            min_confidence,
-            {name: value for name, value in found.items() if value is not None},
-            whole_number(min_component_triangles, "min_component_triangles", 0),
-        )
-
-
-def _checked(name: str, value: float | None) -> float | None:
-    limit = LIMITS[name]
-    if value is None:
-        return limit.default
-    value = number(value, name)
-    if not limit.lowest <= value <= limit.highest:
-        msg = f"{name} must be in [{limit.lowest:g}, {limit.highest:g}], not {value}"
-        raise ValueError(msg)
-    return value
+        components = whole_number(min_component_triangles, "min_component_triangles", 0)
+        return cls(min_confidence, max_uncertainty, components)
 
 
 @dataclass(frozen=True)
@@ -163,7 +127,7 @@ class Tally:
         )
 
     def sums(self) -> Floats:
-        """(TALLY_NUMBERS,) all numbers, which may be added to those of other parts of a map."""
+        """(TALLY_NUMBERS,) all numbers: those of parts of a map add up."""
         return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
 
     @classmethod

@@ -16,7 +16,7 @@ from radarsdf._core import SurfaceTracer, cell_keys
 from radarsdf.checks import flag, number, whole_number
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.map import queries
-from radarsdf.map.contents import MapContents
+from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Limits, across_triangles
 from radarsdf.memory import check_views
@@ -97,68 +97,25 @@ def scans_of_views(views: Iterable[View]) -> Scans:
 
 
 @dataclass(frozen=True, eq=False)
-class TracedSurface:
-    """The surface of a map as rays meet it, and patches that may have returns. It is made once for a map."""
+class ViewedMap:
+    """The surface of a map as rays meet it, and patches that may have returns; in a local frame. It is made once for a map."""
 
-    tracer: SurfaceTracer  # of the triangles that the mesh keeps by default, local frame
-    centres: _Floats  # (P, 3) patches: middles of all triangles where the field crosses zero, local frame, m
+    tracer: SurfaceTracer  # of the triangles that the mesh keeps by default
+    centres: _Floats  # (P, 3) patches: middles of all triangles where the field crosses zero, m
     normals: _Floats  # (P, 3) unit vectors towards free space
     areas_m2: _Floats  # (P,) of the patches
     rates: _Floats  # (P,) detection rate: share of the scans that reached a patch that have a return there
-
-    @classmethod
-    def of(cls, contents: MapContents) -> TracedSurface:
-        """The surface in voxels of a leaf cell's size, which is finer than the noise of a radar."""
-        voxel_m = contents.config.leaf_size_m
-        check_views(contents.config.max_memory_bytes, cells=len(contents.evidence.looks))
-        return cls.of_surface(
-            Surface.of(contents, voxel_m),
-            Limits.of(voxel_m),
-            lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
-        )
-
-    @classmethod
-    def of_surface(
-        cls,
-        surface: Surface,
-        limits: Limits,
-        evidence_at: Callable[[_Floats], queries.EvidenceAt],
-    ) -> TracedSurface:
-        """All triangles are patches; rays meet those within `limits`. `evidence_at`: of points (N, 3), local frame, m."""
-        across, twice_m2 = across_triangles(surface.vertices, surface.faces)
-        centres = surface.vertices[surface.faces].mean(axis=1)
-        evidence = evidence_at(centres)
-        rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
-        faces = np.ascontiguousarray(surface.faces[surface.kept(limits)])
-        return cls(
-            SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),
-            centres,
-            across / np.maximum(twice_m2, 1e-12)[:, None],
-            twice_m2 / 2,
-            rates.astype(np.float64),
-        )
-
-    def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:
-        """(N,) where rays from `origin` (3,) in unit `directions` (N, 3) first meet the mesh, local frame, m; inf: nowhere."""
-        rows = np.ascontiguousarray(directions, np.float32)
-        found, _ = self.tracer.first_hits(origin.tolist(), rows, max_range_m, False, resolve_num_threads(0))
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class ViewedMap:
-    """What views of a map need of it."""
-
-    surface: TracedSurface  # what beams meet, local frame
     origin: _Floats  # (3,) of the local frame, world, m
     roughness: float  # See :func:`radarsdf.map.queries.roughness`
     intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None
-    """Intensities (N,) of returns from points (N, 3) to a sensor (3,), local frame, m. None: the map has none."""
+    """Intensities (N,) of returns from points (N, 3) to a sensor (3,), m. None: the map has none."""
     max_memory_bytes: int | None  # what views may take. None: what the system has left.
 
     @classmethod
-    def of(cls, contents: MapContents, surface: TracedSurface) -> ViewedMap:
-        """Of one map."""
+    def of(cls, contents: MapContents) -> ViewedMap:
+        """A whole map, in voxels of a leaf cell's size, which is finer than the noise of a radar."""
+        config = contents.config
+        check_views(config.max_memory_bytes, cells=len(contents.evidence.looks))
 
         def intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
             x = torch.from_numpy(points.astype(np.float32))
@@ -166,39 +123,70 @@ class ViewedMap:
             values: NDArray[np.float32] = queries.intensity(contents, x, sensors).numpy()
             return values
 
-        return cls(
-            surface,
+        return cls.of_surface(
+            Surface.of(contents, config.leaf_size_m),
+            contents,
             contents.origin,
-            queries.roughness(contents),
+            lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
             None if contents.intensity_scale is None else intensity,
-            contents.config.max_memory_bytes,
         )
+
+    @classmethod
+    def of_surface(
+        cls,
+        surface: Surface,
+        scene: WholeMap,
+        origin: _Floats,
+        evidence_at: Callable[[_Floats], queries.EvidenceAt],
+        intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None,
+    ) -> ViewedMap:
+        """All triangles are patches; rays meet those that the mesh keeps by default. `evidence_at`: of points (N, 3), m."""
+        across, twice_m2 = across_triangles(surface.vertices, surface.faces)
+        centres = surface.vertices[surface.faces].mean(axis=1)
+        evidence = evidence_at(centres)
+        rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
+        faces = np.ascontiguousarray(surface.faces[surface.kept(Limits.of(scene.config.leaf_size_m))])
+        return cls(
+            SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),
+            centres,
+            across / np.maximum(twice_m2, 1e-12)[:, None],
+            twice_m2 / 2,
+            rates.astype(np.float64),
+            origin,
+            queries.roughness(scene),
+            intensity,
+            scene.config.max_memory_bytes,
+        )
+
+    def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:
+        """(N,) where rays from `origin` (3,) in unit `directions` (N, 3) first meet the mesh, m; inf: nowhere."""
+        rows = np.ascontiguousarray(directions, np.float32)
+        found, _ = self.tracer.first_hits(origin.tolist(), rows, max_range_m, False, resolve_num_threads(0))
+        return found
 
 
 def view_from(
-    viewed: ViewedMap, pose: _Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
+    surface: ViewedMap, pose: _Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
 ) -> View:
     """:meth:`Map.render` at a `pose` (4, 4), T_world_sensor, m."""
-    surface = viewed.surface
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
     if not 0 <= wanted <= 1e8:
         msg = f"returns must be in [0, 10^8], not {returns}"
         raise ValueError(msg)
     azimuth, elevation = _beams(sensor)
-    check_views(viewed.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation))
-    position = pose[:3, 3] - viewed.origin
-    chosen = _patches(surface, pose[:3, :3], position, sensor, round(wanted), viewed.roughness)
+    check_views(surface.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation))
+    position = pose[:3, 3] - surface.origin
+    chosen = _patches(surface, pose[:3, :3], position, sensor, round(wanted))
     points = turned(surface.centres[chosen] - position, pose[:3, :3].T)
     intensities = None
-    if viewed.intensity is not None:
-        intensities = viewed.intensity(surface.centres[chosen], position)
-    if intensities is not None:
+    if surface.intensity is not None:
+        intensities = surface.intensity(surface.centres[chosen], position)
         detected = intensities >= sensor.threshold(np.linalg.norm(points, axis=1))
         points, intensities = points[detected], intensities[detected]
     if flag(noise, "noise"):
         seed = seed if isinstance(seed, np.random.Generator) else whole_number(seed, "seed", 0)
         points = _with_noise(points, sensor, np.random.default_rng(seed))
-    ranges_m, beam_intensities = _first_surface(viewed, pose[:3, :3], position, sensor, azimuth, elevation)
+    ranges_m, beam_intensities = _first_surface(surface, pose[:3, :3], position, sensor, azimuth, elevation)
     return View(
         pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, ranges_m, beam_intensities
     )
@@ -213,7 +201,7 @@ def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
 
 
 def _patches(
-    surface: TracedSurface, R: _Floats, position: _Floats, sensor: Sensor, count: int, roughness: float
+    surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, count: int
 ) -> NDArray[np.int64]:
     """Rows of the patches that have a return: `count`, spread evenly by the number that is expected of each."""
     rows = np.concatenate(
@@ -232,7 +220,7 @@ def _patches(
     to_patch /= ranges_m[:, None]
     first_m = surface.ranges(position, to_patch, float(sensor.range_m[1]))
     cosine = np.abs(np.einsum("ni,ni->n", surface.normals[rows], to_patch))
-    rate_power, cosine_power, range_power, hidden = _SMOOTH + roughness * (_ROUGH - _SMOOTH)
+    rate_power, cosine_power, range_power, hidden = _SMOOTH + surface.roughness * (_ROUGH - _SMOOTH)
     expected = surface.areas_m2[rows] * surface.rates[rows] ** rate_power
     expected *= np.maximum(cosine, _MIN_COSINE) ** cosine_power / ranges_m**range_power
     expected *= np.where(ranges_m > first_m + _HIDDEN_M, hidden, 1.0)
@@ -299,23 +287,18 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 
 
 def _first_surface(
-    viewed: ViewedMap,
-    R: _Floats,
-    position: _Floats,
-    sensor: Sensor,
-    azimuth: _Floats,
-    elevation: _Floats,
+    surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, azimuth: _Floats, elevation: _Floats
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Range and intensity (E, A) of what each beam first meets, NaN where that is nothing."""
     shape = (len(elevation), len(azimuth))
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)
-    ranges_m = viewed.surface.ranges(position, directions, float(sensor.range_m[1]))
+    ranges_m = surface.ranges(position, directions, float(sensor.range_m[1]))
     met = np.isfinite(ranges_m) & (ranges_m >= sensor.range_m[0])
     places = position + directions[met] * ranges_m[met, None]
     ranges_m = np.where(met, ranges_m, np.float32(np.nan))
-    if viewed.intensity is None:
+    if surface.intensity is None:
         return ranges_m.reshape(shape), None
     intensities = np.full(len(ranges_m), np.nan, np.float32)
-    intensities[met] = viewed.intensity(places, position)
+    intensities[met] = surface.intensity(places, position)
     return ranges_m.reshape(shape), intensities.reshape(shape)

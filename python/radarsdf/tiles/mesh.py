@@ -24,11 +24,10 @@ from radarsdf.checks import check_box, path_of, positive
 from radarsdf.io.files import whole_file
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.io.ply import face_records, ply_header, records
-from radarsdf.map import queries
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.mesh import Surface, crossed, described_mesh, renumbered, with_all
-from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold, TriangleLimits
-from radarsdf.map.view import TracedSurface, ViewedMap
+from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
+from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.threads import torch_threads
 from radarsdf.tiles.blend import TileBlend
@@ -52,8 +51,8 @@ class PartSettings:
     """Along the edge of a leaf cell."""
     box: tuple[tuple[float, ...], ...] | None
     """Lower and upper corner, world, m."""
-    limits: TriangleLimits
-    """What the mesh of a tile leaves out. All else depends on the other tiles."""
+    max_uncertainty: float
+    """m. What else a mesh leaves out depends on the other tiles."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ def part_of(city: TileBlend, tile: Tile, settings: PartSettings) -> Part:
         num_threads=threads,
     )
     surface = Surface.told_by(city.any_contents, vertices, faces, city.evidence(vertices), len(cells))
-    kept, faces = renumbered(len(vertices), faces[surface.allowed(settings.limits)])
+    kept, faces = renumbered(len(vertices), faces[surface.allowed(settings.max_uncertainty)])
     vertices = vertices[kept]
     rows, edges = _border(config.lattice.cells(vertices) * steps, city.plan.tile_cells * steps)
     return Part(
@@ -402,7 +401,7 @@ def _part_files(
     settings = PartSettings(
         _voxels_per_cell(voxel_size, city.config.leaf_size_m),
         None if box is None else tuple(tuple(corner) for corner in check_box(box).tolist()),
-        limits.of_triangles,
+        limits.max_uncertainty,
     )
     tiles = [tile for tile in city.tiles if not part_path(city, tile.tile, settings).is_file()]
     if executor is None:  # what this map holds in memory serves all tiles
@@ -436,7 +435,7 @@ def viewed_tiles(
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(config.max_memory_bytes, cells=cells)
     origin = config.lattice.position(city.plan.origin_cells(tiles[0]))
-    parts = [part_of(city, tile, PartSettings(1, None, {})) for tile in tiles]
+    parts = [part_of(city, tile, PartSettings(1, None, math.inf)) for tile in tiles]
     starts = np.cumsum([0, *[len(part.vertices) for part in parts]])
     # Parts share the vertices on their borders, to the bit.
     together = np.concatenate([part.vertices for part in parts])
@@ -449,18 +448,15 @@ def viewed_tiles(
         city.evidence(vertices),
         cells,
     )
-    traced = TracedSurface.of_surface(
-        surface, Limits.of(config.leaf_size_m), lambda points: city.evidence(points + origin)
-    )
 
     def local_intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
         assert intensity is not None
         return intensity(points + origin, position + origin).astype(np.float32)
 
-    return ViewedMap(
-        traced,
+    return ViewedMap.of_surface(
+        surface,
+        city.any_contents,
         origin,
-        queries.roughness(city.any_contents),
+        lambda points: city.evidence(points + origin),
         None if intensity is None else local_intensity,
-        config.max_memory_bytes,
     )

@@ -196,7 +196,8 @@ class TiledMap(TileBlend, Map):
         if held is None or held[0] != tiles:
 
             def intensity(points: _Floats, sensor_position: _Floats) -> _Floats:
-                return self.intensity(points, sensor_position, extrapolate=True)
+                found: _Floats = self.intensity(points, sensor_position, extrapolate=True)
+                return found
 
             viewed = viewed_tiles(self, tiles, intensity if self.has_intensity else None)
             held = self._viewed = tiles, viewed
