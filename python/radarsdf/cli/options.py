@@ -8,7 +8,7 @@ import ast
 import dataclasses
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from radarsdf.cli.app import refuse_if
 
@@ -22,6 +22,11 @@ MAP_SUFFIX = ".safetensors"
 
 Box = tuple[float, float, float, float, float, float] | None
 """The lower and the upper corner."""
+
+
+def is_map(path: Path) -> bool:
+    """Whether a path looks like a map and not like scans or a mesh."""
+    return path.is_dir() or path.suffix == MAP_SUFFIX
 
 
 def corners_of(box: Box) -> list[list[float]] | None:
@@ -48,7 +53,6 @@ class Recording:
     stamps: In a bag: the time of a scan; default: of its header, unless stamps are zero or constant.
     """
 
-    panel: ClassVar[str] = "Reading scans"
     scans: Path
     poses: Path | None = None
     _: KW_ONLY
@@ -129,7 +133,6 @@ class Settings:
     set: Change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated.
     """
 
-    panel: ClassVar[str] = "Settings of the fit"
     paper: bool = False
     quick: bool = False
     config: Path | None = None
@@ -170,18 +173,15 @@ def words_of(*groups: Recording | Settings) -> list[str]:
         for field in dataclasses.fields(group):
             value = getattr(group, field.name)
             option = f"--{field.name.replace('_', '-')}"
-            if value in (None, False, []):
+            if value in (None, False):
                 continue
             if value is True:
                 words.append(option)
             elif not field.kw_only:
                 words.append(str(value))
             else:
-                words += [
-                    word
-                    for one in (value if isinstance(value, list) else [value])
-                    for word in (option, str(one))
-                ]
+                for one in value if isinstance(value, list) else [value]:
+                    words += [option, str(one)]
     return words
 
 
@@ -196,7 +196,6 @@ class Surface:
     min_component: Leave out connected components of fewer triangles; default: 30, and fewer in voxels above 0.1 m.
     """
 
-    panel: ClassVar[str] = "Surface"
     voxel: float = 0.1
     min_confidence: float | None = None
     max_uncertainty: float | None = None
@@ -221,12 +220,11 @@ class Address:
     port: Port to listen on; default: 8080, or the next that is free.
     """
 
-    panel: ClassVar[str] = "Address of the page"
     host: str = "127.0.0.1"
     port: int | None = None
 
     def check(self) -> None:
-        """Before any work: raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
+        """Raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
         from radarsdf.view.serving import free_port, require_viser
 
         require_viser()
