@@ -10,6 +10,7 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -183,28 +184,21 @@ def demo(
 
     import radarsdf.map.mesh  # here and not by the first mesh: the printed times are without imports
     from radarsdf.evaluation import holdout
-    from radarsdf.io import Scans, write_scans
+    from radarsdf.io import write_scans
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import write_mesh
     from radarsdf.render.picture import save_picture
 
     config, progress = settings.load(), results.progress
-    shown = _ends_with_viewer(view, results.json)
+    view = _ends_with_viewer(view, results.json)
     out.mkdir(parents=True, exist_ok=True)
     files = [out / name for name in ("scans.npz", "map.safetensors", "mesh.ply", "picture.png")]
     check_outputs(files)
     scans_file, map_file, mesh_file, picture_file = files
     results.add(
-        f"simulates the drive of a radar, makes a map of it, compares that with the truth, and writes all to {out}"
+        f"simulates a drive, makes a map of it, compares that with the truth, and writes all to {out}"
     )
-    simulation = radarsdf.simulate.SCENES[scene](frames=frames)
-    scans = Scans(
-        simulation.points,
-        simulation.poses,
-        simulation.intensities,
-        simulation.ground_truth,
-        truth_kind="simulated",
-    )
+    scans = _simulated(scene, frames)
     train, test = holdout(len(scans.points))
     returns = sum(map(len, scans.points))
     line = f"simulated a drive, {scene}: {returns} returns in {len(scans)} scans"
@@ -237,9 +231,17 @@ def demo(
         warn(f"warning: no picture: {error}")
     results.add("wrote " + ", ".join(map(str, files)), files=files)
     results.add(f"next: {shlex.join(['radarsdf', 'view', str(map_file), str(scans_file)])}")
-    if shown:
+    if view:
         results.end()
         show(radar_map, scans, open_page=True, voxel_size=surface.voxel, progress=progress, **surface.limits)
+
+
+def _simulated(scene: str, frames: int | None) -> Scans:
+    from radarsdf import simulate
+    from radarsdf.io import Scans
+
+    found = simulate.SCENES[scene](frames=frames)
+    return Scans(found.points, found.poses, found.intensities, found.ground_truth, truth_kind="simulated")
 
 
 def _add_surface_errors(results: Results, mesh: trimesh.Trimesh, scans: Scans) -> None:
@@ -257,16 +259,12 @@ def _add_surface_errors(results: Results, mesh: trimesh.Trimesh, scans: Scans) -
 
 
 def _ends_with_viewer(wanted: bool | None, json: bool) -> bool:
-    """Whether the viewer ends the demo. It waits for Ctrl-C, so only if it was asked for, or somebody is there."""
+    """Whether the viewer ends the demo. It waits for Ctrl-C, so only if it was asked for, or somebody can see it."""
     from radarsdf.view.serving import has_display, require_viser
 
-    somebody = sys.stdout is not None and sys.stdout.isatty() and has_display() and not json
-    if not (somebody if wanted is None else wanted):
-        return False
-    try:
+    if wanted:
         require_viser()
-    except ImportError:  # it is optional
-        if wanted:
-            raise
-        return False
-    return True
+    if wanted is not None:
+        return wanted
+    in_terminal = sys.stdout is not None and sys.stdout.isatty() and not json
+    return in_terminal and has_display() and find_spec("viser") is not None

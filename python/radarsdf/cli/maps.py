@@ -42,23 +42,21 @@ def info(map_path: Path | None = None, *, results: Results) -> None:
 def _add_map(results: Results, radar_map: Map) -> dict[str, str]:
     """Add what a map holds, and return it in words."""
     report, scale, range_m = radar_map.report, radar_map.intensity_scale, radar_map.sensor.range_m
-    limits = None if scale is None else (scale.low, scale.high)
     made_of = {name: report[name] for name in ("scans", "returns") if name in report}
     missing = {name: report[name] for name in ("missing_tiles",) if report.get(name)}
     lower, upper = radar_map.extent
-    results.add(
-        map=repr(radar_map),
-        **made_of,
-        extent=[lower, upper],
-        bytes=radar_map.file_bytes,
-        leaf_cells=radar_map.num_cells,
-        leaf_size_m=radar_map.config.leaf_size_m,
-        origin=radar_map.origin,
-        range_m=range_m,
-        intensities=limits,
-        rough_share=radar_map.rough_share,
-        **missing,
-    )
+    values = {
+        "map": repr(radar_map),
+        "extent": [lower, upper],
+        "bytes": radar_map.file_bytes,
+        "leaf_cells": radar_map.num_cells,
+        "leaf_size_m": radar_map.config.leaf_size_m,
+        "origin": radar_map.origin,
+        "range_m": range_m,
+        "intensities": None if scale is None else (scale.low, scale.high),
+        "rough_share": radar_map.rough_share,
+    }
+    results.add(**values, **made_of, **missing)
     edges = " x ".join(f"{edge:.1f}" for edge in upper - lower)
     corners = " to ".join("({:.1f}, {:.1f}, {:.1f})".format(*corner) for corner in (lower, upper))
     return {
@@ -69,7 +67,7 @@ def _add_map(results: Results, radar_map: Map) -> dict[str, str]:
         "leaf cells": f"{radar_map.num_cells} of {radar_map.config.leaf_size_m:g} m",
         "origin": "({:.2f}, {:.2f}, {:.2f}) m".format(*radar_map.origin),
         "ranges": "{:.1f} to {:.1f} m".format(*range_m),
-        "intensities": "none" if limits is None else "{:g} to {:g}".format(*limits),
+        "intensities": "none" if scale is None else f"{scale.low:g} to {scale.high:g}",
         "clutter ratio": f"{radar_map.rough_share:.0%}",
         **{name.replace("_", " "): ", ".join(tiles) for name, tiles in missing.items()},
     }

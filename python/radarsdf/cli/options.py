@@ -70,17 +70,18 @@ class Recording:
     def read(self, poses: StampedPoses | None = None) -> Scans:
         """The scans, with `poses` in place of theirs. What was assumed or left out is logged on standard error."""
         from radarsdf.io.read import read
+        from radarsdf.io.text import read_numbers
 
-        columns = self.columns
+        columns, base, imu = self.columns, self.extrinsic, self.imu_rotation
         replaced: Any = self.poses if poses is None else poses
         return read(
             self.scans,
             replaced,
-            extrinsic=_matrix(self.extrinsic, 4, "extrinsic: that is a 4 x 4 matrix T_base_sensor"),
+            extrinsic=None if base is None else read_numbers(base, 4),
             topic=self.topic,
             pose_topic=self.pose_topic,
             imu_topic=self.imu_topic,
-            R_sensor_imu=_matrix(self.imu_rotation, 3, "rotation: that is a 3 x 3 matrix R_sensor_imu"),
+            R_sensor_imu=None if imu is None else read_numbers(imu, 3),
             fields=dict(_role_and_name(text) for text in self.field or ()) or None,
             columns=int(columns) if columns and columns.isdecimal() else columns and columns.split(","),
             world_frame=self.world_frame,
@@ -103,17 +104,6 @@ class MaybeRecording(Recording):
 
 
 MaybeRecording.__doc__ = Recording.__doc__
-
-
-def _matrix(path: Path | None, size: int, what: str) -> Any:
-    """The matrix in a file, if there is one; `what` it should be is in the error."""
-    from radarsdf.io.text import read_numbers
-
-    try:
-        return None if path is None else read_numbers(path, size)
-    except ValueError as error:
-        msg = f"{path} is no {what}, {size} lines of {size} numbers"
-        raise ValueError(msg) from error
 
 
 def _role_and_name(text: str) -> tuple[str, str]:
