@@ -14,8 +14,6 @@ from bench.growth import __main__ as command
 from bench.growth import fits
 from bench.growth.street import street
 
-from ..warm_python import warm_python
-
 
 @pytest.mark.parametrize(
     ("count", "size_m", "frames"), [(1000, 50.0, 5), (20_001, 50.0, 5), (1000, 500.0, 50)]
@@ -42,11 +40,6 @@ def test_most_returns_lie_on_the_street():
     off_m = np.minimum(np.abs(world[:, 2]), np.abs(np.abs(world[:, 1]) - 25))
     off_m = np.minimum(off_m, np.minimum(np.abs(world[:, 0]), np.abs(world[:, 0] - 200)))
     assert 0.7 < (off_m < 1).mean() < 0.97  # ghosts and clutter are not on it
-
-
-@pytest.fixture(autouse=True)
-def warm(monkeypatch):
-    monkeypatch.setattr(command, "PYTHON", warm_python())
 
 
 def test_quick_fits_give_a_table(tmp_path, capsys):

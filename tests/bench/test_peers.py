@@ -11,21 +11,9 @@ import numpy as np
 import pytest
 import radarsdf
 
-from bench.peers import interface
 from bench.peers.interface import PEERS, Peer, reconstruct
 
-from ..warm_python import warm_python
-
 OURS = PEERS["radarsdf"].with_changes(training={"sdf_iterations": 60}, mesh={"min_component_triangles": 20})
-
-
-@pytest.fixture(scope="module", autouse=True)
-def warm():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(interface, "PYTHON", warm_python())
-        interface._interpreter.cache_clear()
-        yield
-    interface._interpreter.cache_clear()
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,6 @@ from bench.report import experiments, pages, results
 from bench.report.document import WORD_LIMIT, document
 from bench.report.plots import PLOTS
 
-from ..warm_python import warm_python
-
 MACHINE = {
     "processor": "Imaginary 3000", "threads": 2, "instruction_set": "made-up", "python": "3.99", "torch": "9.9",
     "compiler": "none", "cores": 2, "memory_gb": 11, "system": "Nowhere",
@@ -348,8 +346,7 @@ def test_the_commit_is_that_of_the_files():
     assert results.begin(quick=True)["machine"]["cores"] >= 1
 
 
-def test_a_command_that_fails_becomes_a_reason_without_folders(monkeypatch):
-    monkeypatch.setattr(experiments, "PYTHON", warm_python())
+def test_a_command_that_fails_becomes_a_reason_without_folders():
     found = experiments._run(
         ("bench.paper", "surface", "nowhere.npz", "--out", "{folder}"),
         "surface.json",

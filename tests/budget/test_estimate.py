@@ -21,8 +21,6 @@ from radarsdf.returns.rays import prepare
 from bench.growth.street import street
 from bench.stress.memory import peak_of_a_fit
 
-from ..warm_python import warm_python
-
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 QUICK = FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 6, "batch_size": 512})
 
@@ -33,7 +31,7 @@ QUICK = FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 6, "bat
     [(10_000, True, {}), (100_000, True, {}), (25_000, False, {"encoding": {"kind": "octree"}})],
 )
 def test_the_peak_is_within_half_as_much_again(count, with_intensities, changes):
-    estimate, peak = peak_of_a_fit(count, with_intensities, changes, warm_python())
+    estimate, peak = peak_of_a_fit(count, with_intensities, changes, [sys.executable])
     assert 1 / 1.5 < estimate.peak_memory_bytes / peak < 1.5
 
 

@@ -11,13 +11,12 @@ import os
 import re
 import shlex
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from radarsdf.cli import main
-
-from ..warm_python import warm_python
 
 _FENCE = re.compile(r"^```(\S*)\s*$")
 _NOT_RUN = re.compile(r"^<!-- not run: (.+) -->$")
@@ -120,7 +119,7 @@ def shell_environment(folder: Path) -> dict[str, str]:
     """Variables for the shell: `radarsdf` and `python` are those of this process."""
     tools = folder / "tools"
     tools.mkdir()
-    python = shlex.join(warm_python())
+    python = shlex.quote(sys.executable)
     for name, words in (("radarsdf", f"{python} -c {shlex.quote(_SHORT_MAIN)}"), ("python", python)):
         script = tools / name
         script.write_text(f'#!/bin/sh\nexec {words} "$@"\n', encoding="utf-8")

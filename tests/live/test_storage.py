@@ -8,6 +8,7 @@ import io
 import json
 import math
 import subprocess
+import sys
 import time
 
 import numpy as np
@@ -16,7 +17,6 @@ from radarsdf import LiveMap
 
 from bench.live.removal import state
 
-from ..warm_python import warm_python
 from .test_live_map import SCENE, map_of, mesh_bits
 
 
@@ -68,7 +68,7 @@ for i in range(10**6):
 """
     file = tmp_path / "live.npz"
     with subprocess.Popen(
-        [*warm_python(), "-c", code, str(file)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, str(file)], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         for _ in range(3):

@@ -14,7 +14,6 @@ from radarsdf.tiles import locking
 from radarsdf.tiles.fit_tiles import plan_tiles
 from radarsdf.tiles.plan import Plan
 
-from ..warm_python import warm_python
 from .conftest import CONFIG, TILE_M, scans_of
 
 # Plans, and waits for a line before the last scan.
@@ -37,7 +36,7 @@ plan_tiles(slowly(), sys.argv[1], tile_size={TILE_M}, halo=6.4, config=CONFIG)
 @pytest.fixture
 def planner(tmp_path):
     """Another process that is about to plan tmp_path / "city", and its number."""
-    command = [*warm_python(), "-c", PLANNING, str(tmp_path / "city")]
+    command = [sys.executable, "-c", PLANNING, str(tmp_path / "city")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         yield process, int(process.stdout.readline())
         process.kill()
