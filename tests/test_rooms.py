@@ -13,38 +13,30 @@ import radarsdf
 
 ROOT = Path(radarsdf.__file__).parent
 # From the lowest to the highest. A room may import itself and those below it.
-ROOMS = (
-    (
-        "_core",
-        "checks",
-        "extras",
-        "interrupts",
-        "lattice",
-        "products",
-        "progress",
-        "settings",
-        "threads",
-        "versions",
-    ),
-    ("config",),
-    ("io",),
-    ("returns",),
-    ("poses",),
-    ("field",),
-    ("budget",),
-    ("checking",),
-    ("map",),
-    ("fitting",),
-    ("live",),
-    ("tiles",),
-    ("grids",),
-    ("changes",),
-    ("render",),
-    ("view",),
-    ("evaluation", "simulate"),
-    ("report",),
-    ("cli",),
-)
+ROOMS = [
+    rooms.split()
+    for rooms in """
+    _core checks extras interrupts lattice products progress settings threads versions
+    config
+    io
+    returns
+    poses
+    field
+    budget
+    checking
+    map
+    fitting
+    live
+    tiles
+    grids
+    changes
+    render
+    view
+    evaluation simulate
+    report
+    cli
+    """.strip().splitlines()
+]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
 
 
