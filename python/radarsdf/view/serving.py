@@ -38,7 +38,7 @@ def require_viser() -> None:
 def free_port(host: str, port: int, *, exactly: bool) -> int:
     """The port to listen on: `port`, or unless it must be `exactly` that one, the next that is free.
 
-    Raises a ValueError if `port` is not a port, an OSError if none is free or the host is not an address of this machine.
+    Raises an OSError if none is free or the host is not an address of this machine.
     """
     whole_number(port, "--port", 0, 65535)
     # viser would wait forever for an address that it cannot listen on.
@@ -51,9 +51,8 @@ def free_port(host: str, port: int, *, exactly: bool) -> int:
         except OSError as error:  # also for an unknown host name
             reason = (error.strerror or str(error)).partition(" (while")[0]
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                msg = f"cannot listen on {host}, port {candidate}: {reason}; --host takes an address of this machine"
-                raise OSError(msg) from error
-    msg = f"cannot listen on {host}, port {port}: {reason}; --port takes another"
+                break
+    msg = f"cannot listen on {host}, port {port}: {reason}; --host takes an address of this machine, --port a free port"
     raise OSError(msg)
 
 
