@@ -83,7 +83,9 @@ def run(words: Sequence[str]) -> int:
 
 def _in_full(words: list[str]) -> list[str]:
     """Words as typer takes them: ``tiles SCANS`` is ``tiles run SCANS``, ``--pose 5 0 1.5`` is ``--pose "5 0 1.5"``."""
-    if words[:1] == ["tiles"] and words[1:] and words[1] not in (*TILE_STEPS, "--help", "-h"):
+    if words == ["tiles"]:
+        return ["tiles", "--help"]
+    if words[:1] == ["tiles"] and words[1] not in (*TILE_STEPS, "--help", "-h"):
         words = ["tiles", "run", *words[1:]]
     found: list[str] = []
     in_pose = False
@@ -121,7 +123,7 @@ def _application(first_word: str) -> typer.Typer:
         if function:
             app.command(name, help=text)(_for_typer(getattr(found, function)))
             continue
-        steps = typer.Typer(no_args_is_help=True, subcommand_metavar="[STEP] [ARGS]...", **_STYLE)
+        steps = typer.Typer(subcommand_metavar="[STEP] [ARGS]...", **_STYLE)
         app.add_typer(steps, name=name, help=text)
         for step, step_text in TILE_STEPS.items():
             steps.command(step, help=step_text)(_for_typer(getattr(found, step)))

@@ -33,11 +33,11 @@ COMMANDS = {
 """Module and function, and help, of each command, by heading of the overview."""
 
 TILE_STEPS = {
-    "run": "Plan, fit and mesh in one go. The word run may be left out: radarsdf tiles SCANS -o CITY.",
-    "plan": "Read the scans once, and write to a file for each tile the rays that cross it.",
+    "run": "Plan, fit and mesh in one go; the word run may be left out.",
+    "plan": "Read the scans once, and write the rays of each tile.",
     "fit": "Fit the tiles of a plan; those that are done are kept.",
-    "mesh": "Write the surface of all tiles as one mesh, which need not fit into memory.",
-    "status": "Name the tiles that are not done, and why; the exit status is 1 if there are any.",
+    "mesh": "Write the surface of all tiles as one mesh.",
+    "status": "Name the tiles that are not done, and why: exit status 1.",
     "clean": "Remove the rays of tiles that are done, and parts of meshes.",
 }
 """The steps of ``radarsdf tiles``, functions of the module `tiles`, and their help."""

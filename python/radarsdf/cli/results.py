@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,19 +53,14 @@ class Results:
 
     def table(self, rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> None:
         """Print rows for people. With headings, all columns but the first are aligned to the right."""
-        if self.json:
-            return
-        from rich.console import Console
-        from rich.markup import escape
-        from rich.table import Table
-
-        table = Table(box=None, show_header=bool(headings), pad_edge=False)
-        for i, heading in enumerate(headings or ("", "")):
-            table.add_column(heading, justify="right" if headings and i else "left", overflow="fold")
-        for row in rows:
-            table.add_row(*map(escape, row))
-        # What a program reads of a pipe is not broken into lines.
-        Console(width=None if sys.stdout and sys.stdout.isatty() else 10_000).print(table)
+        table = [headings, *rows] if headings else list(rows)
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        for first, *others in table:
+            aligned = [
+                f"{cell:>{width}}" if headings else cell
+                for cell, width in zip(others, widths[1:], strict=True)
+            ]
+            self.add("  ".join([first.ljust(widths[0]), *aligned]))
 
     def add_threshold(self, metadata: Mapping[str, Any]) -> None:
         """Add the confidence from which on a mesh with this ``metadata`` was kept, and what that costs."""
