@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from radarsdf.cli.app import is_number, refuse_if
 from radarsdf.cli.options import Box, Recording, Surface, corners_of, is_map
@@ -45,7 +45,7 @@ def _add_map(results: Results, radar_map: Map) -> dict[str, str]:
     made_of = {name: report[name] for name in ("scans", "returns") if name in report}
     missing = {name: report[name] for name in ("missing_tiles",) if report.get(name)}
     lower, upper = radar_map.extent
-    values = {
+    values: dict[str, Any] = {
         "map": repr(radar_map),
         "extent": [lower, upper],
         "bytes": radar_map.file_bytes,

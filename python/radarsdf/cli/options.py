@@ -218,4 +218,4 @@ class Address:
         from radarsdf.view.serving import free_port, require_viser
 
         require_viser()
-        free_port(self.host, self.port or 0, exactly=True)
+        free_port(self.host, self.port)

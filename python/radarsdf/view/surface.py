@@ -137,6 +137,6 @@ def first_hit(
     """Point (3,) where a ray first hits a mesh, or None. The direction is of any length."""
     origin, direction = np.asarray(ray_origin, np.float64), np.asarray(ray_direction, np.float64)
     direction = direction / np.linalg.norm(direction)
-    tracer = SurfaceTracer(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
+    tracer = SurfaceTracer(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32))
     (range_m,), _ = tracer.first_hits(origin.tolist(), direction[None].astype(np.float32), np.inf)
     return origin + float(range_m) * direction if np.isfinite(range_m) else None
