@@ -132,7 +132,7 @@ def _saved_if_interrupted(path: Path) -> Iterator[None]:
 
 
 def _add_fit(results: Results, radar_map: RadarMap, scans: int, seconds: float) -> None:
-    """Add what the fit used, what it left out, and what it found."""
+    """Add the counts of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
     counts = {name: report[name] for name in ("returns", "returns_used", "movers", "ghosts")}
     returns, used, movers, ghosts = counts.values()

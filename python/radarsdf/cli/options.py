@@ -46,11 +46,12 @@ class Recording:
     imu_topic: In a bag: the topic of the inertial measurements, for poses that are found.
     imu_rotation: File of the 3 x 3 matrix from the axes of the IMU to those of the radar, R_sensor_imu; default: of the
         bag, or found.
-    field: The field of the file for x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
-    columns: Of files without names: how many numbers a return has, or their names, such as x,y,z,intensity,doppler.
-    max_gap: Longest time between two poses over which poses are interpolated, s; default: 0.5.
+    field: Which field of the file holds x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
+    columns: In files without a header: the number of columns, or their names, such as x,y,z,intensity,doppler.
+    max_gap: Longest gap between two poses that is interpolated, s; default: 0.5.
     world_frame: In a bag with TF: the frame of the world.
-    stamps: In a bag: the time of a scan; default: of its header, unless stamps are zero or constant.
+    stamps: In a bag: whether a scan has the time of its header or of its record; default: header, unless its stamps are zero
+        or constant.
     """
 
     scans: Path
@@ -91,7 +92,7 @@ class Recording:
 
     @property
     def inputs(self) -> list[Path]:
-        """The files and folders that are read, which no output may overwrite."""
+        """The input files and folders, which no output may overwrite."""
         paths = (self.scans, self.poses, self.extrinsic, self.imu_rotation)
         return [path for path in paths if path is not None]
 
@@ -180,9 +181,8 @@ class Surface:
     """The voxels of a mesh, and what it leaves out.
 
     voxel: Edge length of a voxel, m.
-    min_confidence: Leave out the surface whose confidence is below this, 0 to 1; default: that of the highest expected
-        F-score.
-    max_uncertainty: Leave out the surface whose standard error is above this, m; default: there is no limit.
+    min_confidence: Leave out surface with a confidence below this, 0 to 1; default: that of the highest expected F-score.
+    max_uncertainty: Leave out surface with a standard error above this, m; default: no limit.
     min_component: Leave out connected components of fewer triangles; default: 30, and fewer in voxels above 0.1 m.
     """
 

@@ -44,9 +44,9 @@ class Cut:
 
 @dataclass(kw_only=True)
 class Where:
-    """Who does the work.
+    """Where the work is done.
 
-    processes: Number of tiles that are fitted at a time, each by a process.
+    processes: Number of worker processes; each fits one tile at a time.
     cluster: Address of the scheduler of dask.distributed, such as tcp://host:8786.
     """
 
@@ -168,7 +168,7 @@ def fit(folder: Path, *, tile: list[str] | None = None, where: Where, results: R
     """Fit the tiles of a plan.
 
     folder: What radarsdf tiles plan wrote.
-    tile: Name of a tile, the only one that is fitted; may be repeated.
+    tile: Fit only the tile of this name; may be repeated.
     """
     from radarsdf.tiles.fit_tiles import run_fits
 
@@ -203,7 +203,7 @@ def status(folder: Path, *, tile: list[str] | None = None, results: Results) -> 
     """Name the tiles that are not done, and why.
 
     folder: What radarsdf tiles plan wrote.
-    tile: Name of a tile, the only one that is looked at; may be repeated.
+    tile: Check only the tile of this name; may be repeated.
     """
     from radarsdf.tiles.plan import Plan, failure_of
     from radarsdf.tiles.tile_fit import is_done

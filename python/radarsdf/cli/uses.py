@@ -111,7 +111,7 @@ def grid(
     out: A file to write, may be repeated: .npz with all arrays, .ply of the voxels' centres, .bt for OctoMap, .yaml and .pgm
         for ROS's map_server.
     voxel: Edge length of a voxel, m.
-    heights: Of the .yaml: what is between these heights above the ground, m.
+    heights: Range of heights above the ground that the .yaml map covers, m.
     distances: Also write the Euclidean distance field of the grid, as .npz.
     costmap: Also write heights, slopes, steps and costs for wheels, as .npz.
     picture: Also draw heights, costs and free space, as .png.
