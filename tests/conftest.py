@@ -41,8 +41,7 @@ def recorded_file(name):
     for folder in above if named is None else [Path(named)]:
         if (path := folder / name).exists():
             return path
-    where = "in shared/data of a folder above" if named is None else "where RADARSDF_DATA says"
-    return pytest.skip(f"no {name} {where}")
+    return pytest.skip(f"no {name} in RADARSDF_DATA or shared/data of a folder above")
 
 
 def pose(position, yaw_rad=0.0):
@@ -119,23 +118,11 @@ def radar_map(scene):
 def sharp_map(scene):
     """Fitted until the plane and the wall are sharp, by numbers of its own: no test of a map's use is a test of the
     default schedule."""
-    config = FitConfig(
-        training={
-            "sdf_iterations": 150,
-            "intensity_iterations": 60,
-            "batch_size": 4096,
-            "learning_rate": 1e-2,
-            "sigma_cells": 0.75,
-        },
-    )
-    on_faces = (
-        0,
-        0,
-        0,
-    )  # ground and wall are faces of cells: what tests find is of the mesh, and not of the cells
-    return radarsdf.fit(
-        scene.points, scene.poses, scene.intensities, config=config, origin=on_faces, progress=False
-    )
+    training = {"sdf_iterations": 150, "intensity_iterations": 60, "batch_size": 4096}
+    config = FitConfig(training=training | {"learning_rate": 1e-2, "sigma_cells": 0.75})
+    # Ground and wall are faces of cells: what tests find is of the mesh, and not of the cells.
+    data = (scene.points, scene.poses, scene.intensities)
+    return radarsdf.fit(*data, config=config, origin=(0, 0, 0), progress=False)
 
 
 @pytest.fixture(params=_core.available_instruction_sets())

@@ -18,9 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from radarsdf import FitConfig
-from radarsdf.io.npz import read_scans
 from radarsdf.map.marching_cubes import marching_cubes
-from radarsdf.returns.rays import prepare
 
 from . import samples
 
@@ -105,41 +103,6 @@ def pose(x):
     return T_world_sensor
 
 
-@examples(120)
-@given(
-    sizes=st.lists(st.sampled_from([1, 2, 3, 4, 0]), min_size=1, max_size=3),
-    ranges=st.tuples(NUMBERS, st.none() | NUMBERS),
-    frames=THINGS,
-    origin=st.none() | arrays(3),
-    odd=st.sampled_from([0, 0, 0, 0, 1, 2, 4, 8, 15]),
-    data=st.data(),
-)
-def test_prepare(sizes, ranges, frames, origin, odd, data):
-    points = [data.draw(arrays(size, 3)) for size in sizes]
-    intensities = data.draw(st.sampled_from([None, [data.draw(arrays(size)) for size in sizes]]))
-    poses = [pose(i) for i in range(len(sizes))]
-    if odd & 8:
-        points, poses = data.draw(st.just(points) | THINGS), data.draw(arrays(len(sizes), 4, 4))
-    keywords = {"min_range_m": ranges[0], "max_range_m": ranges[1]} if odd & 1 else {}
-    keywords |= {"accumulate_scans": frames} if odd & 2 else {}
-    keywords |= {"origin": origin} if odd & 4 else {}
-    rays = answer(prepare, points, poses, intensities, **keywords)
-    if rays is None:
-        return
-    count = len(rays)
-    assert 0 < count <= sum(map(len, points))
-    assert rays.points.shape == rays.directions.shape == (count, 3)
-    assert rays.ranges_m.shape == (count,)
-    assert rays.origin.shape == (3,)
-    for values in (rays.points, rays.directions, rays.ranges_m):
-        assert values.dtype == np.float32
-        assert np.isfinite(values).all()
-    assert (rays.ranges_m > 0).all()
-    if rays.intensities is not None:
-        assert not np.isinf(rays.intensities).any()  # NaN: not measured
-        assert rays.intensities.min() < rays.intensities.max()
-
-
 @examples(60)
 @given(
     volume=hnp.array_shapes(min_dims=3, max_dims=3, min_side=0, max_side=5).flatmap(lambda s: arrays(*s)),
@@ -219,20 +182,6 @@ def test_meshes_of_a_map(tiny_map, voxel_size, box, viewpoint):
     mesh = answer(tiny_map.mesh, voxel_size, box=box, viewpoint=viewpoint, progress=False)
     if mesh is not None:
         assert np.isfinite(mesh.vertices).all()
-
-
-@examples(60)
-@given(
-    st.one_of(
-        THINGS, st.text(max_size=5), st.sampled_from(["", ".", "/", "\0", "a" * 5000, "x.npz", b"x.npz", 2.5])
-    )
-)
-def test_paths(path):
-    for read in (radarsdf.load, read_scans):
-        if isinstance(path, int):  # a file descriptor, which may be open
-            continue
-        with pytest.raises((ValueError, TypeError, OSError)):
-            read(path)
 
 
 TINY = FitConfig(

@@ -4,12 +4,10 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import re
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -52,22 +50,6 @@ def test_the_names_are_those_of_the_reference():
             elif found := re.match(r"\.\. auto(?:class|function|exception):: (\w+)", line):
                 named |= {found[1]} if module == "radarsdf" else set()
     assert named | {"evaluation", "io", "simulate"} == set(radarsdf.__all__)
-
-
-def test_names_are_imported_when_they_are_used():
-    run(
-        "import radarsdf\n"
-        "for name in radarsdf.__all__:\n"
-        "    assert name not in vars(radarsdf) or name in ('io', 'simulate', 'evaluation'), name\n"
-        "    assert getattr(radarsdf, name) is vars(radarsdf)[name]"
-    )
-
-
-def test_functions_are_not_hidden_by_packages_of_similar_names():
-    assert inspect.isfunction(radarsdf.fit)
-    assert inspect.isfunction(radarsdf.estimate)
-    for name in ("fitting", "map", "simulate"):
-        assert inspect.ismodule(import_module(f"radarsdf.{name}"))
 
 
 def test_an_unknown_name():

@@ -69,9 +69,7 @@ def answers(radar_map, x):
 
 def test_a_map_goes_to_spawned_workers(radar_map):
     pieces = np.array_split(X[:2000], 4)
-    with ProcessPoolExecutor(
-        1, mp_context=multiprocessing.get_context("spawn")
-    ) as pool:  # each imports PyTorch
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         found = list(pool.map(answers, [radar_map] * 4, pieces))
     for there, here in zip(zip(*found, strict=True), answers(radar_map, X[:2000]), strict=True):
         np.testing.assert_array_equal(np.concatenate(there), here)
@@ -95,9 +93,8 @@ def test_queries_from_many_threads_give_the_bits_of_one(radar_map):
     wrong = []
 
     def found():
-        return (
-            everywhere(radar_map), radar_map.gradient(X, extrapolate=True), radar_map.mesh(0.2).vertices
-        )  # fmt: skip
+        mesh = radar_map.mesh(0.2)
+        return everywhere(radar_map), radar_map.gradient(X, extrapolate=True), mesh.vertices
 
     expected = found()
 

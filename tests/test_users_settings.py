@@ -16,40 +16,21 @@ from .conftest import ground_and_wall
 
 
 @contextlib.contextmanager
-def float64():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
+def changed(set_value, value, usual):
+    set_value(value)
     try:
         yield
     finally:
-        torch.set_default_dtype(before)
-
-
-@contextlib.contextmanager
-def default_device():
-    torch.set_default_device("meta")
-    try:
-        yield
-    finally:
-        torch.set_default_device(None)
-
-
-@contextlib.contextmanager
-def deterministic():
-    torch.use_deterministic_algorithms(True)
-    try:
-        yield
-    finally:
-        torch.use_deterministic_algorithms(False)
+        set_value(usual)
 
 
 SETTINGS = {
-    "float64": float64,
-    "default device": default_device,
+    "float64": lambda: changed(torch.set_default_dtype, torch.float64, torch.float32),
+    "default device": lambda: changed(torch.set_default_device, "meta", None),
+    "deterministic": lambda: changed(torch.use_deterministic_algorithms, True, False),
     "device context": lambda: torch.device("meta"),
     "inference mode": torch.inference_mode,
     "no gradients": torch.no_grad,
-    "deterministic": deterministic,
     "errors of NumPy": lambda: np.errstate(all="raise"),
 }
 TRAINING = {"sdf_iterations": 4, "intensity_iterations": 8, "batch_size": 256, "intensity_batch_size": 128}
@@ -102,13 +83,9 @@ def test_the_same_bits(few, tmp_path, usual, setting, config):
 
 @pytest.mark.parametrize("number", [1, 16])
 def test_any_number_of_threads_gives_the_same_bits(few, tmp_path, usual, number):
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
+    with changed(torch.set_num_threads, number, torch.get_num_threads()):
         assert answers(few, tmp_path / "map.safetensors", {}) == usual["core"]
         assert torch.get_num_threads() == number
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("size", [1, 3])

@@ -9,10 +9,8 @@ neither PyTorch nor NumPy.
 from importlib import import_module
 
 with open(f"{__file__}i", encoding="utf-8") as _stub:  # noqa: PTH123 - pathlib takes as long to import as all of this
-    _IMPORTS = [
-        line.split() for line in _stub if line.startswith("from .")
-    ]  # from MODULE import NAME as NAME
-_MODULES = {words[3]: words[1] for words in _IMPORTS}
+    _LINES = [line.split() for line in _stub if line.startswith("from .")]  # from MODULE import NAME as NAME
+_MODULES = {words[3]: words[1] for words in _LINES}
 
 __all__ = list(_MODULES)
 

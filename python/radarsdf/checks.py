@@ -26,16 +26,10 @@ _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; sc
 _RIGID = f"rotation, translation within {MAX_POSITION_M:g} m, last row 0 0 0 1"
 
 
-def _require(holds: object, message: str) -> None:
-    if not holds:
-        raise ValueError(message)
-
-
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
-    """`values` as an array of `dtype`, of any shape. It is not copied if it is one already.
+    """`values` as an array of `dtype`, of any shape, which is not copied if it is one already.
 
-    A TypeError is raised for what NumPy would take for real numbers: complex numbers, text, rows of different lengths, and a
-    ValueError for masked values and integers that are too large for float64.
+    Raises a TypeError for what are no real numbers, and a ValueError for masked values and integers too large for float64.
     """
     refuse_masked(values, name)
     try:
@@ -49,8 +43,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
         msg = f"{name} must be real numbers, and all rows equally long: {error}"
         raise TypeError(msg) from error
     if array.dtype.kind not in "biuf":
-        msg = f"{name} must be real numbers, not {array.dtype}"
-        raise TypeError(msg)
+        raise _wrong_type(name, "real numbers", array.dtype)
     with np.errstate(over="ignore"):  # a number that is too large becomes infinite; the callers refuse that
         return array.astype(dtype, copy=False)
 
@@ -66,7 +59,8 @@ def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """`values` as (N, 3) finite positions, m, in C order."""
     points: NDArray[np.float64] = np.ascontiguousarray(real_array(values, name))
     _require(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
-    _require_positions(points, name)
+    within = (np.abs(points) <= MAX_POSITION_M).all()
+    _require(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
     return points
 
 
@@ -75,13 +69,7 @@ def check_box(box: ArrayLike) -> NDArray[np.float64]:
     corners = real_array(box, "box")
     ordered = corners.shape == (2, 3) and (corners[0] < corners[1]).all()
     _require(ordered, "box must be a lower and an upper corner, (2, 3), the lower corner first")
-    _require_positions(corners, "box")
-    return corners
-
-
-def _require_positions(values: NDArray[np.float64], name: str) -> None:
-    within = (np.abs(values) <= MAX_POSITION_M).all()
-    _require(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
+    return positions(corners, "box")
 
 
 def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
@@ -116,19 +104,15 @@ def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, num
 
 
 MISSING_POSES = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
-"""What is said where poses are None."""
 
 
 def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
     """`poses` as (F, 4, 4) float64, of any numbers. Raises a ValueError if the shape is wrong."""
     T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
-    if num_scans is None:
-        num_scans = len(T_world_sensor) if T_world_sensor.ndim else 0
-    fits = T_world_sensor.shape == (num_scans, 4, 4)
-    _require(
-        fits,
-        f"poses must have shape ({num_scans}, 4, 4), one T_world_sensor a scan, not {T_world_sensor.shape}",
-    )
+    shape = T_world_sensor.shape
+    count = (shape or (0,))[0] if num_scans is None else num_scans
+    wanted = f"({count}, 4, 4), one T_world_sensor a scan"
+    _require(shape == (count, 4, 4), f"poses must have shape {wanted}, not {shape}")
     return T_world_sensor
 
 
@@ -146,11 +130,9 @@ def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.fl
     A ValueError names the first pose that is not a rigid transform.
     """
     T_world_sensor = pose_matrices(poses, num_scans)
-    rigid = are_rigid(T_world_sensor)
-    _require(
-        rigid.all(),
-        f"pose {0 if not len(rigid) else int(np.argmin(rigid))} is not a rigid transform ({_RIGID})",
-    )
+    for i in np.flatnonzero(~are_rigid(T_world_sensor))[:1]:
+        msg = f"pose {i} is not a rigid transform ({_RIGID})"
+        raise ValueError(msg)
     return T_world_sensor
 
 
@@ -159,33 +141,20 @@ def usable_poses(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """:func:`check_poses`, but a minority of poses that are not rigid transforms is replaced by interpolation.
 
-    Returns
-    -------
-    T_world_sensor : ndarray
-        (F, 4, 4) float64, m.
-    rigid : ndarray
-        (F,) bool: which poses are as given. The scans of the others are to be left out.
-
-    Raises
-    ------
-    ValueError
-        If the shape is wrong, or half of the poses or more are not rigid transforms.
+    Returns (F, 4, 4) float64 T_world_sensor, m, and a mask (F,) of those as given: the scans of the others are to be left out.
     """
     T_world_sensor = pose_matrices(poses, num_scans)
     rigid = are_rigid(T_world_sensor)
-    if 2 * np.count_nonzero(~rigid) >= max(len(rigid), 1):
+    if rigid.all() or 2 * np.count_nonzero(rigid) <= len(rigid):
         return check_poses(T_world_sensor), rigid
-    if not rigid.all():
-        given, known = np.arange(len(rigid)), np.flatnonzero(rigid)
-        at = np.clip(given, known[0], known[-1])
-        filled = np.tile(np.eye(4), (len(rigid), 1, 1))
-        if len(known) > 1:
-            rotations = Slerp(known, Rotation.from_matrix(T_world_sensor[known, :3, :3]))
-            filled[:, :3, :3] = rotations(at).as_matrix()
-        for axis in range(3):
-            filled[:, axis, 3] = np.interp(at, known, T_world_sensor[known, axis, 3])
-        T_world_sensor = np.where(rigid[:, None, None], T_world_sensor, filled)
-    return T_world_sensor, rigid
+    rows, known = np.arange(len(rigid)), np.flatnonzero(rigid)
+    at = np.clip(rows, known[0], known[-1])
+    filled = np.tile(np.eye(4), (len(rigid), 1, 1))
+    rotations = Slerp(known, Rotation.from_matrix(T_world_sensor[known, :3, :3]))
+    filled[:, :3, :3] = rotations(at).as_matrix()
+    for axis in range(3):
+        filled[:, axis, 3] = np.interp(at, known, T_world_sensor[known, axis, 3])
+    return np.where(rigid[:, None, None], T_world_sensor, filled), rigid
 
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -211,7 +180,8 @@ def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:
 
 def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
     """`values`, if they can be taken one after another."""
-    if not (hasattr(values, "__iter__") or hasattr(values, "__getitem__")):
+    one_by_one = hasattr(values, "__iter__") or hasattr(values, "__getitem__")
+    if not one_by_one or getattr(values, "ndim", 1) == 0:
         raise _wrong_type(name, "a list of arrays, one a scan", values)
     found: Iterable[Any] = values
     return found
@@ -236,7 +206,7 @@ def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise _wrong_type(name, "a whole number", value)
     least = "positive" if lowest == 1 else f"at least {lowest}"
-    _require(lowest <= value <= highest, f"{name} must be {least} and at most {highest}, not {_said(value)}")
+    _require(lowest <= value <= highest, f"{name} must be {least} and at most {highest}, not {value!r:.50}")
     return int(value)
 
 
@@ -257,14 +227,14 @@ def number(value: Any, name: str) -> float:
 
 def _scalar(value: Any, name: str, wanted: str, fits: Callable[[float], bool]) -> float:
     array = real_array(value, name)
-    _require(array.shape == () and fits(float(array)), f"{name} must be {wanted}, not {_said(value)}")
+    _require(array.shape == () and fits(float(array)), f"{name} must be {wanted}, not {value!r:.50}")
     return float(array)
 
 
+def _require(holds: object, message: str) -> None:
+    if not holds:
+        raise ValueError(message)
+
+
 def _wrong_type(name: str, wanted: str, value: Any) -> TypeError:
-    return TypeError(f"{name} must be {wanted}, not {_said(value)}")
-
-
-def _said(value: Any) -> str:
-    """A value in the line of an error."""
-    return " ".join(f"{value!r:.50}".split())
+    return TypeError(f"{name} must be {wanted}, not {value!r:.50}")

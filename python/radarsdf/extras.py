@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import Any
 
 REQUIREMENTS = {
@@ -24,14 +25,13 @@ def require(*modules: str, what: str) -> Any:
     that installs them.
     """
     missing: list[str] = []
-    found: Any = None
     for name in modules:
         try:
-            found = importlib.import_module(name)
+            importlib.import_module(name)
         except ImportError:
             missing.append(name.partition(".")[0])
     if missing:
         wanted = " ".join(f'"{REQUIREMENTS[name]}"' for name in missing)
         msg = f"{what} {' and '.join(missing)}: pip install {wanted}"
         raise ImportError(msg)
-    return found
+    return sys.modules[modules[-1]]

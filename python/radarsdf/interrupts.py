@@ -19,22 +19,20 @@ def deferred_interrupts() -> Iterator[Callable[[], bool]]:
     program has its own handler.
     """
     pressed = False
-    handler_before = signal.getsignal(signal.SIGINT)
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if not in_main_thread or handler_before is not signal.default_int_handler:
-        yield lambda: False
-        return
 
     def remember(_number: int, _frame: FrameType | None) -> None:
         nonlocal pressed
         pressed = True
-        signal.signal(signal.SIGINT, handler_before)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    signal.signal(signal.SIGINT, remember)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if in_main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, remember)
     try:
         yield lambda: pressed
     finally:
-        signal.signal(signal.SIGINT, handler_before)
+        if in_main_thread and signal.getsignal(signal.SIGINT) is remember:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @contextmanager

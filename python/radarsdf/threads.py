@@ -17,44 +17,20 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from functools import cached_property
+from typing import TypeVar
 
 import torch
 from torch.nn import functional
+from typing_extensions import Self
 
 from radarsdf import _core
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-_lock = threading.Lock()
-_users = 0
-_threads_before = 0
-_blocks = threading.local()  # .depth: number of `with Workers` blocks that this thread is in
-_vector_library_started = False
 _TRANSCENDENTAL = ("cos", "erf", "exp", "log", "log10", "log1p", "log2", "pow", "sigmoid", "sin", "tanh")
 _AT_ONCE = 1024  # numbers: enough for vectors, too few for PyTorch to share them among threads
-
-
-def _use_one_thread() -> None:
-    torch.get_num_threads()  # initialises PyTorch in this thread, which would otherwise undo the next line
-    torch.set_num_threads(1)
-
-
-def _reset_after_fork() -> None:
-    """One thread for a forked child: it has only the one that forked, and OpenMP would wait for ever for the others."""
-    global _lock, _users, _blocks  # noqa: PLW0603 - this state belongs to the process
-    _lock = threading.Lock()
-    _users, _blocks = 0, threading.local()
-    torch.set_num_threads(1)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_reset_after_fork)
-
 
 _wanted, _known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
 if _wanted and _wanted not in _known:  # the core goes on with its own choice
@@ -65,36 +41,61 @@ if _wanted and _wanted not in _known:  # the core goes on with its own choice
     )
 
 
+class _State:
+    """What PyTorch's settings were, and who has changed them. There is one, of the process."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.open_blocks = 0
+        self.usual_threads = 0
+        """PyTorch's number before the first block that is still open."""
+        self.here = threading.local()
+        """Its `inside`: whether this thread is in a block."""
+
+
+_state = _State()
+_vector_library_started = False
+
+
+def _use_one_thread() -> None:
+    torch.get_num_threads()  # initialises PyTorch in this thread, which would otherwise undo the next line
+    torch.set_num_threads(1)
+
+
+def _reset_after_fork() -> None:
+    """One thread for a forked child: it has only the one that forked, and OpenMP would wait for ever for the others."""
+    _state.__init__()  # type: ignore[misc]
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_reset_after_fork)
+
+
 def start_vector_library() -> None:
     """Call PyTorch's transcendental functions once in this process, by one thread alone.
 
     Their libraries look for the processor's instructions in the first call. Where several threads make it at once, some get
     other last bits than later: the same fit would differ about once in fifty processes.
     """
-    if not _vector_library_started:
-        with _lock:
-            _start_vector_library()
-
-
-def _start_vector_library() -> None:
-    """The same for who holds the lock."""
     global _vector_library_started  # noqa: PLW0603 - there is one PyTorch
-    if _vector_library_started:
-        return
-    with torch.no_grad():
-        for dtype in (torch.float32, torch.float64):
-            numbers = torch.full((_AT_ONCE,), 0.5, dtype=dtype, device="cpu")
-            for name in _TRANSCENDENTAL:
-                getattr(torch, name)(*[numbers] * (2 if name == "pow" else 1))
-            functional.binary_cross_entropy_with_logits(numbers, numbers)
-            torch.randn(_AT_ONCE, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
-    _vector_library_started = True
+    with _state.lock:
+        if _vector_library_started:
+            return
+        with torch.no_grad():
+            for dtype in (torch.float32, torch.float64):
+                numbers = torch.full((_AT_ONCE,), 0.5, dtype=dtype, device="cpu")
+                for name in _TRANSCENDENTAL:
+                    getattr(torch, name)(*[numbers] * (2 if name == "pow" else 1))
+                functional.binary_cross_entropy_with_logits(numbers, numbers)
+                torch.randn(_AT_ONCE, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
+        _vector_library_started = True
 
 
 def resolve_num_threads(num_threads: int) -> int:
     """`num_threads`, or if it is 0 as many as PyTorch uses, or used before a block of :class:`Workers`."""
-    with _lock:
-        return num_threads or (_threads_before if _users else torch.get_num_threads())
+    with _state.lock:
+        return num_threads or (_state.usual_threads if _state.open_blocks else torch.get_num_threads())
 
 
 @contextmanager
@@ -121,54 +122,45 @@ class Workers:
 
     def __init__(self, num_threads: int = 0) -> None:
         self.num_threads = resolve_num_threads(num_threads)
-        self._pool: ThreadPoolExecutor | None = None
-        self._crew: _core.Crew | None = None
 
     def __enter__(self) -> Self:
-        global _users, _threads_before  # noqa: PLW0603 - PyTorch's setting is global too
-        with _lock:
-            _start_vector_library()
-            depth = getattr(_blocks, "depth", 0)
-            if _users == 0:
-                _threads_before = torch.get_num_threads()
-            if depth == 0:
-                _blocks.threads_before = _threads_before
+        start_vector_library()
+        with _state.lock:
+            if _state.open_blocks == 0:
+                _state.usual_threads = torch.get_num_threads()
+            _state.open_blocks += 1
+            self._is_outermost = not getattr(_state.here, "inside", False)
+            if self._is_outermost:
+                self._threads_after = _state.usual_threads
+                _state.here.inside = True
                 _use_one_thread()
-            _blocks.depth = depth + 1
-            _users += 1
         self._pool = ThreadPoolExecutor(self.num_threads, "radarsdf", initializer=_use_one_thread)
         return self
 
     def __exit__(self, *_: object) -> None:
-        global _users  # noqa: PLW0603
-        assert self._pool is not None
-        self._crew = None
+        self.__dict__.pop("crew", None)  # whose threads end with it
         try:
             self._pool.shutdown(cancel_futures=True)
         finally:  # also if a second Ctrl-C interrupts the wait for the threads
-            with _lock:
-                _users -= 1
-                _blocks.depth -= 1
-                if _blocks.depth == 0:
-                    torch.set_num_threads(_blocks.threads_before)
+            with _state.lock:
+                _state.open_blocks -= 1
+                if self._is_outermost:
+                    _state.here.inside = False
+                    torch.set_num_threads(self._threads_after)
 
-    @property
+    @cached_property
     def crew(self) -> _core.Crew:
         """As many threads of the core, for short work without Python: they look for work for a moment before they sleep.
 
         On two threads, an iteration of a training took 4.1 ms with the pool, which was woken ten times, and takes 2.3.
         """
-        assert self._pool is not None
-        if self._crew is None:
-            self._crew = _core.Crew(self.num_threads)
-        return self._crew
+        return _core.Crew(self.num_threads)
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
         """Like the built-in ``map``, with the items on different threads, where gradients are on.
 
         With one thread or one item it runs in the calling thread, with the grad mode of that.
         """
-        assert self._pool is not None
         if self.num_threads == 1 or len(items) <= 1:
             return map(function, items)
         # If every item gets a thread, the calling thread computes the first one itself: to sleep and be woken
@@ -185,8 +177,6 @@ class Workers:
         with torch.enable_grad():  # as in the threads of the pool
             first = [function(item) for item in items[:own]]
             rest = [function(item) for item in items[own + len(futures) :]]
-        futures.reverse()
-        submitted = (
-            futures.pop().result() for _ in range(len(futures))
-        )  # a result is let go once it is used
+        futures.reverse()  # a result is let go once it is used
+        submitted = (futures.pop().result() for _ in range(len(futures)))
         return itertools.chain(first, submitted, rest)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf.io.clouds.writing import write_cloud
-from radarsdf.io.meshes import read_ground_truth, write_mesh
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.scans import Scans
 
@@ -96,32 +95,12 @@ def test_points_of_several_formats(mesh_file, tmp_path, capsys):
 PLANE = trimesh.Trimesh([[9, -4, 0], [18, -4, 0], [18, 4, 0], [9, 4, 0]], [[0, 1, 2], [0, 2, 3]])
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb", ".off"])
-def test_surfaces_of_all_formats_are_the_same_ground_truth(tmp_path, suffix):
-    found = []
-    for path in (tmp_path / "plane.ply", tmp_path / f"plane{suffix}"):
-        write_mesh(path, PLANE)
-        found.append(read_ground_truth(path))
-    np.testing.assert_allclose(*found, atol=1e-5)
-
-
 def test_a_surface_is_ground_truth_everywhere_on_its_triangles(mesh_file, tmp_path, capsys):
     path = tmp_path / "plane.ply"
     PLANE.export(path)
     printed = values(capsys, "eval", mesh_file, path, *SAMPLES)["surface"]
     assert printed["num_ground_truth"] == 1_000_000
     assert printed["completion_ratio"] > 0.9  # of its four vertices, none is near a return
-
-
-def test_a_scene_of_several_parts_is_one_surface(tmp_path):
-    path = tmp_path / "scene.glb"
-    parts = [trimesh.creation.box(), trimesh.creation.icosphere().apply_translation([9.0, 0, 0])]
-    trimesh.Scene(parts).export(path)
-    points = read_ground_truth(path)
-    shares = [(points[:, 0] < 5).mean(), (points[:, 0] > 5).mean()]
-    areas = np.array([part.area for part in parts])
-    np.testing.assert_allclose(shares, areas / areas.sum(), atol=0.01)
-    np.testing.assert_array_equal(points, read_ground_truth(path))
 
 
 def test_scans_of_other_kinds(map_file, scans_file, tmp_path, capsys):

@@ -158,9 +158,3 @@ def test_the_viewer_ends_the_demo_where_somebody_looks(screen, words, shown, tmp
         == 0
     )
     assert len(calls) == shown
-
-
-def test_the_demo_offers_every_scene(capsys):
-    call("demo", "--scene", "moon")
-    said = capsys.readouterr().err
-    assert all(name in said for name in radarsdf.simulate.SCENES)

@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import urllib.request
@@ -44,19 +43,6 @@ def test_a_fit_with_its_report(scans_file, tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("small_pictures")
-def test_the_map_is_kept_if_the_report_fails(scans_file, tmp_path, capsys, monkeypatch):
-    out, page = tmp_path / "map.safetensors", tmp_path / "report.html"
-
-    def fail(*_, **__):
-        raise OSError(28, "No space left on device", str(page))
-
-    monkeypatch.setattr("radarsdf.cli.fits.add_report", fail)
-    assert call("fit", scans_file, "-o", out, "--report", page, *FAST) == 1
-    assert "No space left on device" in capsys.readouterr().err
-    assert files(tmp_path) == ["map.safetensors"]
-
-
-@pytest.mark.usefixtures("small_pictures")
 def test_a_report_of_a_map_and_scans(map_file, scans_file, tmp_path, capsys):
     page = tmp_path / "report.html"
     words = [map_file, scans_file, "-o", page, "--holdout", 3, "--voxel", 0.4, "--quiet"]
@@ -78,13 +64,6 @@ def test_a_report_of_a_map_and_scans(map_file, scans_file, tmp_path, capsys):
 def test_views_that_cannot_be_shown(map_file, tmp_path, capsys, words, named):
     pytest.importorskip("viser", reason="the extra view is not installed")
     assert named in refusal(capsys, tmp_path, "view", map_file, *words, "--no-open", "--quiet")
-
-
-def test_a_port_in_use(map_file, tmp_path, capsys):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert str(port) in refusal(capsys, tmp_path, "view", map_file, "--port", port)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends the signal of Ctrl-C")

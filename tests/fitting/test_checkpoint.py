@@ -20,7 +20,6 @@ from safetensors import safe_open
 
 from ..conftest import ground_and_wall
 from ..settings import grouped
-from ..warm_python import warm_python
 
 # Batches of more rays than there are, so that the order is drawn anew, and two stages.
 QUICK = FitConfig(
@@ -122,7 +121,7 @@ def counted(self, state):
 radarsdf.fitting.checkpoint.Checkpoint.write = counted
 fitted(ground_and_wall(returns_per_scan=300), {str(path)!r})
 """
-    assert subprocess.run([*warm_python(), "-c", code], check=False).returncode == -signal.SIGKILL
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
     with safe_open(path, "pt") as file:
         assert file.get_tensor("done").tolist() == [30, 37]
     assert_same_bits(fitted(scene), fitted(scene, path))

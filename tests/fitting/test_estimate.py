@@ -20,7 +20,6 @@ from radarsdf.returns.rays import prepare
 from bench.estimates import peak_of_a_fit
 
 from ..settings import grouped
-from ..warm_python import warm_python
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 SHORT = FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 6, "batch_size": 512})
@@ -47,7 +46,7 @@ NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 10, "in
     ],
 )
 def test_the_peak_is_within_a_factor_of_two(count, with_intensities, changes):
-    found, peak = peak_of_a_fit(count, with_intensities, changes, warm_python())
+    found, peak = peak_of_a_fit(count, with_intensities, changes)
     assert 1 / 2 < found.peak_memory_bytes / peak < 2
 
 

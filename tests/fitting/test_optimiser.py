@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -14,8 +15,6 @@ from radarsdf.field import kernels
 from radarsdf.field.encodings import Octree, TriQuadtree
 from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
 from radarsdf.threads import Workers
-
-from ..warm_python import warm_python
 
 
 def test_same_bits_as_pytorch_s():
@@ -47,7 +46,7 @@ def test_a_fit_does_not_import_pytorch_s_compiler(tmp_path):
         "radar_map.mesh()\n"
         "sys.exit(any(name.partition('.')[0] == 'sympy' or name == 'torch._dynamo' for name in sys.modules))\n"
     )
-    subprocess.run([*warm_python(), "-c", code], check=True, cwd=tmp_path)
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
 
 
 def network_and_gradients(seed):

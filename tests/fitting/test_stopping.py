@@ -21,7 +21,6 @@ from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
 
 from ..conftest import ground_and_wall
-from ..warm_python import warm_python
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 LONG = {"training": {"sdf_iterations": 1_000_000, "batch_size": 512}}
@@ -34,7 +33,7 @@ def interrupted_python(code, delay_s=0.0):
 
     Gives what it prints after the line "stopped", and its exit status.
     """
-    process = subprocess.Popen([*warm_python(), "-c", code], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     watchdog = threading.Timer(HUNG_S, process.kill)
     watchdog.start()
     try:
@@ -141,7 +140,7 @@ sys.exit(main())
 """
     )
     process = subprocess.Popen(
-        [*warm_python(), "-c", code, "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
+        [sys.executable, "-c", code, "fit", str(tmp_path / "scans.npz"), "-o", str(tmp_path / "map.safetensors")]
         + ["--quiet", "--set", "training={'sdf_iterations': 1000000}", "--checkpoint", str(tmp_path / "state")],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

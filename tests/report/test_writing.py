@@ -8,7 +8,6 @@ import dataclasses
 import re
 
 import numpy as np
-import pytest
 import radarsdf
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.io import Scans
@@ -114,18 +113,6 @@ def test_the_conclusion_follows_the_figures(written, subject, tmp_path):
         assert figure in poses
 
 
-def test_poses_that_were_kept_or_found():
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    from radarsdf.report.writing import pose_values  # noqa: PLC0415
-
-    kept = pose_values(POSES | {"improved": False, "sigma_m": [0.0] * 3})
-    assert kept["uncertainties"] is None
-    found = pose_values(POSES | {"improved": None, "before": None, "step_m": None, "step_rad": None})
-    assert found["moved_m"] is None
-    assert found["length_m"] == pytest.approx(1 + np.sqrt(2))
-
-
 def test_the_truth_is_called_by_its_kind(subject, tmp_path):
     scans = subject.scans.select(np.arange(len(subject.scans)))
     scans.truth_kind = "simulated"
@@ -158,12 +145,3 @@ def test_a_large_mesh_is_drawn_thinned_and_evaluated_whole(subject, tmp_path, mo
     assert len(large.shown[0].faces) < faces / 2
     page = write(tmp_path / "large.html", subject, scans=None, held_out=None)
     assert f"{len(large.shown[0].faces):,} of {faces:,} triangles" in page.sections["surface"]
-
-
-def test_an_old_file_stays_if_the_new_one_cannot_be_written(subject, tmp_path, monkeypatch):
-    path = tmp_path / "report.html"
-    path.write_text("old")
-    monkeypatch.setattr("radarsdf.io.files.os.fsync", lambda _: (_ for _ in ()).throw(OSError(28, "full")))
-    with pytest.raises(OSError, match="full"):
-        write(path, subject, scans=None, held_out=None)
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("report.html", "old")]

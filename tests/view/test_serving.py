@@ -11,18 +11,19 @@ import pytest
 from radarsdf.view import serving
 
 
-def test_a_port_that_is_taken():
+def test_a_port_that_is_taken(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as listening:
         taken = listening.getsockname()[1]
-        assert serving.free_port("127.0.0.1", taken, exactly=False) > taken
+        monkeypatch.setattr(serving, "_FIRST_PORT", taken)
+        assert serving.free_port("127.0.0.1", None) > taken
         with pytest.raises(OSError, match=f"127.0.0.1, port {taken}: .*--port"):
-            serving.free_port("127.0.0.1", taken, exactly=True)
+            serving.free_port("127.0.0.1", taken)
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
 def test_an_address_of_another_machine(host):
     with pytest.raises(OSError, match=f"cannot listen on {host}.*--host"):
-        serving.free_port(host, 8080, exactly=False)
+        serving.free_port(host, None)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ import pytest
 import radarsdf
 from radarsdf.io import Scans
 from radarsdf.map.colors import intensity_colors
-from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import shaded
 from radarsdf.view.serving import start_server
 from radarsdf.view.viewer import Viewer
@@ -178,18 +177,6 @@ def test_the_surface_is_coloured_by_what_is_chosen(client, viewer, scans, sharp_
     np.testing.assert_array_equal(shown[:, 0] > 1.05 * shown[:, 2], ~seen)  # orange, not grey
     slide(client, "colour by", "intensity")
     client.wait_for(lambda m: "intensity" in content(m), before)
-
-
-def test_the_view_is_reset_for_who_asks(client, viewer):
-    before = len(client.received())
-    client.send(
-        "ViewerCameraMessage", wxyz=(1.0, 0.0, 0.0, 0.0), position=(5.0, 6.0, 7.0), fov=1.0, near=0.1, far=1e3,
-        image_height=800, image_width=400, look_at=(0.0, 0.0, 1.0), up_direction=(0.0, 0.0, 1.0),
-    )  # fmt: skip
-    slide(client, "Reset view", value=True)
-    look = look_at_all(viewer._extent, aspect=0.5)
-    moved = client.wait_for(lambda m: m.kind == "SetCameraPositionMessage", before)
-    np.testing.assert_allclose(moved.message["position"], look.position)
 
 
 def status_of(viewer, *headers):

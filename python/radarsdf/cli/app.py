@@ -9,23 +9,14 @@ import inspect
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import typer
 
-from radarsdf.cli.commands import COMMANDS
+from radarsdf.cli.commands import COMMANDS, TILE_STEPS
 
-app = typer.Typer(
-    name="radarsdf",
-    help="From 3D radar scans to a surface and a reflectance map, on a CPU.",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
-_Command = TypeVar("_Command", bound=Callable[..., int | None])
-_MODULES = ("scans", "fits", "maps", "pages", "tiles")
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
 """Errors with a message for the user. Every other error is a bug and keeps its traceback."""
 
@@ -36,7 +27,6 @@ _SHARED_HELP = {
     "geometry_only": "Do not use the intensities.",
     "no_check": "Do not refuse scans in which radarsdf check would find an error.",
     "refine": "Refine the poses by the returns first.",
-    "quiet": "Show no progress bar.",
 }
 _METAVARS = {
     "box": "X0 Y0 Z0 X1 Y1 Z1",
@@ -47,6 +37,11 @@ _METAVARS = {
     "field": "ROLE=NAME",
     "topic": "NAME",
     "tile": "NAME",
+}
+# Help in plain text, as in most tools: typer's panels take rich, whose import doubles the time of --help.
+_STYLE: dict[str, Any] = {
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+    "rich_markup_mode": None,
 }
 
 
@@ -72,61 +67,114 @@ def run(words: Sequence[str]) -> int:
     # A character that a terminal lacks must not cost the work before it.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
-    for module in _MODULES:
-        import_module(f"radarsdf.cli.{module}")
+    words = _in_full(list(words))
     try:
-        status = app(list(words), prog_name="radarsdf", standalone_mode=False)
+        status = _application(words[0] if words else "")(words, prog_name="radarsdf", standalone_mode=False)
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)
         where = f"; {context.command_path} --help lists the options" if context else ""
-        warn(f"error: {error.format_message().rstrip('.')}{where}")
+        text = error.format_message().rstrip(".").replace("Value error, ", "")
+        warn(f"error: {text}{where}")
         return error.exit_code
     except SystemExit as end:  # of a pipe whose reader has gone
         return int(end.code or 0)
     return int(status or 0)
 
 
-def command(group: typer.Typer = app, **settings: Any) -> Callable[[_Command], _Command]:
-    """Register a function as a command with its arguments and options, which its signature and docstring describe.
+def _in_full(words: list[str]) -> list[str]:
+    """Words as typer takes them: ``tiles SCANS`` is ``tiles run SCANS``, ``--pose 5 0 1.5`` is ``--pose "5 0 1.5"``."""
+    if words == ["tiles"]:
+        return ["tiles", "--help"]
+    if words[:1] == ["tiles"] and words[1] not in (*TILE_STEPS, "--help", "-h"):
+        words = ["tiles", "run", *words[1:]]
+    found: list[str] = []
+    in_pose = False
+    for word in words:
+        if in_pose and (found[-1] == "--pose" or is_number(word)):
+            found += [word] if found[-1] == "--pose" else [f"{found.pop()} {word}"]
+        else:
+            found.append(word)
+            in_pose = word == "--pose"
+    return found
+
+
+def is_number(word: str) -> bool:
+    """Whether a word can be read as a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _application(first_word: str) -> typer.Typer:
+    """The application with the command that the first word names alone, or with all of them.
+
+    So its help imports no module of another, and no pydantic, which typer takes for options of the application itself.
+    """
+    commands = {name: found for of_heading in COMMANDS.values() for name, found in of_heading.items()}
+    named = {first_word: commands[first_word]} if first_word in commands else commands
+    several = named is commands
+    app = typer.Typer(add_completion=several, add_help_option=several, **_STYLE)
+    app.callback()(_main_options)
+    for name, (path, text) in named.items():
+        module, _, function = path.partition(".")
+        found = import_module(f"radarsdf.cli.{module}")
+        if function:
+            app.command(name, help=text)(_for_typer(getattr(found, function)))
+            continue
+        steps = typer.Typer(subcommand_metavar="[STEP] [ARGS]...", **_STYLE)
+        app.add_typer(steps, name=name, help=text)
+        for step, step_text in TILE_STEPS.items():
+            steps.command(step, help=step_text)(_for_typer(getattr(found, step)))
+    return app
+
+
+def _for_typer(function: Callable[..., int | None]) -> Callable[..., int | None]:
+    """The function with a signature that typer reads, and its errors printed.
 
     Positional parameters are arguments, the others options, and a line ``name: text`` of the docstring is the help of one.
-    A parameter whose annotation is a dataclass stands for its fields, so that commands share options; a :class:`Results`
-    for ``--json``.
+    A parameter whose annotation is a dataclass stands for its fields, so that commands share options.
     """
-
-    def register(function: _Command) -> _Command:
-        groups: dict[str, tuple[type, list[str]]] = {}
-        parameters: list[inspect.Parameter] = []
-        texts, name = _SHARED_HELP | _texts(function), function.__name__.strip("_")
-        for parameter in inspect.signature(function, eval_str=True).parameters.values():
-            kind: Any = parameter.annotation
-            fields, panel = [parameter], None
-            if hasattr(kind, "__dataclass_fields__"):
-                fields = list(inspect.signature(kind, eval_str=True).parameters.values())
-                groups[parameter.name] = (kind, [field.name for field in fields])
-                texts, panel = _texts(kind) | texts, getattr(kind, "panel", None)
-            parameters += [_as_typer_has_it(field, texts[field.name], panel) for field in fields]
-
-        def call(**values: Any) -> int | None:
-            with _errors_printed():
-                for group_name, (kind, fields) in groups.items():
-                    values[group_name] = kind(**{field: values.pop(field) for field in fields})
-                status = function(**values)
-                if results := values.get("results"):
-                    results.end()
-                return status
-
-        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        if group is app:
-            ((panel, text),) = [(panel, of[name]) for panel, of in COMMANDS.items() if name in of]
-            settings.update(help=text, rich_help_panel=panel)
+    own: list[inspect.Parameter] = []
+    shared: list[inspect.Parameter] = []
+    groups: dict[str, tuple[type, list[str]]] = {}
+    texts = dict(_SHARED_HELP)
+    for parameter in inspect.signature(function, eval_str=True).parameters.values():
+        kind: Any = parameter.annotation
+        if hasattr(kind, "__dataclass_fields__"):
+            fields = list(inspect.signature(kind, eval_str=True).parameters.values())
+            groups[parameter.name] = (kind, [field.name for field in fields])
+            texts |= _texts(kind)
+            shared += fields
         else:
-            settings["help"] = (function.__doc__ or "").splitlines()[0]
-        group.command(name, **settings)(call)
-        return function
+            own.append(parameter)
+    texts |= _texts(function)
+    parameters = [
+        _as_typer_has_it(parameter, texts[parameter.name])
+        for parameter in sorted(own + shared, key=lambda each: each.kind is inspect.Parameter.KEYWORD_ONLY)
+    ]
 
-    return register
+    def call(**values: Any) -> int | None:
+        try:
+            for name, (kind, fields) in groups.items():
+                values[name] = kind(**{field: values.pop(field) for field in fields})
+            status = function(**values)
+            if results := values.get("results"):
+                results.end()
+        except KeyboardInterrupt as stop:  # the status of shells: 128 and the number of the signal
+            warn(f"error: {str(stop) or 'interrupted'}")
+            return 130
+        except _ERRORS as error:
+            if isinstance(error, OSError) and error.errno == errno.EPIPE:
+                raise
+            warn(f"error: {message_of(error)}")
+            return 1
+        return status
+
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return call
 
 
 def _texts(documented: Any) -> dict[str, str]:
@@ -135,7 +183,7 @@ def _texts(documented: Any) -> dict[str, str]:
     return {name: " ".join(text.split()) for name, text in paragraphs}
 
 
-def _as_typer_has_it(parameter: inspect.Parameter, text: str, panel: str | None) -> inspect.Parameter:
+def _as_typer_has_it(parameter: inspect.Parameter, text: str) -> inspect.Parameter:
     option = f"--{parameter.name.replace('_', '-')}"
     if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
         name = parameter.name.removesuffix("_path").upper()
@@ -145,8 +193,7 @@ def _as_typer_has_it(parameter: inspect.Parameter, text: str, panel: str | None)
     elif "bool" in str(parameter.annotation) and parameter.default is not False:
         described = typer.Option(f"{option}/--no-{option[2:]}", help=text)
     else:
-        metavar = _METAVARS.get(parameter.name)
-        described = typer.Option(option, metavar=metavar, help=text, rich_help_panel=panel)
+        described = typer.Option(option, metavar=_METAVARS.get(parameter.name), help=text)
     annotation: Any = Annotated[parameter.annotation, described]
     return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
 
@@ -159,7 +206,6 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _main_options(
     _version: Annotated[
         bool,
@@ -168,31 +214,14 @@ def _main_options(
 ) -> None: ...
 
 
-@contextmanager
-def _errors_printed() -> Iterator[None]:
-    """Errors of a running command become a line on standard error and an exit status."""
-    try:
-        yield
-    except KeyboardInterrupt as stop:  # the status of shells: 128 and the number of the signal
-        warn(f"error: {str(stop) or 'interrupted'}")
-        raise typer.Exit(130) from stop
-    except _ERRORS as error:
-        if isinstance(error, OSError) and error.errno == errno.EPIPE:
-            raise
-        warn(f"error: {message_of(error)}")
-        raise typer.Exit(1) from error
-
-
 def message_of(error: Exception) -> str:
     """An error in one line: of pydantic's, the first wrong setting; of the system's, the file and what is wrong with it."""
     if type(error).__name__ == "ValidationError":  # whose module is imported only with the settings
         from radarsdf.settings import first_wrong
 
         return first_wrong(error)  # type: ignore[arg-type]
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
     if isinstance(error, OSError) and error.strerror is not None:
-        return error.strerror
+        return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
     # NumPy says which array it could not have; our own words are kept.
     if isinstance(error, MemoryError) and (not str(error) or str(error).startswith("Unable to allocate")):
         return "there is not enough memory"

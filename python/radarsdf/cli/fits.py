@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf fit``, ``live``, ``demo`` and ``config``: from scans to a map."""
+"""``radarsdf fit``, ``demo`` and ``config``: from scans to a map."""
 
 from __future__ import annotations
 
@@ -8,32 +8,27 @@ import contextlib
 import dataclasses
 import shlex
 import sys
-import threading
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from radarsdf.cli.app import command, refuse_if, warn
-from radarsdf.cli.options import MAP_SUFFIX, Address, Recording, Settings, Surface, words_of
+from radarsdf.cli.app import refuse_if, warn
+from radarsdf.cli.options import MAP_SUFFIX, Recording, Settings, Surface, words_of
 from radarsdf.cli.pages import add_report, show
-from radarsdf.cli.results import Results, add_intensity_errors, counted, save_map, split, until_stopped
-from radarsdf.cli.scans import scans_and_poses, scans_or_unposed, warn_or_refuse
+from radarsdf.cli.results import Results, add_intensity_errors, counted, save_map, split
+from radarsdf.cli.scans import scans_and_poses, warn_or_refuse
 
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf import LiveMap, RadarMap
+    from radarsdf import RadarMap
     from radarsdf.io.scans import Scans
-    from radarsdf.live.replay import Replay
-    from radarsdf.view.pages import GrowingView
-
-_SHOWN_EVERY_S = 0.5
 
 
-@command()
 def config(settings: Settings) -> None:
     """Print the configuration as TOML."""
     from radarsdf.config.toml import to_toml
@@ -41,7 +36,6 @@ def config(settings: Settings) -> None:
     typer.echo(to_toml(settings.load()), nl=False)
 
 
-@command()
 def fit(
     recording: Recording,
     *,
@@ -54,7 +48,6 @@ def fit(
     checkpoint: Path | None = None,
     report: Path | None = None,
     settings: Settings,
-    quiet: bool = False,
     results: Results,
 ) -> None:
     """Fit a map, or estimate what the fit takes.
@@ -98,7 +91,7 @@ def fit(
             intensities,
             doppler_mps=scans.doppler_mps,
             config=config,
-            progress=False if quiet else None,
+            progress=results.progress,
             checkpoint=checkpoint,
         )
     seconds = time.perf_counter() - started_s
@@ -113,13 +106,11 @@ def fit(
     following += " --voxel 0.2" if settings.quick else ""
     results.add(f"next: {following}", next=following)
     if holdout is not None:
-        evaluated = shlex.join(
-            ["radarsdf", "eval", str(out), *words_of(recording), "--holdout", str(holdout)]
-        )
-        results.add(f"and: {evaluated}", evaluate=evaluated)
+        words = ["radarsdf", "eval", str(out), *words_of(recording), "--holdout", str(holdout)]
+        results.add(f"and: {shlex.join(words)}", evaluate=shlex.join(words))
     if report is not None:
         findings = check(every_scan, config=radar_map.config)
-        subject = Subject(radar_map, out.name, scans, held_out, findings, progress=False if quiet else None)
+        subject = Subject(radar_map, out.name, scans, held_out, findings, progress=results.progress)
         add_report(results, report, subject)
 
 
@@ -141,22 +132,21 @@ def _saved_if_interrupted(path: Path) -> Iterator[None]:
 
 
 def _add_fit(results: Results, radar_map: RadarMap, scans: int, seconds: float) -> None:
-    """Add what the fit used, what it left out, and what it found."""
+    """Add the counts of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
-    returns, used, movers, ghosts = (report[name] for name in ("returns", "returns_used", "movers", "ghosts"))
-    left_out = {"move by their Doppler": movers, "are ghosts": ghosts}
-    left_out["are out of range"] = returns - used - movers - ghosts
-    results.add(
-        f"{used} of {returns} returns in {counted(scans, 'scan')} make the surface"
-        + "".join(f", {count} {why}" for why, count in left_out.items() if count),
-        scans=scans,
-        **{name: report[name] for name in ("returns", "returns_used", "movers", "ghosts")},
-    )
+    counts = {name: report[name] for name in ("returns", "returns_used", "movers", "ghosts")}
+    returns, used, movers, ghosts = counts.values()
+    left_out = {
+        "move by their Doppler": movers,
+        "are ghosts": ghosts,
+        "are out of range": returns - used - movers - ghosts,
+    }
+    line = f"{used} of {returns} returns in {counted(scans, 'scan')} make the surface"
+    line += "".join(f", {count} {why}" for why, count in left_out.items() if count)
+    results.add(line, scans=scans, **counts)
     if outliers := report["wild_intensities"]:
-        results.add(
-            f"{outliers} intensities are outliers, and are left out of the reflectance: radarsdf check names them",
-            wild_intensities=outliers,
-        )
+        line = f"{outliers} intensities are outliers, and are left out of the reflectance: radarsdf check names them"
+        results.add(line, wild_intensities=outliers)
     for line in report["skipped"]:
         if "moves" in line:
             warn(f"warning: no moving returns were left out: {line.partition(': ')[2]}")
@@ -172,127 +162,6 @@ def _add_fit(results: Results, radar_map: RadarMap, scans: int, seconds: float) 
     )
 
 
-@command()
-def live(
-    recording: Recording,
-    *,
-    out: Path | None = None,
-    trajectory: Path | None = None,
-    rate: float = 1.0,
-    find: bool = False,
-    view: bool = False,
-    address: Address,
-    settings: Settings,
-    quiet: bool = False,
-    results: Results,
-) -> None:
-    """Replay the scans, report how the map kept up, and write it.
-
-    out: The map to write in the end, .safetensors.
-    trajectory: Also write where the scans were placed: .tum, .kitti or .npy.
-    rate: Multiplies the recorded speed, which is 0.1 s a scan without times; 0: as fast as possible.
-    find: Do not use the poses of the scans: track each scan on the last ones.
-    view: Show the map in the browser while it grows.
-    """
-    import numpy as np
-
-    from radarsdf.checks import not_negative
-    from radarsdf.io.files import check_outputs
-    from radarsdf.io.poses.files import check_pose_suffix, check_pose_times, write_poses
-    from radarsdf.live.live_map import LiveMap
-    from radarsdf.live.replay import replay
-
-    config, rate = settings.load(), not_negative(rate, "--rate")
-    if trajectory is not None:
-        check_pose_suffix(trajectory)
-    check_outputs([out, trajectory], recording.inputs)
-    if view:
-        address.check()
-    scans, missing = scans_or_unposed(recording, find=find)
-    with_poses = missing is None and not find
-    if not with_poses and scans.times_s is None:
-        msg = f"{recording.scans}: scans without poses need times: when each was taken"
-        raise ValueError(msg)
-    if trajectory is not None:
-        check_pose_times(trajectory, scans.times_s)
-    growing = LiveMap(config)
-    with contextlib.ExitStack() as stack:
-        shown = None
-        if view:
-            from radarsdf.view.pages import GrowingView
-
-            shown = _Shown(growing, stack.enter_context(GrowingView(host=address.host, port=address.port)))
-            stack.callback(shown.stop)
-        on_scan = None if shown is None else shown.on_scan
-        done = replay(growing, scans, with_poses=with_poses, rate=rate, on_scan=on_scan)
-        _add_rates(results, done, len(scans))
-        if out is not None:
-            save_map(
-                growing.map() if settings.quick else growing.finish(progress=False if quiet else None), out
-            )
-            results.add(f"map {out}", out=out)
-        if trajectory is not None:
-            times_s = None if scans.times_s is None else scans.times_s[done.rows]
-            write_poses(trajectory, np.stack(done.poses), times_s)
-            results.add(f"trajectory {trajectory}", trajectory=trajectory)
-        if shown is not None:
-            results.end()
-            until_stopped(shown.view)
-
-
-def _add_rates(results: Results, done: Replay, scans: int) -> None:
-    import numpy as np
-
-    if not done.rows:
-        msg = "no scan came into the map"
-        raise ValueError(msg)
-    p50, p99, worst = np.percentile(done.seconds, [50, 99, 100])
-    results.add(
-        f"{len(done.rows)} of {counted(scans, 'scan')} in the map, {len(done.dropped)} dropped, {len(done.lost)} lost",
-        scans=len(done.rows),
-        dropped=len(done.dropped),
-        lost=len(done.lost),
-    )
-    results.add(
-        f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99 of 100), {1e3 * worst:.1f} ms (worst): "
-        f"{done.hertz:.0f} scans a second",
-        p50_s=p50,
-        p99_s=p99,
-        worst_s=worst,
-        scans_per_second=done.hertz,
-    )
-
-
-class _Shown:
-    """A thread that shows the newest surface from time to time."""
-
-    def __init__(self, live_map: LiveMap, view: GrowingView) -> None:
-        from radarsdf.view.serving import url_of
-
-        self._live_map, self.view = live_map, view
-        self._path: Any = None
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-        typer.echo(f"the map grows on {url_of(view.host, view.port)}; Ctrl-C ends it")
-
-    def on_scan(self, done: Replay) -> None:
-        self._path = [pose[:3, 3] for pose in done.poses]
-
-    def stop(self) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        import numpy as np
-
-        while not self._ended.wait(_SHOWN_EVERY_S):
-            path, self._path = self._path, None
-            if path is not None:
-                self.view.show(self._live_map.mesh(), np.array(path))
-
-
-@command()
 def demo(
     *,
     scene: Literal["hugin", "oculii", "wall", "astyx"] = "hugin",
@@ -301,7 +170,6 @@ def demo(
     view: bool | None = None,
     surface: Surface,
     settings: Settings,
-    quiet: bool = False,
     results: Results,
 ) -> None:
     """Simulate, fit, mesh, evaluate, write.
@@ -311,34 +179,26 @@ def demo(
     out: The folder to write.
     view: Show the map in the browser at the end, until Ctrl-C; default: in a terminal of a machine with a screen.
     """
-    refuse_if(
-        frames is not None and frames < 2, f"--frames must be at least 2, one to be held out, not {frames}"
-    )
+    too_few = frames is not None and frames < 2
+    refuse_if(too_few, f"--frames must be at least 2, one to be held out, not {frames}")
 
     import radarsdf.map.mesh  # here and not by the first mesh: the printed times are without imports
     from radarsdf.evaluation import holdout
-    from radarsdf.io import Scans, write_scans
+    from radarsdf.io import write_scans
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import write_mesh
     from radarsdf.render.picture import save_picture
 
-    config, progress = settings.load(), False if quiet else None
-    shown = _ends_with_viewer(view, results.json)
+    config, progress = settings.load(), results.progress
+    view = _ends_with_viewer(view, results.json)
     out.mkdir(parents=True, exist_ok=True)
     files = [out / name for name in ("scans.npz", "map.safetensors", "mesh.ply", "picture.png")]
     check_outputs(files)
     scans_file, map_file, mesh_file, picture_file = files
     results.add(
-        f"simulates the drive of a radar, makes a map of it, compares that with the truth, and writes all to {out}"
+        f"simulates a drive, makes a map of it, compares that with the truth, and writes all to {out}"
     )
-    simulation = radarsdf.simulate.SCENES[scene](frames=frames)
-    scans = Scans(
-        simulation.points,
-        simulation.poses,
-        simulation.intensities,
-        simulation.ground_truth,
-        truth_kind="simulated",
-    )
+    scans = _simulated(scene, frames)
     train, test = holdout(len(scans.points))
     returns = sum(map(len, scans.points))
     line = f"simulated a drive, {scene}: {returns} returns in {len(scans)} scans"
@@ -371,9 +231,17 @@ def demo(
         warn(f"warning: no picture: {error}")
     results.add("wrote " + ", ".join(map(str, files)), files=files)
     results.add(f"next: {shlex.join(['radarsdf', 'view', str(map_file), str(scans_file)])}")
-    if shown:
+    if view:
         results.end()
         show(radar_map, scans, open_page=True, voxel_size=surface.voxel, progress=progress, **surface.limits)
+
+
+def _simulated(scene: str, frames: int | None) -> Scans:
+    from radarsdf import simulate
+    from radarsdf.io import Scans
+
+    found = simulate.SCENES[scene](frames=frames)
+    return Scans(found.points, found.poses, found.intensities, found.ground_truth, truth_kind="simulated")
 
 
 def _add_surface_errors(results: Results, mesh: trimesh.Trimesh, scans: Scans) -> None:
@@ -391,16 +259,12 @@ def _add_surface_errors(results: Results, mesh: trimesh.Trimesh, scans: Scans) -
 
 
 def _ends_with_viewer(wanted: bool | None, json: bool) -> bool:
-    """Whether the viewer ends the demo. It waits for Ctrl-C, so only if it was asked for, or somebody is there."""
+    """Whether the viewer ends the demo. It waits for Ctrl-C, so only if it was asked for, or somebody can see it."""
     from radarsdf.view.serving import has_display, require_viser
 
-    somebody = sys.stdout is not None and sys.stdout.isatty() and has_display() and not json
-    if not (somebody if wanted is None else wanted):
-        return False
-    try:
+    if wanted:
         require_viser()
-    except ImportError:  # it is optional
-        if wanted:
-            raise
-        return False
-    return True
+    if wanted is not None:
+        return wanted
+    in_terminal = sys.stdout is not None and sys.stdout.isatty() and not json
+    return in_terminal and has_display() and find_spec("viser") is not None

@@ -1,20 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf mesh``, ``eval``, ``render``, ``compare``, ``grid`` and ``info``: what is made of a map."""
+"""``radarsdf info``, ``mesh``, ``eval`` and ``render``: what a map holds, and how good it is."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-from typer.core import TyperCommand
-
-from radarsdf.cli.app import command, refuse_if
-from radarsdf.cli.options import MAP_SUFFIX, Address, Box, Recording, Surface, corners_of
-from radarsdf.cli.results import Results, add_intensity_errors, counted, load_map, split, until_stopped
-from radarsdf.cli.scans import add_mesh
+from radarsdf.cli.app import is_number, refuse_if
+from radarsdf.cli.options import Box, Recording, Surface, corners_of, is_map
+from radarsdf.cli.results import Results, add_intensity_errors, counted, load_map, split
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -22,20 +17,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from radarsdf.changes.changes import Region
     from radarsdf.map.map import Map
     from radarsdf.map.view import View
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
-_LISTED = 10  # regions, the largest first
 
 
-def _is_map(path: Path) -> bool:
-    return path.is_dir() or path.suffix == MAP_SUFFIX
-
-
-@command()
 def info(map_path: Path | None = None, *, results: Results) -> None:
     """Print one row for each part.
 
@@ -44,50 +32,47 @@ def info(map_path: Path | None = None, *, results: Results) -> None:
     from radarsdf.versions import versions
 
     radar_map = None if map_path is None else load_map(map_path)
-    rows = list(versions().items())
-    results.add(**{name.replace(" ", "_"): value for name, value in rows})
+    rows = versions()
+    results.add(**{name.replace(" ", "_"): value for name, value in rows.items()})
     if radar_map is not None:
-        rows += _add_map(results, radar_map)
-    results.table(rows)
+        rows |= _add_map(results, radar_map)
+    results.table(rows.items())
 
 
-def _add_map(results: Results, radar_map: Map) -> list[tuple[str, str]]:
-    """Add what a map holds, and return it in rows."""
+def _add_map(results: Results, radar_map: Map) -> dict[str, str]:
+    """Add what a map holds, and return it in words."""
     report, scale, range_m = radar_map.report, radar_map.intensity_scale, radar_map.sensor.range_m
-    limits = None if scale is None else (scale.low, scale.high)
     made_of = {name: report[name] for name in ("scans", "returns") if name in report}
-    missing = report.get("missing_tiles")
+    missing = {name: report[name] for name in ("missing_tiles",) if report.get(name)}
     lower, upper = radar_map.extent
-    results.add(
-        map=repr(radar_map),
-        **made_of,
-        extent=[lower, upper],
-        bytes=radar_map.file_bytes,
-        leaf_cells=radar_map.num_cells,
-        leaf_size_m=radar_map.config.leaf_size_m,
-        origin=radar_map.origin,
-        range_m=range_m,
-        intensities=limits,
-        rough_share=radar_map.rough_share,
-        **({"missing_tiles": missing} if missing else {}),
-    )
+    values: dict[str, Any] = {
+        "map": repr(radar_map),
+        "extent": [lower, upper],
+        "bytes": radar_map.file_bytes,
+        "leaf_cells": radar_map.num_cells,
+        "leaf_size_m": radar_map.config.leaf_size_m,
+        "origin": radar_map.origin,
+        "range_m": range_m,
+        "intensities": None if scale is None else (scale.low, scale.high),
+        "rough_share": radar_map.rough_share,
+    }
+    results.add(**values, **made_of, **missing)
     edges = " x ".join(f"{edge:.1f}" for edge in upper - lower)
     corners = " to ".join("({:.1f}, {:.1f}, {:.1f})".format(*corner) for corner in (lower, upper))
-    return [
-        ("map", repr(radar_map)),
-        ("made of", ", ".join(f"{count} {name}" for name, count in made_of.items())),
-        ("extent", f"{edges} m, from {corners} m"),
-        ("size", f"{radar_map.file_bytes / 1e6:.1f} MB"),
-        ("leaf cells", f"{radar_map.num_cells} of {radar_map.config.leaf_size_m:g} m"),
-        ("origin", "({:.2f}, {:.2f}, {:.2f}) m".format(*radar_map.origin)),
-        ("ranges", "{:.1f} to {:.1f} m".format(*range_m)),
-        ("intensities", "none" if limits is None else "{:g} to {:g}".format(*limits)),
-        ("clutter ratio", f"{radar_map.rough_share:.0%}"),
-        *([("missing tiles", ", ".join(missing))] if missing else []),
-    ]
+    return {
+        "map": repr(radar_map),
+        "made of": ", ".join(f"{count} {name}" for name, count in made_of.items()),
+        "extent": f"{edges} m, from {corners} m",
+        "size": f"{radar_map.file_bytes / 1e6:.1f} MB",
+        "leaf cells": f"{radar_map.num_cells} of {radar_map.config.leaf_size_m:g} m",
+        "origin": "({:.2f}, {:.2f}, {:.2f}) m".format(*radar_map.origin),
+        "ranges": "{:.1f} to {:.1f} m".format(*range_m),
+        "intensities": "none" if scale is None else f"{scale.low:g} to {scale.high:g}",
+        "clutter ratio": f"{radar_map.rough_share:.0%}",
+        **{name.replace("_", " "): ", ".join(tiles) for name, tiles in missing.items()},
+    }
 
 
-@command()
 def mesh(
     map_path: Path,
     *,
@@ -96,7 +81,6 @@ def mesh(
     viewpoint: tuple[float, float, float] | None = None,
     picture: Path | None = None,
     surface: Surface,
-    quiet: bool = False,
     results: Results,
 ) -> None:
     """Extract the mesh, write it, draw it.
@@ -116,21 +100,20 @@ def mesh(
         box=corners_of(box),
         viewpoint=viewpoint,
         **surface.limits,
-        progress=False if quiet else None,
+        progress=results.progress,
     )
     if len(found.faces) == 0:
         msg = f"{map_path} has no surface here: nothing written"
         raise ValueError(msg)
     origin = write_mesh(out, found)
-    add_mesh(results, found, out, origin)
+    results.add_mesh(found, out, origin)
     results.add_threshold(found.metadata)
     if picture is not None:
         save_picture(picture, found, scalar=found.vertex_attributes.get("intensity"))
         results.add(f"picture written to {picture}", picture=picture)
 
 
-@command()
-def _eval(
+def evaluate(
     what: Path,
     recording: Recording,
     *,
@@ -138,7 +121,6 @@ def _eval(
     samples: int = 10_000_000,
     box: Box = None,
     surface: Surface,
-    quiet: bool = False,
     results: Results,
 ) -> None:
     """Print the errors of the surface, the intensities, or both.
@@ -152,7 +134,7 @@ def _eval(
     from radarsdf.io.files import check_regular_file
     from radarsdf.io.meshes import read_ground_truth, read_mesh
 
-    radar_map = load_map(what) if _is_map(what) else None
+    radar_map = load_map(what) if is_map(what) else None
     if radar_map is None:
         check_regular_file(what)
     truth = recording.scans
@@ -170,7 +152,7 @@ def _eval(
         if radar_map is None:
             found = read_mesh(what)
         else:
-            found = radar_map.mesh(surface.voxel, **surface.limits, progress=False if quiet else None)
+            found = radar_map.mesh(surface.voxel, **surface.limits, progress=results.progress)
         metrics = evaluation.surface_metrics(found, ground_truth, box=corners_of(box), samples=samples)
         results.add(evaluation.format_metrics(metrics), surface=metrics)
     if radar_map is not None and scans is not None:
@@ -187,33 +169,6 @@ def _holds_scans(path: Path) -> bool:
     return path.is_dir() or is_bag(path) or (path.suffix.lower() == ".npz" and holds_scans(path))
 
 
-class _SeveralNumbers(TyperCommand):
-    """Takes ``--pose 5 0 1.5`` for ``--pose "5 0 1.5"``: an option of click has a fixed number of words."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        joined: list[str] = []
-        words = iter(args)
-        in_pose = False
-        for word in words:
-            if in_pose and _is_number(word):
-                joined[-1] += f" {word}"
-                continue
-            joined.append(word)
-            in_pose = word == "--pose"
-            if in_pose:
-                joined.append(next(words, ""))
-        return super().parse_args(ctx, joined)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-@command(cls=_SeveralNumbers)
 def render(
     map_path: Path,
     *,
@@ -284,19 +239,17 @@ def _poses(text: str) -> NDArray[np.float64]:
     from scipy.spatial.transform import Rotation
 
     words = text.split()
-    if not words or not _is_number(words[0]):
+    if not words or not is_number(words[0]):
         return _poses_of_file(Path(text))
-    usable = len(words) in (3, 7) and all(map(_is_number, words))
+    usable = len(words) in (3, 7) and all(map(is_number, words))
     refuse_if(not usable, f"--pose takes x y z, x y z qx qy qz qw, or a file, not {text!r:.60}")
     numbers = [float(word) for word in words]
+    quaternion = numbers[3:] or [0.0, 0.0, 0.0, 1.0]
+    length = float(np.linalg.norm(quaternion))
+    refuse_if(not abs(length - 1) < 0.01, f"the quaternion of --pose must have length 1, not {length:.3g}")
     pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = numbers[:3]
-    if len(numbers) == 7:
-        length = float(np.linalg.norm(numbers[3:]))
-        refuse_if(
-            not abs(length - 1) < 0.01, f"the quaternion of --pose must have length 1, not {length:.3g}"
-        )
-        pose[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
     return pose[None]
 
 
@@ -310,154 +263,5 @@ def _poses_of_file(path: Path) -> NDArray[np.float64]:
     found = read_poses(path, Notes(str(path)))
     if isinstance(found, Trajectory):
         return found.poses(found.times_s, max_gap_s=0.0)
-    assert not hasattr(found, "pose_at")  # files have no poses of another kind
+    assert isinstance(found, np.ndarray)  # files have no poses of another kind
     return found[np.isfinite(found).all(axis=(1, 2))]
-
-
-@command()
-def compare(
-    map_path: Path,
-    recording: Recording,
-    *,
-    out: Path | None = None,
-    report: Path | None = None,
-    view: bool = False,
-    align: bool = True,
-    min_area: float = 0.1,
-    box: Box = None,
-    address: Address,
-    results: Results,
-) -> None:
-    """Compare, write the surfaces, report what changed.
-
-    scans: The later map, or later scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set.
-    out: The file to write: a mesh in colours, such as changes.ply, or .npz with all arrays.
-    report: Also write a page about what changed, such as changes.html.
-    view: Show what changed in the browser at the end, until Ctrl-C.
-    align: Move the later map as a whole if its surface is then nearer to the earlier one.
-    min_area: Smallest region that is listed, m2.
-    """
-    from radarsdf.changes.compare import compare as compare_maps
-    from radarsdf.io.files import check_outputs
-    from radarsdf.io.meshes import check_mesh_path
-    from radarsdf.report.changes import write_changes_report
-    from radarsdf.report.page import require_extras
-
-    if out is not None and out.suffix != ".npz":
-        check_mesh_path(out)
-    check_outputs([out, report], [map_path, *recording.inputs])
-    if report is not None:
-        require_extras()
-    if view:
-        address.check()
-    later = load_map(recording.scans) if _is_map(recording.scans) else recording.read()
-    earlier = load_map(map_path)
-    changes = compare_maps(earlier, later, align_frames=align, box=corners_of(box))
-    found = changes.report
-    results.add(found["alignment"], alignment=found["alignment"], T_before_after=changes.T_before_after)
-    results.add(found["reflectance"], reflectance=found["reflectance"])
-    areas = ", ".join(f"{name} {area:.1f}" for name, area in found["areas_m2"].items())
-    results.add(
-        f"of {found['compared_m2']:.0f} m2 that both observed, m2: {areas}",
-        areas_m2=found["areas_m2"],
-        compared_m2=found["compared_m2"],
-    )
-    regions = changes.regions(min_area)
-    results.add(regions=[vars(region) for region in regions])
-    if regions:
-        headings = ("region", "m2", "x, m", "y, m", "z, m", "probability")
-        results.table(map(_region_row, regions[:_LISTED]), headings)
-    if out is not None:
-        changes.save(out)
-        results.add(f"{out} written", out=out)
-    edge_m = earlier.config.leaf_size_m
-    if report is not None:
-        names = map_path.absolute().name, recording.scans.absolute().name
-        write_changes_report(report, changes, names, edge_m, regions)
-        results.add(f"{report} written", report=report)
-    if view:
-        results.end()
-        from radarsdf.view.pages import ChangesView
-        from radarsdf.view.serving import url_of
-
-        with ChangesView(changes, regions, edge_m, host=address.host, port=address.port) as page:
-            typer.echo(f"what changed is on {url_of(page.host, page.port)}; Ctrl-C ends it")
-            until_stopped(page)
-
-
-def _region_row(region: Region) -> Sequence[str]:
-    centre = (f"{x:.1f}" for x in region.box.mean(axis=0))
-    return (region.words, f"{region.area_m2:.2f}", *centre, f"{region.probability:.2f}")
-
-
-@command()
-def grid(
-    map_path: Path,
-    *,
-    out: list[Path],
-    voxel: float = 0.2,
-    box: Box = None,
-    heights: tuple[float, float] = (0.3, 2.0),
-    distances: Path | None = None,
-    costmap: Path | None = None,
-    picture: Path | None = None,
-    results: Results,
-) -> None:
-    """Make the grid, write its files, draw it.
-
-    out: A file to write, may be repeated: .npz with all arrays, .ply of the voxels' centres, .bt for OctoMap, .yaml and .pgm
-        for ROS's map_server.
-    voxel: Edge length of a voxel, m.
-    heights: Of the .yaml: what is between these heights above the ground, m.
-    distances: Also write the Euclidean distance field of the grid, as .npz.
-    costmap: Also write heights, slopes, steps and costs for wheels, as .npz.
-    picture: Also draw heights, costs and free space, as .png.
-    """
-    from radarsdf.extras import require
-    from radarsdf.grids.files import check_arrays_path, check_flat_path, check_grid_path
-    from radarsdf.grids.grid import save_arrays
-    from radarsdf.grids.occupancy import grid as grid_of
-    from radarsdf.io.files import check_outputs
-    from radarsdf.render.figures import save_grid_picture
-
-    flat = [path for path in out if path.suffix == ".yaml"]
-    whole = [path for path in out if path.suffix != ".yaml"]
-    for path in whole:
-        check_grid_path(path)
-    for path in flat:
-        check_flat_path(path)
-    for arrays_path in (distances, costmap):
-        check_arrays_path(arrays_path)
-    if picture is not None:
-        require("matplotlib", what="pictures need")
-    outputs = [*out, *(path.with_suffix(".pgm") for path in flat), distances, costmap, picture]
-    check_outputs(outputs, [map_path])
-    radar_map = load_map(map_path)
-    corners = corners_of(box)
-    found = grid_of(radar_map, radar_map.extent if corners is None else corners, voxel)
-    low, high = heights
-    for path in whole:
-        found.save(path)
-    for path in flat:
-        found.flat(low, high).save(path)
-    if distances is not None:
-        save_arrays(distances, found, found.distances())
-    if costmap is not None:
-        save_arrays(costmap, found, found.costmap())
-    if picture is not None:
-        save_grid_picture(picture, found, low, high)
-    shares = {name: float(getattr(found, name).mean()) for name in ("occupied", "free", "unknown")}
-    size = " x ".join(map(str, found.shape))
-    origin = " ".join(f"{coordinate:.2f}" for coordinate in found.origin)
-    results.add(
-        f"{size} voxels of {found.voxel_size:g} m from {origin}: "
-        + ", ".join(f"{100 * share:.1f} % {name}" for name, share in shares.items()),
-        shape=found.shape,
-        origin=found.origin,
-        voxel_size=found.voxel_size,
-        **shares,
-    )
-    written = [path for path in outputs if path is not None]
-    for path in written:
-        results.add(f"{path} written")
-    results.add(out=written)

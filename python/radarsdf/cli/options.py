@@ -8,7 +8,7 @@ import ast
 import dataclasses
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from radarsdf.cli.app import refuse_if
 
@@ -22,6 +22,11 @@ MAP_SUFFIX = ".safetensors"
 
 Box = tuple[float, float, float, float, float, float] | None
 """The lower and the upper corner."""
+
+
+def is_map(path: Path) -> bool:
+    """Whether a path looks like a map and not like scans or a mesh."""
+    return path.is_dir() or path.suffix == MAP_SUFFIX
 
 
 def corners_of(box: Box) -> list[list[float]] | None:
@@ -41,14 +46,14 @@ class Recording:
     imu_topic: In a bag: the topic of the inertial measurements, for poses that are found.
     imu_rotation: File of the 3 x 3 matrix from the axes of the IMU to those of the radar, R_sensor_imu; default: of the
         bag, or found.
-    field: The field of the file for x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
-    columns: Of files without names: how many numbers a return has, or their names, such as x,y,z,intensity,doppler.
-    max_gap: Longest time between two poses over which poses are interpolated, s; default: 0.5.
+    field: Which field of the file holds x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
+    columns: In files without a header: the number of columns, or their names, such as x,y,z,intensity,doppler.
+    max_gap: Longest gap between two poses that is interpolated, s; default: 0.5.
     world_frame: In a bag with TF: the frame of the world.
-    stamps: In a bag: the time of a scan; default: of its header, unless stamps are zero or constant.
+    stamps: In a bag: whether a scan has the time of its header or of its record; default: header, unless its stamps are zero
+        or constant.
     """
 
-    panel: ClassVar[str] = "Reading scans"
     scans: Path
     poses: Path | None = None
     _: KW_ONLY
@@ -66,17 +71,18 @@ class Recording:
     def read(self, poses: StampedPoses | None = None) -> Scans:
         """The scans, with `poses` in place of theirs. What was assumed or left out is logged on standard error."""
         from radarsdf.io.read import read
+        from radarsdf.io.text import read_numbers
 
-        columns = self.columns
+        columns, base, imu = self.columns, self.extrinsic, self.imu_rotation
         replaced: Any = self.poses if poses is None else poses
         return read(
             self.scans,
             replaced,
-            extrinsic=_matrix(self.extrinsic, 4, "extrinsic: that is a 4 x 4 matrix T_base_sensor"),
+            extrinsic=None if base is None else read_numbers(base, 4),
             topic=self.topic,
             pose_topic=self.pose_topic,
             imu_topic=self.imu_topic,
-            R_sensor_imu=_matrix(self.imu_rotation, 3, "rotation: that is a 3 x 3 matrix R_sensor_imu"),
+            R_sensor_imu=None if imu is None else read_numbers(imu, 3),
             fields=dict(_role_and_name(text) for text in self.field or ()) or None,
             columns=int(columns) if columns and columns.isdecimal() else columns and columns.split(","),
             world_frame=self.world_frame,
@@ -86,7 +92,7 @@ class Recording:
 
     @property
     def inputs(self) -> list[Path]:
-        """The files and folders that are read, which no output may overwrite."""
+        """The input files and folders, which no output may overwrite."""
         paths = (self.scans, self.poses, self.extrinsic, self.imu_rotation)
         return [path for path in paths if path is not None]
 
@@ -99,17 +105,6 @@ class MaybeRecording(Recording):
 
 
 MaybeRecording.__doc__ = Recording.__doc__
-
-
-def _matrix(path: Path | None, size: int, what: str) -> Any:
-    """The matrix in a file, if there is one; `what` it should be is in the error."""
-    from radarsdf.io.text import read_numbers
-
-    try:
-        return None if path is None else read_numbers(path, size)
-    except ValueError as error:
-        msg = f"{path} is no {what}, {size} lines of {size} numbers"
-        raise ValueError(msg) from error
 
 
 def _role_and_name(text: str) -> tuple[str, str]:
@@ -129,7 +124,6 @@ class Settings:
     set: Change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated.
     """
 
-    panel: ClassVar[str] = "Settings of the fit"
     paper: bool = False
     quick: bool = False
     config: Path | None = None
@@ -170,18 +164,15 @@ def words_of(*groups: Recording | Settings) -> list[str]:
         for field in dataclasses.fields(group):
             value = getattr(group, field.name)
             option = f"--{field.name.replace('_', '-')}"
-            if value in (None, False, []):
+            if value in (None, False):
                 continue
             if value is True:
                 words.append(option)
             elif not field.kw_only:
                 words.append(str(value))
             else:
-                words += [
-                    word
-                    for one in (value if isinstance(value, list) else [value])
-                    for word in (option, str(one))
-                ]
+                for one in value if isinstance(value, list) else [value]:
+                    words += [option, str(one)]
     return words
 
 
@@ -190,13 +181,11 @@ class Surface:
     """The voxels of a mesh, and what it leaves out.
 
     voxel: Edge length of a voxel, m.
-    min_confidence: Leave out the surface whose confidence is below this, 0 to 1; default: that of the highest expected
-        F-score.
-    max_uncertainty: Leave out the surface whose standard error is above this, m; default: there is no limit.
+    min_confidence: Leave out surface with a confidence below this, 0 to 1; default: that of the highest expected F-score.
+    max_uncertainty: Leave out surface with a standard error above this, m; default: no limit.
     min_component: Leave out connected components of fewer triangles; default: 30, and fewer in voxels above 0.1 m.
     """
 
-    panel: ClassVar[str] = "Surface"
     voxel: float = 0.1
     min_confidence: float | None = None
     max_uncertainty: float | None = None
@@ -221,13 +210,12 @@ class Address:
     port: Port to listen on; default: 8080, or the next that is free.
     """
 
-    panel: ClassVar[str] = "Address of the page"
     host: str = "127.0.0.1"
     port: int | None = None
 
     def check(self) -> None:
-        """Before any work: raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
+        """Raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
         from radarsdf.view.serving import free_port, require_viser
 
         require_viser()
-        free_port(self.host, self.port or 0, exactly=True)
+        free_port(self.host, self.port)

@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 import time
-import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from radarsdf.cli.app import command, refuse_if
+from radarsdf.cli.app import refuse_if
 from radarsdf.cli.options import Address, Box, MaybeRecording, Surface, corners_of
 from radarsdf.cli.results import Results, load_map, split, until_stopped
 
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from radarsdf.report.subject import Subject
 
 
-@command()
 def view(
     map_path: Path,
     recording: MaybeRecording,
@@ -37,6 +35,7 @@ def view(
 
     open: Open the page in a browser here; default: if there is a screen.
     max_vertices: Simplify the mesh if it has more vertices.
+    quiet: Show no progress bar.
     """
     from radarsdf.view.serving import has_display
 
@@ -70,11 +69,12 @@ def show(radar_map: Map, scans: Scans | None, *, open_page: bool, **arguments: A
         typer.echo(f"from elsewhere: {ssh_line(viewer.host, viewer.port)}, then {local}")
         typer.echo(f"the surface is {viewer.surface.threshold}")
         if open_page:
+            import webbrowser
+
             webbrowser.open(url)
         until_stopped(viewer)
 
 
-@command()
 def report(
     map_path: Path,
     recording: MaybeRecording,
@@ -83,18 +83,17 @@ def report(
     holdout: int | None = None,
     box: Box = None,
     surface: Surface,
-    quiet: bool = False,
     results: Results,
 ) -> None:
     """Write the page.
 
     out: The page to write, .html.
     """
+    lacking = holdout and not recording.scans
+    refuse_if(lacking, f"--holdout {holdout} needs the scans: name them after the map")
+
     from radarsdf.report.page import require_extras
 
-    refuse_if(
-        holdout and not recording.scans, f"--holdout {holdout} needs the scans: name them after the map"
-    )
     require_extras()
 
     from radarsdf import check
@@ -116,7 +115,7 @@ def report(
         findings,
         voxel_size_m=surface.voxel,
         box=corners_of(box),
-        progress=False if quiet else None,
+        progress=results.progress,
         limits=surface.limits,
     )
     add_report(results, out, subject)

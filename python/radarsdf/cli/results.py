@@ -4,10 +4,7 @@
 
 from __future__ import annotations
 
-import json as json_module
 import math
-import sys
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +15,10 @@ import typer
 from radarsdf.cli.app import warn
 
 if TYPE_CHECKING:
+    import numpy as np
+    import trimesh
+    from numpy.typing import NDArray
+
     from radarsdf import RadarMap
     from radarsdf.io.scans import Scans
     from radarsdf.map.map import Map
@@ -28,14 +29,21 @@ if TYPE_CHECKING:
 class Results:
     """Prints what a command has found; with ``--json``, nothing before :meth:`end`.
 
+    quiet: Show no progress bar.
     json: Print the results as one JSON object, lengths in m; progress and warnings go to standard error.
     """
 
+    quiet: bool = False
     json: bool = False
 
     def __post_init__(self) -> None:
         self._values: dict[str, Any] = {}
         self._ended = False
+
+    @property
+    def progress(self) -> bool | None:
+        """The argument `progress` of the library's functions."""
+        return False if self.quiet else None
 
     def add(self, line: str | None = None, **values: Any) -> None:
         """Print a line for people, and keep the same numbers for programs by name; lengths in m, times in s."""
@@ -45,19 +53,14 @@ class Results:
 
     def table(self, rows: Iterable[Sequence[str]], headings: Sequence[str] = ()) -> None:
         """Print rows for people. With headings, all columns but the first are aligned to the right."""
-        if self.json:
-            return
-        from rich.console import Console
-        from rich.markup import escape
-        from rich.table import Table
-
-        table = Table(box=None, show_header=bool(headings), pad_edge=False)
-        for i, heading in enumerate(headings or ("", "")):
-            table.add_column(heading, justify="right" if headings and i else "left", overflow="fold")
-        for row in rows:
-            table.add_row(*map(escape, row))
-        # What a program reads of a pipe is not broken into lines.
-        Console(width=None if sys.stdout and sys.stdout.isatty() else 10_000).print(table)
+        table = [headings, *rows] if headings else list(rows)
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        for first, *others in table:
+            aligned = [
+                f"{cell:>{width}}" if headings else cell
+                for cell, width in zip(others, widths[1:], strict=True)
+            ]
+            self.add("  ".join([first.ljust(widths[0]), *aligned]))
 
     def add_threshold(self, metadata: Mapping[str, Any]) -> None:
         """Add the confidence from which on a mesh with this ``metadata`` was kept, and what that costs."""
@@ -66,11 +69,27 @@ class Results:
         threshold = Threshold.of_mesh(metadata)
         self.add(str(threshold), **threshold.metadata)
 
+    def add_mesh(self, mesh: trimesh.Trimesh, path: Path, origin: NDArray[np.float64] | None) -> None:
+        """Add what was written to a file, and where its origin is, if it has one of its own."""
+        vertices, triangles = len(mesh.vertices), len(mesh.faces)
+        line = f"{vertices} vertices and {triangles} triangles written to {path}"
+        self.add(line, vertices=vertices, triangles=triangles, out=path)
+        self.add_origin(path, origin)
+
+    def add_origin(self, path: Path, origin: NDArray[np.float64] | None) -> None:
+        """Add where the origin of a file is, if it has one of its own."""
+        from radarsdf.io.files import origin_path
+
+        line = None if origin is None else f"in a local frame, whose origin is in {origin_path(path)}"
+        self.add(line, origin=origin)
+
     def end(self) -> None:
         """Print the object, if it is for programs, once. A number that is not finite is null."""
         if self.json and not self._ended:
+            import json
+
             self._ended = True
-            typer.echo(json_module.dumps(_plain(self._values), indent=2, allow_nan=False))
+            typer.echo(json.dumps(_plain(self._values), indent=2, allow_nan=False))
 
 
 def _plain(value: Any) -> Any:
@@ -109,6 +128,8 @@ def save_map(radar_map: RadarMap, path: Path) -> None:
     try:
         radar_map.save(path)
     except (OSError, ValueError) as error:  # ValueError: it is no regular file any more
+        import tempfile
+
         why = getattr(error, "strerror", None) or str(error)
         spare = Path(tempfile.mkdtemp(prefix="radarsdf_")) / path.name
         radar_map.save(spare)

@@ -13,13 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from radarsdf.cli.app import command, refuse_if, warn
+from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.options import MAP_SUFFIX, Recording, Settings, words_of
 from radarsdf.cli.results import Results, counted
 
 if TYPE_CHECKING:
-    import numpy as np
-    import trimesh
     from numpy.typing import NDArray
 
     from radarsdf import FitConfig
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
     from radarsdf.poses.posed import Posed
 
 
-@command()
 def check(recording: Recording, settings: Settings, results: Results) -> int:
     """Print the findings, the worst first, and the command to run next. The status is 1 if one is an error."""
     from radarsdf import check
@@ -60,7 +57,6 @@ def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None
             warn(str(finding))
 
 
-@command()
 def poses(
     recording: Recording,
     *,
@@ -150,16 +146,11 @@ def scans_and_poses(
         with finding_poses(missing):
             found = odometry(scans, config=config)
         results.add(found.report["verdict"], poses=found.report)
-        for note in found.report["notes"]:
-            warn(f"note: {note}")
         if found.report["doppler_sign"] < 0:
             results.add("this radar's Doppler is positive where the sensor approaches")
         posed, scans = Posed.found(found), scans.with_poses(found.poses, other_world=True)
-        if posed.pieces > 1:
-            rows = posed.rows
-            results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest segment")
-            scans = scans.select_range(rows)
-        return scans, posed
+        add_segments(results, posed)
+        return (scans.select_range(posed.rows) if posed.pieces > 1 else scans), posed
     if not refine:
         return scans, Posed.as_given(scans.poses)
     refined = refine_poses(scans, config=config)
@@ -172,6 +163,14 @@ def scans_and_poses(
             "(root mean square, standard deviations)"
         )
     return scans.with_poses(refined.poses), Posed.refined(refined, scans.poses)
+
+
+def add_segments(results: Results, posed: Posed) -> None:
+    """Add which segment of a trajectory is used, and print what was not used to find it."""
+    for note in posed.notes:
+        warn(f"note: {note}")
+    if posed.pieces > 1:
+        results.add(f"the scans {posed.rows.start} to {posed.rows.stop - 1} are used, the longest segment")
 
 
 def scans_or_unposed(recording: Recording, *, find: bool = False) -> tuple[Scans, NoPoses | None]:
@@ -189,21 +188,18 @@ def scans_or_unposed(recording: Recording, *, find: bool = False) -> tuple[Scans
 @contextmanager
 def finding_poses(missing: NoPoses | None) -> Iterator[None]:
     """A block in which poses are found. If they are `missing`, that is printed, or why they cannot be found."""
-    from radarsdf.io.poses.trajectory import NoPoses
-
     try:
         yield
     except ValueError as error:
         if missing is None:
             raise
         msg = f"{missing}, but not here: {error}"
-        raise NoPoses(msg) from error
+        raise ValueError(msg) from error
     if missing is not None:
         warn("note: there are no poses: they were found from the radar alone")
 
 
-@command()
-def convert(recording: Recording, *, out: Path, quiet: bool = False, results: Results) -> None:
+def convert(recording: Recording, *, out: Path, results: Results) -> None:
     """Read, and write as the ending of the output says.
 
     scans: The scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set; or a mesh: .ply,
@@ -221,7 +217,7 @@ def convert(recording: Recording, *, out: Path, quiet: bool = False, results: Re
     if recording.poses is None and holds_mesh(recording.scans):
         check_mesh_path(out)
         mesh = read_mesh(recording.scans)
-        add_mesh(results, mesh, out, write_mesh(out, mesh))
+        results.add_mesh(mesh, out, write_mesh(out, mesh))
         return
     suffix = out.suffix.lower()
     if suffix != ".npz":
@@ -236,23 +232,8 @@ def convert(recording: Recording, *, out: Path, quiet: bool = False, results: Re
         write_scans(out, scans)
         returns = sum(map(len, scans.points))
     else:
-        written = write_cloud(out, scans, progress=False if quiet else None)
+        written = write_cloud(out, scans, progress=results.progress)
         returns, origin = written.returns, written.origin
     line = f"{returns} returns of {counted(len(scans), 'scan')} written to {out}"
     results.add(line, returns=returns, scans=len(scans), out=out)
-    _add_origin(results, out, origin)
-
-
-def add_mesh(results: Results, mesh: trimesh.Trimesh, path: Path, origin: NDArray[np.float64] | None) -> None:
-    """Add what was written, and where its origin is, if it has one of its own."""
-    vertices, triangles = len(mesh.vertices), len(mesh.faces)
-    line = f"{vertices} vertices and {triangles} triangles written to {path}"
-    results.add(line, vertices=vertices, triangles=triangles, out=path)
-    _add_origin(results, path, origin)
-
-
-def _add_origin(results: Results, path: Path, origin: NDArray[np.float64] | None) -> None:
-    from radarsdf.io.files import origin_path
-
-    line = None if origin is None else f"in a local frame, whose origin is in {origin_path(path)}"
-    results.add(line, origin=origin)
+    results.add_origin(out, origin)

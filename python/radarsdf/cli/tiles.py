@@ -1,45 +1,27 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf tiles``: maps that do not fit into memory, in one go or step by step."""
+"""``radarsdf tiles``: maps that do not fit into memory, in one go or step by step. Each function is a step."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-import multiprocessing
-from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-from typer.core import TyperGroup
-
-from radarsdf.cli.app import app, command, refuse_if, warn
-from radarsdf.cli.commands import COMMANDS
+from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.options import Recording, Settings, Surface
 from radarsdf.cli.results import Results
-from radarsdf.cli.scans import finding_poses, scans_or_unposed, warn_or_refuse
+from radarsdf.cli.scans import add_segments, finding_poses, scans_or_unposed, warn_or_refuse
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from radarsdf.tiles.plan import Plan
 
 _FIRST_SCANS = 100  # that are checked before the work
-
-
-class _Steps(TyperGroup):
-    """Runs the step ``run`` where the first word is the name of no step."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if args and args[0] not in (*self.commands, "--help", "-h"):
-            args = ["run", *args]
-        return super().parse_args(ctx, args)
-
-
-_tiles = typer.Typer(cls=_Steps, no_args_is_help=True, subcommand_metavar="[STEP] [ARGS]...")
-_PANEL = next(panel for panel, texts in COMMANDS.items() if "tiles" in texts)
-app.add_typer(_tiles, name="tiles", help=COMMANDS[_PANEL]["tiles"], rich_help_panel=_PANEL)
 
 
 @dataclass(kw_only=True)
@@ -62,9 +44,9 @@ class Cut:
 
 @dataclass(kw_only=True)
 class Where:
-    """Who does the work.
+    """Where the work is done.
 
-    processes: Number of tiles that are fitted at a time, each by a process.
+    processes: Number of worker processes; each fits one tile at a time.
     cluster: Address of the scheduler of dask.distributed, such as tcp://host:8786.
     """
 
@@ -72,13 +54,10 @@ class Where:
     cluster: str | None = None
 
     def __post_init__(self) -> None:
-        refuse_if(
-            self.processes and self.cluster, "--processes and --cluster exclude each other: leave out one"
-        )
-        refuse_if(
-            self.processes is not None and self.processes < 1,
-            f"--processes must be at least 1, not {self.processes}",
-        )
+        both = self.processes and self.cluster
+        refuse_if(both, "--processes and --cluster exclude each other: leave out one")
+        too_few = self.processes is not None and self.processes < 1
+        refuse_if(too_few, f"--processes must be at least 1, not {self.processes}")
 
     @property
     def is_here(self) -> bool:
@@ -93,12 +72,14 @@ class Where:
 
             return cluster_executor(self.cluster, max(tile.memory_bytes for tile in Plan.load(folder).tiles))
         if self.processes is not None:
+            import multiprocessing
+            from concurrent.futures import ProcessPoolExecutor
+
             # Not forked: a forked child has only one of the threads of PyTorch and OpenMP.
             return ProcessPoolExecutor(self.processes, multiprocessing.get_context("spawn"))
         return nullcontext()
 
 
-@command(_tiles)
 def run(
     recording: Recording,
     *,
@@ -107,29 +88,20 @@ def run(
     where: Where,
     settings: Settings,
     surface: Surface,
-    quiet: bool = False,
     results: Results,
 ) -> int:
-    """Plan, fit and mesh in one go. The word run may be left out: radarsdf tiles SCANS -o CITY.
+    """Plan, fit and mesh in one go.
 
     out: The folder to write.
     """
-    plan(recording, out=out, cut=cut, where=where, settings=settings, quiet=quiet, results=results)
-    missing = fit(out, where=where, quiet=quiet, results=results)
-    mesh(out, where=where, surface=surface, quiet=quiet, results=results)
+    plan(recording, out=out, cut=cut, where=where, settings=settings, results=results)
+    missing = fit(out, where=where, results=results)
+    mesh(out, where=where, surface=surface, results=results)
     return missing
 
 
-@command(_tiles)
 def plan(
-    recording: Recording,
-    *,
-    out: Path,
-    cut: Cut,
-    where: Where,
-    settings: Settings,
-    quiet: bool = False,
-    results: Results,
+    recording: Recording, *, out: Path, cut: Cut, where: Where, settings: Settings, results: Results
 ) -> None:
     """Read the scans once, and write to a file for each tile the rays that cross it.
 
@@ -162,88 +134,9 @@ def plan(
             threads=None if where.is_here else 1,
             refine=cut.refine,
             find=missing is not None,
-            progress=False if quiet else None,
+            progress=results.progress,
         )
     _add_plan(results, planned, out)
-
-
-@command(_tiles)
-def fit(
-    folder: Path, *, tile: list[str] | None = None, where: Where, quiet: bool = False, results: Results
-) -> int:
-    """Fit the tiles of a plan; those that are done are kept.
-
-    folder: What radarsdf tiles plan wrote.
-    tile: Name of a tile, the only one that is fitted; may be repeated.
-    """
-    from radarsdf.tiles.fit_tiles import run_fits
-
-    with where.executor(folder) as executor:
-        city = run_fits(folder, executor=executor, names=tile, progress=False if quiet else None)
-    results.add(f"{city} in {folder}", tiles_done=len(city.tiles))
-    return status(folder, tile=tile, results=results)
-
-
-@command(_tiles)
-def mesh(
-    folder: Path,
-    *,
-    out: Path | None = None,
-    where: Where,
-    surface: Surface,
-    quiet: bool = False,
-    results: Results,
-) -> None:
-    """Write the surface of all tiles as one mesh, which need not fit into memory.
-
-    folder: What radarsdf tiles fit wrote.
-    out: The mesh to write: a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder.
-    """
-    from radarsdf.io.files import check_outputs
-    from radarsdf.tiles.tiled_map import TiledMap
-
-    out = folder / "mesh.ply" if out is None else out
-    check_outputs([out])
-    city = TiledMap(folder)
-    progress = False if quiet else None
-    with where.executor(folder) as executor:
-        vertices, triangles = city.export(
-            out, surface.voxel, **surface.limits, executor=executor, progress=progress
-        )
-    line = f"{vertices} vertices and {triangles} triangles written to {out}"
-    results.add(line, vertices=vertices, triangles=triangles, out=out)
-    results.add_threshold(city.threshold(surface.voxel, **surface.limits).metadata)
-
-
-@command(_tiles)
-def status(folder: Path, *, tile: list[str] | None = None, results: Results) -> int:
-    """Name the tiles that are not done, and why; the exit status is 1 if there are any.
-
-    folder: What radarsdf tiles plan wrote.
-    tile: Name of a tile, the only one that is looked at; may be repeated.
-    """
-    from radarsdf.tiles.plan import Plan, failure_of, is_done
-
-    plan = Plan.load(folder)
-    tiles = [planned for planned in plan.tiles if tile is None or planned.name in tile]
-    undone = [planned for planned in tiles if not is_done(folder, plan, planned)]
-    missing = {planned.name: failure_of(folder, planned) or "not yet done" for planned in undone}
-    results.add(f"{len(tiles) - len(missing)} of {len(tiles)} tiles are done", missing=missing)
-    for name, reason in missing.items():
-        warn(f"error: {name}: {reason}")
-    return int(bool(missing))
-
-
-@command(_tiles)
-def clean(folder: Path, *, results: Results) -> None:
-    """Remove the rays of tiles that are done, and parts of meshes.
-
-    folder: What radarsdf tiles fit wrote.
-    """
-    from radarsdf.tiles.tiled_map import TiledMap
-
-    freed = TiledMap(folder).clean()
-    results.add(f"{freed / 1e6:.1f} MB of rays and parts of meshes removed from {folder}", bytes=freed)
 
 
 def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
@@ -251,12 +144,8 @@ def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
 
     if (poses := DrivePoses.load(folder)) is not None:
         way: dict[str, Any] = poses.posed.way or {}
-        rows = poses.posed.rows
         results.add(way["verdict"], poses=folder / TRAJECTORY, improved=way["improved"])
-        for note in poses.posed.notes:
-            warn(f"note: {note}")
-        if poses.posed.pieces > 1:
-            results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest segment")
+        add_segments(results, poses.posed)
     returns, rays = (sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays"))
     seconds, most = sum(tile.seconds for tile in plan.tiles), max(tile.memory_bytes for tile in plan.tiles)
     results.add(
@@ -273,3 +162,67 @@ def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
         memory_bytes=most,
         plan=folder / "plan.json",
     )
+
+
+def fit(folder: Path, *, tile: list[str] | None = None, where: Where, results: Results) -> int:
+    """Fit the tiles of a plan.
+
+    folder: What radarsdf tiles plan wrote.
+    tile: Fit only the tile of this name; may be repeated.
+    """
+    from radarsdf.tiles.fit_tiles import run_fits
+
+    with where.executor(folder) as executor:
+        city = run_fits(folder, executor=executor, names=tile, progress=results.progress)
+    results.add(f"{city} in {folder}", tiles_done=len(city.tiles))
+    return status(folder, tile=tile, results=results)
+
+
+def mesh(folder: Path, *, out: Path | None = None, where: Where, surface: Surface, results: Results) -> None:
+    """Write the surface of all tiles as one mesh.
+
+    folder: What radarsdf tiles fit wrote.
+    out: The mesh to write: a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder.
+    """
+    from radarsdf.io.files import check_outputs
+    from radarsdf.tiles.tiled_map import TiledMap
+
+    out = folder / "mesh.ply" if out is None else out
+    check_outputs([out])
+    city = TiledMap(folder)
+    with where.executor(folder) as executor:
+        vertices, triangles = city.export(
+            out, surface.voxel, **surface.limits, executor=executor, progress=results.progress
+        )
+    line = f"{vertices} vertices and {triangles} triangles written to {out}"
+    results.add(line, vertices=vertices, triangles=triangles, out=out)
+    results.add_threshold(city.threshold(surface.voxel, **surface.limits).metadata)
+
+
+def status(folder: Path, *, tile: list[str] | None = None, results: Results) -> int:
+    """Name the tiles that are not done, and why.
+
+    folder: What radarsdf tiles plan wrote.
+    tile: Check only the tile of this name; may be repeated.
+    """
+    from radarsdf.tiles.plan import Plan, failure_of, is_done
+
+    plan = Plan.load(folder)
+    tiles = [planned for planned in plan.tiles if tile is None or planned.name in tile]
+    undone = [planned for planned in tiles if not is_done(folder, plan, planned)]
+    missing = {planned.name: failure_of(folder, planned) or "not yet done" for planned in undone}
+    results.add(f"{len(tiles) - len(missing)} of {len(tiles)} tiles are done", missing=missing)
+    for name, reason in missing.items():
+        warn(f"error: {name}: {reason}")
+    return int(bool(missing))
+
+
+def clean(folder: Path, *, results: Results) -> None:
+    """Remove what is no longer needed.
+
+    folder: What radarsdf tiles fit wrote.
+    """
+    from radarsdf.tiles.tiled_map import TiledMap
+
+    freed = TiledMap(folder).clean()
+    results.add(f"{freed / 1e6:.1f} MB of rays and parts of meshes removed from {folder}", bytes=freed)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Pictures of a mesh, drawn in NumPy: they need no display and no OpenGL."""
+"""Pictures of a mesh by casting rays: they need no display and no OpenGL."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._core import SurfaceTracer
 from radarsdf.checks import real_array
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.figures import new_figure, png_of
-from radarsdf.render.raster import PIXELS_AT_ONCE, barycentric, contours, corner_normals, project, rasterise
+from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
     import trimesh
 
 _Floats = NDArray[np.float64]
 
+_PIXELS_AT_ONCE = 1 << 20  # bounds the memory
+_CREASE = np.cos(np.deg2rad(40.0))  # edges with a larger angle are drawn sharp, others are shaded smoothly
 _SUPERSAMPLING = 2  # subpixels per pixel and axis, which are averaged for smooth edges
 
 
@@ -57,7 +60,7 @@ def render(
         If the mesh has no triangles, or the shape of the colours or of the viewpoint is wrong.
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
+    faces = np.asarray(mesh.faces, dtype=np.int32).reshape(-1, 3)
     if len(faces) == 0:
         msg = "the mesh has no triangles to draw"
         raise ValueError(msg)
@@ -68,28 +71,40 @@ def render(
     origin = vertices.mean(axis=0)
     vertices = vertices - origin
     eye, axes = _camera(vertices[np.unique(faces)], viewpoint, origin)
-    fine = (height * _SUPERSAMPLING, width * _SUPERSAMPLING)
-    x, y, nearness = project((vertices - eye) @ axes.T, faces, fine)
-    faces = faces[np.isfinite(nearness[faces]).all(axis=1)]  # entirely in front of the viewer
-    ids, near = rasterise(x[faces], y[faces], nearness[faces], fine)
+    seen = (vertices - eye) @ axes.T
+    in_front = seen[:, 2] > 1e-3 * np.abs(seen[:, 2]).max()
+    faces = faces[in_front[faces].all(axis=1)]
+    rows, columns = height * _SUPERSAMPLING, width * _SUPERSAMPLING
+    frame = _zoom(seen[np.unique(faces)], rows, columns)
+    if frame is None:
+        return np.full((height, width, 3), 255, np.uint8)
 
-    image = np.full((*fine, 3), 255.0, dtype=np.float32)
-    normals = corner_normals(vertices, faces)
+    (middle_u, middle_v), focal = frame
+    right, up, forward = axes
     light = np.array([-0.45, 0.55, -0.70]) @ axes  # from the upper left, behind the viewer
-    for start in range(0, ids.size, PIXELS_AT_ONCE):
-        part = np.arange(start, min(start + PIXELS_AT_ONCE, ids.size))
-        part = part[ids.flat[part] >= 0]
-        f = ids.flat[part]
-        weight = barycentric(x[faces[f]], y[faces[f]], part % fine[1], part // fine[1])
-        weight *= nearness[faces[f]]  # perspective correction: now linear in space, not in the picture
-        weight /= weight.sum(axis=1, keepdims=True)
+    normals = _corner_normals(vertices, faces)
+    threads = resolve_num_threads(0)
+    tracer = SurfaceTracer(vertices, faces, threads)
+    u = middle_u + (np.arange(columns) + 0.5 - columns / 2) / focal
+    v = middle_v + (np.arange(rows) + 0.5 - rows / 2) / focal
+    image = np.full((rows, columns, 3), 255.0, np.float32)
+    depth = np.full((rows, columns), np.inf)
+    for part in np.array_split(np.arange(rows), -(-rows * columns // _PIXELS_AT_ONCE)):
+        rays = u[None, :, None] * right - v[part][:, None, None] * up + forward  # of depth 1
+        length = np.linalg.norm(rays, axis=2)
+        directions = np.asarray(rays / length[..., None], np.float32).reshape(-1, 3)
+        range_m, face = tracer.first_hits(eye.tolist(), directions, np.inf, False, threads)
+        depth[part] = range_m.reshape(length.shape) / length
+        hit = (face >= 0).reshape(length.shape)
+        f = face[face >= 0]
+        points = eye + depth[part][hit][:, None] * rays[hit]
+        weight = _barycentric(points, vertices[faces[f]])
         normal = np.einsum("ni,nij->nj", weight, normals[f])
-        to_eye = eye - np.einsum("ni,nij->nj", weight, vertices[faces[f]])
-        normal *= np.sign(np.einsum("nj,nj->n", normal, to_eye))[:, None]
+        normal *= np.sign(np.einsum("nj,nj->n", normal, eye - points))[:, None]
         lambert = np.maximum(normal @ light / np.maximum(np.linalg.norm(normal, axis=1), 1e-12), 0.0)
         color = np.einsum("ni,nij->nj", weight, rgb[faces[f], :3])
-        image.reshape(-1, 3)[part] = color * (0.42 + 0.60 * lambert)[:, None]
-    image *= contours(near, 2 * _SUPERSAMPLING)[..., None]
+        image[part[0] : part[-1] + 1][hit] = color * (0.42 + 0.60 * lambert)[:, None]
+    image *= _contours(depth, 2 * _SUPERSAMPLING)[..., None]
     image = image.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3).mean(axis=(1, 3))
     picture: NDArray[np.uint8] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     return picture
@@ -207,3 +222,55 @@ def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tu
         right = np.array([1.0, 0.0, 0.0])
     right = right / np.linalg.norm(right)
     return eye, np.stack([right, np.cross(right, forward), forward])
+
+
+def _zoom(seen: _Floats, rows: int, columns: int) -> tuple[_Floats, float] | None:
+    """Middle (2,) of the picture, and pixels per unit, both at depth 1, for points (N, 3) along the axes of the eye.
+
+    None: all of them are more than 56° from its axis. The zoom ignores such points.
+    """
+    screen = np.stack([seen[:, 0], -seen[:, 1]]) / seen[:, 2]
+    screen = screen[:, np.hypot(*screen) <= 1.5]
+    if screen.shape[1] == 0:
+        return None
+    low, high = np.percentile(screen, [2, 98], axis=1)
+    reach = 0.2 * (high - low)  # all of a compact scene, yet a few stray triangles must not make it small
+    low, high = np.maximum(low - reach, screen.min(axis=1)), np.minimum(high + reach, screen.max(axis=1))
+    focal = 0.93 * float(np.min(np.array([columns, rows]) / np.maximum(high - low, 1e-9)))
+    return 0.5 * (low + high), focal
+
+
+def _barycentric(points: _Floats, corners: _Floats) -> _Floats:
+    """Weights (N, 3) of the corners (N, 3, 3) of triangles at points (N, 3) on them."""
+    a, b, c = (corners[:, i] - points for i in range(3))
+    across = np.cross(b - a, c - a)
+    weight = np.stack([np.einsum("nj,nj->n", across, np.cross(*two)) for two in ((b, c), (c, a), (a, b))], 1)
+    weight = (
+        np.maximum(weight, 0.0) + 1e-300
+    )  # rounding can put a point outside, and triangles can have no area
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
+def _corner_normals(vertices: _Floats, faces: NDArray[np.int32]) -> _Floats:
+    """Normals (F, 3, 3) at the corners of triangles: the vertex normal on smooth surfaces, else the face normal."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    own = np.cross(b - a, c - a)
+    shared = np.zeros_like(vertices)
+    for axis in range(3):
+        shared[:, axis] = np.bincount(faces.ravel(), np.repeat(own[:, axis], 3), len(vertices))
+    own /= np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-300)
+    shared /= np.maximum(np.linalg.norm(shared, axis=1, keepdims=True), 1e-300)
+    smooth = np.einsum("fij,fj->fi", shared[faces], own) > _CREASE
+    return np.where(smooth[..., None], shared[faces], own[:, None])
+
+
+def _contours(depth: _Floats, step: int) -> NDArray[np.float32]:
+    """Brightness factors (rows, columns) of eye-dome lighting: a pixel is darker if those `step` pixels away are nearer."""
+    far = np.log(depth).astype(np.float32)
+    padded = np.pad(far, step, constant_values=np.inf)
+    hidden = np.zeros_like(far)
+    for dy, dx in ((0, 1), (1, 0), (1, 2), (2, 1), (0, 0), (0, 2), (2, 0), (2, 2)):
+        neighbour = padded[dy * step : dy * step + far.shape[0], dx * step : dx * step + far.shape[1]]
+        with np.errstate(invalid="ignore"):
+            hidden += np.nan_to_num(np.maximum(far - neighbour, 0.0), nan=0.0, posinf=0.0)
+    return np.exp(-6.0 * np.minimum(hidden / 8, 0.12)).astype(np.float32)

@@ -109,7 +109,7 @@ def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Flo
     to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
     look: Look = look_at_all(everything, to_eye, _SCENE_ASPECT)
     host = "127.0.0.1"
-    server: Any = start_server(host, free_port(host, 0, exactly=True))
+    server: Any = start_server(host, free_port(host, 0))
     try:
         data = glb(np.round(vertices * _STEPS_PER_M) / _STEPS_PER_M, faces, colors)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)

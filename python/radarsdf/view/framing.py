@@ -29,15 +29,13 @@ class Look(NamedTuple):
     """(3,) the point in the middle, which the user rotates the view about, m."""
 
 
-def look_at_all(
-    points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT, fov_rad: float = FOV_RAD
-) -> Look:
+def look_at_all(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT) -> Look:
     """The nearest camera that sees all points (N, 3), m, with z up, in the direction `to_eye` (3,), which is not vertical."""
     back = to_eye / np.linalg.norm(to_eye)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     up = np.cross(back, right)
-    tangent = math.tan(fov_rad / 2) / _MARGIN
+    tangent = math.tan(FOV_RAD / 2) / _MARGIN
     depth_m = points @ back
     # A camera at a along an axis and t back sees a point x if |x - a| <= slope * (t - depth).
     sides = [(axis, points @ axis, slope) for axis, slope in ((right, tangent * aspect), (up, tangent))]

@@ -62,12 +62,19 @@ class State:
     settle_s: float = 0.0
     """The mesh is drawn if nothing changes for so long."""
 
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The arguments of :meth:`ShownSurface.kept`."""
+        return self.max_uncertainty_m, self.min_confidence
+
 
 class Painter:
     """Draws the newest state on a canvas, from a thread of its own. States that are superseded are skipped."""
 
     def __init__(self, canvas: Any, state: State) -> None:
-        self._canvas, self._state = canvas, state
+        self._canvas = canvas
+        self.newest = state
+        """The state, which may not be drawn yet."""
         self._changed = threading.Condition()
         self._pending, self._stopped = True, False
         self._ended = threading.Event()
@@ -75,15 +82,10 @@ class Painter:
         self._thread = threading.Thread(target=self._run, name="radarsdf view", daemon=True)
         self._thread.start()
 
-    @property
-    def newest(self) -> State:
-        """The state, which may not be drawn yet."""
-        return self._state
-
     def change(self, **fields: Any) -> None:
         """Change the state, from any thread, without waiting."""
         with self._changed:
-            self._state = dataclasses.replace(self._state, **fields)
+            self.newest = dataclasses.replace(self.newest, **fields)
             self._pending = True
             self._changed.notify_all()
 
@@ -109,7 +111,7 @@ class Painter:
         try:
             while self._superseded(within_s=None) and not self._stopped:
                 with self._changed:
-                    self._pending, state = False, self._state
+                    self._pending, state = False, self.newest
                 self._canvas.show_scan(state)
                 if state.coarse:
                     self._canvas.show_cloud(state)
@@ -151,14 +153,15 @@ class Canvas:
         """The parent of mesh and cloud."""
         self._cloud: Any = None
         if any(quantity.of_sensor for quantity in quantities.values()):
-            colors = np.full((len(self._spread), 3), NEUTRAL, np.uint8)
-            options = _POINTS | {
-                "point_shape": "circle",
-                "point_size": _POINT_SIZE * spacing_m,
-                "visible": False,
-            }
-            local = self._local[self._spread]
-            self._cloud = server.scene.add_point_cloud("/surface/cloud", local, colors, **options)
+            self._cloud = server.scene.add_point_cloud(
+                "/surface/cloud",
+                self._local[self._spread],
+                np.full((len(self._spread), 3), NEUTRAL, np.uint8),
+                point_shape="circle",
+                point_size=_POINT_SIZE * spacing_m,
+                visible=False,
+                **_POINTS,
+            )
 
     def show_scan(self, state: State) -> None:
         """Show the returns of the scan."""
@@ -169,11 +172,10 @@ class Canvas:
         """Recolour the cloud and show it instead of the mesh, if the quantity depends on the sensor."""
         if not self._quantities[state.quantity].of_sensor:
             return
-        limits = (state.max_uncertainty_m, state.min_confidence)
-        moved = limits != self._cloud_limits
+        moved = state.limits != self._cloud_limits
         if moved:
-            self._cloud_rows = self._spread[self._surface.kept(*limits)[self._spread]]
-            self._cloud_limits = limits
+            self._cloud_rows = self._spread[self._surface.kept(*state.limits)[self._spread]]
+            self._cloud_limits = state.limits
         colors = self._colors(self._cloud_rows, state)
         with self._server.atomic():
             if moved:
@@ -186,12 +188,12 @@ class Canvas:
 
     def show_mesh(self, state: State, superseded: Callable[[], bool]) -> None:
         """Send the mesh, and show it alone once the page has drawn it, unless the state is superseded before."""
-        limits = (state.max_uncertainty_m, state.min_confidence)
-        drawn = (limits, state.quantity, state.sensor if self._quantities[state.quantity].of_sensor else None)
+        of_sensor = self._quantities[state.quantity].of_sensor
+        drawn = (state.limits, state.quantity, state.sensor if of_sensor else None)
         if drawn == self._drawn and not self.coarse:
             self._shown(state)
             return
-        rows, faces = self._surface.part(self._surface.kept(*limits))
+        rows, faces = self._surface.part(self._surface.kept(*state.limits))
         colors = self._colors(rows, state)
         if superseded():
             return
@@ -222,7 +224,7 @@ class Canvas:
 class ScanClouds:
     """The sensor's path, and the returns of one scan, measured and predicted, or of all scans.
 
-    `colors`: the scale of measured intensities. `describe` is called with a sentence about the scan that is shown.
+    `colors`: the scale of measured intensities. `text`: what shows a sentence about the scan that is shown.
     """
 
     def __init__(
@@ -231,10 +233,10 @@ class ScanClouds:
         radar_map: Map,
         scans: Scans,
         colors: Colors | None,
-        describe: Callable[[str], None],
+        text: Any,
     ) -> None:
         self._server, self._map, self._scans = server, radar_map, list(scans)
-        self._colors, self._describe = colors, describe
+        self._colors, self._text = colors, text
         self._shown: int | None = None
         self._clouds: dict[str, Any] = {}
         self._visible = {"measured": True, "predicted": True, "all": False}
@@ -263,7 +265,7 @@ class ScanClouds:
             errors = np.abs(found - np.asarray(scan.intensities, np.float64))
             errors = errors[np.isfinite(errors)]
             text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
-        self._describe(text)
+        self._text.content = text
 
     def set_visible(self, what: str, visible: bool) -> None:
         """Show or hide the cloud ``measured``, ``predicted`` or ``all``."""

@@ -25,7 +25,7 @@ from radarsdf.view.guarding import guarded
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-_PORTS_TRIED = 100
+_FIRST_PORT, _PORTS_TRIED = 8080, 100
 WAIT_STEP_S = 0.2
 """The main thread waits in such steps: Windows does not interrupt an endless wait by Ctrl-C."""
 
@@ -35,14 +35,16 @@ def require_viser() -> None:
     require("viser", what="the viewer needs")
 
 
-def free_port(host: str, port: int, *, exactly: bool) -> int:
-    """The port to listen on: `port`, or unless it must be `exactly` that one, the next that is free.
+def free_port(host: str, port: int | None) -> int:
+    """The port to listen on: `port`, or if that is None, from 8080 on the next that is free.
 
-    Raises a ValueError if `port` is not a port, an OSError if none is free or the host is not an address of this machine.
+    Raises an OSError if none is free or the host is not an address of this machine.
     """
-    whole_number(port, "--port", 0, 65535)
+    candidates = range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED)
+    if port is not None:
+        candidates = range(whole_number(port, "--port", 0, 65535), port + 1)
     # viser would wait forever for an address that it cannot listen on.
-    for candidate in [port] if exactly else range(port, min(port + _PORTS_TRIED, 65536)):
+    for candidate in candidates:
         try:
             family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
             with socket.create_server((host, candidate), family=family) as listening:
@@ -51,9 +53,8 @@ def free_port(host: str, port: int, *, exactly: bool) -> int:
         except OSError as error:  # also for an unknown host name
             reason = (error.strerror or str(error)).partition(" (while")[0]
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                msg = f"cannot listen on {host}, port {candidate}: {reason}; --host takes an address of this machine"
-                raise OSError(msg) from error
-    msg = f"cannot listen on {host}, port {port}: {reason}; --port takes another"
+                break
+    msg = f"cannot listen on {host}, port {candidate}: {reason}; --host takes an address of this machine, --port a free port"
     raise OSError(msg)
 
 
@@ -129,7 +130,7 @@ class Page:
     def __init__(self, host: str, port: int | None) -> None:
         require_viser()
         self.host = host
-        self.port = free_port(host, 8080 if port is None else port, exactly=port is not None)
+        self.port = free_port(host, port)
 
     def _start(self) -> None:
         self._server: Any = start_server(self.host, self.port)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._core import SurfaceTracer
 from radarsdf.checks import whole_number
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Threshold
@@ -97,8 +98,7 @@ def spread_evenly(points: _Floats, count: int, edge_m: float) -> tuple[_Rows, _R
     edge_m *= math.sqrt(len(points) / count)
     while True:
         cells = np.floor((points - points.min(axis=0)) / edge_m).astype(np.int64)
-        shape = cells.max(axis=0) + 1
-        keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
+        keys = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
         _, of_point, counts = np.unique(keys, return_inverse=True, return_counts=True)
         if len(counts) <= count:
             break
@@ -134,24 +134,9 @@ def thinned(mesh: trimesh.Trimesh, max_vertices: int, edge_m: float) -> tuple[tr
 def first_hit(
     vertices: _Floats, faces: NDArray[np.int32], ray_origin: ArrayLike, ray_direction: ArrayLike
 ) -> _Floats | None:
-    """Point (3,) where a ray first hits a mesh, or None: Möller and Trumbore's test. The direction is of any length."""
+    """Point (3,) where a ray first hits a mesh, or None. The direction is of any length."""
     origin, direction = np.asarray(ray_origin, np.float64), np.asarray(ray_direction, np.float64)
     direction = direction / np.linalg.norm(direction)
-    corners = vertices[faces]
-    # A triangle can be hit only if its first corner is no farther from the ray's line than the longest edge.
-    offsets = corners[:, 0] - origin
-    away_m = np.linalg.norm(offsets - np.outer(offsets @ direction, direction), axis=1)
-    edges_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    a, b, c = corners[away_m <= edges_m.max(initial=0.0)].transpose(1, 0, 2)
-    p = np.cross(direction, c - a)
-    with np.errstate(divide="ignore", invalid="ignore"):  # triangles along the ray
-        inverse = 1 / np.einsum("ij,ij->i", b - a, p)
-        u = np.einsum("ij,ij->i", origin - a, p) * inverse
-        q = np.cross(origin - a, b - a)
-        v = q @ direction * inverse
-        distances_m = np.einsum("ij,ij->i", c - a, q) * inverse
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (distances_m > 0) & np.isfinite(distances_m)
-    if not hit.any():
-        return None
-    point: _Floats = origin + distances_m[hit].min() * direction
-    return point
+    tracer = SurfaceTracer(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32))
+    (range_m,), _ = tracer.first_hits(origin.tolist(), direction[None].astype(np.float32), np.inf)
+    return origin + float(range_m) * direction if np.isfinite(range_m) else None

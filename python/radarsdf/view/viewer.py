@@ -63,7 +63,7 @@ class Viewer(Page):
         **limits: Any,
     ) -> None:
         super().__init__(host, port)
-        self._map = radar_map
+        self._map, self._voxel_size = radar_map, voxel_size
         self.surface = ShownSurface.of(
             radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
@@ -74,8 +74,6 @@ class Viewer(Page):
         except BaseException:
             super().stop()
             raise
-        self.notes = self._notes(voxel_size)
-        """What is shown more coarsely than it is, in words."""
 
     def wait(self) -> None:
         """Wait until the viewer is stopped, from another thread or by Ctrl-C. Raises an error of its thread."""
@@ -102,7 +100,7 @@ class Viewer(Page):
         self._add_controls(0 if scans is None else len(scans), measured)
         self._clouds = None
         if scans is not None:
-            self._clouds = ScanClouds(server, radar_map, scans, measured, self._describe_scan)
+            self._clouds = ScanClouds(server, radar_map, scans, measured, self._scan_text)
         self._canvas = Canvas(server, radar_map, surface, self.quantities, self._clouds, self._describe)
         self._gizmo: Any = None
         if radar_map.has_intensity:
@@ -195,9 +193,6 @@ class Viewer(Page):
         for box in self._layers.values():
             box.on_update(on_layer)
 
-    def _describe_scan(self, text: str) -> None:
-        self._scan_text.content = text
-
     def _look_at_all(self, client: Any) -> Look:
         """Let a page show everything."""
         camera = client.camera
@@ -284,9 +279,11 @@ class Viewer(Page):
             rows["intensity"] = f"{self._map.intensity(x, sensor)[0]:.1f} from {range_m:.1f} m"
         self._answer.content = table(rows)
 
-    def _notes(self, voxel_size: float) -> list[str]:
+    @property
+    def notes(self) -> list[str]:
+        """What is shown more coarsely than it is, in words."""
         notes = []
-        if self.surface.spacing_m > voxel_size:
+        if self.surface.spacing_m > self._voxel_size:
             notes.append(
                 f"the mesh is thinned to {len(self.surface.vertices)} vertices, {self.surface.spacing_m:.2g} m apart: "
                 "--max-vertices allows more, --box shows a part"
