@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _scans(options: argparse.Namespace) -> Scans | None:
     """The scans, if the truth is not a file of points or a surface."""
-    from radarsdf.io.bags.reading import is_bag
+    from radarsdf.io.bags.files import is_bag
     from radarsdf.io.npz import holds_scans
 
     path = options.scans

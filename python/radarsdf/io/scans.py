@@ -21,7 +21,9 @@ _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
 
 _ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a scan
+_NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 
+_Arrays: TypeAlias = dict[str, "list[NDArray[Any]] | None"]
 TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
 """Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
 
@@ -56,13 +58,31 @@ class Scan:
         return world
 
 
-class Notes:
-    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``."""
+def finite_returns(scan: Scan, notes: Notes) -> Scan:
+    """The returns of a scan whose coordinates and intensity are finite. The others are counted."""
+    points, intensities = scan.points, scan.intensities
+    # All at once first: that is usual, and row by row takes twenty times as long.
+    if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
+        return scan
+    finite = np.isfinite(points).all(axis=1)
+    if intensities is not None:
+        finite &= np.isfinite(intensities)
+    notes.count(_NOT_FINITE, int((~finite).sum()))
+    optional = (intensities, scan.doppler_mps, scan.sigma)
+    intensities, doppler_mps, sigma = (None if array is None else array[finite] for array in optional)
+    return Scan(points[finite], scan.T_world_sensor, intensities, doppler_mps, scan.time_s, sigma)
 
-    def __init__(self, about: str = "the scans") -> None:
+
+class Notes:
+    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``.
+
+    `about` names what is read, for errors. Without `log`, the sentences are kept, but not logged.
+    """
+
+    def __init__(self, about: str = "the scans", *, log: bool = True) -> None:
         self.about = about
-        """What is read, for errors."""
         self.lines: list[str] = []
+        self._log = log
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
 
@@ -70,13 +90,14 @@ class Notes:
         """Keep a sentence, and log it if it is new."""
         if line not in self.lines:
             self.lines.append(line)
-            _LOG.warning(line)
+            if self._log:
+                _LOG.warning(line)
 
     def ending(self) -> str:
         """All sentences, to end an error with."""
         return "".join(f"; {line}" for line in self.lines)
 
-    def count(self, what: str, number: int, example: str = "") -> None:
+    def count(self, what: str, number: int = 1, example: str = "") -> None:
         """Count what was left out in this pass through the files, and keep the first example."""
         if number:
             self._first.setdefault(what, f"; the first: {example}" if example else "")
@@ -133,7 +154,7 @@ class Scans:
         truth_kind: TruthKind = "lidar",
         imu: Imu | None = None,
     ) -> None:
-        self._arrays: dict[str, Any] | None = {
+        self._arrays: _Arrays | None = {
             name: None if arrays is None else list(one_for_each_scan(arrays, name))
             for name, arrays in zip(_ARRAYS, (points, intensities, doppler_mps, sigmas), strict=True)
         }
@@ -183,8 +204,7 @@ class Scans:
     @property
     def points(self) -> list[NDArray[Any]]:
         """F arrays (N_i, 3), sensor frame, m."""
-        found: list[NDArray[Any]] = self._loaded()["points"]
-        return found
+        return self._loaded()["points"] or []
 
     @property
     def poses(self) -> NDArray[np.float64]:
@@ -197,17 +217,17 @@ class Scans:
     @property
     def intensities(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
-        return self._optional("intensities")
+        return self._loaded()["intensities"]
 
     @property
     def doppler_mps(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
-        return self._optional("doppler_mps")
+        return self._loaded()["doppler_mps"]
 
     @property
     def sigmas(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
-        return self._optional("sigmas")
+        return self._loaded()["sigmas"]
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
@@ -281,11 +301,7 @@ class Scans:
             for _ in self._read():
                 pass
 
-    def _optional(self, name: str) -> list[NDArray[Any]] | None:
-        arrays: list[NDArray[Any]] | None = self._loaded()[name]
-        return arrays
-
-    def _loaded(self) -> dict[str, Any]:
+    def _loaded(self) -> _Arrays:
         """The arrays of all scans, which are read from their files at the first call."""
         if self._arrays is None:
             self._arrays = _arrays_of(list(self._read()))
@@ -316,7 +332,7 @@ def chosen(arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64]) -> lis
     return None if arrays is None else [arrays[i] for i in numbers]
 
 
-def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
+def _arrays_of(scans: Sequence[Scan]) -> _Arrays:
     """By their names in :class:`Scans`: lists of one array a scan, or None where a scan has none."""
     return {
         "points": [scan.points for scan in scans],
