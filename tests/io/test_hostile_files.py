@@ -27,8 +27,7 @@ from bench.stress.mutations import boundaries
 FILES = 120
 
 
-# Of LAZ files, lazrs allocates what their chunks claim: under the limit of memory here it ends the process.
-@pytest.mark.parametrize("name", [name for name in files.READERS if name != "read: LAZ"])
+@pytest.mark.parametrize("name", files.READERS)
 def test_damaged_files_are_read_or_refused(name, tmp_path, monkeypatch):
     monkeypatch.setattr("radarsdf.io.meshes._SAMPLES", 1000)  # of each surface that is read
     reader = files.READERS[name]

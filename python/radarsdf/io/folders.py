@@ -17,13 +17,17 @@ from numpy.typing import NDArray
 
 from radarsdf.io.clouds.bin import KITTI, bin_layout
 from radarsdf.io.clouds.fields import names_of, plain_name
-from radarsdf.io.clouds.pcd import read_viewpoint
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, read_columns, read_points
-from radarsdf.io.ply import Columns
+from radarsdf.io.clouds.reading import (
+    CLOUD_SUFFIXES,
+    TEXT_SUFFIXES,
+    read_columns,
+    read_points,
+    read_viewpoint,
+)
 from radarsdf.io.poses.files import FIND_POSES, POSE_FILES, poses_of, read_transform
 from radarsdf.io.poses.trajectory import UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.recordings import RawScan, Request, Truth, posed, scan_poses
-from radarsdf.io.scans import Notes, Scans
+from radarsdf.io.scans import Columns, Notes, Scans
 from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970, without_unit
 
 BASE_T_RADAR = "base_T_radar.txt"

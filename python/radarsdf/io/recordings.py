@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.ply import Columns
 from radarsdf.io.poses.trajectory import MAX_GAP_S, ScanPoses, StampedPoses, Trajectory
-from radarsdf.io.scans import Notes, Scan
+from radarsdf.io.scans import Columns, Notes, Scan
 
 WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
 _UNREADABLE = "scans left out: they cannot be read"

@@ -23,6 +23,9 @@ _Value = TypeVar("_Value")
 _ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a scan
 _NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 
+Columns: TypeAlias = dict[str, NDArray[Any]]
+"""(N,) each, by name."""
+
 _Arrays: TypeAlias = dict[str, "list[NDArray[Any]] | None"]
 TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
 """Where ground truth comes from: the lidar of a recording, a simulator, or the user."""

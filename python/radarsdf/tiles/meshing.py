@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from radarsdf.budget.estimate import check_triangles
 from radarsdf.checks import check_box, path_of, positive
+from radarsdf.io.clouds.writing import face_records, ply_header, records
 from radarsdf.io.files import whole_file
-from radarsdf.io.ply import face_records, ply_header, records
 from radarsdf.map.mesh import described_mesh
 from radarsdf.map.threshold import Limits, Threshold
 from radarsdf.tiles.blend import TileBlend

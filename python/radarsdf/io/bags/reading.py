@@ -24,11 +24,10 @@ from radarsdf.io.bags.messages import CLOUD_TYPES, IMU, PACKETS, POINT_A_MESSAGE
 from radarsdf.io.bags.poses import attached, poses_in_bags, transforms_in
 from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.imu import Imu
-from radarsdf.io.ply import Columns
 from radarsdf.io.poses.files import poses_of
 from radarsdf.io.poses.trajectory import UNPOSED, ScanPoses, StampedPoses
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
-from radarsdf.io.scans import Notes, Scans
+from radarsdf.io.scans import Columns, Notes, Scans
 
 KNOWN_TOPICS = {
     "/hugin_raf_1/radar_data": "/icp_odom",  # Viking Hill

@@ -188,23 +188,6 @@ class NoPoses(ValueError):
     """Scans have no poses, and none are given."""
 
 
-class _Unposed:
-    """Scans without poses: the identity at all times."""
-
-    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64]:  # noqa: ARG002
-        return np.eye(4)
-
-    def span(self) -> str:
-        return "all times"
-
-    def __repr__(self) -> str:
-        return "UNPOSED"
-
-
-UNPOSED: StampedPoses = _Unposed()
-"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
-
-
 @dataclass(frozen=True, eq=False)
 class TransformChain:
     """A product of transforms, each of which is constant or moves: T_world_a · T_a_b · … of a tree of frames."""
@@ -228,6 +211,10 @@ class TransformChain:
     def span(self) -> str:
         """First and last time of its moving links, for messages."""
         return ", ".join(link.span() for link in self.moving())
+
+
+UNPOSED: StampedPoses = TransformChain(())
+"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
 
 
 @dataclass(frozen=True, eq=False)
