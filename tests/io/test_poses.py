@@ -31,17 +31,6 @@ def test_matrices(tmp_path, shape):
     assert notes.lines == []
 
 
-def test_array(tmp_path):
-    np.save(tmp_path / "poses.npy", POSES)
-    assert_allclose(read_poses(tmp_path / "poses.npy", Notes()), POSES)
-    np.save(tmp_path / "poses.npy", POSES[0])
-    with pytest.raises(ValueError, match=r"poses\.npy is not poses \(F, 4, 4\)"):
-        read_poses(tmp_path / "poses.npy", Notes())
-    (tmp_path / "poses.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(ValueError, match=r"not a whole \.npy file"):
-        read_poses(tmp_path / "poses.npy", Notes())
-
-
 def test_kitti_with_calibration(tmp_path):
     """The truth are poses of the sensor in the frame of the first one; KITTI stores those of the camera."""
     truth = np.linalg.inv(POSES[0]) @ POSES
@@ -121,12 +110,6 @@ def test_names_decide_what_columns_mean(tmp_path, layout):
     assert_allclose(found.poses(found.times_s, 1.0), [pose([1.0, 2, 3], np.pi / 2)] * 2, atol=1e-9)
 
 
-def test_named_poses_without_times_are_in_order(tmp_path):
-    (tmp_path / "a.csv").write_text(f"frame,qw,qx,qy,qz,x,y,z\n0,{HALF},0,0,{HALF},1,2,3\n1,1,0,0,0,0,0,0\n")
-    found = read_poses(tmp_path / "a.csv", Notes())
-    assert_allclose(found, [pose([1.0, 2, 3], np.pi / 2), np.eye(4)], atol=1e-9)
-
-
 def test_one_bad_pose_is_left_out_and_named(tmp_path):
     rows = [f"{t} {t} 0 0 0 0 0 1" for t in range(10)]
     rows[2], rows[4], rows[6] = "2 nan 0 0 0 0 0 1", "4 4 0 0 0 0 0 0", "6 6 0 0 0 oops 0 1"
@@ -145,17 +128,6 @@ def test_one_bad_pose_is_left_out_and_named(tmp_path):
     assert [note[-9:] for note in notes.lines] == ["pose 1, 3", "line 2, 4"]
     with pytest.raises(ValueError, match="pose 0 is not"):
         poses_of(np.full((2, 4, 4), np.nan), Notes())
-
-
-def test_poses_as_users_give_them(tmp_path):
-    assert_allclose(poses_of(POSES.tolist(), Notes()), POSES)
-    assert_allclose(poses_of(str(written(tmp_path / "a.txt", POSES.reshape(3, 16))), Notes()), POSES)
-    chain = TransformChain((POSES[1],))
-    assert poses_of(chain, Notes()) is chain
-    with pytest.raises(ValueError, match=r"must be \(F, 4, 4\) T_world_sensor"):
-        poses_of(np.eye(4), Notes())
-    with pytest.raises(ValueError, match="pose 1 is not a rigid transform"):
-        poses_of([np.eye(4), np.ones((4, 4))], Notes())
 
 
 def test_one_time_of_many_is_as_all_of_them():
