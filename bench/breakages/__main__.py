@@ -60,7 +60,7 @@ def slow(name: str, step_m: float, seed: int = 0, cell: float = 0.0) -> Data:
     at = np.maximum(np.arange(24.0) - 12, 0) * min(step_m / usual_m, 1)
     along = Trajectory(np.arange(12.0), drive.poses[:, :3, 3], Rotation.from_matrix(drive.poses[:, :3, :3]))
     scans = radarsdf.simulate.simulate(
-        drive.scene, drive.sensor, along.poses(at, np.inf), name=name, seed=seed
+        drive.scene, drive.sensor, along.poses(at), name=name, seed=seed
     )
     points = scans.points
     if cell:

@@ -18,7 +18,6 @@ import zipfile
 import numpy as np
 import pytest
 import radarsdf
-import torch
 from radarsdf.io.npz import read_scans
 
 from bench.stress import files, samples

@@ -77,7 +77,7 @@ def test_which_topic(tmp_path):
 def test_our_files_keep_them(tmp_path):
     given = Imu(TIMES_S, RATES, FORCES, MOUNTING[:3, :3])
     scans = Scans([np.ones((2, 3))] * 3, np.tile(np.eye(4), (3, 1, 1)), times_s=TIMES_S[:3], imu=given)
-    for kept in (scans, scans.select_range(slice(0, 2))):
+    for kept in (scans, scans.select(np.arange(2))):
         write_scans(tmp_path / "scans.npz", kept)
         for again in (read_scans(tmp_path / "scans.npz").imu, read(tmp_path / "scans.npz").imu):
             for name, values in vars(given).items():

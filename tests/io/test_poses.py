@@ -107,7 +107,7 @@ def test_names_decide_what_columns_mean(tmp_path, layout):
     (tmp_path / "a.csv").write_text("\n".join([head, row, row.replace("1700000000", "1700000001")]))
     found = read_poses(tmp_path / "a.csv", Notes())
     assert found.times_s.tolist() == [1_700_000_000, 1_700_000_001]
-    assert_allclose(found.poses(found.times_s, 1.0), [pose([1.0, 2, 3], np.pi / 2)] * 2, atol=1e-9)
+    assert_allclose(found.poses(found.times_s), [pose([1.0, 2, 3], np.pi / 2)] * 2, atol=1e-9)
 
 
 def test_one_bad_pose_is_left_out_and_named(tmp_path):
@@ -135,7 +135,7 @@ def test_one_time_of_many_is_as_all_of_them():
     times_s = 1.7e9 + np.cumsum(rng.uniform(0.05, 0.4, 50))
     trajectory = Trajectory(times_s, rng.normal(size=(50, 3)), Rotation.random(50, random_state=0))
     wanted = np.concatenate([rng.uniform(times_s[0], times_s[-1], 40), times_s[[0, 7, -1]]])
-    expected = trajectory.poses(wanted, 1.0)
+    expected = trajectory.poses(wanted)
     assert_allclose([trajectory.pose_at(t, 1.0) for t in wanted], expected, atol=1e-9)
     assert trajectory.pose_at(times_s[0] - 0.01, 1.0) is None
     assert trajectory.pose_at(times_s[-1] + 0.01, 1.0) is None

@@ -21,7 +21,7 @@ def test_poses_come_back(tmp_path, name):
     found = read_poses(tmp_path / name, Notes())
     if not isinstance(found, np.ndarray):
         np.testing.assert_allclose(found.times_s, TIMES)
-        found = found.poses(TIMES, np.inf)
+        found = found.poses(TIMES)
     np.testing.assert_allclose(found, POSES, atol=1e-8)
 
 

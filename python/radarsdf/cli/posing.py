@@ -104,5 +104,5 @@ def _found(scans: Scans, config: FitConfig, results: Results, command: str) -> t
     if posed.pieces > 1:
         rows = posed.rows
         results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest piece")
-        placed = placed.select_range(rows)
+        placed = placed.select(range(len(placed))[rows])
     return placed, posed

@@ -154,6 +154,6 @@ def _poses_of_file(path: Path) -> NDArray[np.float64]:
 
     found = read_poses(path, Notes(str(path)))
     if isinstance(found, Trajectory):
-        return found.poses(found.times_s, max_gap_s=0.0)
+        return found.poses(found.times_s)
     assert not hasattr(found, "pose_at")  # files have no poses of another kind
     return found[np.isfinite(found).all(axis=(1, 2))]

@@ -332,8 +332,10 @@ def _lidar_scans(
         if (np.abs(times_s[used] - time_s) > _MAX_SWEEP_S).any():
             msg = f"{path}: the times of its points differ by more than {_MAX_SWEEP_S} s from the time in its name"
             raise ValueError(msg)
-        used &= trajectory.covers(times_s)
-        yield trajectory.move(xyz[used], times_s[used], MAX_GAP_S)
+        used &= trajectory.covers(times_s, MAX_GAP_S)
+        if used.any():
+            T_world_lidar = trajectory.poses(times_s[used])
+            yield (T_world_lidar[:, :3, :3] @ xyz[used][:, :, None])[:, :, 0] + T_world_lidar[:, :3, 3]
 
 
 def _stamped_files(folder: Path) -> list[tuple[float, Path]]:

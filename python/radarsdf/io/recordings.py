@@ -219,6 +219,6 @@ def scan_poses(
             f"the scans have no time stamps: they are matched to the {count} poses in their order"
         )
         times_s = poses.times_s.tolist()
-        poses = poses.poses(poses.times_s, np.inf)
+        poses = poses.poses(poses.times_s)
     T = np.eye(4) if T_base_sensor is None else T_base_sensor
     return ScanPoses(poses, T, request.max_gap_s), times_s

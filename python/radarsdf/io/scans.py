@@ -253,16 +253,12 @@ class Scans:
         """Sentences on what was assumed, and after the files were read, on what was left out."""
         return list(self._notes.lines)
 
-    def select(self, frames: NDArray[np.int64]) -> Scans:
+    def select(self, frames: NDArray[np.int64] | Sequence[int]) -> Scans:
         """The scans with the numbers `frames`, (K,), in this order. All scans are read."""
         scans = self.with_poses(self.poses[frames])
         scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
         scans._times_s = None if self._times_s is None else self._times_s[frames]
         return scans
-
-    def select_range(self, rows: slice) -> Scans:
-        """The scans of a range of numbers. All scans are read."""
-        return self.select(np.arange(len(self.points))[rows])
 
     def with_poses(self, poses: NDArray[np.float64], *, other_world: bool = False) -> Scans:
         """The same scans with other poses (F, 4, 4) T_world_sensor, m. All scans are read.
@@ -330,7 +326,9 @@ def filled(points: Any, **given: Any) -> tuple[Any, ...]:
     return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
 
 
-def chosen(arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64]) -> list[NDArray[Any]] | None:
+def chosen(
+    arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64] | Sequence[int]
+) -> list[NDArray[Any]] | None:
     """Those of these `numbers`, (K,), in this order, if there are arrays."""
     return None if arrays is None else [arrays[i] for i in numbers]
 
