@@ -212,8 +212,8 @@ def _split(
     plain = {plain_name(name)[0]: name for name in reversed(table)}
     number = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
     time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
-    in_order = isinstance(poses, np.ndarray)
-    key = number if number is not None or (in_order and len(poses) == 1) else time
+    one_pose = isinstance(poses, np.ndarray) and len(poses) == 1
+    key = number if number is not None or one_pose else time
     if key is None or table[key].dtype.kind not in "biuf":
         return whole
     rows = np.flatnonzero(np.isfinite(table[key]))
@@ -227,7 +227,7 @@ def _split(
     if time is not None and table[time].dtype.kind in "iuf":
         scale = SCALES.get(without_unit(time)[1], 1.0)
         times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
-    if in_order and len(values) < len(poses) and 0 <= values[0] <= values[-1] < len(poses):
+    if isinstance(poses, np.ndarray) and 0 <= values[0] <= values[-1] < len(poses) > len(values):
         poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
     return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
 

@@ -131,7 +131,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} cannot be read as a mesh: {error}"
         raise ValueError(msg) from error
-    faces = mesh.faces if isinstance(mesh, trimesh.Trimesh) else None
+    faces: Any = mesh.faces if isinstance(mesh, trimesh.Trimesh) else None
     if np.ndim(faces) != 2 or (len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices)):
         msg = f"{path} is not one mesh, or a triangle has a corner that is none of its vertices"
         raise ValueError(msg)
@@ -139,7 +139,8 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
         mesh.apply_transform(_T_GLTF_WORLD.T)
     if (origin := origin_of(file)) is not None:
         mesh.vertices = np.asarray(mesh.vertices, np.float64) + origin
-    return mesh
+    read: trimesh.Trimesh = mesh
+    return read
 
 
 def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:

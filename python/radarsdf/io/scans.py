@@ -26,7 +26,6 @@ _NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite n
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """(N,) each, by name."""
 
-_Arrays: TypeAlias = dict[str, "list[NDArray[Any]] | None"]
 TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
 """Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
 
@@ -157,7 +156,7 @@ class Scans:
         truth_kind: TruthKind = "lidar",
         imu: Imu | None = None,
     ) -> None:
-        self._arrays: _Arrays | None = {
+        self._arrays: dict[str, Any] | None = {
             name: None if arrays is None else list(one_for_each_scan(arrays, name))
             for name, arrays in zip(_ARRAYS, (points, intensities, doppler_mps, sigmas), strict=True)
         }
@@ -207,7 +206,8 @@ class Scans:
     @property
     def points(self) -> list[NDArray[Any]]:
         """F arrays (N_i, 3), sensor frame, m."""
-        return self._loaded()["points"] or []
+        found: list[NDArray[Any]] = self._loaded()["points"]
+        return found
 
     @property
     def poses(self) -> NDArray[np.float64]:
@@ -220,17 +220,17 @@ class Scans:
     @property
     def intensities(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
-        return self._loaded()["intensities"]
+        return self._optional("intensities")
 
     @property
     def doppler_mps(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
-        return self._loaded()["doppler_mps"]
+        return self._optional("doppler_mps")
 
     @property
     def sigmas(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
-        return self._loaded()["sigmas"]
+        return self._optional("sigmas")
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
@@ -300,7 +300,11 @@ class Scans:
             for _ in self._read():
                 pass
 
-    def _loaded(self) -> _Arrays:
+    def _optional(self, name: str) -> list[NDArray[Any]] | None:
+        arrays: list[NDArray[Any]] | None = self._loaded()[name]
+        return arrays
+
+    def _loaded(self) -> dict[str, Any]:
         """The arrays of all scans, which are read from their files at the first call."""
         if self._arrays is None:
             self._arrays = _arrays_of(list(self._read()))
@@ -333,7 +337,7 @@ def chosen(
     return None if arrays is None else [arrays[i] for i in numbers]
 
 
-def _arrays_of(scans: Sequence[Scan]) -> _Arrays:
+def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
     """By their names in :class:`Scans`: lists of one array a scan, or None where a scan has none."""
     return {
         "points": [scan.points for scan in scans],

@@ -35,8 +35,7 @@ class Topic(NamedTuple):
 
     name: str
     message_type: str
-    count: int
-    """Number of its messages."""
+    num_messages: int
 
 
 class Message(NamedTuple):
@@ -75,14 +74,16 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
                 name = connection.topic
                 if not (isinstance(name, str) and isinstance(connection.msgtype, str)):
                     raise _damaged(path, ValueError("a topic has no name or no type"))
-                count = connection.msgcount + (topics[name].count if name in topics else 0)
+                count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
                 topics[name] = Topic(name, _type_of(connection), count)
     return topics
 
 
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
     """Those that have messages of these types."""
-    return {name: topic for name, topic in topics.items() if topic.message_type in types and topic.count}
+    return {
+        name: topic for name, topic in topics.items() if topic.message_type in types and topic.num_messages
+    }
 
 
 def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
@@ -129,7 +130,9 @@ def _encoding(connection: Any) -> str:
     return str(getattr(connection.ext, "serialization_format", "ros1"))
 
 
-def _stream(path: Path, names: set[str]) -> Generator[tuple[float, Path, Any, bytes], None, None]:
+def _stream(
+    path: Path, names: set[str]
+) -> Generator[tuple[float, Path, Any, bytes | memoryview], None, None]:
     """Record time, s, bag, connection of rosbags, and bytes of each message."""
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic in names and _encoding(c) in _ENCODINGS]

@@ -101,7 +101,7 @@ def _given(
     """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
     if isinstance(poses, np.ndarray):
         numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
-        count = topics[0].count if numbered else sum(1 for _ in raw_scans())
+        count = topics[0].num_messages if numbered else sum(1 for _ in raw_scans())
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
         return lambda _: numbered_poses
     if poses is UNPOSED:
@@ -139,7 +139,7 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
     unread = [
         t
         for t in topics.values()
-        if t.count
+        if t.num_messages
         and t.name not in fitting
         and _POINTS.search(_words(t))
         and not _NO_POINTS.search(t.message_type)
