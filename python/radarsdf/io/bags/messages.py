@@ -46,12 +46,10 @@ class Header(NamedTuple):
 
 
 class CloudMessage(NamedTuple):
-    """A message with points, whose columns (N,) by field are read when they are asked for."""
+    """A message with points."""
 
     header: Header
-    columns: Callable[[], Columns]
-    point_id: int | None = None
-    """Number of the point, of messages of one point each."""
+    columns: Columns
 
 
 class PoseMessage(NamedTuple):
@@ -139,8 +137,7 @@ class _Cursor:
         return self.raw[self.at - size : self.at]
 
 
-def _point_cloud2(cursor: _Cursor) -> CloudMessage:
-    header = cursor.header()
+def _point_cloud2(cursor: _Cursor) -> Columns:
     height, width = cursor.values("II")
     fields = [(cursor.string(), *cursor.values("IBI")) for _ in range(cursor.count())]
     big_endian, point_step, row_step = cursor.values("BII")
@@ -159,68 +156,57 @@ def _point_cloud2(cursor: _Cursor) -> CloudMessage:
         if count <= 1 and name:  # 0 is what some drivers write for 1
             columns.setdefault(name, (offset, (">" if big_endian else "<") + kind))
 
-    def read() -> Columns:
-        if not height * width:
-            return {name: np.zeros(0, kind) for name, (_, kind) in columns.items()}
-        # Views of the message: no loop over points.
-        shape, strides = (height, width), (row_step, point_step)
-        return {
-            name: np.ndarray(shape, kind, data, offset, strides).reshape(-1)
-            for name, (offset, kind) in columns.items()
-        }
-
-    return CloudMessage(header, read)
+    if not height * width:
+        return {name: np.zeros(0, kind) for name, (_, kind) in columns.items()}
+    # Views of the message: no loop over points.
+    shape, strides = (height, width), (row_step, point_step)
+    return {
+        name: np.ndarray(shape, kind, data, offset, strides).reshape(-1)
+        for name, (offset, kind) in columns.items()
+    }
 
 
-def _point_cloud(cursor: _Cursor) -> CloudMessage:
-    header = cursor.header()
+def _point_cloud(cursor: _Cursor) -> Columns:
     xyz = cursor.records([(axis, "f4") for axis in "xyz"], cursor.count())
     columns: Columns = {axis: xyz[axis] for axis in "xyz"}
     for _ in range(cursor.count()):
         name, values = cursor.string(), cursor.records([("value", "f4")], cursor.count())["value"]
         if len(values) == len(xyz):
             columns.setdefault(name, values)
-    return CloudMessage(header, lambda: columns)
+    return columns
 
 
-def _radar_scan(cursor: _Cursor) -> CloudMessage:
-    header = cursor.header()
+def _radar_scan(cursor: _Cursor) -> Columns:
     returns = cursor.records(_RADAR_RETURN, cursor.count())
-    return CloudMessage(header, lambda: {name: returns[name] for name, _ in _RADAR_RETURN})
+    return {name: returns[name] for name, _ in _RADAR_RETURN}
 
 
-def _ti_radar_scan(cursor: _Cursor) -> CloudMessage:
+def _ti_radar_scan(cursor: _Cursor) -> Columns:
     """One point a message: its number, x, y, z, range, velocity, Doppler bin, bearing and intensity."""
-    header = cursor.header()
     number, x, y, z, _, velocity, _, _, intensity = cursor.values("HfffffHff")
     point = {"x": x, "y": y, "z": z, "velocity": velocity, "intensity": intensity}
-    return CloudMessage(
-        header, lambda: {name: np.array([value], np.float32) for name, value in point.items()}, number
-    )
+    return {POINT_ID: np.array([number])} | {name: np.array([v], np.float32) for name, v in point.items()}
 
 
-def _nebula_list(cursor: _Cursor) -> CloudMessage:
+def _nebula_list(cursor: _Cursor) -> Columns:
     """A ContinentalArs548DetectionList."""
-    header = cursor.header()
     cursor.values("B" + "ddd" + "ffffffffB")  # among them, where the sensor is on the vehicle
     returns = cursor.records(_NEBULA_RETURN, cursor.count())
     invalid = np.frombuffer(returns["flags"].tobytes(), bool).reshape(-1, 8)
-    return CloudMessage(header, lambda: _ars548_columns(returns, invalid))
+    return _ars548_columns(returns, invalid)
 
 
-def _ars548_list(cursor: _Cursor) -> CloudMessage:
+def _ars548_list(cursor: _Cursor) -> Columns:
     """A DetectionList of ars548_messages: as the radar sends it, always with space for 800 returns."""
-    header = cursor.header()
     cursor.values("QIIIIIBIBH" + "f" * 12 + "B")
     returns = cursor.records(_ARS548_RETURN, _ARS548_MAX)
     _, _, count, *_ = cursor.values("ffIffB")
-    returns = returns[:count]
-    return CloudMessage(header, lambda: _ars548_columns(returns))
+    return _ars548_columns(returns[:count])
 
 
-def _nebula_packets(cursor: _Cursor) -> CloudMessage:
+def _nebula_packets(cursor: _Cursor) -> Columns:
     """What an ARS548 sent, among which lists of returns are found by their length."""
-    header, lists = cursor.header(), []
+    lists = []
     for _ in range(cursor.count()):
         cursor.values("II")  # its time
         packet = cursor.data()
@@ -229,7 +215,7 @@ def _nebula_packets(cursor: _Cursor) -> CloudMessage:
             record = np.dtype([(name, ">" + kind) for name, kind in _ARS548_RETURN])
             lists.append(np.frombuffer(packet, record, count, _ARS548_RETURNS_AT))
     returns = np.concatenate(lists) if lists else np.zeros(0, _ARS548_RETURN)
-    return CloudMessage(header, lambda: _ars548_columns(returns))
+    return _ars548_columns(returns)
 
 
 def _ars548_columns(returns: NDArray[Any], invalid: NDArray[np.bool_] | None = None) -> Columns:
@@ -268,12 +254,13 @@ def _imu(cursor: _Cursor) -> ImuMessage:
     return ImuMessage(header, *measured)
 
 
+POINT_ID = "point_id"
 POINT_A_MESSAGE = "ti_mmwave_rospkg/msg/RadarScan"
 PACKETS = "nebula_msgs/msg/NebulaPackets"
 PATH = "nav_msgs/msg/Path"
 IMU = "sensor_msgs/msg/Imu"
 
-_CLOUDS = {
+_CLOUDS: dict[str, Callable[[_Cursor], Columns]] = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
     "sensor_msgs/msg/PointCloud": _point_cloud,
     "radar_msgs/msg/RadarScan": _radar_scan,
@@ -290,7 +277,7 @@ _POSES: dict[str, Callable[[_Cursor], Any]] = {
     PATH: partial(_poses, child=False),
 }
 _TRANSFORMS = dict.fromkeys(("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), partial(_poses, child=True))
-_LAYOUTS: dict[str, Callable[[_Cursor], Any]] = {**_CLOUDS, **_POSES, **_TRANSFORMS, IMU: _imu}
+_LAYOUTS: dict[str, Callable[[_Cursor], Any]] = {**_POSES, **_TRANSFORMS, IMU: _imu}
 CLOUD_TYPES = tuple(_CLOUDS)
 POSE_TYPES = tuple(_POSES)
 TRANSFORM_TYPES = tuple(_TRANSFORMS)
@@ -300,7 +287,10 @@ def read_message(raw: bytes | memoryview, message_type: str, cdr: bool) -> Any:
     """The content of a message: a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`, by its type."""
     try:
         cursor = _Cursor(raw, cdr)
-        message = _LAYOUTS[message_type](cursor)
+        if message_type in _CLOUDS:
+            message: Any = CloudMessage(cursor.header(), _CLOUDS[message_type](cursor))
+        else:
+            message = _LAYOUTS[message_type](cursor)
         cursor.end()
     except KeyError as error:
         msg = "its topic has messages of other types, too"

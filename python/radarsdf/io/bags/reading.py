@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.bags.files import Message, Topic, by_record, is_bag, read_messages, topics_of, topics_with
-from radarsdf.io.bags.messages import CLOUD_TYPES, IMU, PACKETS, POINT_A_MESSAGE, CloudMessage
+from radarsdf.io.bags.messages import CLOUD_TYPES, IMU, PACKETS, POINT_A_MESSAGE, POINT_ID, CloudMessage
 from radarsdf.io.bags.poses import attached, poses_in_bags, transforms_in
 from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.imu import Imu
@@ -172,7 +172,7 @@ def _has_doppler(paths: list[Path], topic: Topic) -> bool:
     quiet = Notes(log=False)
     with closing(read_messages(paths, {topic.name}, quiet)) as messages, suppress(ValueError):
         for message in messages:
-            return "doppler" in Fields.of(list(message.content.columns())).names
+            return "doppler" in Fields.of(list(message.content.columns)).names
     return False
 
 
@@ -195,7 +195,9 @@ def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request
         cloud: CloudMessage = message.content
         time_s = message.recorded_s if recorded else cloud.header.stamp_s
         name = f"{message.bag}: message {message.number} of {topic.name}"
-        yield RawScan(cloud.columns, time_s, name, cloud.header.frame, topic.name, message.number)
+        yield RawScan(
+            partial(dict, cloud.columns), time_s, name, cloud.header.frame, topic.name, message.number
+        )
 
 
 def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
@@ -212,7 +214,7 @@ def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) 
     for message in read_messages(paths, {topic.name}, request.notes):
         last = scan[-1] if scan else message
         pause = message.recorded_s > last.recorded_s + _PAUSE_S
-        if scan and (pause or message.content.point_id <= last.content.point_id):
+        if scan and (pause or _point_id(message) <= _point_id(last)):
             yield whole(number)
             scan, number = [], number + 1
         scan.append(message)
@@ -221,8 +223,12 @@ def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) 
 
 
 def _joined(points: list[CloudMessage]) -> Columns:
-    rows = [point.columns() for point in points]
-    return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
+    fields = [field for field in points[0].columns if field != POINT_ID]
+    return {field: np.concatenate([point.columns[field] for point in points]) for field in fields}
+
+
+def _point_id(message: Message) -> int:
+    return int(message.content.columns[POINT_ID][0])
 
 
 def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
