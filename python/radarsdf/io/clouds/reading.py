@@ -33,6 +33,8 @@ _MAX_LINE = 1 << 16
 _LITERALS = 32  # control bytes of LZF below this are followed by so many bytes, and one more, as they are
 _FACES = re.compile(rb"element\s+face\s+0*[1-9]")
 _PLY_HEADER_BYTES = 1 << 16
+_LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
+_VARIABLE = 2**32 - 1  # in place of the number of points in each chunk
 _MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth
 _HEADER_BYTES, _COUNT_AT, _RECORD_BYTES = (
     227,
@@ -300,23 +302,39 @@ def read_las(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _check_chunks(path: Path, header: Any) -> None:
-    """Raises a ValueError for more chunks than the file can hold: lazrs ends the process where it cannot allocate."""
-    size, points_at = path.stat().st_size, header.offset_to_point_data
+    """Raises a ValueError for chunks that the file cannot hold: lazrs allocates what they claim, or ends the process."""
+    import lazrs  # noqa: PLC0415 - an extra
+
+    point, file_bytes, at = header.point_format, path.stat().st_size, header.offset_to_point_data
+    record = bytes(header.vlrs.get("LasZipVlr")[0].record_data)
+    usual = bytes(lazrs.LazVlr.new_for_compression(point.id, point.num_extra_bytes).record_data())
+    # Compressor, then type, size and version of each part of a point.
+    parts, usual_parts = (np.frombuffer(data[34:], "<u2").reshape(-1, 3)[:, :2] for data in (record, usual))
+    possible = record[:2] == usual[:2] and np.array_equal(parts, usual_parts)
     with path.open("rb") as file:
-        for place in (
-            points_at,
-            size - 8,
-        ):  # of the table's place, which stands before the points or at the end
+        for place in (at, file_bytes - 8):  # of the place of the chunk table: before the points or at the end
             file.seek(place)
             table_at = int.from_bytes(file.read(8), "little", signed=True)
-            if table_at > points_at:
-                file.seek(min(table_at, size))
+            if table_at > at:
+                file.seek(min(table_at, file_bytes))
                 chunks = int.from_bytes(file.read(8)[4:], "little")
                 # Each begins with a point as it is.
-                if chunks * header.point_format.size > size or chunks > max(header.point_count, 1):
-                    msg = f"it claims {chunks} chunks of points, for which it is too small"
-                    raise ValueError(msg)
-                return
+                possible &= chunks * point.size <= file_bytes and chunks <= max(header.point_count, 1)
+                break
+        chunk_size, left = int.from_bytes(record[12:16], "little"), header.point_count
+        layers = _LAZ_LAYERS.get(point.id, 0) + point.num_extra_bytes
+        at += 8
+        # In a chunk, the first point, the number of points, and the sizes of its layers are before these.
+        while possible and left > 0 and point.id in _LAZ_LAYERS:
+            file.seek(at + point.size)
+            count, *sizes = np.frombuffer(file.read(4 * (1 + layers)), "<u4").tolist() or [0]
+            at += point.size + 4 * (1 + layers) + sum(sizes)
+            expected = count if chunk_size == _VARIABLE else min(chunk_size, left)
+            possible = len(sizes) == layers and at <= file_bytes and 0 < count == expected
+            left -= count
+    if not possible:
+        msg = "its chunks of compressed points are damaged, or it is too small for them"
+        raise ValueError(msg)
 
 
 READERS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
