@@ -316,6 +316,7 @@ def _check_chunks(path: Path, header: Any) -> None:
             file.seek(place)
             table_at = int.from_bytes(file.read(8), "little", signed=True)
             if table_at > at:
+                possible &= table_at + 8 <= file_bytes
                 file.seek(min(table_at, file_bytes))
                 chunks = int.from_bytes(file.read(8)[4:], "little")
                 # Each begins with a point as it is.
