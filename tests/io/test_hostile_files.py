@@ -159,5 +159,3 @@ def test_what_is_no_file(tmp_path, read):
     os.mkfifo(path)  # nobody ever writes to it
     with pytest.raises(ValueError, match=r"map\.npz is not a regular file"):
         read(path)
-
-
