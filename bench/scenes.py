@@ -18,9 +18,9 @@ from radarsdf import FitConfig, RadarMap
 from radarsdf.checks import check_box
 from radarsdf.evaluation import holdout
 from radarsdf.io import read
+from radarsdf.io.datasets import find
 from radarsdf.io.npz import read_scans
 from radarsdf.io.scans import Scans
-from radarsdf.io.snail_radar import is_snail_radar
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.simulate import SCENES, Simulation
 from scipy.spatial import cKDTree
@@ -238,7 +238,9 @@ def _file(path: Path, frames: int | None) -> Scene:
 
 def _folder(path: Path, frames: int | None) -> Scene:
     scene = _recorded(path.resolve().name, read(path), frames)
-    return dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M) if is_snail_radar(path) else scene
+    dataset = find(path)
+    is_snail_radar = dataset is not None and dataset.name == "SNAIL-Radar"
+    return dataclasses.replace(scene, min_range_m=_MIN_RANGE_OCULII_M) if is_snail_radar else scene
 
 
 def _recorded(name: str, scans: Scans, frames: int | None) -> Scene:

@@ -323,9 +323,7 @@ def slow(name: str, step_m: float, seed: int = 0, cell: float = 0.0) -> Data:
     usual_m = np.linalg.norm(np.diff(drive.poses[:2, :3, 3], axis=0))
     at = np.maximum(np.arange(24.0) - 12, 0) * min(step_m / usual_m, 1)
     along = Trajectory(np.arange(12.0), drive.poses[:, :3, 3], Rotation.from_matrix(drive.poses[:, :3, :3]))
-    scans = radarsdf.simulate.simulate(
-        drive.scene, drive.sensor, along.poses(at, np.inf), name=name, seed=seed
-    )
+    scans = radarsdf.simulate.simulate(drive.scene, drive.sensor, along.poses(at), name=name, seed=seed)
     points = scans.points
     if cell:
         points = [_rounded(scan, cell) for scan in points]

@@ -28,7 +28,6 @@ def write_recordings(folder: Path) -> None:
     drive = radarsdf.simulate.hugin(frames=_FRAMES)
     _pcd(folder / "drive", drive)
     _tum(folder / "drive.tum", drive.poses)
-    _kitti(folder / "kitti_mm", drive, 1000.0)
     _bag(folder / "drive_mcap", drive)
     _cut_off(folder / "drive_mcap", folder / "cut_mcap")
 
@@ -52,27 +51,6 @@ def _tum(path, poses):
         for i, pose in enumerate(poses)
     ]
     path.write_text("\n".join(" ".join(f"{x:.9f}" for x in row) for row in rows) + "\n", encoding="utf-8")
-
-
-def _kitti(folder, drive, scale):
-    """Poses P are those of a camera: T_world_sensor = inv(Tr) P Tr, relative to the first scan."""
-    clouds = folder / "velodyne"
-    clouds.mkdir(parents=True)
-    Tr = np.eye(4)
-    Tr[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
-    Tr[:3, 3] = [0.1, -0.2, -0.3]
-    first = np.linalg.inv(drive.poses[0])
-    poses = [Tr @ first @ pose @ np.linalg.inv(Tr) for pose in drive.poses]
-    for i, (points, values) in enumerate(zip(drive.points, drive.intensities, strict=True)):
-        np.column_stack([points * scale, values]).astype("<f4").tofile(clouds / f"{i:06d}.bin")
-
-    def line(matrix):
-        return " ".join(f"{x:.9f}" for x in matrix[:3].ravel())
-
-    (folder / "poses.txt").write_text("\n".join(map(line, poses)) + "\n", encoding="utf-8")
-    (folder / "calib.txt").write_text(f"Tr: {line(Tr)}\n", encoding="utf-8")
-    times = "\n".join(f"{i * _STEP_S:.6f}" for i in range(len(drive)))
-    (folder / "times.txt").write_text(times + "\n", encoding="utf-8")
 
 
 def _bag(path, drive):

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -95,16 +93,6 @@ def test_cloud2_and_odometry(tmp_path, kind):
     assert no_doppler.doppler_mps is None
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap"])
-@pytest.mark.parametrize(
-    "options",
-    [{"padding": 7}, {"height": 1, "big_endian": True}],
-    ids=["padding", "big-endian"],
-)
-def test_layouts_of_cloud2(tmp_path, kind, options):
-    check(read(scans_and(tmp_path, kind, odometry, **options)))
-
-
 def test_cloud2_in_rows_with_other_types(tmp_path):
     cloud = {
         "rcs": np.array([-3, 4, 5, 6, 7, 8], np.int8), "x": np.arange(6.0), "y": np.arange(6.0), "z": np.arange(6.0),
@@ -112,7 +100,7 @@ def test_cloud2_in_rows_with_other_types(tmp_path):
     }  # fmt: skip
     with BagWriter(tmp_path / "a.bag", "ros1") as bag:
         odometry(bag)
-        message = bag.cloud2(START_S, cloud, height=2, padding=3)
+        message = bag.cloud2(START_S, cloud, height=2, padding=3, big_endian=True)
         rows = np.asarray(message.data).reshape(2, -1)
         message.data = np.concatenate([np.pad(row, (0, 10)) for row in rows])  # space after each row
         message.row_step += 10
@@ -165,15 +153,6 @@ def test_one_point_a_message(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_stamped_poses(tmp_path, kind):
-    def write(bag):
-        for time_s in TIMES_S:
-            bag.write("/pose", bag.pose_stamped(time_s, moved(time_s)), time_s)
-
-    check(read(scans_and(tmp_path, kind, write)))
-
-
-@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_of_paths_the_last_counts(tmp_path, kind):
     def write(bag):
         for count in (2, 5):  # the second one is corrected
@@ -203,40 +182,6 @@ def test_tree_of_transforms(tmp_path, kind):
         ValueError, match="world_frame earth is not above radar, whose frames are radar -> mast"
     ):
         read(path, world_frame="earth")
-
-
-def test_tree_without_the_radar(tmp_path):
-    path = scans_and(tmp_path, "mcap", tree, frame="hugin")
-    with pytest.raises(
-        ValueError, match="do not lead to the frame of the scans, hugin: they have base_link, mast"
-    ):
-        read(path)
-    check(read(path, extrinsic=MOUNTING), pose([100.0, 0, 0]) @ MOVED @ MOUNTING)
-
-
-def test_the_extrinsic_is_in_the_static_transforms(tmp_path):
-    def write(bag):
-        odometry(bag)
-        mast = {("base_link", "mast"): pose([0, 0, 1.0]), ("mast", "radar"): pose([0.5, 0, 0], np.pi / 2)}
-        bag.write("/tf_static", bag.transforms(START_S, mast), START_S)
-
-    notes = ["poses: 13 of /odom", "extrinsic: of the static transforms, base_link -> radar"]
-    check(read(scans_and(tmp_path, "mcap", write)), MOVED @ MOUNTING, notes)
-
-
-def test_a_tree_that_does_not_move_or_runs_in_a_circle(tmp_path):
-    def still(bag):
-        bag.write("/tf", bag.transforms(START_S, {("map", "radar"): np.eye(4)}), START_S)
-
-    def circle(bag):
-        edges = {("a", "radar"): np.eye(4), ("radar", "a"): np.eye(4)}
-        bag.write("/tf", bag.transforms(START_S, edges), START_S)
-
-    for write, message in ((still, "no transform between map and radar moves"), (circle, "run in a circle")):
-        folder = tmp_path / write.__name__
-        folder.mkdir()
-        with pytest.raises(ValueError, match=message):
-            read(scans_and(folder, "mcap", write))
 
 
 @pytest.mark.parametrize("stamp_s", [0.0, 12.0])
@@ -291,35 +236,23 @@ def test_choices_that_are_not_clear(tmp_path):
         odometry(bag)
         for topic in ("/left/points", "/right/points"):
             bag.write(topic, bag.cloud2(START_S, columns(1)), START_S)
-    with pytest.raises(
-        ValueError, match=r"say by topic which is the radar's, one or several of /left/points"
-    ):
-        read(tmp_path / "a.bag")
-    assert len(read(tmp_path / "a.bag", topic="/right/points")) == 1
-    with pytest.raises(ValueError, match="has no topic /up: topics with points are /left/points"):
-        read(tmp_path / "a.bag", topic="/up")
-    with pytest.raises(ValueError, match="/odom has messages nav_msgs/msg/Odometry"):
-        read(tmp_path / "a.bag", topic="/odom")
-    with pytest.raises(ValueError, match="has no poses in /left/points: topics with poses are /odom"):
-        read(tmp_path / "a.bag", topic="/left/points", pose_topic="/left/points")
     with BagWriter(tmp_path / "b.bag", "ros1") as bag:
-        bag.write("/once", bag.pose_stamped(START_S, np.eye(4)), START_S)
         for topic in ("/gps", "/slam"):
             for time_s in (START_S - 0.1, START_S + 0.1):
                 bag.write(topic, bag.pose_stamped(time_s, np.eye(4)), time_s)
         bag.write("/lidar", bag.cloud2(START_S, columns(1)), START_S)
         bag.write("/front_radar", bag.cloud2(START_S, columns(1)), START_S)  # the radar, by its name
-    with pytest.raises(ValueError, match="say by pose_topic which one counts, of /gps, /slam"):
-        read(tmp_path / "b.bag")
-    with pytest.raises(ValueError, match="/once holds 1 poses at different times"):
-        read(tmp_path / "b.bag", pose_topic="/once")
-    with BagWriter(tmp_path / "c.bag", "ros1") as bag:
-        odometry(bag)
-    with pytest.raises(
-        ValueError, match=r"has no topic with points .*: it has /odom \(nav_msgs/msg/Odometry\)"
+    assert len(read(tmp_path / "a.bag", topic="/right/points")) == 1
+    for path, choices, names in (
+        ("a.bag", {}, "/left/points"),
+        ("a.bag", {"topic": "/up"}, "/up"),
+        ("a.bag", {"topic": "/odom"}, "/odom has messages nav_msgs/msg/Odometry"),
+        ("a.bag", {"topic": "/left/points", "pose_topic": "/left/points"}, "topics with poses are /odom"),
+        ("b.bag", {}, "pose_topic which one counts, of /gps, /slam"),
     ):
-        read(tmp_path / "c.bag")
-    with pytest.raises(ValueError, match="is no bag: only bags can be read together"):
+        with pytest.raises(ValueError, match=names):
+            read(tmp_path / path, **choices)
+    with pytest.raises(ValueError, match="is no bag"):
         read([tmp_path / "a.bag", tmp_path])
 
 
@@ -329,40 +262,15 @@ def test_damaged_bags(tmp_path, kind):
     path = scans_and(tmp_path, kind, odometry)
     file = path if kind == "ros1" else next(p for p in path.iterdir() if p.suffix in (".db3", ".mcap"))
     whole = file.read_bytes()
-    sizes = (0, 10, len(whole) // 3, len(whole) - 200)
-    for size in sizes[:-1] if kind == "sqlite3" else sizes:  # whose last page is empty
+    for size in (0, 10, len(whole) // 3):
         file.write_bytes(whole[:size])
         for target in {path, file}:
-            with pytest.raises(ValueError, match="is not a whole") as error:
+            with pytest.raises(ValueError, match="is not a whole bag") as error:
                 list(read(target))
             assert str(tmp_path) in str(error.value)
-            assert "('" not in str(error.value)
-            if size == sizes[2] and kind != "sqlite3":  # as a recording that was cut off
-                assert "reindex" in str(error.value) if kind == "ros1" else "mcap recover" in str(error.value)
     if kind != "ros1":
         file.unlink()
+        text = "rosbag2_bagfile_information: !!python/object/apply:os.getcwd []\n"
+        (path / "metadata.yaml").write_text(text)
         with pytest.raises(ValueError, match="is not a whole bag"):
             read(path)
-        (path / "metadata.yaml").write_text(
-            "rosbag2_bagfile_information: !!python/object/apply:os.getcwd []\n"
-        )
-        with pytest.raises(ValueError, match="is not a whole bag"):
-            read(path)
-
-
-def test_memory_is_that_of_a_message(tmp_path):
-    """A bag of 60 MB, mostly of another sensor, is read in less than a sixth of that."""
-    rng = np.random.default_rng(0)
-    cloud = {axis: rng.normal(size=20_000).astype(np.float32) for axis in "xyz"}
-    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
-        odometry(bag)
-        for i in range(250):
-            time_s = START_S + 0.002 * i
-            bag.write("/radar" if i % 5 == 0 else "/lidar", bag.cloud2(time_s, cloud), time_s)
-    assert (tmp_path / "a.bag").stat().st_size > 60e6
-    scans = read(tmp_path / "a.bag", topic="/radar")
-    tracemalloc.start()
-    assert sum(len(scan) for scan in scans) == 50 * 20_000
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 10e6

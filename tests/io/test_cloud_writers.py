@@ -88,15 +88,6 @@ def test_columns_that_scans_lack(tmp_path):
     )
 
 
-def test_an_origin_of_an_older_file_does_not_stay(tmp_path):
-    path = tmp_path / "cloud.pcd"
-    write_cloud(path, lazily(UTM_M)[0])
-    assert origin_path(path).exists()
-    write_cloud(path, lazily(np.zeros(3))[0])
-    assert not origin_path(path).exists()
-    np.testing.assert_allclose(read_points(path)[:, 0], expected(np.zeros(3))["x"], atol=1e-5)
-
-
 @pytest.mark.parametrize("suffix", CLOUD_OUT_SUFFIXES)
 def test_a_source_that_fails_leaves_the_old_file(tmp_path, suffix):
     if suffix in (".las", ".laz") and find_spec("laspy") is None:

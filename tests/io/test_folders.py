@@ -103,35 +103,12 @@ def test_posed_folder(posed):
     assert_allclose(scans.poses, expected, atol=2e-6)  # of 1.7e9 s, float64 resolves 0.2 microseconds
 
 
-def test_mounting_turns_and_shifts_with_the_base(posed):
-    (posed / "base_T_radar.txt").write_text(
-        "0 -1 0 2\n1 0 0 0\n0 0 1 0.5  # a radar that looks left\n0 0 0 1\n"
-    )
-    poses = read(posed).poses
-    assert_allclose(poses[0], pose([12, 0, 1.5], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-6)
-    assert_allclose(poses[2], pose([11, 2, 1.5], [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]), atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["pcd", "ply"])
-def test_ground_truth(posed, kind):
+def test_ground_truth(posed):
     points = np.array([[245821.25, 3380553.5, 20.0], [0.5, 1, 2]])
-    if kind == "pcd":
-        write_pcd(posed / "lidar.pcd", dict(zip("xyz", points.T, strict=True)))
-    else:
-        (posed / "lidar.ply").write_text(
-            "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n"
-            "end_header\n" + "".join(f"{x} {y} {z}\n" for x, y, z in points)
-        )
+    write_pcd(posed / "lidar.pcd", dict(zip("xyz", points.T, strict=True)))
     truth = read(posed).ground_truth
     assert truth.dtype == np.float64
     assert_array_equal(truth, points)
-
-
-@pytest.mark.parametrize("text", ["1 0 0 0\n0 1 0 0\n0 0 1 0\n", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"])
-def test_damaged_mounting(posed, text):
-    (posed / "base_T_radar.txt").write_text(text)
-    with pytest.raises(ValueError, match="base_T_radar"):
-        read(posed)
 
 
 UTM = np.array([245821.0, 3380553.0, 20.0])
@@ -194,22 +171,6 @@ def test_snail_radar_lidar_points_move_with_their_own_time(snail):
     assert_array_equal(read(snail).ground_truth, UTM[None])
 
 
-def test_damaged_snail_radar(snail):
-    columns = radar_cloud([[5, 5, 5]]) | {"timestamp": np.array([12.0])}
-    write_pcd(snail / "xt32" / stamp(0.0), columns)
-    scans = read(snail)
-    with pytest.raises(ValueError, match="times of its points"):
-        _ = scans.ground_truth
-    wrong = snail / "eagleg7" / "enhanced" / "first.pcd"
-    wrong.touch()
-    with pytest.raises(ValueError, match="not named by its time"):
-        read(snail)
-    wrong.unlink()
-    (snail / "utm50r_T_xt32.txt").unlink()
-    with pytest.raises(ValueError, match="full_trajs"):
-        read(snail)
-
-
 COLUMNS = {
     "x": np.array([1.5, -2], np.float32),
     "n": np.array([3, 65535], np.uint16),
@@ -227,42 +188,3 @@ def test_pcd_with_padding_and_fields_of_several_values(tmp_path):
     }
     write_pcd(tmp_path / "cloud.pcd", {"x": np.ones(6, np.float32)}, WIDTH="3", HEIGHT="2", COUNT=None)
     assert read_columns(tmp_path / "cloud.pcd")["x"].tolist() == [1] * 6
-
-
-@pytest.mark.parametrize("data", ["ascii", "binary"])
-def test_empty_pcd(data, tmp_path):
-    write_pcd(tmp_path / "cloud.pcd", radar_cloud(np.zeros((0, 3))), data)
-    assert [len(c) for c in read_columns(tmp_path / "cloud.pcd").values()] == [0, 0, 0]
-
-
-@pytest.mark.parametrize("data", ["ascii", "binary"])
-def test_pcd_cut_short(data, tmp_path):
-    path = tmp_path / "cloud.pcd"
-    write_pcd(path, COLUMNS, data)
-    whole = path.read_bytes()
-    for size in (0, 10, 60, whole.index(b"DATA") + 2, len(whole) - (1 if data == "binary" else 3)):
-        path.write_bytes(whole[:size])
-        with pytest.raises(ValueError, match=r"not a whole \.pcd file of points"):
-            read_columns(path)
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        {"WIDTH": "1000000000000"},
-        {"WIDTH": "two"},
-        {"WIDTH": None},
-        {"COUNT": "1 1 1 0"},
-        {"COUNT": "1 1 1 1000000000000"},
-        {"COUNT": "1 1 1"},
-        {"SIZE": "4 2 8 3"},
-        {"TYPE": "F U F O"},
-        {"DATA": "binary_compressed"},
-        {"DATA": "zipped"},
-        {"FIELDS": "x \xff t i"},
-    ],
-)
-def test_hostile_pcd(header, tmp_path):
-    write_pcd(tmp_path / "cloud.pcd", COLUMNS, **header)
-    with pytest.raises(ValueError, match=r"cloud\.pcd is not a whole"):
-        read_columns(tmp_path / "cloud.pcd")

@@ -44,12 +44,6 @@ def test_glb_stands_upright_in_programs_that_read_gltf(tmp_path):
     np.testing.assert_allclose(read_mesh(tmp_path / "tower.glb").extents, [1, 2, 30])
 
 
-@pytest.mark.parametrize("suffix", [".stl", ".glb"])
-def test_near_the_origin_coordinates_are_those_of_the_world(tmp_path, suffix):
-    assert write_mesh(tmp_path / f"mesh{suffix}", sphere(origin=0.0)) is None
-    assert [path.name for path in tmp_path.iterdir()] == [f"mesh{suffix}"]
-
-
 def test_ply_keeps_attributes_colours_and_faces(tmp_path):
     mesh = sphere()
     mesh.visual = trimesh.visual.ColorVisuals(

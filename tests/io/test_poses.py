@@ -31,17 +31,6 @@ def test_matrices(tmp_path, shape):
     assert notes.lines == []
 
 
-def test_array(tmp_path):
-    np.save(tmp_path / "poses.npy", POSES)
-    assert_allclose(read_poses(tmp_path / "poses.npy", Notes()), POSES)
-    np.save(tmp_path / "poses.npy", POSES[0])
-    with pytest.raises(ValueError, match=r"poses\.npy is not poses \(F, 4, 4\)"):
-        read_poses(tmp_path / "poses.npy", Notes())
-    (tmp_path / "poses.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(ValueError, match=r"not a whole \.npy file"):
-        read_poses(tmp_path / "poses.npy", Notes())
-
-
 def test_kitti_with_calibration(tmp_path):
     """The truth are poses of the sensor in the frame of the first one; KITTI stores those of the camera."""
     truth = np.linalg.inv(POSES[0]) @ POSES
@@ -118,13 +107,7 @@ def test_names_decide_what_columns_mean(tmp_path, layout):
     (tmp_path / "a.csv").write_text("\n".join([head, row, row.replace("1700000000", "1700000001")]))
     found = read_poses(tmp_path / "a.csv", Notes())
     assert found.times_s.tolist() == [1_700_000_000, 1_700_000_001]
-    assert_allclose(found.poses(found.times_s, 1.0), [pose([1.0, 2, 3], np.pi / 2)] * 2, atol=1e-9)
-
-
-def test_named_poses_without_times_are_in_order(tmp_path):
-    (tmp_path / "a.csv").write_text(f"frame,qw,qx,qy,qz,x,y,z\n0,{HALF},0,0,{HALF},1,2,3\n1,1,0,0,0,0,0,0\n")
-    found = read_poses(tmp_path / "a.csv", Notes())
-    assert_allclose(found, [pose([1.0, 2, 3], np.pi / 2), np.eye(4)], atol=1e-9)
+    assert_allclose(found.poses(found.times_s), [pose([1.0, 2, 3], np.pi / 2)] * 2, atol=1e-9)
 
 
 def test_one_bad_pose_is_left_out_and_named(tmp_path):
@@ -147,23 +130,12 @@ def test_one_bad_pose_is_left_out_and_named(tmp_path):
         poses_of(np.full((2, 4, 4), np.nan), Notes())
 
 
-def test_poses_as_users_give_them(tmp_path):
-    assert_allclose(poses_of(POSES.tolist(), Notes()), POSES)
-    assert_allclose(poses_of(str(written(tmp_path / "a.txt", POSES.reshape(3, 16))), Notes()), POSES)
-    chain = TransformChain((POSES[1],))
-    assert poses_of(chain, Notes()) is chain
-    with pytest.raises(ValueError, match=r"must be \(F, 4, 4\) T_world_sensor"):
-        poses_of(np.eye(4), Notes())
-    with pytest.raises(ValueError, match="pose 1 is not a rigid transform"):
-        poses_of([np.eye(4), np.ones((4, 4))], Notes())
-
-
 def test_one_time_of_many_is_as_all_of_them():
     rng = np.random.default_rng(0)
     times_s = 1.7e9 + np.cumsum(rng.uniform(0.05, 0.4, 50))
     trajectory = Trajectory(times_s, rng.normal(size=(50, 3)), Rotation.random(50, random_state=0))
     wanted = np.concatenate([rng.uniform(times_s[0], times_s[-1], 40), times_s[[0, 7, -1]]])
-    expected = trajectory.poses(wanted, 1.0)
+    expected = trajectory.poses(wanted)
     assert_allclose([trajectory.pose_at(t, 1.0) for t in wanted], expected, atol=1e-9)
     assert trajectory.pose_at(times_s[0] - 0.01, 1.0) is None
     assert trajectory.pose_at(times_s[-1] + 0.01, 1.0) is None

@@ -98,25 +98,11 @@ def test_times_in_names_and_tum_poses(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "time_s"),
-    [
-        ("1700000000123.pcd", 1700000000.123),
-        ("1700000000123456789.pcd", 1700000000.123456789),
-        ("1700000000_123456789.pcd", 1700000000.123456789),
-        ("1700000000.pcd", 1700000000),
-    ],
+    [("1700000000123.pcd", 1700000000.123), ("1700000000_123456789.pcd", 1700000000.123456789)],
 )
 def test_units_of_times(tmp_path, name, time_s):
     write_pcd(tmp_path / name, radar_cloud([[1, 2, 3]]))
     assert read(tmp_path, POSES[:1]).times_s == pytest.approx([time_s], abs=1e-6)
-
-
-def test_times_in_a_file(tmp_path):
-    clouds(tmp_path, 3, "{:06d}.pcd")
-    (tmp_path / "times.txt").write_text("0.5\n0.6\n0.7\n")
-    assert read(tmp_path, POSES[:3]).times_s.tolist() == [0.5, 0.6, 0.7]
-    (tmp_path / "times.txt").write_text("0.5\n0.6\n")
-    with pytest.raises(ValueError, match="2 times for 3 scans"):
-        read(tmp_path, POSES[:3])
 
 
 def test_scans_outside_of_the_poses_and_in_gaps_are_counted(tmp_path):
@@ -151,61 +137,18 @@ def test_what_is_not_finite_is_dropped_and_counted(tmp_path, caplog):
     assert_array_equal(scans.poses, POSES[[0, 3]])
 
 
-def test_nothing_at_all(tmp_path):
-    np.save(tmp_path / "0.npy", np.full((3, 4), np.nan))
-    with pytest.raises(ValueError, match="no scan with a return and a pose; 3 returns left out"):
-        list(read(tmp_path, POSES[:1]))
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="holds no scans"):
-        read(tmp_path / "empty", POSES[:1])
-
-
-def test_an_npz_of_ours_loses_what_is_not_finite(tmp_path):
-    points = [np.array([[1.0, 2, 3], [np.nan, 2, 3]]), np.array([[4.0, 5, 6]])]
-    scans = Scans(points, POSES[:2], [np.array([1.0, 2]), np.array([3.0])], times_s=np.array([5.0, 6]))
-    write_scans(tmp_path / "scans.npz", scans)
-    again = read(tmp_path / "scans.npz")
-    assert [scan.points.tolist() for scan in again] == [[[1, 2, 3]], [[4, 5, 6]]]
-    assert again.times_s.tolist() == [5, 6]
-    assert again.notes == ["1 returns left out: a coordinate or the intensity is not a finite number"]
-
-
-def test_extrinsic(tmp_path):
-    clouds(tmp_path / "radar", 2)  # so that base_T_radar.txt is the only text in the folder, and no scan
-    mounting = pose([0.5, 0, 1], np.pi / 2)
-    assert_allclose(read(tmp_path, POSES[:2], extrinsic=mounting).poses, POSES[:2] @ mounting)
-    (tmp_path / "base_T_radar.txt").write_text(
-        "\n".join(" ".join(map(repr, row)) for row in mounting.tolist())
-    )
-    assert_allclose(read(tmp_path, POSES[:2]).poses, POSES[:2] @ mounting)
-    for wrong, message in (
-        (np.eye(3), r"T_base_sensor must have shape \(4, 4\)"),
-        (2 * np.eye(4), "not a rigid transform"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            read(tmp_path, POSES[:2], extrinsic=wrong)
-
-
-def test_sentences(tmp_path):
+def test_what_cannot_be_read_is_named(tmp_path):
     clouds(tmp_path / "scans", 3)
-    with pytest.raises(ValueError, match=r"has no poses: give a file of poses"):
-        read(tmp_path)
-    with pytest.raises(ValueError, match=r"3 scans but 2 poses: give as many poses as scans"):
-        read(tmp_path, POSES[:2])
-    with pytest.raises(FileNotFoundError, match=r"nowhere does not exist"):
-        read(tmp_path / "nowhere", POSES[:2])
-    with pytest.raises(FileNotFoundError, match=r"poses\.txt does not exist"):
-        read(tmp_path, tmp_path / "poses.txt")
     (tmp_path / "scans.h5").write_bytes(b"HDF")
-    with pytest.raises(ValueError, match=r"scans\.h5 is of no kind that can be read"):
-        read(tmp_path / "scans.h5", POSES[:2])
-    with pytest.raises(ValueError, match='stamps must be "header" or "record"'):
-        read(tmp_path, POSES[:3], stamps="both")
-    rows = [f"{t} 0 0 0 0 0 0 1" for t in range(5)]
-    (tmp_path / "poses.tum").write_text("\n".join(rows))
-    with pytest.raises(ValueError, match=r"3 scans have no time stamps in their names"):
-        read(tmp_path)
-    (tmp_path / "poses.tum").write_text("\n".join(rows[:3]))
+    (tmp_path / "poses.tum").write_text("".join(f"{t} 0 0 0 0 0 0 1\n" for t in range(3)))
+    for path, poses, error, names in (
+        (tmp_path / "scans", POSES[:2], ValueError, "3 scans but 2 poses"),
+        (tmp_path / "nowhere", POSES[:2], FileNotFoundError, "nowhere does not exist"),
+        (tmp_path / "scans", tmp_path / "poses.txt", FileNotFoundError, r"poses\.txt does not exist"),
+        (tmp_path / "scans.h5", POSES[:2], ValueError, r"scans\.h5 is of no kind"),
+    ):
+        with pytest.raises(error, match=names):
+            read(path, poses)
     scans = read(tmp_path)
     assert scans.notes == ["the scans have no time stamps: they are matched to the 3 poses in their order"]
     assert scans.times_s.tolist() == [0, 1, 2]

@@ -34,13 +34,3 @@ def test_it_becomes_the_scans_that_it_holds():
         "the header stamps of /ti_mmwave/radar_scan_pcl are zero: the record time is used instead",
         "197 scans left out: no poses within 0.5 s of each other around them",
     ]
-
-
-def test_its_way_out_without_poses():
-    bag, poses = bag_and_poses()
-    with pytest.raises(
-        ValueError, match=r"has no poses \(Odometry, PoseStamped, Path or TF\): give a file of poses"
-    ):
-        read(bag)
-    with pytest.raises(ValueError, match="are both of one clock"):
-        list(read(bag, poses, stamps="header"))

@@ -7,13 +7,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from radarsdf.config import toml
 from radarsdf.io import read
 from radarsdf.io.clouds.reading import read_columns
-from radarsdf.io.poses.files import read_calibration, read_poses
+from radarsdf.io.poses.files import read_poses
 from radarsdf.io.poses.trajectory import trajectory_of
 from radarsdf.io.scans import Notes
-from radarsdf.io.text import read_numbers, read_table
+from radarsdf.io.text import read_numbers
 
 ROWS = np.array([[1.5, -2, 3, 40.25], [4, 5.125, 6, 70], [7, 8, 9e-2, 10]])
 TUM = np.array([[10.0, 1, 2, 3, 0, 0, 0, 1], [10.25, 2, 2, 3, 0, 0, 1, 0], [10.5, 3, 2, 3, 0, 0, 0, 1]])
@@ -53,14 +52,6 @@ def test_the_same_numbers_in_all_layouts(tmp_path, layout, encoding):
         assert_array_equal(trajectory.positions, TUM[:, 1:4])
 
 
-def test_a_calibration_and_settings_with_a_byte_order_mark(tmp_path):
-    matrix = " ".join(map(str, np.eye(4)[:3].ravel()))
-    (tmp_path / "calib.txt").write_text(f"Tr: {matrix}\n", "utf-8-sig")
-    assert_array_equal(read_calibration(tmp_path / "calib.txt"), np.eye(4))
-    (tmp_path / "a.toml").write_text("seed = 3\n", "utf-8-sig")
-    assert toml.read_toml(tmp_path / "a.toml") == {"seed": 3}
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -88,18 +79,6 @@ def test_a_row_that_is_none_is_left_out_of_a_cloud_and_counted(tmp_path, wrong, 
     assert scans.notes == ["1 returns left out: a coordinate or the intensity is not a finite number"]
     with pytest.raises(ValueError, match="line"):
         read_numbers(tmp_path / "a.csv")
-
-
-def test_labels_are_a_column_that_is_not_used(tmp_path):
-    (tmp_path / "a.csv").write_text("x,class,y,z\n1,car,2,3\n4,tree,5,6\n")
-    scans = read(tmp_path / "a.csv", [np.eye(4)])
-    assert_array_equal(scans.points[0], [[1, 2, 3], [4, 5, 6]])
-    assert "not used: class;" in scans.notes[0]
-
-
-def test_rows_of_numbers_may_have_names_and_a_comma_at_their_end(tmp_path):
-    (tmp_path / "a.txt").write_text("time, x,\n1, 2,\n3, nan,\n")
-    assert_array_equal(read_table(tmp_path / "a.txt").values, [[1, 2], [3, np.nan]])
 
 
 # What belongs to what in a folder.
@@ -147,22 +126,6 @@ def test_times_may_be_in_other_units(folder):
     (folder / "poses.txt").write_text(tum.replace(" ", "000 ", 1))
     with pytest.raises(ValueError, match=r"poses\.txt holds times of different units"):
         read(folder)
-
-
-@pytest.mark.parametrize("times", ["0.1\nnan\n0.3\n0.4\n", "0.1\ninf\n0.3\n0.4\n", "0.1\n0.2\n0.3\n1e18\n"])
-def test_times_that_are_none(folder, times):
-    (folder / "times.txt").write_text(times)
-    with pytest.raises(ValueError, match=r"times\.txt"):
-        read(folder)
-
-
-def test_scans_of_one_time_in_their_names(folder):
-    for i in range(4):
-        (folder / f"{i}.csv").rename(folder / f"scan{i}_100.5.csv")
-    scans = read(folder)
-    assert pairs(scans) == [(1, 10), (2, 20), (3, 30), (4, 40)]
-    assert scans.times_s is None
-    assert "several scans have the same time in their names: these times are not used" in scans.notes
 
 
 @pytest.mark.parametrize(

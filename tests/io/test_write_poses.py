@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import radarsdf
-from radarsdf.io import UNPOSED, NoPoses, write_poses
+from radarsdf.io import write_poses
 from radarsdf.io.poses.files import read_poses
 from radarsdf.io.scans import Notes
 
@@ -22,19 +21,8 @@ def test_poses_come_back(tmp_path, name):
     found = read_poses(tmp_path / name, Notes())
     if not isinstance(found, np.ndarray):
         np.testing.assert_allclose(found.times_s, TIMES)
-        found = found.poses(TIMES, np.inf)
+        found = found.poses(TIMES)
     np.testing.assert_allclose(found, POSES, atol=1e-8)
-
-
-def test_evo_reads_them(tmp_path):
-    files = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed: pip install evo")
-    write_poses(tmp_path / "a.tum", POSES, TIMES)
-    write_poses(tmp_path / "a.kitti", POSES)
-    for found in (
-        files.read_tum_trajectory_file(tmp_path / "a.tum"),
-        files.read_kitti_poses_file(tmp_path / "a.kitti"),
-    ):
-        np.testing.assert_allclose(np.stack(found.poses_se3), POSES, atol=1e-8)
 
 
 def test_wrong_arguments_are_refused_and_nothing_is_written(tmp_path):
@@ -47,14 +35,3 @@ def test_wrong_arguments_are_refused_and_nothing_is_written(tmp_path):
     with pytest.raises(ValueError, match="rigid"):
         write_poses(tmp_path / "a.kitti", 2 * POSES)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_scans_without_poses_are_read_as_such(tmp_path):
-    rng = np.random.default_rng(0)
-    for i in range(3):
-        np.save(tmp_path / f"{10 + i}.5.npy", rng.normal(5, 1, (20, 4)))
-    with pytest.raises(NoPoses, match="radarsdf poses"):
-        radarsdf.io.read(tmp_path)
-    scans = radarsdf.io.read(tmp_path, UNPOSED)
-    assert scans.times_s.tolist() == [10.5, 11.5, 12.5]
-    np.testing.assert_array_equal(scans.poses, np.tile(np.eye(4), (3, 1, 1)))

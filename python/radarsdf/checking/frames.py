@@ -286,4 +286,4 @@ def _mean_direction(scan: FloatArray) -> FloatArray:
 def _at(T_world_sensor: FloatArray, times: FloatArray, wanted: FloatArray) -> FloatArray:
     """Poses (F, 4, 4) at the wanted times (F,), interpolated. Beyond the ends: the first and the last pose."""
     trajectory = Trajectory(times, T_world_sensor[:, :3, 3], Rotation.from_matrix(T_world_sensor[:, :3, :3]))
-    return trajectory.poses(np.clip(wanted, times[0], times[-1]), np.inf)
+    return trajectory.poses(np.clip(wanted, times[0], times[-1]))

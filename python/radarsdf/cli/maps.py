@@ -163,7 +163,7 @@ def evaluate(
 
 def _holds_scans(path: Path) -> bool:
     """Whether the truth is scans, and not a file of points or a surface."""
-    from radarsdf.io.bags.reading import is_bag
+    from radarsdf.io.bags.files import is_bag
     from radarsdf.io.npz import holds_scans
 
     return path.is_dir() or is_bag(path) or (path.suffix.lower() == ".npz" and holds_scans(path))
@@ -262,6 +262,6 @@ def _poses_of_file(path: Path) -> NDArray[np.float64]:
 
     found = read_poses(path, Notes(str(path)))
     if isinstance(found, Trajectory):
-        return found.poses(found.times_s, max_gap_s=0.0)
+        return found.poses(found.times_s)
     assert isinstance(found, np.ndarray)  # files have no poses of another kind
     return found[np.isfinite(found).all(axis=(1, 2))]

@@ -150,7 +150,7 @@ def scans_and_poses(
             results.add("this radar's Doppler is positive where the sensor approaches")
         posed, scans = Posed.found(found), scans.with_poses(found.poses, other_world=True)
         add_segments(results, posed)
-        return (scans.select_range(posed.rows) if posed.pieces > 1 else scans), posed
+        return (scans.select(range(len(scans))[posed.rows]) if posed.pieces > 1 else scans), posed
     if not refine:
         return scans, Posed.as_given(scans.poses)
     refined = refine_poses(scans, config=config)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
+from radarsdf.io.clouds.writing import ply_header, records
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.io.npz import write_arrays
-from radarsdf.io.ply import ply_header, records
 
 _PIXELS = {-1: 205, 0: 254, 1: 0}  # as map_saver writes unknown, free and occupied
 _COLORS = np.array([[70, 150, 220], [220, 90, 40]], np.uint8)  # of free and occupied

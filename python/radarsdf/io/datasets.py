@@ -2,34 +2,42 @@
 # SPDX-License-Identifier: MIT
 """Published data sets, found by the shape of their folders; `DATASETS` lists them.
 
-The reader of each knows where the scans, the poses and the pose of the radar on its platform are. What a user gives to
-:func:`radarsdf.io.read` comes first: poses, extrinsic, topics, fields.
+Each entry states where the scans, the poses and the pose of the radar on its platform are. What a user passes to
+:func:`radarsdf.io.read` comes first: poses, extrinsic, topics, fields. `T_a_b` transforms points of frame b to frame a, and
+so does the matrix in a file `a_T_b.txt`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sized
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from radarsdf._core import cell_keys
 from radarsdf.checks import check_pose
-from radarsdf.io import snail_radar
-from radarsdf.io.bags.reading import bags_in, read_bags
+from radarsdf.io.bags.files import bags_in
+from radarsdf.io.bags.reading import read_bags
+from radarsdf.io.clouds.fields import Fields
+from radarsdf.io.clouds.reading import read_columns
 from radarsdf.io.files import reading
-from radarsdf.io.folders import BASE_T_RADAR, natural, scans_of_files
+from radarsdf.io.folders import BASE_T_RADAR, lidar_map, natural, scans_of_files
 from radarsdf.io.poses.files import poses_of, read_calibration, read_transform
-from radarsdf.io.poses.trajectory import pose_matrices_of, trajectory_of
-from radarsdf.io.recordings import Request
+from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, pose_matrices_of, trajectory_of
+from radarsdf.io.recordings import Request, Truth
 from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text
 
 
-@dataclass(frozen=True)
-class Dataset:
+class Dataset(NamedTuple):
     """A published data set."""
 
     name: str
@@ -39,103 +47,123 @@ class Dataset:
     """The scans of a folder; see :func:`radarsdf.io.read`."""
 
 
-def _ntu4dradlm_bags(folder: Path) -> list[Path]:
-    return [path for path in bags_in(folder) if path.stem != "gt_odom"]
+def find(folder: Path) -> Dataset | None:
+    """The data set whose shape a folder has; None if it has none."""
+    return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
+
+
+def _has(*parts: str, bags: bool = False) -> Callable[[Path], bool]:
+    return lambda folder: (
+        all((folder / part).exists() for part in parts) and (not bags or _bags(folder) != [])
+    )
+
+
+def _bags(folder: Path) -> list[Path]:
+    return [path for path in bags_in(folder) if path.stem != "gt_odom"]  # ground truth of NTU4DRadLM
+
+
+def _scans(
+    files: list[Path],
+    times_s: Any,
+    poses: Callable[[], Any],
+    T_base_sensor: Callable[[], NDArray[np.float64] | None],
+    request: Request,
+    truth: Truth = lambda: None,
+) -> Scans:
+    """Scans of one file each. The data set's own poses and extrinsic are read only if the user gives none."""
+    if not files or (times_s is not None and len(times_s) != len(files)):
+        msg = f"{request.notes.about} has {len(files)} scans, of which the times or poses are not known for each"
+        raise ValueError(msg)
+    found = poses() if request.poses is None else poses_of(request.poses, request.notes)
+    extrinsic = T_base_sensor() if request.extrinsic is None else request.extrinsic
+    return scans_of_files(files, times_s, found, extrinsic, request, truth)
 
 
 def _ntu4dradlm(folder: Path, request: Request) -> Scans:
-    """Bags and ``gt_odom.txt`` (TUM), github.com/junzhang2016/NTU4DRadLM.
-
-    The scans are of ``/radar_enhanced_pcl``, a ``sensor_msgs/PointCloud``. The poses are those of the platform: the folder
-    ``calib`` of the data set has the calibrations, to be given by `extrinsic`.
-    """
-    if request.poses is None:
-        request = replace(request, poses=folder / "gt_odom.txt")
+    """Bags and ``gt_odom.txt`` (TUM) of the platform; the calibration is given by `extrinsic`."""
     if request.extrinsic is None:
         request.notes.add(
             "NTU4DRadLM: no extrinsic is given, so the poses of gt_odom.txt are taken as those of the radar; "
             "the calibration of the data set has it"
         )
-    return read_bags(_ntu4dradlm_bags(folder), request)
+    poses = folder / "gt_odom.txt" if request.poses is None else request.poses
+    return read_bags(_bags(folder), replace(request, poses=poses))
+
+
+def _viking_hill(folder: Path, request: Request) -> Scans:
+    """Bags with ``/hugin_raf_1/radar_data`` and ``/icp_odom``, and the pose of the radar on the platform."""
+    if request.extrinsic is None:
+        request = replace(request, extrinsic=read_transform(folder / BASE_T_RADAR, np.eye(4)))
+    return read_bags(_bags(folder), request)
 
 
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
-    """``3_RADAR/PCD/000000.pcd`` and ``3_RADAR/timestamp_radar.txt``: lines of a number, seconds and nanoseconds.
-
-    The data set has positions but no poses: they must be given, such as a TUM file of odometry.
-    """
+    """PCD files, and ``timestamp_radar.txt`` with lines of a number, seconds and nanoseconds. It has no poses."""
     if request.poses is None:
         msg = f"{folder}: MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
         raise ValueError(msg)
-    stamps = folder / "3_RADAR" / "timestamp_radar.txt"
-    times_s = [float(seconds + 1e-9 * nanoseconds) for _, seconds, nanoseconds in read_numbers(stamps, 3)]
-    files = sorted((folder / "3_RADAR" / "PCD").glob("*.pcd"), key=natural)
-    _check_count(times_s, files, stamps)
-    return _of_files(files, times_s, request.extrinsic, request)
+    stamps = read_numbers(folder / "3_RADAR/timestamp_radar.txt", 3)
+    times_s = (stamps[:, 1] + 1e-9 * stamps[:, 2]).tolist()
+    files = sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural)
+    return _scans(files, times_s, lambda: None, lambda: None, request)
 
 
 def _coloradar(folder: Path, request: Request) -> Scans:
-    """The single-chip radar of ColoRadar, arpg.github.io/coloradar.
+    """The single-chip radar: rows of x, y, z, intensity and Doppler; poses of the platform in ``groundtruth``."""
+    clouds, truth = folder / "single_chip/pointclouds", folder / "groundtruth"
 
-    ``single_chip/pointclouds/data/radar_pointcloud_0.bin`` has rows of x, y, z, intensity and Doppler; poses of the
-    platform are in ``groundtruth``. The pose of the radar is looked for in ``calib/transforms`` of the folder and of the two
-    above it.
-    """
-    clouds, truth = folder / "single_chip" / "pointclouds", folder / "groundtruth"
-    files = sorted((clouds / "data").glob("radar_pointcloud_*.bin"), key=natural)
-    times_s = read_numbers(clouds / "timestamps.txt", 1)[:, 0].tolist()
-    _check_count(times_s, files, clouds / "timestamps.txt")
-    poses, extrinsic = request.poses, request.extrinsic
-    if poses is None:
-        stamps = read_numbers(truth / "timestamps.txt", 1)
+    def poses() -> Trajectory:
         table = read_numbers(truth / "groundtruth_poses.txt", 7)
-        _check_count(stamps, table, truth / "timestamps.txt")
-        poses = trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
-    if extrinsic is None:
-        places = (folder, *folder.resolve().parents[:2])
-        found = [place / "calib" / "transforms" / "base_to_single_chip.txt" for place in places]
-        file = next((path for path in found if path.is_file()), None)
-        if file is not None:
-            extrinsic = _translation_and_quaternion(file)
-        else:
-            request.notes.add(
-                "there is no calib/transforms/base_to_single_chip.txt: the poses are taken as those of the radar"
-            )
-    return _of_files(files, times_s, extrinsic, replace(request, poses=poses, columns=request.columns or 5))
+        stamps = read_numbers(truth / "timestamps.txt", 1)
+        if len(stamps) != len(table):
+            msg = f"{truth} has {len(stamps)} times for {len(table)} poses"
+            raise ValueError(msg)
+        return trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
+
+    def T_base_sensor() -> NDArray[np.float64] | None:
+        for place in (folder, *folder.resolve().parents[:2]):
+            file = place / "calib/transforms/base_to_single_chip.txt"
+            if file.is_file():
+                with reading(file, "two lines x y z and qx qy qz qw"):
+                    numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
+                    return check_pose(pose_matrices_of(numbers)[0], "it")
+        request.notes.add(
+            "there is no calib/transforms/base_to_single_chip.txt: the poses are taken as those of the radar"
+        )
+        return None
+
+    times_s = read_numbers(clouds / "timestamps.txt", 1)[:, 0].tolist()
+    files = sorted((clouds / "data").glob("radar_pointcloud_*.bin"), key=natural)
+    return _scans(files, times_s, poses, T_base_sensor, replace(request, columns=request.columns or 5))
 
 
 def _delft_parts(folder: Path) -> tuple[Path, Path] | None:
     """The training folders of the radar, and of the poses."""
     folder = folder.resolve()
     for radar, poses in ((folder / "radar", folder / "lidar"), (folder, folder.parent / "lidar")):
-        if (radar / "training" / "velodyne").is_dir() and (poses / "training" / "pose").is_dir():
+        if (radar / "training/velodyne").is_dir() and (poses / "training/pose").is_dir():
             return radar / "training", poses / "training"
     return None
 
 
 def _view_of_delft(folder: Path, request: Request) -> Scans:
-    """View-of-Delft, whole or one of its radar folders, github.com/tudelft-iv/view-of-delft-dataset.
-
-    ``radar/training/velodyne/00000.bin`` has rows of x, y, z, RCS, v_r, compensated v_r and time;
-    ``radar/training/calib`` the pose of the radar in the camera, and ``lidar/training/pose`` that of the camera in the map.
-    Of the whole data set, ``radar`` is read; ``radar_3frames`` and ``radar_5frames`` are read by their own names.
-    """
+    """View-of-Delft, whole or one of its radar folders: a calibration and a pose for each frame."""
     parts = _delft_parts(folder)
     assert parts is not None
     radar, lidar = parts
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
-        return _of_files(files, None, request.extrinsic, request)
-    posed_files = [path for path in files if (lidar / "pose" / f"{path.stem}.json").is_file()]
-    if not posed_files:
-        msg = f"{lidar / 'pose'} has a pose for none of the {len(files)} scans in {radar / 'velodyne'}"
-        raise ValueError(msg)
-    if len(posed_files) < len(files):
-        request.notes.add(f"{len(files) - len(posed_files)} scans left out: they have no file of a pose")
+        return _scans(files, None, lambda: None, lambda: None, request)
+    posed = [path for path in files if (lidar / "pose" / f"{path.stem}.json").is_file()]
+    if len(posed) < len(files):
+        request.notes.add(f"{len(files) - len(posed)} scans left out: they have no file of a pose")
     request.notes.add("the scans have no times; the world is the map frame of View-of-Delft")
-    poses = np.stack([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed_files])
-    return scans_of_files(posed_files, None, poses, None, request)
+
+    def poses() -> NDArray[np.float64]:
+        return np.stack([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed])
+
+    return _scans(posed, None, poses, lambda: None, replace(request, extrinsic=None))
 
 
 def _delft_pose(
@@ -144,81 +172,200 @@ def _delft_pose(
     """T_map_radar (4, 4) of a frame. ``mapToCamera`` is T_map_camera, whatever its name says."""
     path = lidar / "pose" / f"{frame}.json"
     with reading(path, "a pose mapToCamera of View-of-Delft", TypeError, IndexError, RecursionError):
-        # An object a line.
-        lines = [json.loads(line) for line in read_text(path).splitlines() if line.strip()]
-        T_map_camera = [record["mapToCamera"] for record in lines if "mapToCamera" in record][-1]
+        records = [json.loads(line) for line in read_text(path).splitlines() if line.strip()]
+        T_map_camera = [record["mapToCamera"] for record in records if "mapToCamera" in record][-1]
         T_map_camera = check_pose(np.array(T_map_camera, np.float64).reshape(4, 4), "mapToCamera")
-    T_camera_radar = extrinsic
+    calibration = radar / "calib" / f"{frame}.txt"
+    T_camera_radar = read_calibration(calibration) if extrinsic is None else extrinsic
     if T_camera_radar is None:
-        T_camera_radar = read_calibration(radar / "calib" / f"{frame}.txt")
-    if T_camera_radar is None:
-        msg = f"{radar / 'calib' / frame}.txt lacks Tr_velo_to_cam"
+        msg = f"{calibration} lacks Tr_velo_to_cam"
         raise ValueError(msg)
     T_map_radar: NDArray[np.float64] = T_map_camera @ T_camera_radar
     return T_map_radar
 
 
-def _viking_hill(folder: Path, request: Request) -> Scans:
-    """Bags with ``/hugin_raf_1/radar_data`` and ``/icp_odom``, and the pose of the radar on the platform.
+# SNAIL-Radar, snail-radar.github.io: two radars, the poses of its lidar in UTM zone 50R, which is the world frame, and the
+# lidar as ground truth.
+#
+#     eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
+#     ars548/points/1706001762.429354169.pcd      ARS548 frame (forward, left, up); intensity: RCS + 128
+#     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
+#     xt32/1706001766.715735580.pcd               optional: lidar scan, lidar frame (left, back, up)
+#     body_T_oculii.txt, body_T_ars548.txt,       optional: 4 x 4, instead of the published calibration
+#     body_T_xt32.txt
+#     lidar.pcd or lidar.ply                      optional: ground truth instead of xt32
 
-    Its export as a folder of PCD files with ``poses.txt`` is read as any folder of scans.
-    """
-    if request.extrinsic is None:
-        request = replace(request, extrinsic=read_transform(folder / BASE_T_RADAR, np.eye(4)))
-    return read_bags(bags_in(folder), request)
+_SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
+_SNAIL_TRAJECTORY = "utm50r_T_xt32.txt"
+
+# The published calibration, for sequences without calibration files. The axes of the body point forward, left and up; its
+# origin is that of the lidar. Source: matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m, multiplied out,
+# of github.com/snail-radar/dataset_tools, commit 2f82c2c.
+_BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+_BODY_T_OCULII = np.array(
+    [
+        [0.999756831, 0.020010494, -0.009265982, 0.07],
+        [-0.019750133, 0.999429818, 0.027385610, 0.0],
+        [0.009808698, -0.027195946, 0.999581997, -0.115],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+_ARS548_POSITION_M = (0.0, 0.0, 0.07)
+# Its orientation, qx qy qz qw, was set anew several times: from this day on. Afternoons and evenings are half a day later.
+_ARS548_ORIENTATIONS = (
+    (20231104.0, (0.004112068, -0.127365674, -0.006945404, 0.991822987)),
+    (20231105.5, (-0.001244648, 0.001010494, -0.018245103, 0.999832259)),
+    (20231109.0, (-0.008126773, 0.001224424, -0.024923832, 0.999655570)),
+    (20231201.0, (-0.002238636, -0.013322733, -0.022325986, 0.999659464)),
+    (20231208.0, (-0.002173148, -0.012493422, -0.022981144, 0.999655470)),
+    (20231213.0, (-0.003973179, -0.011377850, -0.020249871, 0.999722312)),
+    (20240113.0, (-0.001835193, -0.014938248, -0.025422503, 0.999563493)),
+)
+_DAY = re.compile(r"(\d{8})(_aft|_eve)?$")
+
+_LIDAR_RANGE_M = (1.0, 60.0)  # nearer points are on the platform or its operator; the radar sees no farther
+_LIDAR_CELL_M = 0.05  # a lidar point a cell: else most would lie on the ground where the platform stood
+_LIDAR_BATCH = 50  # scans from one thinning to the next; bounds the memory
+_MAX_SWEEP_S = 1.0  # larger differences between the times of a point and of its scan mean different clocks
+
+
+def _snail_parts(folder: Path) -> tuple[Path, str] | None:
+    """The sequence and the radar that a folder means: ``data3``, or in it ``ars548`` or ``ars548/points``."""
+    here = folder.resolve()
+    for sequence in (here, *here.parents[:2]):
+        for radar in _SNAIL_RADARS:
+            if (sequence / radar).is_dir() and (sequence / radar).is_relative_to(here):
+                return sequence, radar
+    return None
+
+
+def _snail_radar(folder: Path, request: Request) -> Scans:
+    """A sequence, or one radar of it."""
+    found = _snail_parts(folder)
+    assert found is not None
+    sequence, radar = found
+    others = [other for other in _SNAIL_RADARS if other != radar and (sequence / other).is_dir()]
+    if others and folder.resolve() == sequence:
+        request.notes.add(f"{radar} is read; {' and '.join(others)} are read as folders of their own")
+    stamped = _stamped_files(sequence / radar)
+    times_s = [time_s for time_s, _ in stamped]
+    return _scans(
+        [path for _, path in stamped],
+        times_s,
+        partial(_snail_trajectory, sequence),
+        partial(_T_xt32_radar, sequence, radar),
+        request,
+        partial(_snail_ground_truth, sequence, np.array(times_s)),
+    )
+
+
+def _snail_trajectory(sequence: Path) -> Trajectory:
+    path = sequence / _SNAIL_TRAJECTORY
+    if not path.is_file():
+        msg = f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence> of the data set"
+        raise ValueError(msg)
+    return trajectory_of(read_numbers(path, 8), str(path))
+
+
+def _T_xt32_radar(sequence: Path, radar: str) -> NDArray[np.float64]:
+    """The radar in the frame of the lidar, (4, 4). Raises a ValueError if it is not known."""
+    T_body_xt32 = read_transform(sequence / "body_T_xt32.txt", _BODY_T_XT32)
+    if radar.startswith("ars548"):
+        file = sequence / "body_T_ars548.txt"
+        T_body_radar = read_transform(file, np.eye(4)) if file.is_file() else _body_T_ars548(sequence)
+    else:
+        T_body_radar = read_transform(sequence / "body_T_oculii.txt", _BODY_T_OCULII)
+    T_xt32_radar: NDArray[np.float64] = np.linalg.inv(T_body_xt32) @ T_body_radar
+    return T_xt32_radar
+
+
+def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
+    """The published calibration of the day."""
+    name = sequence.parent.name
+    found = _DAY.match(name)
+    day = float(found[1]) + 0.5 * (found[2] is not None) if found else 0.0
+    known = [orientation for first, orientation in _ARS548_ORIENTATIONS if first <= day]
+    if not known:
+        msg = (
+            f"{sequence}: the calibration of the ARS548 depends on the day, which is the name of the folder above, such "
+            f"as 20231105_aft, but that is {name}: give extrinsic, or body_T_ars548.txt (4 x 4)"
+        )
+        raise ValueError(msg)
+    T_body_ars548 = np.eye(4)
+    T_body_ars548[:3, :3] = Rotation.from_quat(known[-1]).as_matrix()
+    T_body_ars548[:3, 3] = _ARS548_POSITION_M
+    return T_body_ars548
+
+
+def _snail_ground_truth(sequence: Path, times_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Lidar points (M, 3), m, of all lidar scans while the radar's were taken, at most one in each cell."""
+    points = lidar_map(sequence)
+    if points is not None or not (sequence / "xt32").is_dir() or not (sequence / _SNAIL_TRAJECTORY).is_file():
+        return points
+    trajectory = _snail_trajectory(sequence)
+    times_s = times_s[trajectory.covers(times_s)]
+    if not len(times_s):
+        return None
+    origin = trajectory.positions[0]  # cell keys are relative to it: UTM coordinates are out of their range
+    found = [np.zeros((0, 3))]
+    for count, world in enumerate(_lidar_scans(sequence / "xt32", trajectory, times_s[0], times_s[-1]), 1):
+        found.append(_thin(world - origin))
+        if count % _LIDAR_BATCH == 0:
+            found = [_thin(np.concatenate(found))]
+    points = _thin(np.concatenate(found)) + origin
+    return points if len(points) else None
+
+
+def _lidar_scans(
+    folder: Path, trajectory: Trajectory, first_s: float, last_s: float
+) -> Iterator[NDArray[np.float64]]:
+    """(K, 3) world, m, of 1 to 60 m range, each point moved with the pose at its own time if it has a ``timestamp``."""
+    for time_s, path in _stamped_files(folder):
+        if not first_s <= time_s <= last_s:
+            continue
+        columns = read_columns(path)
+        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
+        xyz = fields.points(columns).astype(np.float64)
+        times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
+        ranges_m = np.linalg.norm(xyz, axis=1)
+        used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
+        if (np.abs(times_s[used] - time_s) > _MAX_SWEEP_S).any():
+            msg = f"{path}: the times of its points differ by more than {_MAX_SWEEP_S} s from the time in its name"
+            raise ValueError(msg)
+        used &= trajectory.covers(times_s, MAX_GAP_S)
+        if used.any():
+            T_world_lidar = trajectory.poses(times_s[used])
+            yield (T_world_lidar[:, :3, :3] @ xyz[used][:, :, None])[:, :, 0] + T_world_lidar[:, :3, 3]
+
+
+def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
+    """Times, s, and paths of the PCD files of a folder, in the order of time."""
+    files = []
+    for path in folder.glob("*.pcd"):
+        try:
+            time_s = float(path.stem)
+        except ValueError:
+            time_s = np.nan
+        if not np.isfinite(time_s):
+            msg = f"{path} is not named by its time in seconds"
+            raise ValueError(msg)
+        files.append((time_s, path))
+    return sorted(files)
+
+
+def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The first point (K, 3) in each cell of points (N, 3)."""
+    _, first = np.unique(cell_keys(points, _LIDAR_CELL_M), return_index=True)
+    kept: NDArray[np.float64] = points[np.sort(first)]
+    return kept
 
 
 DATASETS = (
-    Dataset("SNAIL-Radar", snail_radar.is_snail_radar, snail_radar.read),
+    Dataset("SNAIL-Radar", lambda folder: _snail_parts(folder) is not None, _snail_radar),
     Dataset("View-of-Delft", lambda folder: _delft_parts(folder) is not None, _view_of_delft),
-    Dataset("ColoRadar", lambda folder: (folder / "single_chip/pointclouds/data").is_dir(), _coloradar),
-    Dataset(
-        "MSC-RAD4R",
-        lambda folder: (
-            (folder / "3_RADAR/PCD").is_dir() and (folder / "3_RADAR/timestamp_radar.txt").is_file()
-        ),
-        _msc_rad4r,
-    ),
-    Dataset(
-        "NTU4DRadLM",
-        lambda folder: (folder / "gt_odom.txt").is_file() and bool(_ntu4dradlm_bags(folder)),
-        _ntu4dradlm,
-    ),
-    Dataset(
-        "Viking Hill",
-        lambda folder: (folder / BASE_T_RADAR).is_file() and bool(bags_in(folder)),
-        _viking_hill,
-    ),
+    Dataset("ColoRadar", _has("single_chip/pointclouds/data"), _coloradar),
+    Dataset("MSC-RAD4R", _has("3_RADAR/PCD", "3_RADAR/timestamp_radar.txt"), _msc_rad4r),
+    Dataset("NTU4DRadLM", _has("gt_odom.txt", bags=True), _ntu4dradlm),
+    Dataset("Viking Hill", _has(BASE_T_RADAR, bags=True), _viking_hill),
 )
 """The data sets. The first that fits a folder reads it."""
-
-
-def find(folder: Path) -> Dataset | None:
-    """The data set whose shape a folder has; None if it has none."""
-    return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
-
-
-def _of_files(
-    files: list[Path],
-    times_s: list[float] | None,
-    T_base_sensor: NDArray[np.float64] | None,
-    request: Request,
-) -> Scans:
-    """Scans of one file each, with the poses of the request."""
-    if not files:
-        msg = "the folder of the scans is empty"
-        raise ValueError(msg)
-    return scans_of_files(files, times_s, poses_of(request.poses, request.notes), T_base_sensor, request)
-
-
-def _check_count(times: Sized, wanted: Sized, path: Path) -> None:
-    if len(times) != len(wanted):
-        msg = f"{path} has {len(times)} lines for {len(wanted)} scans or poses"
-        raise ValueError(msg)
-
-
-def _translation_and_quaternion(path: Path) -> NDArray[np.float64]:
-    """T_base_sensor (4, 4) of two lines: x y z, and qx qy qz qw."""
-    with reading(path, "two lines x y z and qx qy qz qw"):
-        numbers = np.array(read_text(path).split(), np.float64)
-        return check_pose(pose_matrices_of(numbers.reshape(1, 7))[0], "it")

@@ -140,23 +140,6 @@ def _open_temporary(target: Path) -> tuple[int, Path]:
         raise OSError(error.errno, error.strerror, str(target)) from error
 
 
-if sys.platform == "win32":
-    import msvcrt
-
-    def _lock(descriptor: int) -> None:
-        # A byte far beyond the text: nobody could read what is locked.
-        os.lseek(descriptor, 1 << 30, os.SEEK_SET)
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        os.lseek(descriptor, 0, os.SEEK_SET)
-
-else:
-
-    def _lock(descriptor: int) -> None:
-        import fcntl  # noqa: PLC0415 (a system without it can do all but plan tiles)
-
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
 def take_lock(path: Path, use: str) -> int:
     """The descriptor of a file that nobody else has locked; closing it, or the end of the process, unlocks it.
 
@@ -166,7 +149,18 @@ def take_lock(path: Path, use: str) -> int:
     descriptor = os.open(path, sum(getattr(os, flag, 0) for flag in _LOCK_FLAGS), 0o666)
     try:
         try:
-            _lock(descriptor)
+            if sys.platform == "win32":
+                import msvcrt  # noqa: PLC0415
+
+                os.lseek(
+                    descriptor, 1 << 30, os.SEEK_SET
+                )  # far beyond the text: nobody could read what is locked
+                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+                os.lseek(descriptor, 0, os.SEEK_SET)
+            else:
+                import fcntl  # noqa: PLC0415
+
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in _LOCKED:
                 text = path.read_text(errors="replace")[:100]

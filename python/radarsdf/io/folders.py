@@ -17,13 +17,17 @@ from numpy.typing import NDArray
 
 from radarsdf.io.clouds.bin import KITTI, bin_layout
 from radarsdf.io.clouds.fields import names_of, plain_name
-from radarsdf.io.clouds.pcd import read_viewpoint
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, TEXT_SUFFIXES, read_columns, read_points
-from radarsdf.io.ply import Columns
+from radarsdf.io.clouds.reading import (
+    CLOUD_SUFFIXES,
+    TEXT_SUFFIXES,
+    read_columns,
+    read_points,
+    read_viewpoint,
+)
 from radarsdf.io.poses.files import FIND_POSES, POSE_FILES, poses_of, read_transform
 from radarsdf.io.poses.trajectory import UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.recordings import RawScan, Request, Truth, posed, scan_poses
-from radarsdf.io.scans import Notes, Scans
+from radarsdf.io.scans import Columns, Notes, Scans
 from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970, without_unit
 
 BASE_T_RADAR = "base_T_radar.txt"
@@ -59,29 +63,28 @@ def read_folder(folder: Path, request: Request) -> Scans:
 
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
     """The scans of files with the poses of the request, or those that are found in or near the folder."""
-    notes = request.notes
+    notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
     places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
-    poses = request.poses
     if poses is None:
         poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
         if poses is not None and poses.parent != folder:  # which is easily overlooked
             notes.add(f"poses: of {poses}")
     if poses is None:
-        files, times_s, _ = in_order_of_time(files, UNPOSED, notes)
-        viewpoints = _viewpoint_poses(files, notes)
-        if viewpoints is None:
+        files, times_s, _ = _in_order_of_time(files, UNPOSED, notes)
+        known: Poses | None = _viewpoint_poses(files, notes)
+        if known is None:
             what = files[0] if len(files) == 1 else folder
             msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
             raise NoPoses(msg)
-        return scans_of_files(files, times_s, viewpoints, request.extrinsic, request, truth)
-    if isinstance(poses, (str, PathLike)):
-        places = list(dict.fromkeys((Path(poses).parent, *places)))
-    known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
-    _note_viewpoint(files[0], notes)
-    files, times_s, known = in_order_of_time(files, known, notes)
-    T_base_sensor = request.extrinsic
-    if T_base_sensor is None:
-        T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
+    else:
+        if isinstance(poses, (str, PathLike)):
+            places = list(dict.fromkeys((Path(poses).parent, *places)))
+        known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
+        if (viewpoint := _viewpoint(files[0])) is not None and (viewpoint != np.eye(4)).any():
+            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")
+        files, times_s, known = _in_order_of_time(files, known, notes)
+        if T_base_sensor is None:
+            T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
     return scans_of_files(files, times_s, known, T_base_sensor, request, truth)
 
 
@@ -142,7 +145,7 @@ def lidar_map(folder: Path) -> NDArray[np.float64] | None:
     return next((read_points(path) for path in found if path.is_file()), None)
 
 
-def in_order_of_time(
+def _in_order_of_time(
     files: list[Path], poses: Poses, notes: Notes
 ) -> tuple[list[Path], list[float] | None, Poses]:
     """Scans in the order of their times, these times, s, None if there are none, and the poses.
@@ -168,17 +171,23 @@ def in_order_of_time(
 
 def _times_of(files: list[Path], notes: Notes) -> tuple[list[float] | None, Path | None]:
     """Times of scans, s, by their names, or by a file of times near them, and this file; None if there are none."""
-    named = [_time_in(path.stem) for path in files]
-    times = [time for time in named if time is not None]
-    if len(times) == len(files) and len(set(times)) == len(files):
-        return times, None
-    if len(times) == len(files) > 1:
+    times = [time for path in files if (time := _time_in(path.stem)) is not None]
+    if len(times) == len(files):
+        if len(set(times)) == len(files):
+            return times, None
         notes.add("several scans have the same time in their names: these times are not used")
-    for folder in (files[0].parent, files[0].parent.parent):
-        for name in TIME_FILES:
-            if (path := folder / name).is_file():
-                return _listed_times(path, len(files), notes), path
-    return None, None
+    places = [folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES]
+    path = next((path for path in places if path.is_file()), None)
+    if path is None:
+        return None, None
+    listed = read_numbers(path)[:, -1]
+    if len(listed) != len(files):
+        msg = f"{path} has {len(listed)} times for {len(files)} scans"
+        raise ValueError(msg)
+    seconds: list[float] = in_seconds(listed, path.name, notes).tolist()
+    if len(set(seconds)) < len(files):
+        notes.add(f"{path.name} has the same time for several scans")
+    return seconds, path
 
 
 def _time_in(stem: str) -> float | None:
@@ -188,20 +197,7 @@ def _time_in(stem: str) -> float | None:
     found = _TIME.search(stem)
     if found is None:
         return None
-    if "." in found[1]:
-        return float(found[1])
-    return int(found[1]) * unit_since_1970(int(found[1]))[1]
-
-
-def _listed_times(path: Path, count: int, notes: Notes) -> list[float]:
-    times = read_numbers(path)[:, -1]
-    if len(times) != count:
-        msg = f"{path} has {len(times)} times for {count} scans"
-        raise ValueError(msg)
-    seconds: list[float] = in_seconds(times, path.name, notes).tolist()
-    if len(set(seconds)) < count:
-        notes.add(f"{path.name} has the same time for several scans")
-    return seconds
+    return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
 
 
 def _split(
@@ -231,11 +227,7 @@ def _split(
     if time is not None and table[time].dtype.kind in "iuf":
         scale = SCALES.get(without_unit(time)[1], 1.0)
         times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
-    if (
-        isinstance(poses, np.ndarray)
-        and len(values) < len(poses)
-        and 0 <= values[0] <= values[-1] < len(poses)
-    ):
+    if isinstance(poses, np.ndarray) and 0 <= values[0] <= values[-1] < len(poses) > len(values):
         poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
     return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
 
@@ -255,23 +247,18 @@ def _bin_columns(files: list[Path], columns: Any, notes: Notes) -> Any:
     return layout
 
 
+def _viewpoint(path: Path) -> NDArray[np.float64] | None:
+    if path.suffix.lower() == ".pcd":
+        with contextlib.suppress(ValueError):
+            return read_viewpoint(path)
+    return None
+
+
 def _viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | None:
     """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if it is where each scan was taken."""
-    if {path.suffix.lower() for path in files} != {".pcd"}:
-        return None
-    poses = np.full((len(files), 4, 4), np.nan)
-    for pose, path in zip(poses, files, strict=True):
-        with contextlib.suppress(ValueError):
-            pose[:] = read_viewpoint(path)
-    known = poses[np.isfinite(poses).all(axis=(1, 2))]
-    if not len(known) or (known == (np.eye(4) if len(files) == 1 else known[0])).all():
+    found = [_viewpoint(path) for path in files]
+    known = [pose for pose in found if pose is not None]
+    if not known or (np.array(known) == (np.eye(4) if len(files) == 1 else known[0])).all():
         return None
     notes.add("poses: VIEWPOINT of the PCD files")
-    return poses
-
-
-def _note_viewpoint(path: Path, notes: Notes) -> None:
-    """Notes that the ``VIEWPOINT`` of a scan is not applied where poses are given: it would place the scan twice."""
-    with contextlib.suppress(ValueError):
-        if path.suffix.lower() == ".pcd" and (read_viewpoint(path) != np.eye(4)).any():
-            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")
+    return np.stack([np.full((4, 4), np.nan) if pose is None else pose for pose in found])

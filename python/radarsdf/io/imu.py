@@ -5,12 +5,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import check_pose, real_array
+from radarsdf.checks import are_rigid, real_array
 
 FloatArray = NDArray[np.float64]
 
@@ -36,11 +35,16 @@ class Imu:
 
     def __post_init__(self) -> None:
         """Checks the arrays."""
-        count = np.shape(self.times_s)[:1]
+        count = np.shape(self.times_s)[:1] or ("G",)
         shapes = {"times_s": count, "angular_velocity": (*count, 3), "specific_force": (*count, 3)}
         for name, shape in shapes.items():
-            if (values := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _checked(values, name, shape))
+            if (values := getattr(self, name)) is None:
+                continue
+            array = real_array(values, name)
+            if array.shape != shape or array.size == 0 or not np.isfinite(array).all():
+                msg = f"{name} of an IMU must be finite numbers of shape {shape}, not {array.shape}"
+                raise ValueError(msg)
+            object.__setattr__(self, name, array)
         if (np.diff(self.times_s) < 0).any():
             msg = "times_s of an IMU must ascend"
             raise ValueError(msg)
@@ -55,22 +59,10 @@ class Imu:
 def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
     """`R_sensor_imu` as a rotation (3, 3); of a rigid transform (4, 4), its rotation."""
     matrix: FloatArray = real_array(R_sensor_imu, "R_sensor_imu")
-    if matrix.shape not in ((3, 3), (4, 4)):
-        msg = f"R_sensor_imu must be a rotation (3, 3), not {matrix.shape}"
-        raise ValueError(msg)
     whole = np.eye(4)
-    whole[:3, :3] = matrix[:3, :3]
-    try:
-        return check_pose(whole, "R_sensor_imu")[:3, :3]
-    except ValueError as error:
-        msg = "R_sensor_imu is no rotation matrix (orthogonal, with determinant 1)"
-        raise ValueError(msg) from error
-
-
-def _checked(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
-    array: FloatArray = real_array(values, name)
-    if array.shape != shape or array.size == 0 or not np.isfinite(array).all():
-        expected = "(G,)" if name == "times_s" else shape
-        msg = f"{name} of an IMU must be finite numbers of shape {expected}, not {array.shape}"
+    if matrix.shape in ((3, 3), (4, 4)):
+        whole[:3, :3] = matrix[:3, :3]
+    if matrix.shape not in ((3, 3), (4, 4)) or not are_rigid(whole[None]).all():
+        msg = f"R_sensor_imu, of shape {matrix.shape}, is no rotation matrix (3, 3): orthogonal, with determinant 1"
         raise ValueError(msg)
-    return array
+    return whole[:3, :3]

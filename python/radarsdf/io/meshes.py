@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of, positions
 from radarsdf.interrupts import whole_import
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
+from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, has_faces, ply_bytes, read_points
+from radarsdf.io.clouds.writing import face_records, ply_header, records
 from radarsdf.io.files import check_regular_file, origin_for, origin_of, write_origin, write_whole
 from radarsdf.io.npz import arrays_of
-from radarsdf.io.ply import Columns, face_records, has_faces, ply_bytes, ply_header, records
+from radarsdf.io.scans import Columns
 
 if TYPE_CHECKING:
     import trimesh
@@ -121,8 +122,8 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
         raise ValueError(msg)
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long
+    ply = file.suffix.lower() == ".ply"
     try:
-        ply = file.suffix.lower() == ".ply"
         source: Any = ply_bytes(file) if ply else file
         mesh: Any = trimesh.load_mesh(source, file_type="ply" if ply else None, process=False)
     except OSError:
@@ -130,17 +131,16 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} cannot be read as a mesh: {error}"
         raise ValueError(msg) from error
-    if isinstance(mesh, trimesh.Trimesh) and np.ndim(mesh.faces) == 2:
-        if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
-            msg = f"{path} is damaged: a triangle has a corner that is none of its {len(mesh.vertices)} vertices"
-            raise ValueError(msg)
-        if file.suffix.lower() == ".glb":
-            mesh.apply_transform(_T_GLTF_WORLD.T)
-        if (origin := origin_of(file)) is not None:
-            mesh.vertices = np.asarray(mesh.vertices, np.float64) + origin
-        return mesh
-    msg = f"{path} is not one mesh"
-    raise ValueError(msg)
+    faces: Any = mesh.faces if isinstance(mesh, trimesh.Trimesh) else None
+    if np.ndim(faces) != 2 or (len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices)):
+        msg = f"{path} is not one mesh, or a triangle has a corner that is none of its vertices"
+        raise ValueError(msg)
+    if file.suffix.lower() == ".glb":
+        mesh.apply_transform(_T_GLTF_WORLD.T)
+    if (origin := origin_of(file)) is not None:
+        mesh.vertices = np.asarray(mesh.vertices, np.float64) + origin
+    read: trimesh.Trimesh = mesh
+    return read
 
 
 def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:

@@ -81,24 +81,23 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         _check_scans(arrays)
         times_s, rates, *others = (arrays.get(name) for name in _IMU)
         imu = None if times_s is None or rates is None else Imu(times_s, rates, *others)
-    points, poses = arrays["points"], arrays["poses"]
     frame = arrays["frame"].astype(np.int64)
     order = np.flatnonzero(arrays["static"]) if "static" in arrays else np.arange(len(frame))
     order = order[np.argsort(frame[order], kind="stable")]
     frames, first = np.unique(frame[order], return_index=True)
     rows = np.split(order, first)[1:]  # the part before the first scan is empty
-    per_return = {
-        name: [arrays[name][r] for r in rows] if name in arrays else None
-        for name in ("intensity", "doppler", "sigma")
-    }
+
+    def by_scan(name: str) -> list[NDArray[Any]] | None:
+        return [arrays[name][r] for r in rows] if name in arrays else None
+
     return Scans(
-        points=[points[r] for r in rows],
-        poses=poses[frames].astype(np.float64),
-        intensities=per_return["intensity"],
+        points=by_scan("points") or [],
+        poses=arrays["poses"][frames].astype(np.float64),
+        intensities=by_scan("intensity"),
         ground_truth=arrays.get("lidar_points"),
-        doppler_mps=per_return["doppler"],
+        doppler_mps=by_scan("doppler"),
         times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
-        sigmas=per_return["sigma"],
+        sigmas=by_scan("sigma"),
         truth_kind="simulated" if "simulated" in arrays and arrays["simulated"].any() else "lidar",
         imu=imu,
     )
@@ -118,11 +117,8 @@ def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
             msg = f"{name} must have shape {expected}, not {shape}"
             raise ValueError(msg)
     frame, num_poses = arrays["frame"], len(arrays["poses"])
-    if (frame != np.floor(frame)).any():
-        msg = "frame must hold row numbers of poses"
-        raise ValueError(msg)
-    if len(frame) and not 0 <= frame.min() <= frame.max() < num_poses:
-        msg = f"frame must lie in [0, {num_poses})"
+    if not ((frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)).all():
+        msg = f"frame must hold row numbers of the {num_poses} poses"
         raise ValueError(msg)
 
 
@@ -142,24 +138,23 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
         If the file cannot be written.
     """
     instance(scans, Scans, "scans")
-    arrays: dict[str, NDArray[Any] | None] = {
-        "points": np.concatenate(scans.points),
-        "frame": np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points]),
-        "poses": scans.poses,
-        "intensity": None if scans.intensities is None else np.concatenate(scans.intensities),
-        "doppler": None if scans.doppler_mps is None else np.concatenate(scans.doppler_mps),
-        "sigma": None if scans.sigmas is None else np.concatenate(scans.sigmas),
-        "times": scans.times_s,
+    lists = {
+        "points": scans.points,
+        "intensity": scans.intensities,
+        "doppler": scans.doppler_mps,
+        "sigma": scans.sigmas,
     }
+    arrays = {name: np.concatenate(parts) for name, parts in lists.items() if parts is not None}
+    arrays["frame"] = np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points])
+    single = {"poses": scans.poses, "times": scans.times_s, "lidar_points": scans.ground_truth}
     if scans.imu is not None:
-        arrays |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
-    if scans.ground_truth is not None:
-        arrays["lidar_points"] = scans.ground_truth
-        arrays["simulated"] = np.array(1, np.uint8) if scans.truth_kind == "simulated" else None
+        single |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
+    if scans.ground_truth is not None and scans.truth_kind == "simulated":
+        single["simulated"] = np.array(1, np.uint8)
+    arrays |= {name: array for name, array in single.items() if array is not None}
     target = path_of(path, "path")
     named = target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz")
-    held = {name: array for name, array in arrays.items() if array is not None}
-    write_arrays(named, held, compressed=True)
+    write_arrays(named, arrays, compressed=True)
 
 
 def holds_scans(path: str | PathLike[str]) -> bool:
@@ -198,14 +193,13 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[
     for name, (dtype, *shape) in wanted.items():
         array = arrays.get(name)
         if (
-            array is not None
-            and array.dtype == dtype
-            and array.ndim == len(shape)
-            and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+            array is None
+            or array.dtype != dtype
+            or array.ndim != len(shape)
+            or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True))
         ):
-            continue
-        msg = f"{name} is missing, or of another type or shape"
-        raise ValueError(msg)
+            msg = f"{name} is missing, or of another type or shape"
+            raise ValueError(msg)
 
 
 def write_arrays(

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,17 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import check_pose, path_of, positions, positive
 from radarsdf.io import datasets
-from radarsdf.io.bags.reading import bags_in, is_bag, read_bags
-from radarsdf.io.clouds.fields import finite_scan
+from radarsdf.io.bags.files import bags_in, is_bag
+from radarsdf.io.bags.reading import read_bags
 from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
 from radarsdf.io.folders import read_files, read_folder
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
 from radarsdf.io.poses.files import POSE_FILES, poses_of
-from radarsdf.io.poses.trajectory import MAX_GAP_S, UNPOSED, ScanPoses, StampedPoses
+from radarsdf.io.poses.trajectory import MAX_GAP_S, UNPOSED, StampedPoses
 from radarsdf.io.recordings import WITHOUT_POSES, Request, Truth, scan_poses
-from radarsdf.io.scans import Notes, Scan, Scans
+from radarsdf.io.scans import Notes, Scan, Scans, finite_returns
 
-_STAMPS = (None, "header", "record")
 _OF_BAGS = ("topic", "pose_topic", "imu_topic", "world_frame", "stamps")  # choices without effect elsewhere
 
 
@@ -124,9 +124,16 @@ def read(
     >>> scans.notes
     ['1 returns left out: a coordinate or the intensity is not a finite number']
     """
-    if not isinstance(stamps, (str, type(None))) or stamps not in _STAMPS:
+    if stamps not in (None, "header", "record"):
         msg = f'stamps must be "header" or "record", not {stamps!r:.50}'
         raise ValueError(msg)
+    one = isinstance(path, (str, PathLike))
+    paths = [path_of(part, "path") for part in ([path] if one or not isinstance(path, Iterable) else path)]
+    files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
+    for file in (*paths, *map(Path, files)):
+        if not file.exists():  # many readers would not name it
+            msg = f"{file} does not exist"
+            raise FileNotFoundError(msg)
     request = Request(
         poses=poses,
         extrinsic=None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor"),
@@ -140,18 +147,9 @@ def read(
         columns=columns,
         max_gap_s=positive(max_gap_s, "max_gap_s"),
         truth=_truth(ground_truth),
-        notes=Notes(str(path) if isinstance(path, (str, PathLike)) else "the bags"),
+        notes=Notes(str(path) if one else "the bags"),
     )
-    if isinstance(poses, (str, PathLike)):
-        _check_exists(Path(poses))
-    if isinstance(path, (str, PathLike)):
-        _check_exists(Path(path))
-        found = _read(Path(path), request)
-    else:
-        paths = [path_of(part, "path") for part in (path if isinstance(path, Iterable) else [path])]
-        for part in paths:
-            _check_exists(part)
-        found = read_bags(paths, request)
+    found = _read(paths[0], request) if one else read_bags(paths, request)
     if request.truth is not None:
         found.truth_kind = "given"
     return found
@@ -165,7 +163,11 @@ def _read(path: Path, request: Request) -> Scans:
         if (dataset := datasets.find(path)) is not None:
             return dataset.read(path, request)
         if bags := bags_in(path):
-            return read_bags(bags, _with_poses_in(path, request))
+            file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
+            if file is not None and request.poses is None and request.pose_topic is None:
+                request.notes.add(f"poses: of {file.name}")
+                request = dataclasses.replace(request, poses=file)
+            return read_bags(bags, request)
     for name in _OF_BAGS:
         if getattr(request, name) not in (None, ()):
             msg = f"{path} is no bag: {name} is of bags alone"
@@ -181,43 +183,35 @@ def _read(path: Path, request: Request) -> Scans:
     raise ValueError(msg)
 
 
-def _with_poses_in(folder: Path, request: Request) -> Request:
-    """The request with the file of poses in a folder of bags, unless a user has chosen others."""
-    file = next((folder / name for name in POSE_FILES if (folder / name).is_file()), None)
-    if file is None or request.poses is not None or request.pose_topic is not None:
-        return request
-    request.notes.add(f"poses: of {file.name}")
-    return dataclasses.replace(request, poses=file)
-
-
 def _npz(path: Path, request: Request) -> Scans:
     """The scans of our own file, with its poses or those that are given."""
-    given = None if request.poses is UNPOSED else request.poses
-    if given is None and request.extrinsic is not None:
+    notes = request.notes
+    others = None if request.poses is UNPOSED else request.poses
+    if others is None and request.extrinsic is not None:
         msg = f"{path} has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
         raise ValueError(msg)
     if request.fields is not None or request.columns is not None:
         msg = f"{path} has arrays of known names: fields and columns are not used for .npz files"
         raise ValueError(msg)
-    notes = request.notes
     scans = read_scans(path)
-    matched = None if given is None else _other_poses(given, scans, path, request)
-    truth = scans.ground_truth if given is None else None
-    if given is not None and request.truth is None and scans.ground_truth is not None:
-        notes.add(f"the ground truth of {path.name} is left out: it lies in the world of the poses there")
+    truth, matched = scans.ground_truth, None
+    if others is not None:
+        times_s = None if scans.times_s is None else scans.times_s.tolist()
+        matched, _ = scan_poses(poses_of(others, notes), len(scans), times_s, request.extrinsic, request)
+        of = others if isinstance(others, (str, PathLike)) else "those given"
+        notes.add(f"poses: {of}, in place of those in {path.name}")
+        if truth is not None and request.truth is None:
+            notes.add(f"the ground truth of {path.name} is left out: it lies in the world of the poses there")
+        truth = None
 
     def source() -> Iterator[Scan]:
         for number, scan in enumerate(scans):
             pose = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
             if pose is None:
-                notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s), 1)
-                continue
-            if not np.isfinite(pose).all():
-                notes.count("scans left out: their poses are not finite", 1, f"scan {number}")
-                continue
-            arrays = scan.intensities, scan.doppler_mps, scan.time_s, scan.sigma
-            finite = finite_scan(scan.points, pose, *arrays, notes)
-            if len(finite):
+                notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s))
+            elif not np.isfinite(pose).all():
+                notes.count("scans left out: their poses are not finite", example=f"scan {number}")
+            elif finite := finite_returns(dataclasses.replace(scan, T_world_sensor=pose), notes):
                 yield finite
 
     imu = scans.imu
@@ -228,28 +222,10 @@ def _npz(path: Path, request: Request) -> Scans:
     return found
 
 
-def _other_poses(given: Any, scans: Scans, path: Path, request: Request) -> ScanPoses:
-    """Poses that are given for scans which have some."""
-    times_s = None if scans.times_s is None else scans.times_s.tolist()
-    matched, _ = scan_poses(poses_of(given, request.notes), len(scans), times_s, request.extrinsic, request)
-    of = given if isinstance(given, (str, PathLike)) else "those given"
-    request.notes.add(f"poses: {of}, in place of those in {path.name}")
-    return matched
-
-
 def _truth(ground_truth: Any) -> Truth | None:
     if ground_truth is None:
         return None
     if isinstance(ground_truth, (str, PathLike)):
-        file = Path(ground_truth)
-        _check_exists(file)
-        return lambda: read_points(file)
+        return partial(read_points, ground_truth)
     points = positions(ground_truth, "ground_truth")
     return lambda: points
-
-
-def _check_exists(path: Path) -> None:
-    """Raises an error that names the path: many readers would not."""
-    if not path.exists():
-        msg = f"{path} does not exist"
-        raise FileNotFoundError(msg)

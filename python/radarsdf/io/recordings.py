@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.ply import Columns
 from radarsdf.io.poses.trajectory import MAX_GAP_S, ScanPoses, StampedPoses, Trajectory
-from radarsdf.io.scans import Notes, Scan
+from radarsdf.io.scans import Columns, Notes, Scan
 
 WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
 _UNREADABLE = "scans left out: they cannot be read"
@@ -76,135 +75,121 @@ RawScans = Callable[[], Iterable[RawScan]]
 """Returns a new iterator over the scans of a recording."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """What the columns of a topic mean, by its first scan."""
+
+    fields: Fields
+    columns: list[str]
+    scan: str
+
+
 def posed(raw_scans: RawScans, find_poses: FindPoses, request: Request) -> Callable[[], Iterator[Scan]]:
     """The source of :meth:`Scans.of_source`: scans with poses and at least one return, in the order of the files."""
+    notes = request.notes
 
     def source() -> Iterator[Scan]:
-        reader = _Reader(raw_scans, find_poses, request)
+        layouts: dict[str, _Layout] = {}
+        num_posed, unposed = 0, ""
         for number, raw in enumerate(raw_scans()):
-            T_world_sensor = reader.pose(number, raw)
-            if T_world_sensor is None:
+            known = find_poses(raw.frame)
+            if known is None:
+                notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}")
                 continue
-            scan = reader.scan(raw, T_world_sensor)
-            if scan is not None:
-                yield scan
-        reader.check_poses()
+            T_world_sensor = known.of(number if raw.number is None else raw.number, raw.time_s)
+            if T_world_sensor is not None:
+                num_posed += 1
+                scan = _scan(raw, T_world_sensor, layouts, raw_scans, request)
+                if scan is not None:
+                    yield scan
+            elif not isinstance(known.poses, np.ndarray):  # else it was named when the poses were read
+                notes.count(WITHOUT_POSES.format(gap_s=known.max_gap_s))
+                if not unposed:
+                    span = known.poses.span()
+                    unposed = f"the first scan is at {raw.time_s:.3f} s, the poses are from {span}"
+        if unposed and not num_posed:
+            gap_s = request.max_gap_s
+            msg = f"{notes.about}: no scan has a pose: {unposed}, and a gap between poses may be {gap_s} s: are both of one clock?"
+            raise ValueError(msg)
 
     return source
 
 
-class _Reader:
-    """One pass through the scans of a recording."""
-
-    def __init__(self, raw_scans: RawScans, find_poses: FindPoses, request: Request) -> None:
-        self._raw_scans, self._find_poses, self._request = raw_scans, find_poses, request
-        self._notes = request.notes
-        self._first: dict[str, tuple[Fields, RawScan, list[str]]] = {}
-        """Of each topic, what the fields of its first scan mean, that scan, and the names of its columns."""
-        self._posed = 0
-        self._unposed = ""
-        """What is known of the first scan without a pose."""
-
-    def pose(self, number: int, raw: RawScan) -> NDArray[np.float64] | None:
-        """T_world_sensor (4, 4); None, and counted, if it is not known."""
-        own = self._find_poses(raw.frame)
-        if own is None:
-            self._notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}", 1)
-            return None
-        T_world_sensor = own.of(number if raw.number is None else raw.number, raw.time_s)
-        if T_world_sensor is not None:
-            self._posed += 1
-        elif not isinstance(own.poses, np.ndarray):  # else it was named when the poses were read
-            self._notes.count(WITHOUT_POSES.format(gap_s=own.max_gap_s), 1)
-            span = own.poses.span()
-            self._unposed = (
-                self._unposed or f"the first scan is at {raw.time_s:.3f} s, the poses are from {span}"
-            )
-        return T_world_sensor
-
-    def check_poses(self) -> None:
-        """Raises a ValueError if there were scans and poses, but of different times."""
-        if self._unposed and not self._posed:
-            gap_s = self._request.max_gap_s
-            msg = f"{self._notes.about}: no scan has a pose: {self._unposed}, and a gap between poses may be {gap_s} s: are both of one clock?"
-            raise ValueError(msg)
-
-    def scan(self, raw: RawScan, T_world_sensor: NDArray[np.float64]) -> Scan | None:
-        """The scan with its pose; None, and counted, if it is damaged or has no returns."""
-        try:
-            columns = raw.read()
-        except ValueError as error:
-            self._notes.count(_UNREADABLE, 1, str(error))
-            return None
-        if not columns or len(next(iter(columns.values()))) == 0:
-            self._notes.count(_NO_RETURNS, 1)
-            return None
-        fields = self._fields(raw, columns)
-        if fields is None:
-            return None
-        scan = fields.scan(columns, raw.name, T_world_sensor, raw.time_s, self._notes)
-        if len(scan) == 0:
-            self._notes.count(_NO_RETURNS, 1)
-            return None
-        return scan
-
-    def _fields(self, raw: RawScan, columns: Columns) -> Fields | None:
-        """What the columns mean: as those of the first scan of the topic. None, and counted, without positions."""
-        if raw.topic not in self._first:
-            fields = self._first_fields(raw, columns)
-            if fields is None:
+def _scan(
+    raw: RawScan,
+    T_world_sensor: NDArray[np.float64],
+    layouts: dict[str, _Layout],
+    raw_scans: RawScans,
+    request: Request,
+) -> Scan | None:
+    """The scan with its pose; None, and counted, if it is damaged or has no returns."""
+    notes = request.notes
+    try:
+        columns = raw.read()
+    except ValueError as error:
+        notes.count(_UNREADABLE, example=str(error))
+        return None
+    scan = None
+    if columns and len(next(iter(columns.values()))):
+        if raw.topic not in layouts:
+            try:
+                layouts[raw.topic] = _layout(raw, columns, layouts, raw_scans, request)
+            except ValueError as error:
+                if request.fields:
+                    raise
+                notes.count(_UNREADABLE, example=str(error))
                 return None
-            self._first[raw.topic] = fields, raw, list(columns)
-        fields, first, names = self._first[raw.topic]
-        if not fields.position_names <= set(columns):
-            self._notes.count(_UNREADABLE, 1, f"{raw.name} has no positions, but {', '.join(columns)}")
+        layout = layouts[raw.topic]
+        if not layout.fields.position_names <= set(columns):
+            notes.count(_UNREADABLE, example=f"{raw.name} has no positions, but {', '.join(columns)}")
             return None
-        if list(columns) != names:
-            own = Fields.of(list(columns), self._request.fields, raw.name)
-            if (role := fields.missing_role(own)) is not None:
-                msg = (
-                    f"{raw.name} has the field {own.names[role]} for {role}, which {first.name} lacks: leave it out of all scans "
-                    f"by fields={{{role!r}: None}}"
-                )
-                raise ValueError(msg)
-        return fields
+        if list(columns) != layout.columns:
+            _check_same_roles(raw, columns, layout, request)
+        scan = layout.fields.scan(columns, raw.name, T_world_sensor, raw.time_s, notes)
+    if not scan:
+        notes.count(_NO_RETURNS)
+        return None
+    return scan
 
-    def _first_fields(self, raw: RawScan, columns: Columns) -> Fields | None:
-        """What the columns of the first scan of a topic mean, which raises an error only if a user has chosen some."""
-        chosen = self._request.fields
-        try:
-            fields = Fields.of(list(columns), chosen, raw.name)
-        except ValueError as error:
-            if chosen:
-                raise
-            self._notes.count(_UNREADABLE, 1, str(error))
-            return None
-        fields = fields.judged(self._first_clouds(raw.topic), self._notes)
-        fields.note_use(columns, self._notes, chosen=bool(chosen))
-        for other, _, _ in self._first.values():
-            _note_differences(fields, raw.topic, other, self._notes)
-        return fields
 
-    def _first_clouds(self, topic: str) -> Iterator[Columns]:
-        """The first scans of a topic that can be read, to judge their numbers by."""
-        of_topic = (raw for raw in self._raw_scans() if raw.topic == topic)
-        for raw in itertools.islice(of_topic, _JUDGED_SCANS):
+def _layout(
+    raw: RawScan, columns: Columns, others: Mapping[str, _Layout], raw_scans: RawScans, request: Request
+) -> _Layout:
+    """What the columns of the first scan of a topic mean, and what to know of that. Raises as :meth:`Fields.of`."""
+    notes = request.notes
+
+    def first_clouds() -> Iterator[Columns]:
+        of_topic = (other for other in raw_scans() if other.topic == raw.topic)
+        for scan in itertools.islice(of_topic, _JUDGED_SCANS):
             with contextlib.suppress(ValueError):
-                yield raw.read()
+                yield scan.read()
 
-
-def _note_differences(fields: Fields, topic: str, other: Fields, notes: Notes) -> None:
-    """Scans of several sensors: what some of them lack, and intensities that may have other units."""
-    for role in ("intensity", "doppler", "sigma_range"):
-        if (role in fields.names) != (role in other.names):
+    fields = Fields.of(list(columns), request.fields, raw.name).judged(first_clouds(), notes)
+    fields.note_use(columns, notes, chosen=bool(request.fields))
+    for other in others.values():
+        for role in ("intensity", "doppler", "sigma_range"):
+            if (role in fields.names) != (role in other.fields.names):
+                notes.add(
+                    f"some topics have {role}, others have none: it is not used where all scans must have it"
+                )
+        own, others_own = fields.names.get("intensity"), other.fields.names.get("intensity")
+        if own and others_own and own != others_own:
             notes.add(
-                f"some topics have {role}, others have none: it is not used where all scans must have it"
+                f"intensities of {raw.topic} are {own}, of other topics {others_own}: they are taken as of one unit"
             )
-    own, others = fields.names.get("intensity"), other.names.get("intensity")
-    if own and others and own != others:
-        notes.add(
-            f"intensities of {topic} are {own}, of other topics {others}: they are taken as of one unit"
-        )
+    return _Layout(fields, list(columns), raw.name)
+
+
+def _check_same_roles(raw: RawScan, columns: Columns, layout: _Layout, request: Request) -> None:
+    """Raises a ValueError if a later scan has what the first one of its topic lacks: it would be lost silently."""
+    own = Fields.of(list(columns), request.fields, raw.name)
+    for role, name in own.names.items():
+        if role.startswith(("intensity", "doppler", "sigma")) and role not in layout.fields.names:
+            msg = (
+                f"{raw.name} has the field {name} for {role}, which {layout.scan} lacks: leave it out of all scans by "
+                f"fields={{{role!r}: None}}"
+            )
+            raise ValueError(msg)
 
 
 def scan_poses(
@@ -215,7 +200,6 @@ def scan_poses(
     request: Request,
 ) -> tuple[ScanPoses, Sequence[float] | None]:
     """Which pose each of `count` scans has, and the times of the scans as far as they are then known."""
-    T = np.eye(4) if T_base_sensor is None else T_base_sensor
     about = request.notes.about
     if isinstance(poses, np.ndarray):
         if len(poses) != count:
@@ -234,6 +218,7 @@ def scan_poses(
         request.notes.add(
             f"the scans have no time stamps: they are matched to the {count} poses in their order"
         )
-        times_s = [float(time_s) for time_s in poses.times_s]
-        poses = poses.poses(poses.times_s, np.inf)
+        times_s = poses.times_s.tolist()
+        poses = poses.poses(poses.times_s)
+    T = np.eye(4) if T_base_sensor is None else T_base_sensor
     return ScanPoses(poses, T, request.max_gap_s), times_s

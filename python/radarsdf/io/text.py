@@ -10,9 +10,8 @@ import itertools
 import re
 from bisect import bisect
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +46,7 @@ _BEYOND = 1.05  # angles that exceed a limit by rounding
 _STEPS, _ENOUGH = 4, 30  # parts of a degree, and angles that lie in such steps not by chance
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
+class Table(NamedTuple):
     """The R rows of numbers of a text file."""
 
     header: list[str] | None
@@ -67,29 +65,28 @@ def read_table(path: Path) -> Table:
     Comments begin with ``#``, ``//`` or ``%``; decimal commas are read where semicolons separate the numbers. The first
     line with a number is the first row. Raises a ValueError if most rows have words that are no numbers.
     """
-    lines = _with_points(read_text(path)).split("\n")
     header: list[str] | None = None
     heads: list[list[str]] = []
-    start = len(lines)
-    for number, line in enumerate(lines):
+    rows: list[str] = []
+    numbers: list[int] = []
+    for number, line in enumerate(_with_points(read_text(path)).split("\n"), 1):
+        if rows:
+            if line and not line.isspace() and not line.lstrip().startswith(_COMMENTS):
+                rows.append(line)
+                numbers.append(number)
+            continue
         bare = _without_comment(line)
         words = _words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
         if bare and (header is not None or any(map(_is_number, words))):
-            start = number
-            break
+            rows, numbers = [line], [number]
+            continue
         if bare:
             header = words
         if line.strip():
             heads.append(words)
-    rows = [
-        number
-        for number, line in enumerate(lines)
-        if number >= start and line and not line.isspace() and not line.lstrip().startswith(_COMMENTS)
-    ]
     if not rows:
         return Table(header, heads, np.zeros((0, len(header or ()))), [])
-    values = _values([lines[number] for number in rows], [number + 1 for number in rows], header)
-    return Table(header, heads, values, [number + 1 for number in rows])
+    return Table(header, heads, _values(rows, numbers, header), numbers)
 
 
 def _values(texts: list[str], lines: list[int], header: list[str] | None) -> NDArray[np.float64]:
@@ -117,9 +114,7 @@ def _values(texts: list[str], lines: list[int], header: list[str] | None) -> NDA
 
 def read_numbers(path: Path, columns: int | None = None) -> NDArray[np.float64]:
     """(R, columns) finite numbers of a text file; None: as many as it has. Raises a ValueError that names the line."""
-    with reading(
-        path, "a table of numbers" if columns is None else f"a table of {columns} columns of numbers"
-    ):
+    with reading(path, f"a table of {columns or 'any number of'} columns of numbers"):
         table = read_table(path)
         bad = ~np.isfinite(table.values).all(axis=1)
         if bad.any():

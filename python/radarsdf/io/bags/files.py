@@ -11,9 +11,9 @@ import threading
 from collections import Counter
 from collections.abc import Collection, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,38 +24,31 @@ from radarsdf.io.files import check_regular_file
 from radarsdf.io.scans import Notes
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-_ROS1_SUFFIX = ".bag"
 _METADATA = "metadata.yaml"
 _ENCODINGS = ("cdr", "ros1")
 _PATCHED = threading.Lock()
 _QUOTED = re.compile(r"\('(.*?)',\)")  # how rosbags prints the words of another error
 
 
-@dataclass(frozen=True)
-class Topic:
+class Topic(NamedTuple):
     """A topic of bags."""
 
     name: str
     message_type: str
-    count: int
-    """Number of its messages."""
+    num_messages: int
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """A message of a bag."""
 
+    bag: Path
     topic: str
     message_type: str
     recorded_s: float
-    raw: bytes | memoryview
-    cdr: bool
-    """Whether it is of ROS 2."""
-    bag: Path
-    content: Any = None
-    """What :func:`radarsdf.io.bags.messages.read_message` returns."""
-    number: int = 0
+    number: int
     """Of its topic, from 0."""
+    content: Any
+    """What :func:`radarsdf.io.bags.messages.read_message` returns."""
 
 
 def is_bag(path: Path) -> bool:
@@ -75,20 +68,22 @@ def bags_in(folder: Path) -> list[Path]:
 def topics_of(paths: list[Path]) -> dict[str, Topic]:
     """The topics of bags, by name."""
     topics: dict[str, Topic] = {}
-    with ExitStack() as stack:
-        for path in paths:
-            for connection in stack.enter_context(_opened(path)).connections:
-                if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
-                    raise _damaged(path, ValueError("a topic has no name or no type"))
+    for path in paths:
+        with _opened(path) as reader:
+            for connection in reader.connections:
                 name = connection.topic
-                count = connection.msgcount + (topics[name].count if name in topics else 0)
+                if not (isinstance(name, str) and isinstance(connection.msgtype, str)):
+                    raise _damaged(path, ValueError("a topic has no name or no type"))
+                count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
                 topics[name] = Topic(name, _type_of(connection), count)
     return topics
 
 
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
     """Those that have messages of these types."""
-    return {name: topic for name, topic in topics.items() if topic.message_type in types and topic.count}
+    return {
+        name: topic for name, topic in topics.items() if topic.message_type in types and topic.num_messages
+    }
 
 
 def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
@@ -97,31 +92,29 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
     damaged: dict[str, list[str]] = {}
     with ExitStack() as stack:
         streams = [stack.enter_context(closing(_stream(path, names))) for path in paths]
-        for message in heapq.merge(*streams, key=lambda message: message.recorded_s):
-            topic, number = message.topic, numbers[message.topic]
-            numbers[topic] += 1
+        for recorded_s, path, connection, raw in heapq.merge(*streams, key=itemgetter(0)):
+            topic, message_type = connection.topic, _type_of(connection)
+            number, numbers[topic] = numbers[topic], numbers[topic] + 1
             try:
-                content = read_message(message.raw, message.message_type, message.cdr)
+                content = read_message(raw, message_type, _encoding(connection) == "cdr")
             except ValueError as error:
                 damaged.setdefault(topic, []).append(
-                    f"{message.bag}: message {number} of {topic}, at {message.recorded_s:.3f} s, is not a whole "
-                    f"{message.message_type}: {error}"
+                    f"{path}: message {number} of {topic}, at {recorded_s:.3f} s, is not a whole {message_type}: {error}"
                 )
                 continue
-            yield replace(message, content=content, number=number)
+            yield Message(path, topic, message_type, recorded_s, number, content)
     for topic, texts in damaged.items():
         notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
 
 
-def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes | None) -> bool:
+def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes) -> bool:
     """Whether record times stand for the header stamps of `what`: as wanted, or where these are zero or stand still."""
     if wanted is not None:
         return wanted == "record"
     if stamps.any() and (len(stamps) == 1 or (stamps != stamps[0]).any()):
         return False
-    if notes is not None:
-        why = "stand still" if stamps.any() else "are zero"
-        notes.add(f"the header stamps of {what} {why}: the record time is used instead")
+    why = "stand still" if stamps.any() else "are zero"
+    notes.add(f"the header stamps of {what} {why}: the record time is used instead")
     return True
 
 
@@ -137,7 +130,10 @@ def _encoding(connection: Any) -> str:
     return str(getattr(connection.ext, "serialization_format", "ros1"))
 
 
-def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
+def _stream(
+    path: Path, names: set[str]
+) -> Generator[tuple[float, Path, Any, bytes | memoryview], None, None]:
+    """Record time, s, bag, connection of rosbags, and bytes of each message."""
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic in names and _encoding(c) in _ENCODINGS]
         if not connections:  # of none, rosbags would give all messages
@@ -148,8 +144,7 @@ def _stream(path: Path, names: set[str]) -> Generator[Message, None, None]:
                 if not (isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))):
                     msg = "a message has no time or no bytes"
                     raise ValueError(msg)  # noqa: TRY004 - the file is damaged
-                cdr = _encoding(connection) == "cdr"
-                yield Message(connection.topic, _type_of(connection), 1e-9 * recorded_ns, raw, cdr, path)
+                yield 1e-9 * recorded_ns, path, connection, raw
         except Exception as error:  # damaged bags raise exceptions of many kinds
             raise _damaged(path, error) from error
 
@@ -162,13 +157,9 @@ def _opened(path: Path) -> Iterator[Any]:
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
 
     try:
-        if path.suffix.lower() == _ROS1_SUFFIX:
-            reader: Any = rosbag1.Reader(path)
+        reader: Any = (rosbag1 if path.suffix.lower() == ".bag" else rosbag2).Reader(path)
+        with _any_mcap():
             reader.open()
-        else:
-            reader = rosbag2.Reader(path)
-            with _any_mcap():
-                reader.open()
     except PermissionError:
         raise
     except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
@@ -201,15 +192,9 @@ def _any_mcap() -> Iterator[None]:
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
-    why = str(error) or type(error).__name__
+    why = _QUOTED.sub(r"\1", str(error) or type(error).__name__).rstrip(".")
     if isinstance(error, MemoryError):  # rosbags reads as many bytes as a damaged size says
         why = "a size in it is larger than the memory"
-    why = _QUOTED.sub(r"\1", why).rstrip(".")
-    remedy = ""
-    if path.suffix.lower() == _ROS1_SUFFIX and "index" in why.lower():
-        remedy = f"; if its recording was cut off, rosbag reindex {path.name} may repair it"
-    elif "end magic" in why:
-        files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        name = files[0].name if files else path.name
-        remedy = f"; if its recording was cut off, mcap recover {name} may repair it"
+    cut_off = "end magic" in why or "index" in why.lower()
+    remedy = "; if its recording was cut off, mcap recover or rosbag reindex may repair it" if cut_off else ""
     return ValueError(f"{path} is not a whole bag: {why}{remedy}")

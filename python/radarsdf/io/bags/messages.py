@@ -12,14 +12,13 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.ply import Columns
+from radarsdf.io.scans import Columns
 
 _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _RADAR_RETURN = [
@@ -34,51 +33,41 @@ _ARS548_RETURN = [
 """As the radar sends it, and ars548_messages has it."""
 _NEBULA_RETURN = [(n, "V8" if n == "flags" else kind) for n, kind in _ARS548_RETURN[:-1]]
 _ARS548_LIST_BYTES, _ARS548_RETURNS_AT, _ARS548_COUNT_AT, _ARS548_MAX = 35336, 101, 35309, 800
-_TI_POINT = [("point_id", "H"), *((n, "f") for n in ("x", "y", "z", "range", "velocity")), ("doppler_bin", "H"),
-             ("bearing", "f"), ("intensity", "f")]  # fmt: skip
 _CDR_HEADER = 4
 _MAX_CDR_PADDING = 7
 _NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
 
 
-@dataclass(frozen=True)
-class Header:
+class Header(NamedTuple):
     """Stamp and frame of a message."""
 
     stamp_s: float
     frame: str
 
 
-@dataclass(frozen=True, eq=False)
-class CloudMessage:
-    """A message with points, whose columns (N,) by field are read when they are asked for."""
+class CloudMessage(NamedTuple):
+    """A message with points."""
 
     header: Header
-    columns: Callable[[], Columns]
-    point_id: int | None = None
-    """Number of the point, of messages of one point each."""
+    columns: Columns
 
 
-@dataclass(frozen=True)
-class PoseMessage:
+class PoseMessage(NamedTuple):
     """A pose T_frame_child."""
 
     header: Header
     child: str
-    """The frame that has the pose. Empty where the message does not say."""
+    """The frame that has the pose. Empty where the message does not name it."""
     values: tuple[float, ...]
     """x, y, z, m; qx, qy, qz, qw."""
 
 
-@dataclass(frozen=True, eq=False)
-class ImuMessage:
-    """What an IMU measured at one time, in its own axes. None: it does not measure it."""
+class ImuMessage(NamedTuple):
+    """Rates, rad/s, and specific force, m/s², of an IMU at one time, in its own axes. None: it does not measure it."""
 
     header: Header
     angular_velocity: tuple[float, ...] | None
-    """rad/s."""
     specific_force: tuple[float, ...] | None
-    """m/s²: acceleration less that of gravity."""
 
 
 class _Cursor:
@@ -102,11 +91,8 @@ class _Cursor:
             self.at += struct.calcsize(layout)
         return tuple(found)
 
-    def value(self, kind: str) -> Any:
-        return self.values(kind)[0]
-
     def count(self) -> int:
-        found: int = self.value("I")
+        found: int = self.values("I")[0]
         return found
 
     def data(self) -> memoryview:
@@ -129,7 +115,7 @@ class _Cursor:
 
     def header(self) -> Header:
         if not self.cdr:
-            self.value("I")  # the sequence number, which ROS 2 has not
+            self.values("I")  # the sequence number, which ROS 2 has not
         seconds, nanoseconds = self.values("iI" if self.cdr else "II")
         return Header(seconds + 1e-9 * nanoseconds, self.string().lstrip("/"))
 
@@ -151,13 +137,12 @@ class _Cursor:
         return self.raw[self.at - size : self.at]
 
 
-def _point_cloud2(cursor: _Cursor) -> CloudMessage:
-    header = cursor.header()
+def _point_cloud2(cursor: _Cursor) -> Columns:
     height, width = cursor.values("II")
     fields = [(cursor.string(), *cursor.values("IBI")) for _ in range(cursor.count())]
     big_endian, point_step, row_step = cursor.values("BII")
     data = cursor.data()
-    cursor.value("B")  # is_dense; what is not finite is looked for anyway
+    cursor.values("B")  # is_dense; what is not finite is looked for anyway
     row_step = row_step if height > 1 else point_step * width  # of one row, some drivers leave it 0
     if point_step * width > row_step or row_step * height > len(data):
         msg = f"{height} x {width} points of {point_step} bytes do not fit into its {len(data)} bytes"
@@ -171,74 +156,57 @@ def _point_cloud2(cursor: _Cursor) -> CloudMessage:
         if count <= 1 and name:  # 0 is what some drivers write for 1
             columns.setdefault(name, (offset, (">" if big_endian else "<") + kind))
 
-    record = np.dtype(
-        {
-            "names": list(columns),
-            "formats": [kind for _, kind in columns.values()],
-            "offsets": [offset for offset, _ in columns.values()],
-            "itemsize": point_step,
-        }
-    )
-
-    def read() -> Columns:
-        if not height * width:
-            return {name: np.zeros(0, kind) for name, (_, kind) in columns.items()}
-        # One view of the message: no loop over points, and no copy.
-        cloud: NDArray[Any] = np.ndarray((height, width), record, data, strides=(row_step, point_step))
-        return {name: cloud[name].reshape(-1) for name in columns}
-
-    return CloudMessage(header, read)
+    if not height * width:
+        return {name: np.zeros(0, kind) for name, (_, kind) in columns.items()}
+    # Views of the message: no loop over points.
+    shape, strides = (height, width), (row_step, point_step)
+    return {
+        name: np.ndarray(shape, kind, data, offset, strides).reshape(-1)
+        for name, (offset, kind) in columns.items()
+    }
 
 
-def _point_cloud(cursor: _Cursor) -> CloudMessage:
-    header = cursor.header()
+def _point_cloud(cursor: _Cursor) -> Columns:
     xyz = cursor.records([(axis, "f4") for axis in "xyz"], cursor.count())
     columns: Columns = {axis: xyz[axis] for axis in "xyz"}
     for _ in range(cursor.count()):
         name, values = cursor.string(), cursor.records([("value", "f4")], cursor.count())["value"]
         if len(values) == len(xyz):
             columns.setdefault(name, values)
-    return CloudMessage(header, lambda: columns)
+    return columns
 
 
-def _radar_scan(cursor: _Cursor) -> CloudMessage:
-    header = cursor.header()
+def _radar_scan(cursor: _Cursor) -> Columns:
     returns = cursor.records(_RADAR_RETURN, cursor.count())
-    return CloudMessage(header, lambda: {name: returns[name] for name, _ in _RADAR_RETURN})
+    return {name: returns[name] for name, _ in _RADAR_RETURN}
 
 
-def _ti_radar_scan(cursor: _Cursor) -> CloudMessage:
-    """One point a message."""
-    header = cursor.header()
-    fields = {name: cursor.value(kind) for name, kind in _TI_POINT}
-    used = ("x", "y", "z", "velocity", "intensity")
-    return CloudMessage(
-        header, lambda: {name: np.array([fields[name]], np.float32) for name in used}, fields["point_id"]
-    )
+def _ti_radar_scan(cursor: _Cursor) -> Columns:
+    """One point a message: its number, x, y, z, range, velocity, Doppler bin, bearing and intensity."""
+    number, x, y, z, _, velocity, _, _, intensity = cursor.values("HfffffHff")
+    point = {"x": x, "y": y, "z": z, "velocity": velocity, "intensity": intensity}
+    return {POINT_ID: np.array([number])} | {name: np.array([v], np.float32) for name, v in point.items()}
 
 
-def _nebula_list(cursor: _Cursor) -> CloudMessage:
+def _nebula_list(cursor: _Cursor) -> Columns:
     """A ContinentalArs548DetectionList."""
-    header = cursor.header()
     cursor.values("B" + "ddd" + "ffffffffB")  # among them, where the sensor is on the vehicle
     returns = cursor.records(_NEBULA_RETURN, cursor.count())
     invalid = np.frombuffer(returns["flags"].tobytes(), bool).reshape(-1, 8)
-    return CloudMessage(header, lambda: _ars548_columns(returns, invalid))
+    return _ars548_columns(returns, invalid)
 
 
-def _ars548_list(cursor: _Cursor) -> CloudMessage:
+def _ars548_list(cursor: _Cursor) -> Columns:
     """A DetectionList of ars548_messages: as the radar sends it, always with space for 800 returns."""
-    header = cursor.header()
     cursor.values("QIIIIIBIBH" + "f" * 12 + "B")
     returns = cursor.records(_ARS548_RETURN, _ARS548_MAX)
     _, _, count, *_ = cursor.values("ffIffB")
-    returns = returns[:count]
-    return CloudMessage(header, lambda: _ars548_columns(returns))
+    return _ars548_columns(returns[:count])
 
 
-def _nebula_packets(cursor: _Cursor) -> CloudMessage:
+def _nebula_packets(cursor: _Cursor) -> Columns:
     """What an ARS548 sent, among which lists of returns are found by their length."""
-    header, lists = cursor.header(), []
+    lists = []
     for _ in range(cursor.count()):
         cursor.values("II")  # its time
         packet = cursor.data()
@@ -247,7 +215,7 @@ def _nebula_packets(cursor: _Cursor) -> CloudMessage:
             record = np.dtype([(name, ">" + kind) for name, kind in _ARS548_RETURN])
             lists.append(np.frombuffer(packet, record, count, _ARS548_RETURNS_AT))
     returns = np.concatenate(lists) if lists else np.zeros(0, _ARS548_RETURN)
-    return CloudMessage(header, lambda: _ars548_columns(returns))
+    return _ars548_columns(returns)
 
 
 def _ars548_columns(returns: NDArray[Any], invalid: NDArray[np.bool_] | None = None) -> Columns:
@@ -255,17 +223,11 @@ def _ars548_columns(returns: NDArray[Any], invalid: NDArray[np.bool_] | None = N
     each before its deviation. Azimuth is positive to the left, elevation upwards."""
     if invalid is None:
         invalid = np.unpackbits(returns["flags"][:, None], axis=1, bitorder="little").astype(bool)
-    values = {
-        "range": "range",
-        "azimuth_rad": "azimuth",
-        "elevation_rad": "elevation",
-        "range_rate": "range_rate",
-    }
-    columns = {
-        name: np.where(invalid[:, 2 * i], np.nan, returns[field])
-        for i, (name, field) in enumerate(values.items())
-    }
-    return columns | {n: returns[n] for n in ("rcs", "range_std", "azimuth_std", "elevation_std")}
+    columns = {name: returns[name] for name in ("rcs", "range_std", "azimuth_std", "elevation_std")}
+    for i, name in enumerate(("range", "azimuth", "elevation", "range_rate")):
+        unit = "_rad" if name in ("azimuth", "elevation") else ""
+        columns[name + unit] = np.where(invalid[:, 2 * i], np.nan, returns[name])
+    return columns
 
 
 def _pose(cursor: _Cursor, *, child: bool = False, behind: int = 0) -> list[PoseMessage]:
@@ -276,13 +238,10 @@ def _pose(cursor: _Cursor, *, child: bool = False, behind: int = 0) -> list[Pose
     return [pose]
 
 
-def _path(cursor: _Cursor) -> list[PoseMessage]:
-    cursor.header()
-    return [_pose(cursor)[0] for _ in range(cursor.count())]
-
-
-def _transforms(cursor: _Cursor) -> list[PoseMessage]:
-    return [_pose(cursor, child=True)[0] for _ in range(cursor.count())]
+def _poses(cursor: _Cursor, *, child: bool) -> list[PoseMessage]:
+    if not child:  # a Path has a header of its own
+        cursor.header()
+    return [_pose(cursor, child=child)[0] for _ in range(cursor.count())]
 
 
 def _imu(cursor: _Cursor) -> ImuMessage:
@@ -295,12 +254,13 @@ def _imu(cursor: _Cursor) -> ImuMessage:
     return ImuMessage(header, *measured)
 
 
+POINT_ID = "point_id"
 POINT_A_MESSAGE = "ti_mmwave_rospkg/msg/RadarScan"
 PACKETS = "nebula_msgs/msg/NebulaPackets"
 PATH = "nav_msgs/msg/Path"
 IMU = "sensor_msgs/msg/Imu"
 
-_CLOUDS = {
+_CLOUDS: dict[str, Callable[[_Cursor], Columns]] = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
     "sensor_msgs/msg/PointCloud": _point_cloud,
     "radar_msgs/msg/RadarScan": _radar_scan,
@@ -314,10 +274,10 @@ _POSES: dict[str, Callable[[_Cursor], Any]] = {
     "geometry_msgs/msg/PoseStamped": _pose,
     "geometry_msgs/msg/PoseWithCovarianceStamped": partial(_pose, behind=36),
     "geometry_msgs/msg/TransformStamped": partial(_pose, child=True),
-    PATH: _path,
+    PATH: partial(_poses, child=False),
 }
-_TRANSFORMS = {"tf2_msgs/msg/TFMessage": _transforms, "tf/msg/tfMessage": _transforms}
-_LAYOUTS: dict[str, Callable[[_Cursor], Any]] = {**_CLOUDS, **_POSES, **_TRANSFORMS, IMU: _imu}
+_TRANSFORMS = dict.fromkeys(("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), partial(_poses, child=True))
+_LAYOUTS: dict[str, Callable[[_Cursor], Any]] = {**_POSES, **_TRANSFORMS, IMU: _imu}
 CLOUD_TYPES = tuple(_CLOUDS)
 POSE_TYPES = tuple(_POSES)
 TRANSFORM_TYPES = tuple(_TRANSFORMS)
@@ -327,7 +287,10 @@ def read_message(raw: bytes | memoryview, message_type: str, cdr: bool) -> Any:
     """The content of a message: a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`, by its type."""
     try:
         cursor = _Cursor(raw, cdr)
-        message = _LAYOUTS[message_type](cursor)
+        if message_type in _CLOUDS:
+            message: Any = CloudMessage(cursor.header(), _CLOUDS[message_type](cursor))
+        else:
+            message = _LAYOUTS[message_type](cursor)
         cursor.end()
     except KeyError as error:
         msg = "its topic has messages of other types, too"

@@ -19,27 +19,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.bags.files import Topic, bags_in, by_record, is_bag, read_messages, topics_of, topics_with
-from radarsdf.io.bags.messages import (
-    CLOUD_TYPES,
-    IMU,
-    PACKETS,
-    POINT_A_MESSAGE,
-    CloudMessage,
-    Header,
-    ImuMessage,
-)
-from radarsdf.io.bags.poses import attached, poses_in_bags
-from radarsdf.io.bags.tf import transforms_in
+from radarsdf.io.bags.files import Message, Topic, by_record, is_bag, read_messages, topics_of, topics_with
+from radarsdf.io.bags.messages import CLOUD_TYPES, IMU, PACKETS, POINT_A_MESSAGE, POINT_ID, CloudMessage
+from radarsdf.io.bags.poses import attached, poses_in_bags, transforms_in
 from radarsdf.io.clouds.fields import Fields
 from radarsdf.io.imu import Imu
-from radarsdf.io.ply import Columns
 from radarsdf.io.poses.files import poses_of
 from radarsdf.io.poses.trajectory import UNPOSED, ScanPoses, StampedPoses
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
-from radarsdf.io.scans import Notes, Scans
-
-__all__ = ["bags_in", "is_bag", "read_bags"]
+from radarsdf.io.scans import Columns, Notes, Scans
 
 KNOWN_TOPICS = {
     "/hugin_raf_1/radar_data": "/icp_odom",  # Viking Hill
@@ -63,22 +51,19 @@ _PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the c
 
 def read_bags(paths: list[Path], request: Request) -> Scans:
     """Scans of one drive in one or several bags; see :func:`radarsdf.io.read`."""
-    if not paths:
-        msg = "there is no bag to read: the list is empty"
+    if not paths or not all(map(is_bag, paths)):
+        others = ", ".join(str(path) for path in paths if not is_bag(path))
+        msg = f"{others or 'an empty list'} is no bag: only bags can be read together"
         raise ValueError(msg)
-    for path in paths:
-        if not is_bag(path):
-            msg = f"{path} is no bag: only bags can be read together"
-            raise ValueError(msg)
     topics = topics_of(paths)
     scan_topics = _scan_topics(topics, paths, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.header.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
-    by_recording = {}
-    for name, clouds in peeked.items():
-        stamps = np.array([cloud.header.stamp_s for cloud in clouds])
-        by_recording[name] = by_record(stamps, name, request.stamps, request.notes)
+    by_recording = {
+        name: by_record(np.array([c.header.stamp_s for c in clouds]), name, request.stamps, request.notes)
+        for name, clouds in peeked.items()
+    }
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, by_recording[topic.name], request) for topic in scan_topics]
@@ -116,7 +101,7 @@ def _given(
     """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
     if isinstance(poses, np.ndarray):
         numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
-        count = topics[0].count if numbered else sum(1 for _ in raw_scans())
+        count = topics[0].num_messages if numbered else sum(1 for _ in raw_scans())
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
         return lambda _: numbered_poses
     if poses is UNPOSED:
@@ -132,16 +117,11 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
     """The topics of the scans: the wanted ones, or the only one that can be meant. The others are noted."""
     about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
-    for wanted in request.topic:
-        if wanted not in topics:
-            msg = (
-                f"{about} has no topic {wanted}: topics with points are {_listed(fitting.values()) or 'none'}"
-            )
-            raise ValueError(msg)
-        if wanted not in fitting:
-            kind = topics[wanted].message_type
-            msg = f"{about}: {wanted} has messages {kind}, or none; scans are {', '.join(CLOUD_TYPES)}"
-            raise ValueError(msg)
+    if missing := [name for name in request.topic if name not in fitting]:
+        has = topics[missing[0]].message_type if missing[0] in topics else ""
+        what = f": {missing[0]} has messages {has}, or none" if has else f" has no topic {missing[0]}"
+        msg = f"{about}{what}: topics with points are {_listed(fitting.values()) or 'none'}"
+        raise ValueError(msg)
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
     if not fitting:
@@ -156,7 +136,14 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
     else:
         msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
         raise ValueError(msg)
-    unread = [t for t in topics.values() if t.count and t.name not in fitting and _may_have_points(t)]
+    unread = [
+        t
+        for t in topics.values()
+        if t.num_messages
+        and t.name not in fitting
+        and _POINTS.search(_words(t))
+        and not _NO_POINTS.search(t.message_type)
+    ]
     radars = [t for t in unread if _is_radar(t)]
     if radars and not _is_radar(chosen[0]) and not has_doppler(chosen[0]):
         msg = (
@@ -170,23 +157,22 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
 
 
 def _listed(topics: Iterable[Topic]) -> str:
-    return ", ".join(f"{t.name} ({t.message_type})" for t in sorted(topics, key=lambda t: t.name))
+    return ", ".join(f"{t.name} ({t.message_type})" for t in sorted(topics))
+
+
+def _words(topic: Topic) -> str:
+    return f"{topic.name} {topic.message_type}"
 
 
 def _is_radar(topic: Topic) -> bool:
-    return bool(_RADAR.search(f"{topic.name} {topic.message_type}"))
-
-
-def _may_have_points(topic: Topic) -> bool:
-    """Whether messages of a type that cannot be read are probably scans."""
-    named = _POINTS.search(f"{topic.name} {topic.message_type}")
-    return named is not None and not _NO_POINTS.search(topic.message_type)
+    return bool(_RADAR.search(_words(topic)))
 
 
 def _has_doppler(paths: list[Path], topic: Topic) -> bool:
-    with closing(read_messages(paths, {topic.name}, Notes())) as messages, suppress(ValueError):
+    quiet = Notes(log=False)
+    with closing(read_messages(paths, {topic.name}, quiet)) as messages, suppress(ValueError):
         for message in messages:
-            return "doppler" in Fields.of(list(message.content.columns())).names
+            return "doppler" in Fields.of(list(message.content.columns)).names
     return False
 
 
@@ -209,87 +195,87 @@ def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request
         cloud: CloudMessage = message.content
         time_s = message.recorded_s if recorded else cloud.header.stamp_s
         name = f"{message.bag}: message {message.number} of {topic.name}"
-        yield RawScan(cloud.columns, time_s, name, cloud.header.frame, topic.name, message.number)
+        yield RawScan(
+            partial(dict, cloud.columns), time_s, name, cloud.header.frame, topic.name, message.number
+        )
 
 
 def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
-    scan: list[CloudMessage] = []
-    last, last_s, start_s, number = -1, 0.0, 0.0, 0
-    name = ""
+    scan: list[Message] = []
+
+    def whole(number: int) -> RawScan:
+        first, clouds = scan[0], [message.content for message in scan]
+        time_s = first.recorded_s if recorded else first.content.header.stamp_s
+        name = f"{first.bag}: scan {number} of {topic.name}"
+        return RawScan(partial(_joined, clouds), time_s, name, first.content.header.frame, topic.name)
+
+    number = 0
     for message in read_messages(paths, {topic.name}, request.notes):
-        cloud: CloudMessage = message.content
-        assert cloud.point_id is not None
-        if scan and (cloud.point_id <= last or message.recorded_s > last_s + _PAUSE_S):
-            yield RawScan(partial(_joined, scan), start_s, name, scan[0].header.frame, topic.name)
+        last = scan[-1] if scan else message
+        pause = message.recorded_s > last.recorded_s + _PAUSE_S
+        if scan and (pause or _point_id(message) <= _point_id(last)):
+            yield whole(number)
             scan, number = [], number + 1
-        if not scan:
-            start_s = message.recorded_s if recorded else cloud.header.stamp_s
-            name = f"{message.bag}: scan {number} of {topic.name}"
-        scan.append(cloud)
-        last, last_s = cloud.point_id, message.recorded_s
+        scan.append(message)
     if scan:
-        yield RawScan(partial(_joined, scan), start_s, name, scan[0].header.frame, topic.name)
+        yield whole(number)
 
 
 def _joined(points: list[CloudMessage]) -> Columns:
-    rows = [point.columns() for point in points]
-    return {field: np.concatenate([row[field] for row in rows]) for field in rows[0]}
+    fields = [field for field in points[0].columns if field != POINT_ID]
+    return {field: np.concatenate([point.columns[field] for point in points]) for field in fields}
 
 
-def _imu_topic(topics: dict[str, Topic], request: Request) -> Topic | None:
+def _point_id(message: Message) -> int:
+    return int(message.content.columns[POINT_ID][0])
+
+
+def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several."""
-    fitting = topics_with([IMU], topics)
-    listed = ", ".join(sorted(fitting))
-    if request.imu_topic is not None:
-        if request.imu_topic not in fitting:
-            msg = f"{request.notes.about} has no inertial measurements in {request.imu_topic}: topics that have some are {listed or 'none'}"
-            raise ValueError(msg)
-        return fitting[request.imu_topic]
-    if len(fitting) > 1:
+    fitting = sorted(topics_with([IMU], topics))
+    listed = ", ".join(fitting)
+    if request.imu_topic is not None and request.imu_topic not in fitting:
+        msg = f"{request.notes.about} has no inertial measurements in {request.imu_topic}: topics that have some are {listed or 'none'}"
+        raise ValueError(msg)
+    if request.imu_topic is None and len(fitting) > 1:
         request.notes.add(
             f"there are several topics of IMUs, of which none is used: say by imu_topic which, of {listed}"
         )
-    return next(iter(fitting.values())) if len(fitting) == 1 else None
+        return None
+    return request.imu_topic or next(iter(fitting), None)
 
 
 def _read_imu(
-    paths: list[Path],
-    topic: Topic,
-    sensor_frame: str,
-    recorded_scans: bool,
-    request: Request,
+    paths: list[Path], topic: str, sensor_frame: str, recorded_scans: bool, request: Request
 ) -> Imu | None:
     """What the topic holds; None if it has no gyroscope.
 
     `recorded_scans`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
     from stamp to record, because messages of an IMU are recorded several at a time.
     """
-    stamps_s, recorded_s, rates, forces = (array("d") for _ in range(4))
-    first: Header | None = None
-    for message in read_messages(paths, {topic.name}, request.notes):
-        measured: ImuMessage = message.content
-        if measured.angular_velocity is None:
-            request.notes.add(f"{topic.name} has no angular velocity: it is not used")
+    numbers, frame = array("d"), ""
+    for message in read_messages(paths, {topic}, request.notes):
+        header, rates, force = message.content
+        if rates is None:
+            request.notes.add(f"{topic} has no angular velocity: it is not used")
             return None
-        first = measured.header if first is None else first
-        stamps_s.append(measured.header.stamp_s)
-        recorded_s.append(message.recorded_s)
-        rates.extend(measured.angular_velocity)
-        forces.extend(measured.specific_force or (np.nan,) * 3)
-    stamps, recorded = np.array(stamps_s), np.array(recorded_s)
+        frame = header.frame if not numbers else frame
+        numbers.extend((header.stamp_s, message.recorded_s, *rates, *(force or (np.nan,) * 3)))
+    table = np.array(numbers).reshape(-1, 8)
+    stamps, recorded = table[:, 0], table[:, 1]
     times_s = recorded
-    if not by_record(stamps, topic.name, None, None if recorded_scans else request.notes):
+    notes = Notes(log=False) if recorded_scans else request.notes
+    if not by_record(stamps, topic, None, notes):
         times_s = stamps + np.median(recorded - stamps) if recorded_scans else stamps
-    table = np.column_stack([np.array(rates).reshape(-1, 3), np.array(forces).reshape(-1, 3)])
     order = np.argsort(times_s, kind="stable")
-    finite = order[np.isfinite(table[order, :3]).all(axis=1)]
-    if len(finite) == 0:
+    rows = order[np.isfinite(table[order, 2:5]).all(axis=1)]
+    if len(rows) == 0:
         return None
-    table = table[finite]
-    has_force = np.isfinite(table).all() and table[:, 3:].any()
+    rates, forces = table[rows, 2:5], table[rows, 5:]
+    has_force = np.isfinite(table[rows]).all() and forces.any()
     R_sensor_imu = request.R_sensor_imu
-    if R_sensor_imu is None and first is not None and first.frame:
-        T_imu_sensor = transforms_in(paths, request).fixed(first.frame, sensor_frame)
+    if R_sensor_imu is None and frame:
+        T_imu_sensor = transforms_in(paths, request).fixed(frame, sensor_frame)
         R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
-    return Imu(times_s[finite], table[:, :3], table[:, 3:] if has_force else None, R_sensor_imu)
+    return Imu(times_s[rows], rates, forces if has_force else None, R_sensor_imu)

@@ -47,14 +47,15 @@ def bin_layout(paths: Sequence[Path], width: int | None = None) -> BinLayout:
     """
     rows = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MAX_FILES)).astype(int))
     chosen = [path for path in (paths[i] for i in rows) if path.stat().st_size]
-    kitti = KITTI if width is None else BinLayout("<f4", width)
+    if not chosen:
+        return KITTI if width is None else BinLayout("<f4", width)
     chances: dict[BinLayout, float] = {}
-    for dtype in _TYPES if chosen else ():
+    for dtype in _TYPES:
         tables = _tables(chosen, dtype, _WIDTHS if width is None else [width])
+        if width is not None and (tables or dtype == _TYPES[-1]):
+            return BinLayout(dtype if tables else "<f4", width)
         if not tables:
             continue
-        if width is not None:
-            return BinLayout(dtype, width)
         left = {columns: _variance(table) for columns, table in tables.items()}
         best = min(left, key=lambda columns: left[columns])
         for columns in tables:  # every second return may differ, as of two lasers by turns
@@ -65,9 +66,8 @@ def bin_layout(paths: Sequence[Path], width: int | None = None) -> BinLayout:
         if _chance(tables[best]) < _CHANCE:
             return BinLayout(dtype, best)
         chances |= {BinLayout(dtype, columns): _chance(table) for columns, table in tables.items()}
-    sure = not chosen or width is not None
-    if sure or (kitti in chances and chances[kitti] <= _PREFERRED * min(chances.values())):
-        return kitti
+    if KITTI in chances and chances[KITTI] <= _PREFERRED * min(chances.values()):
+        return KITTI
     why = "its size is no whole number of points of 4 float32 each, or its numbers are no positions in m"
     if chances:
         why = f"the content does not decide how many numbers a return has, {' or '.join(map(str, chances))}"

@@ -12,29 +12,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.scans import Notes, Scan
+from radarsdf.io.scans import Notes, Scan, finite_returns
 from radarsdf.io.text import SCALES, are_degrees, without_unit
-
-ROLES = ("x", "y", "z", "range", "azimuth", "elevation", "intensity", "doppler",
-         "sigma_range", "sigma_azimuth", "sigma_elevation")  # fmt: skip
-"""What a field can be. Positions are x, y and z, or else range, azimuth and elevation."""
 
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
 _SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
-_NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
-
-
 _ALIASES: dict[str, tuple[str, ...]] = {
     # The first name that a cloud has counts. Files of ours come first.
+    "x": ("x",),
+    "y": ("y",),
+    "z": ("z",),
+    "range": ("range", "distance", "r", "rng", "dist", "radius", "slantrange"),
+    "azimuth": ("azimuth", "azimuthangle", "az", "azi", "azim", "angleazimuth"),
+    "elevation": ("elevation", "elevationangle", "el", "ele", "elev", "angleelevation"),
     "intensity": ("power", "intensity", "rcs", "snr", "snrdb", "amplitude", "reflectivity", "reflectance", "magnitude",
                   "rssi", "signalpower", "signalstrength"),
     "doppler": ("doppler", "velocity", "dopplervelocity", "vdopplermps", "radialspeed", "radialvelocity", "rangerate",
                 "vr", "speed", "rdot", "vradial", "vrad", "velr", "vel", "radialvel", "velocityradial",
                 "dopplerspeed", "vdoppler", "relativevelocity"),
-    "range": ("range", "distance", "r", "rng", "dist", "radius", "slantrange"),
-    "azimuth": ("azimuth", "azimuthangle", "az", "azi", "azim", "angleazimuth"),
-    "elevation": ("elevation", "elevationangle", "el", "ele", "elev", "angleelevation"),
     "sigma_range": ("sigmarange", "rangestd", "rangeaccu"),
     "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
     "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
@@ -44,6 +40,9 @@ _ALIASES: dict[str, tuple[str, ...]] = {
 Of Sensrad Hugin, Oculii Eagle, Continental ARS548 (nebula, SNAIL-Radar, HKUST RIO), smartmicro, TI mmWave (ti_mmwave,
 reve), radar_msgs, View-of-Delft, TJ4DRadSet, and others.
 """
+ROLES = tuple(_ALIASES)
+"""What a field can be. Positions are x, y and z, or else range, azimuth and elevation."""
+
 _SNAIL_ARS548 = {"x", "doppler", "intensity", "range_std", "azimuth_std", "elevation_std"}
 
 COLUMNS: dict[int, tuple[str, ...]] = {
@@ -71,29 +70,6 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
     return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
 
 
-def finite_scan(
-    points: NDArray[Any],
-    T_world_sensor: NDArray[np.float64],
-    intensities: NDArray[Any] | None,
-    doppler_mps: NDArray[Any] | None,
-    time_s: float | None,
-    sigma: NDArray[Any] | None,
-    notes: Notes,
-) -> Scan:
-    """The returns whose coordinates and intensity are finite. The others are counted."""
-    # All at once first: that is usual, and row by row takes twenty times as long.
-    if not (np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all())):
-        finite = np.isfinite(points).all(axis=1)
-        if intensities is not None:
-            finite &= np.isfinite(intensities)
-        notes.count(_NOT_FINITE, int((~finite).sum()))
-        points = points[finite]
-        intensities, doppler_mps, sigma = (
-            None if array is None else array[finite] for array in (intensities, doppler_mps, sigma)
-        )
-    return Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma)
-
-
 @dataclass(frozen=True)
 class Fields:
     """Which field of a cloud plays which role."""
@@ -116,7 +92,7 @@ class Fields:
         # AzimuthAngle, azimuth_angle and Azimuth Angle are one name.
         squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
-        for role, aliases in ({axis: (axis,) for axis in _XYZ} | _ALIASES).items():
+        for role, aliases in _ALIASES.items():
             name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
             if name is not None and name not in found.values():
                 found[role] = name
@@ -125,8 +101,15 @@ class Fields:
                 msg = f"fields has no role {role!r}: roles are {', '.join(ROLES)}"
                 raise ValueError(msg)
             found.pop(role, None)
-            if field is not None:
-                found[role] = _field(field, names, lower, role, what)
+            if field is None:
+                continue
+            by_number = dict(enumerate(names)) if isinstance(field, (int, np.integer)) else {}
+            name = by_number.get(field, field if field in names else lower.get(str(field).lower()))
+            if name is None:
+                kind = "column" if by_number else "field"
+                msg = f"{what} has no {kind} {field} for {role}: it has {', '.join(names)}"
+                raise ValueError(msg)
+            found[role] = name
         if not set(_XYZ) <= set(found) and not set(_POLAR) <= set(found):
             wanted = _POLAR if "range" in found and "x" not in found else _XYZ
             missing = ", ".join(role for role in wanted if role not in found)
@@ -188,26 +171,17 @@ class Fields:
     ) -> Scan:
         """The finite returns in the columns, (N,) each, of the cloud `what`."""
         for name in self.names.values():
-            if name not in columns:
-                msg = f"{what} lacks the field {name}, which other scans have: it has {', '.join(columns)}"
-                raise ValueError(msg)
-            if columns[name].dtype.kind not in "biuf":
-                msg = f"{what}: the field {name} holds no numbers"
+            if name not in columns or columns[name].dtype.kind not in "biuf":
+                why = "holds no numbers" if name in columns else "is missing, which other scans have"
+                msg = f"{what}: the field {name} {why}; it has {', '.join(columns)}"
                 raise ValueError(msg)
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is dropped
+            intensities, doppler_mps = (
+                np.ascontiguousarray(self._values(columns, role), np.float32) if role in self.names else None
+                for role in ("intensity", "doppler")
+            )
             points, sigma = self.points(columns), self._sigma(columns)
-            intensities, doppler_mps = (self._column(columns, role) for role in ("intensity", "doppler"))
-        return finite_scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma, notes)
-
-    def missing_role(self, others: Fields) -> str | None:
-        """A role that `others` have for more than positions, and these fields leave out."""
-        roles = ("intensity", "doppler", *_SIGMA)
-        return next((role for role in roles if role in others.names and role not in self.names), None)
-
-    def _column(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[np.float32] | None:
-        if role not in self.names:
-            return None
-        return np.ascontiguousarray(self._values(columns, role), np.float32)
+        return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma), notes)
 
     def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
         """A column in m, rad or m/s, where its name has another unit, or angles are in degrees."""
@@ -248,18 +222,3 @@ def plain_name(name: str) -> tuple[str, str]:
 
 def _squeezed(name: str) -> str:
     return re.sub(r"[\W_]+", "", name.lower())
-
-
-def _field(field: Any, names: list[str], lower: Mapping[str, str], role: str, what: str) -> str:
-    """The name of the field that a user names, by its name or by the number of its column."""
-    if isinstance(field, (int, np.integer)) and not isinstance(field, bool):
-        if not 0 <= field < len(names):
-            msg = f"{what} has no column {field} for {role}: it has {len(names)}, counted from 0"
-            raise ValueError(msg)
-        return names[int(field)]
-    if field in names:
-        return str(field)
-    if str(field).lower() in lower:
-        return lower[str(field).lower()]
-    msg = f"{what} has no field {field} for {role}: it has {', '.join(names)}"
-    raise ValueError(msg)

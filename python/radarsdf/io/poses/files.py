@@ -98,9 +98,9 @@ def read_poses(
             msg = "it has no rows of numbers"
             raise ValueError(msg)
     heads = [head for head in table.heads if len(head) == width]
-    for head in reversed(heads):
-        if (columns := _pose_columns(head)) is not None:
-            return _named(values, columns, head, path, notes, lines)
+    named = next((found for head in reversed(heads) if (found := _pose_columns(head, values))), None)
+    if named is not None:
+        return _of_columns(*named, path, notes, lines)
     if width == _TUM_COLUMNS:
         if heads:
             notes.add(
@@ -110,7 +110,17 @@ def read_poses(
     if width == _KITTI_COLUMNS:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
-        return _of_kitti(_rigid_or_nan(poses, str(path), notes, lines), path, notes, calibration)
+        P = _rigid_or_nan(poses, str(path), notes, lines)
+        for file in calibration:
+            if file.is_file() and (Tr := read_calibration(file)) is not None:
+                notes.add(
+                    f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
+                )
+                return np.linalg.inv(Tr) @ P @ Tr
+        notes.add(
+            f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor"
+        )
+        return P
     if width == _MATRIX_COLUMNS or (width == 4 and len(values) % 4 == 0):
         return _rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes, lines[:: 16 // width])
     msg = (
@@ -207,80 +217,56 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike 
     write_whole(path, text.getvalue())
 
 
-def _pose_columns(names: list[str]) -> dict[str, int] | None:
-    """Column by role: time, sec, nsec, x, y, z, qx, qy, qz, qw, roll, pitch, yaw; None if the names are no pose's."""
-    found: dict[str, int] = {}
-    for column, name in enumerate(names):
-        words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
-        for pattern, role in _ROLES:
+_Columns = dict[str, NDArray[np.float64]]
+
+
+def _pose_columns(names: list[str], table: NDArray[np.float64]) -> tuple[_Columns, str] | None:
+    """Columns by role, times in s, and the unit in the names of angles; None if the names are no pose's.
+
+    Roles are time, sec, nsec, x, y, z, qx, qy, qz, qw, roll, pitch and yaw.
+    """
+    found: _Columns = {}
+    unit_of_angles = ""
+    for name, column in zip(names, table.T, strict=True):
+        bare, unit = without_unit(name)
+        words = re.sub(r"[\W_]+", " ", bare).strip()
+        for pattern, template in _ROLES:
             if match := re.fullmatch(pattern, words):
-                found.setdefault(role.format(*match.groups()), column)
+                role = template.format(*match.groups())
+                unit_of_angles = unit_of_angles or (unit if role in _EULER else "")
+                found.setdefault(role, column * SCALES.get(unit, 1.0) if role in _TIMES else column)
                 break
-    if "sec" not in found or "nsec" not in found:
-        found.pop("nsec", None)
-        time = next((found[name] for name in (*_TIMES, "sec") if name in found), None)
-        found |= {} if time is None else {"time": time}
+    if {"sec", "nsec"} <= set(found):
+        found["time"] = found["sec"] + 1e-9 * found["nsec"]
+    elif times := [found[name] for name in (*_TIMES, "sec") if name in found]:
+        found["time"] = times[0]
     rotation = {"qx", "qy", "qz", "qw"} <= set(found) or "yaw" in found
-    return found if {"x", "y"} <= set(found) and ("z" in found or "yaw" in found) and rotation else None
+    is_pose = rotation and {"x", "y"} <= set(found) and ("z" in found or "yaw" in found)
+    return (found, unit_of_angles) if is_pose else None
 
 
-def _quaternions(
-    table: NDArray[np.float64], columns: dict[str, int], names: list[str], file: str, notes: Notes
-) -> NDArray[np.float64]:
-    """(P, 4) quaternions qx, qy, qz, qw of named columns; NaN where angles are."""
-    if "qw" in columns:
-        return table[:, [columns[role] for role in ("qx", "qy", "qz", "qw")]]
-    angles = np.stack(
-        [table[:, columns[role]] if role in columns else np.zeros(len(table)) for role in _EULER], axis=1
-    )
-    named = next(
-        (unit for role in _EULER if role in columns and (unit := without_unit(names[columns[role]])[1])), ""
-    )
-    degrees = are_degrees(angles[:, 0], angles[:, 1], named)
-    unit, by = "degrees" if degrees else "rad", "name" if named else "their numbers"
-    notes.add(f"{file}: roll, pitch and yaw are in {unit} by {by}, R = Rz(yaw) Ry(pitch) Rx(roll)")
-    quaternions = np.full((len(table), 4), np.nan)
-    finite = np.isfinite(angles).all(axis=1)
-    if finite.any():
-        quaternions[finite] = Rotation.from_euler("ZYX", angles[finite], degrees=degrees).as_quat()
-    return quaternions
-
-
-def _named(
-    table: NDArray[np.float64],
-    columns: dict[str, int],
-    head: list[str],
-    path: Path,
-    notes: Notes,
-    lines: list[int],
+def _of_columns(
+    columns: _Columns, unit_of_angles: str, path: Path, notes: Notes, lines: list[int]
 ) -> StampedPoses | NDArray[np.float64]:
     """Poses of named columns: by time, or in their order."""
+    zeros = np.zeros_like(columns["x"])
     if missing := [role for role in ("z", "roll", "pitch") if "qw" not in columns and role not in columns]:
         notes.add(f"{path.name} has no {', '.join(missing)}: taken as 0")
-    position = [table[:, columns[axis]] if axis in columns else np.zeros(len(table)) for axis in "xyz"]
-    poses = np.column_stack([*position, _quaternions(table, columns, head, path.name, notes)])
-    if "nsec" in columns:
-        times = table[:, columns["sec"]] + 1e-9 * table[:, columns["nsec"]]
-    elif "time" in columns:
-        times = table[:, columns["time"]] * SCALES.get(without_unit(head[columns["time"]])[1], 1.0)
+    if "qw" in columns:
+        quaternions = np.stack([columns[role] for role in ("qx", "qy", "qz", "qw")], axis=1)
     else:
+        angles = np.stack([columns.get(role, zeros) for role in _EULER], axis=1)
+        degrees = are_degrees(angles[:, 0], angles[:, 1], unit_of_angles)
+        unit, by = "degrees" if degrees else "rad", "name" if unit_of_angles else "their numbers"
+        notes.add(f"{path.name}: roll, pitch and yaw are in {unit} by {by}, R = Rz(yaw) Ry(pitch) Rx(roll)")
+        quaternions = np.full((len(angles), 4), np.nan)
+        finite = np.isfinite(angles).all(axis=1)
+        if finite.any():
+            quaternions[finite] = Rotation.from_euler("ZYX", angles[finite], degrees=degrees).as_quat()
+    poses = np.column_stack([*(columns.get(axis, zeros) for axis in "xyz"), quaternions])
+    if "time" not in columns:
         return _rigid_or_nan(pose_matrices_of(poses), str(path), notes, lines)
-    return _stamped(np.column_stack([times, poses]), path, notes, lines)
-
-
-def _of_kitti(
-    P: NDArray[np.float64], path: Path, notes: Notes, calibration: Sequence[Path]
-) -> NDArray[np.float64]:
-    """Poses (F, 4, 4) turned from the camera to the sensor if there is a calibration."""
-    for file in calibration:
-        if file.is_file() and (Tr := read_calibration(file)) is not None:
-            notes.add(
-                f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
-            )
-            T_world_sensor: NDArray[np.float64] = np.linalg.inv(Tr) @ P @ Tr
-            return T_world_sensor
-    notes.add(f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor")
-    return P
+    return _stamped(np.column_stack([columns["time"], poses]), path, notes, lines)
 
 
 def _stamped(table: NDArray[np.float64], path: Path, notes: Notes, lines: list[int]) -> Trajectory:

@@ -41,24 +41,25 @@ class Trajectory:
         """First and last time, for error messages."""
         return f"{self.times_s[0]} to {self.times_s[-1]} s"
 
-    def covers(self, times_s: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Mask (N,) of the times (N,), s, that lie between the first and the last pose."""
+    def covers(self, times_s: NDArray[np.float64], max_gap_s: float = np.inf) -> NDArray[np.bool_]:
+        """Mask (N,) of the times (N,), s, that lie between two poses at most `max_gap_s` apart."""
+        after = np.clip(np.searchsorted(self.times_s, times_s), 1, len(self.times_s) - 1)
         inside: NDArray[np.bool_] = (times_s >= self.times_s[0]) & (times_s <= self.times_s[-1])
-        return inside
+        return inside & (self.times_s[after] - self.times_s[after - 1] <= max_gap_s)
 
-    def poses(self, times_s: NDArray[np.float64], max_gap_s: float) -> NDArray[np.float64]:
-        """Poses T_world_base (N, 4, 4) at the times (N,), s.
+    def poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses T_world_base (N, 4, 4) at the times (N,), s, between the first and the last pose.
 
-        Between two poses, the position is interpolated linearly and the rotation spherically (slerp).
+        The position is interpolated linearly and the rotation spherically (slerp).
         """
-        rotations, positions = self._at(times_s, max_gap_s)
         poses = np.tile(np.eye(4), (len(times_s), 1, 1))
-        poses[:, :3, :3] = rotations.as_matrix()
-        poses[:, :3, 3] = positions
+        poses[:, :3, :3] = Slerp(self.times_s, self.rotations)(times_s).as_matrix()
+        for axis in range(3):
+            poses[:, axis, 3] = np.interp(times_s, self.times_s, self.positions[:, axis])
         return poses
 
     def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
-        """Pose T_world_base (4, 4) at one time, s. None where `poses` would raise.
+        """Pose T_world_base (4, 4) at one time, s, as `poses`; None outside of them, and in longer gaps.
 
         A millisecond before the first pose or after the last one, or next to one in a longer gap, is at that pose: times
         in files are rounded.
@@ -76,34 +77,6 @@ class Trajectory:
         pose[:3, :3] = Rotation.from_quat(_slerp(first, last, share)).as_matrix()
         pose[:3, 3] = (1 - share) * self.positions[after - 1] + share * self.positions[after]
         return pose
-
-    def move(
-        self, points: NDArray[np.float64], times_s: NDArray[np.float64], max_gap_s: float
-    ) -> NDArray[np.float64]:
-        """Points (N, 3) in the world frame, m, of points (N, 3) in the moving frame, each with its own time (N,), s."""
-        if len(points) == 0:
-            return points
-        rotations, positions = self._at(times_s, max_gap_s)
-        moved: NDArray[np.float64] = rotations.apply(points) + positions
-        return moved
-
-    def _at(self, times_s: NDArray[np.float64], max_gap_s: float) -> tuple[Rotation, NDArray[np.float64]]:
-        if not self.covers(times_s).all():
-            first = times_s[~self.covers(times_s)][0]
-            msg = f"{self.name} has no pose at {first} s: its poses are from {self.span()}"
-            raise ValueError(msg)
-        after = np.searchsorted(self.times_s, times_s)  # the first pose that is not earlier
-        before = np.where(self.times_s[after] == times_s, after, after - 1)
-        gaps_s = self.times_s[after] - self.times_s[before]
-        if (gaps_s > max_gap_s).any():
-            worst = int(np.argmax(gaps_s))
-            msg = (
-                f"{self.name} has no pose near {times_s[worst]} s: the poses before and after it are "
-                f"{gaps_s[worst]:.3f} s apart, more than {max_gap_s} s"
-            )
-            raise ValueError(msg)
-        positions = [np.interp(times_s, self.times_s, self.positions[:, axis]) for axis in range(3)]
-        return Slerp(self.times_s, self.rotations)(times_s), np.stack(positions, axis=1)
 
 
 def _slerp(first: NDArray[np.float64], last: NDArray[np.float64], share: float) -> NDArray[np.float64]:
@@ -188,23 +161,6 @@ class NoPoses(ValueError):
     """Scans have no poses, and none are given."""
 
 
-class _Unposed:
-    """Scans without poses: the identity at all times."""
-
-    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64]:  # noqa: ARG002
-        return np.eye(4)
-
-    def span(self) -> str:
-        return "all times"
-
-    def __repr__(self) -> str:
-        return "UNPOSED"
-
-
-UNPOSED: StampedPoses = _Unposed()
-"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
-
-
 @dataclass(frozen=True, eq=False)
 class TransformChain:
     """A product of transforms, each of which is constant or moves: T_world_a · T_a_b · … of a tree of frames."""
@@ -228,6 +184,10 @@ class TransformChain:
     def span(self) -> str:
         """First and last time of its moving links, for messages."""
         return ", ".join(link.span() for link in self.moving())
+
+
+UNPOSED: StampedPoses = TransformChain(())
+"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
 
 
 @dataclass(frozen=True, eq=False)
