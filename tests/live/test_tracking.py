@@ -19,7 +19,7 @@ SETTINGS = FitConfig(num_threads=1)
 @pytest.fixture(scope="module")
 def drive():
     scans = first(radarsdf.simulate.oculii, 25, seed=91, frames=60)
-    return scans, radarsdf.simulate.motion(scans)
+    return scans, radarsdf.simulate.measured_motion(scans)
 
 
 def follow(live, scans, motion, rows, sign=1, most_mps=np.inf, **more):
@@ -50,7 +50,7 @@ def test_scans_are_put_where_they_were_taken(drive, sign, most_mps):
 @pytest.mark.parametrize("seed", [9, 11])  # 3 to 16 m off, or lost, while first scans were not placed again
 def test_a_drive_that_begins_fast_is_placed_as_by_odometry(seed):
     scans = radarsdf.simulate.oculii(seed=seed, frames=20)
-    motion = radarsdf.simulate.motion(scans, seed=seed)
+    motion = radarsdf.simulate.measured_motion(scans, seed=seed)
     live = LiveMap(SETTINGS)
     moved = [follow(live, scans, motion, [i], sign=-1).moved for i in range(20)]
     assert live._follower._steps[-1].sign == -1

@@ -148,7 +148,7 @@ def test_wrong_arguments_are_refused(street):
 
 def test_scans_that_cannot_be_used_are_left_out():
     scans = radarsdf.simulate.wall(frames=12)
-    motion = radarsdf.simulate.motion(scans)
+    motion = radarsdf.simulate.measured_motion(scans)
     points, speeds, poses = list(scans.points), list(motion.doppler_mps), scans.poses.copy()
     points[2], speeds[2], poses[5] = points[2][:0], speeds[2][:0], np.nan
     refined = radarsdf.refine_poses(points, poses, doppler_mps=speeds, times_s=motion.times_s)
@@ -162,7 +162,7 @@ def test_scans_that_cannot_be_used_are_left_out():
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_zeros_for_doppler_do_not_draw_true_poses_together(share):
     drive = radarsdf.simulate.hugin(seed=8, frames=30)
-    motion, rng = radarsdf.simulate.motion(drive), np.random.default_rng(0)
+    motion, rng = radarsdf.simulate.measured_motion(drive), np.random.default_rng(0)
     speeds = [np.where(rng.random(len(v)) < share, 0.0, v) for v in motion.doppler_mps]
     found = radarsdf.refine_poses(drive.points, drive.poses, doppler_mps=speeds, times_s=motion.times_s)
     np.testing.assert_array_equal(found.poses, drive.poses)
@@ -170,7 +170,7 @@ def test_zeros_for_doppler_do_not_draw_true_poses_together(share):
 
 
 def test_doppler_that_contradicts_the_given_poses_is_left_out(street):
-    motion = radarsdf.simulate.motion(street)
+    motion = radarsdf.simulate.measured_motion(street)
     speeds = [0.2 * v for v in motion.doppler_mps]
     found = radarsdf.refine_poses(street.points, street.poses, doppler_mps=speeds, times_s=motion.times_s)
     np.testing.assert_array_equal(found.poses, street.poses)

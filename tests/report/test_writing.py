@@ -134,7 +134,7 @@ def test_a_map_alone_without_surface_intensities_or_training(subject, scene, tmp
     page = write(tmp_path / "quick.html", subject, radar_map=quick, box=nowhere)
     assert "without intensities" in page.sections["intensity"]
     assert "no surface here" in page.sections["surface"]
-    assert "sdf_iterations 0" in page.sections["configuration"]
+    assert "train False" in page.sections["configuration"]
     assert page.frames == []
 
 

@@ -46,9 +46,7 @@ def tiles_of(drive, out, **arguments):
 
 
 def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
-    # Positions are rounded to float32 in another frame. Smoothing would hand that on from vertex to vertex.
-    config = CONFIG.override(training={"start": "average"})
-    city = tiles_of(drive, tmp_path / "city", tile_size=512, halo=51.2, config=config)
+    city = tiles_of(drive, tmp_path / "city", tile_size=512, halo=51.2)
     contents = {tile.tile: city.contents_of(tile.tile) for tile in city.tiles}
     assert len(contents) == 2  # the drive crosses a border, and each knows what lies within 51 m
     part = contents[0, 0]
@@ -59,15 +57,18 @@ def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
     }
     whole = radarsdf.fit(
         drive,
-        config=config.override(returns=known),
+        config=CONFIG.override(returns=known),
         origin=part.origin,
         intensity_range=scale,
         progress=False,
     )
-    np.testing.assert_array_equal(whole.field.cells.table.leaf_keys(), part.field.cells.table.leaf_keys())
+    np.testing.assert_array_equal(whole.field.table.leaf_keys(), part.field.table.leaf_keys())
     np.testing.assert_array_equal(whole.evidence.looks, part.evidence.looks)
     points = np.concatenate([s.world_points for s in drive])[::50]
-    np.testing.assert_allclose(city.sdf(points), whole.sdf(points), atol=1e-4)
+    # Positions are rounded to float32 in another frame, which smoothing carries from corner to corner: 0.24 mm at most.
+    error_m = np.abs(city.sdf(points) - whole.sdf(points))
+    assert np.nanmedian(error_m) < 1e-5
+    assert np.nanmax(error_m) < 1e-3
     # So a return at the edge of a cell may lie in the next one.
     error = np.abs(city.intensity(points, [0, 0, 1]) - whole.intensity(points, [0, 0, 1]))
     assert error.mean() < 0.004 * (scale[1] - scale[0])

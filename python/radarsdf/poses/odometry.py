@@ -127,7 +127,7 @@ def odometry(
     --------
     >>> import radarsdf
     >>> scans = radarsdf.simulate.wall(frames=6)
-    >>> motion = radarsdf.simulate.motion(scans)
+    >>> motion = radarsdf.simulate.measured_motion(scans)
     >>> found = radarsdf.odometry(scans.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
     >>> found.poses.shape, found.report["pieces"]
     ((6, 4, 4), 1)
