@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.cli import main
-from radarsdf.grids.costmap import Wheels
-from radarsdf.grids.grid import Grid
+from radarsdf.grids.grid import Grid, Wheels
 
 from bench.kinds import KINDS
 
