@@ -1,12 +1,13 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
+#include "poses/block_band.hpp"
+
 #include <doctest/doctest.h>
 
 #include <cmath>
 #include <vector>
 
 #include "helpers.hpp"
-#include "poses/block_band.hpp"
 
 using radarsdf::BlockBand;
 using radarsdf::kBlock;
