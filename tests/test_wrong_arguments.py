@@ -59,7 +59,6 @@ def test_fits(wall, tmp_path):
     refused("origin", radarsdf.fit, NO_ARRAY, **given)
     refused("intensity_range", radarsdf.fit, (*NO_ARRAY, 3, (1, 2, 3), (2, 1), (0, np.inf)), **given)
     refused("checkpoint", radarsdf.fit, NO_PATH[1:], **given)
-    refused("progress", radarsdf.fit, ("no", [], np.zeros(2)), **given)
     scans = io.Scans(wall.points, wall.poses)
     refused("out", radarsdf.fit_tiles, NO_PATH, scans)
     refused("config", radarsdf.fit_tiles, ("a",), scans, tmp_path / "city")
