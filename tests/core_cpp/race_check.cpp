@@ -42,7 +42,7 @@ namespace {
 
 using radarsdf::Mesh;
 
-constexpr std::int64_t kPoints = 40000;
+constexpr std::int64_t kPoints = 20000;  // more than a block of most loops
 constexpr int kLevels = 3;
 
 // Bytes of all results, one after the other.
