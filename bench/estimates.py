@@ -89,7 +89,7 @@ def memory_of_fits(count: int) -> list[float]:
 
 
 _SHORT: Changes = {"training": {"sdf_iterations": 100, "intensity_iterations": 300}}
-_WIDE: Changes = {"networks": {"sdf_hidden": (128, 128), "intensity_hidden": (128, 128, 128)}}
+_WIDE: Changes = {"networks": {"intensity_hidden": (128, 128, 128)}}
 _LARGE: Changes = {"training": {"batch_size": 32768, "intensity_batch_size": 32768}}
 DURATION_CASES: list[tuple[int, bool, str, Changes]] = [
     (10_000, True, "default", {}),

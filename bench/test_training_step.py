@@ -14,6 +14,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.average import near_leaf_keys
+from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_SAMPLES
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import Training
 from radarsdf.returns.intensities import IntensityScale
@@ -93,8 +94,8 @@ def test_whole(benchmark, stage, rays, leaf_keys):
 
 def products(stage, field):
     """Operands of all matrix products of the layers: forward, gradients of the weights, gradients of the inputs."""
-    size, sampling = batch_size(stage), CONFIG.sampling
-    num_near = size * sampling.near_samples // (sampling.near_samples + sampling.free_samples)
+    size = batch_size(stage)
+    num_near = size * NEAR_SAMPLES // (NEAR_SAMPLES + FREE_SAMPLES)
     geometry = linear(field.sdf_network)
     operands = [
         operand for layer in geometry for operand in layer_products(layer, size, stage != "intensity", True)
