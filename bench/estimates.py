@@ -8,8 +8,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -55,12 +54,10 @@ def memory(options: argparse.Namespace) -> Iterator[Row]:
         yield row | {"ratio": estimate.peak_memory_bytes / peak}
 
 
-def peak_of_a_fit(
-    count: int, with_intensities: bool, changes: Changes, python: Sequence[str] = (sys.executable,)
-) -> tuple[Estimate, float]:
-    """The estimate, and the measured growth of the peak memory, bytes, in a new process, whose command begins with `python`."""
+def peak_of_a_fit(count: int, with_intensities: bool, changes: Changes) -> tuple[Estimate, float]:
+    """The estimate, and the measured growth of the peak memory, bytes, in a new process."""
     case = count, with_intensities, merged(_FEW, changes)
-    values, peak = in_new_process("bench.estimates:measured_peak", *case, python=python)
+    values, peak = in_new_process("bench.estimates:measured_peak", *case)
     return Estimate(**values), peak
 
 

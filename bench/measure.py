@@ -10,7 +10,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,7 +72,7 @@ def return_freed_memory() -> None:
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1_000_000)
 
 
-def in_new_process(function: str, *arguments: Any, python: Sequence[str] = (sys.executable,)) -> Any:
+def in_new_process(function: str, *arguments: Any) -> Any:
     """Result of ``module:function`` in a process of its own. Arguments and result go through JSON.
 
     Raises
@@ -80,7 +80,7 @@ def in_new_process(function: str, *arguments: Any, python: Sequence[str] = (sys.
     RuntimeError
         If the process fails.
     """
-    command = [*python, "-m", "bench.measure", function, json.dumps(arguments)]
+    command = [sys.executable, "-m", "bench.measure", function, json.dumps(arguments)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(failure(done))

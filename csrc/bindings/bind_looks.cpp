@@ -1,23 +1,10 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include <pybind11/stl.h>
-
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
-#include "returns/column_sample.hpp"
 #include "returns/looks.hpp"
 
 namespace radarsdf {
-namespace {
-
-ColumnSample check_sample(std::int64_t column, double share) {
-  if (column < 1 || !(share >= 0 && share <= 1)) {
-    throw std::invalid_argument("column must be at least 1, and share from 0 to 1");
-  }
-  return {column, share};
-}
-
-}  // namespace
 
 void bind_looks(py::module_& m) {
   using namespace py::literals;
@@ -48,48 +35,6 @@ void bind_looks(py::module_& m) {
       "For each leaf cell (C,) the number of scans with a ray through its cube of 8 x 8 x 8 leaf cells, or to there: "
       "(C,) uint32. `leaf_keys` (C,) uint64, ascending; `points`, `directions` (N, 3), `ranges_m` (N,) float32, local "
       "frame, m; `scans` (N,) int32, ascending.");
-  m.def(
-      "sample_cells",
-      [](const Array<std::int64_t>& cells, std::int64_t column, double share, int num_threads) {
-        const ColumnSample sample = check_sample(column, share);
-        const py::ssize_t count = cells.ndim() == 2 ? cells.shape(0) : 0, dims = cells.ndim() == 2 ? cells.shape(1) : 0;
-        check_shape(cells, count, dims, "cells");
-        py::array_t<bool> chosen(count);
-        const std::int64_t* c = cells.data();
-        auto* result = reinterpret_cast<std::uint8_t*>(chosen.mutable_data());
-        {
-          const py::gil_scoped_release release;
-          sample_cells(sample, c, count, static_cast<int>(dims), result, num_threads);
-        }
-        return chosen;
-      },
-      "cells"_a.noconvert(), "column"_a, "share"_a, "num_threads"_a = 0,
-      "Whether each cell is in the sample, (N,) bool: a hash chooses this `share` of all columns of `column` cells an "
-      "edge. `cells` (N, K) int64, lattice coordinates.");
-  m.def(
-      "sample_rays",
-      [](const Array<float>& points, const Array<float>& directions, const Array<float>& offsets_m,
-         const std::vector<int>& axes, double cell_size_m, std::int64_t column, double share, int num_threads) {
-        const ColumnSample sample = check_sample(column, share);
-        const std::int64_t count = check_points(points), num_offsets = check_column(offsets_m, "offsets_m");
-        check_shape(directions, count, 3, "directions");
-        if (axes.size() > 3 || std::any_of(axes.begin(), axes.end(), [](int axis) { return axis < 0 || axis > 2; })) {
-          throw std::invalid_argument("axes must be some of 0, 1 and 2");
-        }
-        py::array_t<bool> chosen(static_cast<py::ssize_t>(count));
-        const float *p = points.data(), *d = directions.data(), *o = offsets_m.data();
-        auto* result = reinterpret_cast<std::uint8_t*>(chosen.mutable_data());
-        {
-          const py::gil_scoped_release release;
-          sample_rays(sample, cell_size_m, p, d, count, o, num_offsets, axes.data(), static_cast<int>(axes.size()),
-                      result, num_threads);
-        }
-        return chosen;
-      },
-      "points"_a.noconvert(), "directions"_a.noconvert(), "offsets_m"_a.noconvert(), "axes"_a, "cell_size_m"_a,
-      "column"_a, "share"_a, "num_threads"_a = 0,
-      "Whether a point `offsets_m` (K,) behind each of the `points` (N, 3), along the rays' `directions` (N, 3), is in "
-      "the sample by these of its coordinates, (N,) bool; see `sample_cells`. All float32, local frame, m.");
   m.def(
       "count_scans",
       [](const Array<std::int32_t>& cells, const Array<std::int32_t>& scans, std::int64_t num_cells, int num_threads) {

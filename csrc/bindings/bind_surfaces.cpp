@@ -36,7 +36,6 @@ template <typename... T>
 using Arrays = py::typing::Tuple<py::array_t<T>...>;
 
 using DenseEdges = Arrays<double, std::int32_t, std::int64_t>;
-using SparseEdges = Arrays<double, std::int32_t, std::int64_t, std::int32_t>;
 
 Arrays<double, std::int32_t> adopt_mesh(Mesh mesh) {
   return py::make_tuple(adopt(std::move(mesh.vertices), {mesh.num_vertices, 3}),
@@ -44,11 +43,8 @@ Arrays<double, std::int32_t> adopt_mesh(Mesh mesh) {
 }
 
 py::tuple adopt_mesh_with_edges(Mesh mesh) {
-  const py::ssize_t count = mesh.num_vertices;
-  py::array edges = adopt(std::move(mesh.edges), {count});
-  if (!mesh.uppers) return adopt_mesh(std::move(mesh)) + py::make_tuple(std::move(edges));
-  py::array uppers = adopt(std::move(mesh.uppers), {count});
-  return adopt_mesh(std::move(mesh)) + py::make_tuple(std::move(edges), std::move(uppers));
+  py::array edges = adopt(std::move(mesh.edges), {mesh.num_vertices});
+  return adopt_mesh(std::move(mesh)) + py::make_tuple(std::move(edges));
 }
 
 void check_columns(const py::array& array, py::ssize_t columns, const char* message) {
@@ -88,9 +84,9 @@ DenseEdges dense_with_edges(const Array<T>& volume, const std::optional<Array<bo
 }
 
 template <typename T>
-Mesh sparse_mesh(const Array<std::int32_t>& corners, const Array<T>& values, const Array<std::int32_t>& cells,
-                 const std::array<double, 3>& spacing, const std::array<double, 3>& origin, double level,
-                 int num_threads, bool with_edges) {
+Arrays<double, std::int32_t> sparse(const Array<std::int32_t>& corners, const Array<T>& values,
+                                    const Array<std::int32_t>& cells, const std::array<double, 3>& spacing,
+                                    const std::array<double, 3>& origin, double level, int num_threads) {
   check_columns(corners, 3, "corners must have shape (K, 3)");
   check_columns(cells, 8, "cells must have shape (M, 8)");
   const std::int64_t num_corners = corners.shape(0);
@@ -100,23 +96,13 @@ Mesh sparse_mesh(const Array<std::int32_t>& corners, const Array<T>& values, con
   }
   const std::int32_t *corner_data = corners.data(), *cell_data = cells.data();
   const T* value_data = values.data();
-  const py::gil_scoped_release nogil;
-  return marching_cubes_sparse(corner_data, value_data, num_corners, cell_data, num_cells, {spacing, origin}, level,
-                               num_threads, with_edges);
-}
-
-template <typename T>
-Arrays<double, std::int32_t> sparse(const Array<std::int32_t>& corners, const Array<T>& values,
-                                    const Array<std::int32_t>& cells, const std::array<double, 3>& spacing,
-                                    const std::array<double, 3>& origin, double level, int num_threads) {
-  return adopt_mesh(sparse_mesh(corners, values, cells, spacing, origin, level, num_threads, false));
-}
-
-template <typename T>
-SparseEdges sparse_with_edges(const Array<std::int32_t>& corners, const Array<T>& values,
-                              const Array<std::int32_t>& cells, const std::array<double, 3>& spacing,
-                              const std::array<double, 3>& origin, double level, int num_threads) {
-  return adopt_mesh_with_edges(sparse_mesh(corners, values, cells, spacing, origin, level, num_threads, true));
+  Mesh mesh;
+  {
+    const py::gil_scoped_release nogil;
+    mesh = marching_cubes_sparse(corner_data, value_data, num_corners, cell_data, num_cells, {spacing, origin}, level,
+                                 num_threads);
+  }
+  return adopt_mesh(std::move(mesh));
 }
 
 void check_edges(const Array<double>& vertices_grad, const py::array& edges) {
@@ -139,28 +125,6 @@ void dense_backward(const Array<T>& volume, const Array<std::int64_t>& edges, co
   T* out = volume_grad.mutable_data();
   const py::gil_scoped_release nogil;
   marching_cubes_dense_backward(samples, shape, edge_data, grad_data, num_vertices, spacing, level, out, num_threads);
-}
-
-template <typename T>
-void sparse_backward(const Array<T>& values, const Array<std::int64_t>& edges, const Array<std::int32_t>& uppers,
-                     const Array<double>& vertices_grad, const std::array<double, 3>& spacing, double level,
-                     Array<T>& values_grad, int num_threads) {
-  if (values.ndim() != 1) throw std::invalid_argument("values must have shape (K,)");
-  check_edges(vertices_grad, edges);
-  check_edges(vertices_grad, uppers);
-  if (values_grad.ndim() != 1 || values_grad.size() != values.size()) {
-    throw std::invalid_argument("values_grad must have the shape of values");
-  }
-  const std::int64_t num_corners = values.size();
-  const std::int64_t num_vertices = edges.shape(0);
-  const T* samples = values.data();
-  const std::int64_t* edge_data = edges.data();
-  const std::int32_t* upper_data = uppers.data();
-  const double* grad_data = vertices_grad.data();
-  T* out = values_grad.mutable_data();
-  const py::gil_scoped_release nogil;
-  marching_cubes_sparse_backward(samples, num_corners, edge_data, upper_data, grad_data, num_vertices, spacing, level,
-                                 out, num_threads);
 }
 
 Arrays<std::int32_t, std::int32_t, std::int32_t> lattice(const Array<std::int32_t>& cells, int num_threads) {
@@ -199,18 +163,11 @@ void bind_for_type(py::module_& m) {
   };
   def_dense("marching_cubes_dense", &dense<T>);
   def_dense("marching_cubes_dense_with_edges", &dense_with_edges<T>);
-  const auto def_sparse = [&m](const char* name, auto function) {
-    m.def(name, function, arg("corners").noconvert(), arg("values").noconvert(), arg("cells").noconvert(),
-          arg("spacing"), arg("origin"), arg("level"), arg("num_threads") = 0);
-  };
-  def_sparse("marching_cubes_sparse", &sparse<T>);
-  def_sparse("marching_cubes_sparse_with_edges", &sparse_with_edges<T>);
+  m.def("marching_cubes_sparse", &sparse<T>, arg("corners").noconvert(), arg("values").noconvert(),
+        arg("cells").noconvert(), arg("spacing"), arg("origin"), arg("level"), arg("num_threads") = 0);
   m.def("marching_cubes_dense_backward", &dense_backward<T>, arg("volume").noconvert(), arg("edges").noconvert(),
         arg("vertices_grad").noconvert(), arg("spacing"), arg("level"), arg("volume_grad").noconvert(),
         arg("num_threads") = 0);
-  m.def("marching_cubes_sparse_backward", &sparse_backward<T>, arg("values").noconvert(), arg("edges").noconvert(),
-        arg("uppers").noconvert(), arg("vertices_grad").noconvert(), arg("spacing"), arg("level"),
-        arg("values_grad").noconvert(), arg("num_threads") = 0);
 }
 
 }  // namespace

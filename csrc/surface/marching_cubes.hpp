@@ -23,9 +23,8 @@ struct Mesh {
   std::int64_t num_faces = 0;
   std::unique_ptr<double[]> vertices;     ///< (num_vertices, 3), world units
   std::unique_ptr<std::int32_t[]> faces;  ///< (num_faces, 3) rows of vertices
-  // Null unless asked for. They say which edge a vertex is on; the derivatives below need them.
-  std::unique_ptr<std::int64_t[]> edges;   ///< (num_vertices,) 3 * sample + axis: the edge's lower sample, its axis
-  std::unique_ptr<std::int32_t[]> uppers;  ///< (num_vertices,) the edge's upper sample, of sparse marching cubes only
+  // Null unless asked for, of dense marching cubes: the edge that a vertex is on, which the derivatives below need.
+  std::unique_ptr<std::int64_t[]> edges;  ///< (num_vertices,) 3 * sample + axis: the edge's lower sample, its axis
 };
 
 // Where the samples are: sample (i, j, k) at origin + spacing * (i, j, k).
@@ -45,20 +44,14 @@ Mesh marching_cubes_dense(const T* volume, const std::array<std::int64_t, 3>& sh
 template <typename T>
 Mesh marching_cubes_sparse(const std::int32_t* corners, const T* values, std::int64_t num_corners,
                            const std::int32_t* cells, std::int64_t num_cells, const Lattice& lattice, double level,
-                           int num_threads, bool with_edges = false);
+                           int num_threads);
 
-// The derivative of a sum over vertices by each sample, volume_grad (shape) or values_grad (num_corners): vertices_grad
-// (num_vertices, 3) is the derivative of that sum by each vertex, edges and uppers are those of the mesh. A vertex
+// The derivative of a sum over vertices by each sample, volume_grad (shape): vertices_grad
+// (num_vertices, 3) is the derivative of that sum by each vertex, edges are those of the mesh. A vertex
 // moves along its edge alone. It does not move where it was kept away from a sample, or where a sample is infinite.
 template <typename T>
 void marching_cubes_dense_backward(const T* volume, const std::array<std::int64_t, 3>& shape, const std::int64_t* edges,
                                    const double* vertices_grad, std::int64_t num_vertices,
                                    const std::array<double, 3>& spacing, double level, T* volume_grad, int num_threads);
-
-template <typename T>
-void marching_cubes_sparse_backward(const T* values, std::int64_t num_corners, const std::int64_t* edges,
-                                    const std::int32_t* uppers, const double* vertices_grad, std::int64_t num_vertices,
-                                    const std::array<double, 3>& spacing, double level, T* values_grad,
-                                    int num_threads);
 
 }  // namespace radarsdf

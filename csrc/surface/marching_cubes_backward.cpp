@@ -6,23 +6,19 @@
 // sample, and the bits do not depend on the number of threads.
 #include <algorithm>
 #include <array>
-#include <atomic>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <numeric>
 #include <stdexcept>
 #include <vector>
 
 #include "surface/marching_cubes.hpp"
 #include "surface/marching_cubes_common.hpp"
-#include "util/large_array.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
 
-using std::int32_t;
 using std::int64_t;
 using std::size_t;
 
@@ -96,74 +92,9 @@ void marching_cubes_dense_backward(const T* volume, const std::array<int64_t, 3>
   });
 }
 
-// The vertices are in the order of their lower corners. A corner is the upper one of at most three edges, one along
-// each axis, which are noted first.
-template <typename T>
-void marching_cubes_sparse_backward(const T* values, int64_t num_corners, const int64_t* edges, const int32_t* uppers,
-                                    const double* vertices_grad, int64_t num_vertices,
-                                    const std::array<double, 3>& spacing, double level, T* values_grad,
-                                    int num_threads) {
-  constexpr int64_t block_size = 1 << 14;
-  constexpr int32_t no_vertex = -1;
-  if (num_vertices > std::numeric_limits<int32_t>::max()) refuse_edges();
-  const auto for_each_block = [&](int64_t size, const auto& task) {
-    parallel_tasks((size + block_size - 1) / block_size, num_threads, [&](int64_t block) {
-      task(static_cast<size_t>(block), block * block_size, std::min(size, (block + 1) * block_size));
-    });
-  };
-
-  // No two vertices write to one place, unless a corner was given twice, which is found below: the atomics make that
-  // well defined.
-  const auto vertex_below = large_array<std::atomic<int32_t>>(3 * num_corners);
-  for_each_block(3 * num_corners, [&](size_t, int64_t begin, int64_t end) {
-    for (int64_t e = begin; e < end; ++e) {
-      vertex_below[static_cast<size_t>(e)].store(no_vertex, std::memory_order_relaxed);
-    }
-  });
-  for_each_block(num_vertices, [&](size_t, int64_t begin, int64_t end) {
-    for (int64_t v = begin; v < end; ++v) {
-      const int64_t before = v > 0 ? edges[v - 1] : -1;
-      if (edges[v] <= before || edges[v] >= 3 * num_corners || uppers[v] < 0 || uppers[v] >= num_corners) {
-        refuse_edges();
-      }
-      const int64_t edge_below = 3 * int64_t{uppers[v]} + edges[v] % 3;
-      vertex_below[static_cast<size_t>(edge_below)].store(static_cast<int32_t>(v), std::memory_order_relaxed);
-    }
-  });
-
-  const auto gradient = [&](int64_t v) {
-    const int64_t axis = edges[v] % 3;
-    const double grad = vertices_grad[3 * v + axis] * spacing[static_cast<size_t>(axis)];
-    return edge_gradient(static_cast<double>(values[edges[v] / 3]), static_cast<double>(values[uppers[v]]), level,
-                         grad);
-  };
-  std::vector<int64_t> found(static_cast<size_t>((num_corners + block_size - 1) / block_size));
-  for_each_block(num_corners, [&](size_t block, int64_t begin, int64_t end) {
-    int64_t above = std::lower_bound(edges, edges + num_vertices, 3 * begin) - edges;
-    for (int64_t c = begin; c < end; ++c) {
-      double sum = 0;
-      for (; above < num_vertices && edges[above] < 3 * (c + 1); ++above) sum += gradient(above).lower;
-      for (int64_t e = 3 * c; e < 3 * (c + 1); ++e) {
-        const int32_t below = vertex_below[static_cast<size_t>(e)].load(std::memory_order_relaxed);
-        if (below == no_vertex) continue;
-        sum += gradient(below).upper;
-        ++found[block];
-      }
-      values_grad[c] = static_cast<T>(sum);
-    }
-  });
-  if (std::accumulate(found.begin(), found.end(), int64_t{0}) != num_vertices) {
-    throw std::invalid_argument("a corner occurs twice: two edges along one axis end there");
-  }
-}
-
 template void marching_cubes_dense_backward(const float*, const std::array<int64_t, 3>&, const int64_t*, const double*,
                                             int64_t, const std::array<double, 3>&, double, float*, int);
 template void marching_cubes_dense_backward(const double*, const std::array<int64_t, 3>&, const int64_t*, const double*,
                                             int64_t, const std::array<double, 3>&, double, double*, int);
-template void marching_cubes_sparse_backward(const float*, int64_t, const int64_t*, const int32_t*, const double*,
-                                             int64_t, const std::array<double, 3>&, double, float*, int);
-template void marching_cubes_sparse_backward(const double*, int64_t, const int64_t*, const int32_t*, const double*,
-                                             int64_t, const std::array<double, 3>&, double, double*, int);
 
 }  // namespace radarsdf

@@ -78,7 +78,7 @@ void check_corner_positions(const int32_t* corners, const int32_t* cell) {
 
 template <typename T>
 Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_corners, const int32_t* cells,
-                           int64_t num_cells, const Lattice& lattice, double level, int num_threads, bool with_edges) {
+                           int64_t num_cells, const Lattice& lattice, double level, int num_threads) {
   check_lattice(lattice, level);
   if (num_corners > std::numeric_limits<int32_t>::max()) {
     throw std::invalid_argument("there are more corners than int32 cells can refer to");
@@ -125,19 +125,7 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
   });
   sum_up(first_vertex);
 
-  Mesh mesh = allocate_mesh(first_vertex.back(), first_face.back(), with_edges);
-  if (with_edges) {  // while `edges` has the upper corners
-    mesh.uppers = large_array<int32_t>(mesh.num_vertices);
-    for_each_block(num_corners, num_threads, [&](size_t block, int64_t begin, int64_t end) {
-      auto vertex = static_cast<size_t>(first_vertex[block]);
-      for (int64_t e = 3 * begin; e < 3 * end; ++e) {
-        const int32_t upper = edges[static_cast<size_t>(e)].load(std::memory_order_relaxed);
-        if (upper == no_vertex) continue;
-        mesh.edges[vertex] = e;
-        mesh.uppers[vertex++] = upper;
-      }
-    });
-  }
+  Mesh mesh = allocate_mesh(first_vertex.back(), first_face.back(), false);
   for_each_block(num_corners, num_threads, [&](size_t block, int64_t begin, int64_t end) {
     auto vertex = static_cast<int32_t>(first_vertex[block]);
     for (int64_t c = begin; c < end; ++c) {
@@ -169,8 +157,8 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
 }
 
 template Mesh marching_cubes_sparse(const int32_t*, const float*, int64_t, const int32_t*, int64_t, const Lattice&,
-                                    double, int, bool);
+                                    double, int);
 template Mesh marching_cubes_sparse(const int32_t*, const double*, int64_t, const int32_t*, int64_t, const Lattice&,
-                                    double, int, bool);
+                                    double, int);
 
 }  // namespace radarsdf

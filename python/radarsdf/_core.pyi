@@ -49,8 +49,6 @@ __all__: list[str] = [
     "marching_cubes_dense_backward",
     "marching_cubes_dense_with_edges",
     "marching_cubes_sparse",
-    "marching_cubes_sparse_backward",
-    "marching_cubes_sparse_with_edges",
     "mesh_components",
     "mlp",
     "mlp_backward",
@@ -59,8 +57,6 @@ __all__: list[str] = [
     "openmp_version",
     "principal_axes",
     "random_bytes",
-    "sample_cells",
-    "sample_rays",
     "set_instruction_set",
     "soap_memory_size",
     "soap_step",
@@ -1169,70 +1165,6 @@ def marching_cubes_sparse(
     level: typing.SupportsFloat | typing.SupportsIndex,
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
 ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32]]: ...
-@typing.overload
-def marching_cubes_sparse_backward(
-    values: numpy.typing.NDArray[numpy.float32],
-    edges: numpy.typing.NDArray[numpy.int64],
-    uppers: numpy.typing.NDArray[numpy.int32],
-    vertices_grad: numpy.typing.NDArray[numpy.float64],
-    spacing: typing.Annotated[
-        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-    ],
-    level: typing.SupportsFloat | typing.SupportsIndex,
-    values_grad: numpy.typing.NDArray[numpy.float32],
-    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> None: ...
-@typing.overload
-def marching_cubes_sparse_backward(
-    values: numpy.typing.NDArray[numpy.float64],
-    edges: numpy.typing.NDArray[numpy.int64],
-    uppers: numpy.typing.NDArray[numpy.int32],
-    vertices_grad: numpy.typing.NDArray[numpy.float64],
-    spacing: typing.Annotated[
-        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-    ],
-    level: typing.SupportsFloat | typing.SupportsIndex,
-    values_grad: numpy.typing.NDArray[numpy.float64],
-    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> None: ...
-@typing.overload
-def marching_cubes_sparse_with_edges(
-    corners: numpy.typing.NDArray[numpy.int32],
-    values: numpy.typing.NDArray[numpy.float32],
-    cells: numpy.typing.NDArray[numpy.int32],
-    spacing: typing.Annotated[
-        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-    ],
-    origin: typing.Annotated[
-        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-    ],
-    level: typing.SupportsFloat | typing.SupportsIndex,
-    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> tuple[
-    numpy.typing.NDArray[numpy.float64],
-    numpy.typing.NDArray[numpy.int32],
-    numpy.typing.NDArray[numpy.int64],
-    numpy.typing.NDArray[numpy.int32],
-]: ...
-@typing.overload
-def marching_cubes_sparse_with_edges(
-    corners: numpy.typing.NDArray[numpy.int32],
-    values: numpy.typing.NDArray[numpy.float64],
-    cells: numpy.typing.NDArray[numpy.int32],
-    spacing: typing.Annotated[
-        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-    ],
-    origin: typing.Annotated[
-        collections.abc.Sequence[typing.SupportsFloat | typing.SupportsIndex], "FixedSize(3)"
-    ],
-    level: typing.SupportsFloat | typing.SupportsIndex,
-    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> tuple[
-    numpy.typing.NDArray[numpy.float64],
-    numpy.typing.NDArray[numpy.int32],
-    numpy.typing.NDArray[numpy.int64],
-    numpy.typing.NDArray[numpy.int32],
-]: ...
 def mesh_components(
     faces: numpy.typing.NDArray[numpy.int32], num_vertices: typing.SupportsInt | typing.SupportsIndex
 ) -> tuple[numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int64]]: ...
@@ -1341,30 +1273,6 @@ def random_bytes(
 ) -> numpy.typing.NDArray[numpy.uint8]:
     """
     Random bytes (rows, columns), those of a dropout with this seed.
-    """
-
-def sample_cells(
-    cells: numpy.typing.NDArray[numpy.int64],
-    column: typing.SupportsInt | typing.SupportsIndex,
-    share: typing.SupportsFloat | typing.SupportsIndex,
-    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> numpy.typing.NDArray[numpy.bool]:
-    """
-    Whether each cell is in the sample, (N,) bool: a hash chooses this `share` of all columns of `column` cells an edge. `cells` (N, K) int64, lattice coordinates.
-    """
-
-def sample_rays(
-    points: numpy.typing.NDArray[numpy.float32],
-    directions: numpy.typing.NDArray[numpy.float32],
-    offsets_m: numpy.typing.NDArray[numpy.float32],
-    axes: collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex],
-    cell_size_m: typing.SupportsFloat | typing.SupportsIndex,
-    column: typing.SupportsInt | typing.SupportsIndex,
-    share: typing.SupportsFloat | typing.SupportsIndex,
-    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> numpy.typing.NDArray[numpy.bool]:
-    """
-    Whether a point `offsets_m` (K,) behind each of the `points` (N, 3), along the rays' `directions` (N, 3), is in the sample by these of its coordinates, (N,) bool; see `sample_cells`. All float32, local frame, m.
     """
 
 def set_instruction_set(name: str) -> None:

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The set of cells, the sample of columns, and the order of keys, against NumPy."""
+"""The set of cells and the order of keys, against NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf._core import CellSet, cell_keys, gather_rows, sample_cells, sample_rays, stable_order
+from radarsdf._core import CellSet, cell_keys, gather_rows, stable_order
 
 LEAF_M = 0.2
 OFFSETS_M = np.linspace(-0.3, 0.3, 7).astype(np.float32)
@@ -35,29 +35,6 @@ def test_points_along_rays_mark_the_cells_of_those_points(count, threads):
             cells.insert(along(points, directions), threads)
         np.testing.assert_array_equal(cells.sorted_keys(threads), expected)
         assert len(cells) == len(expected)
-
-
-def in_columns(cells, column, share):
-    """The definition: a hash of the columns' coordinates."""
-    hashed = np.zeros(len(cells), np.uint64)
-    for coordinate in (cells // column).T:
-        hashed = (hashed ^ coordinate.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        hashed ^= hashed >> np.uint64(29)
-    return (hashed >> np.uint64(40)) < np.uint64(share * 2**24)
-
-
-@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2), (1,)])
-@pytest.mark.parametrize("share", [0.0, 0.03, 1.0])
-def test_a_sample_of_columns_is_that_of_its_hash(axes, share):
-    points, directions = rays_of(20_000, 100.0)
-    places = np.ascontiguousarray(along(points, directions)[:, axes])
-    cells = np.floor(places / np.float32(LEAF_M)).astype(np.int64)
-    expected = in_columns(cells, 16, share)
-    np.testing.assert_array_equal(sample_cells(cells, 16, share), expected)
-    assert expected.mean() == pytest.approx(share, abs=0.02)
-    for threads in (1, 2):
-        chosen = sample_rays(points, directions, OFFSETS_M, list(axes), LEAF_M, 16, share, threads)
-        np.testing.assert_array_equal(chosen, expected.reshape(-1, len(OFFSETS_M)).any(axis=1))
 
 
 @pytest.mark.parametrize("highest", [1, 2**9, 2**40, 2**64])

@@ -24,7 +24,6 @@
 #include "returns/bridges.hpp"
 #include "returns/cell_means.hpp"
 #include "returns/cell_sums.hpp"
-#include "returns/column_sample.hpp"
 #include "returns/looks.hpp"
 #include "returns/onto_planes.hpp"
 #include "returns/ray_average.hpp"
@@ -253,7 +252,7 @@ void means_and_tracing(int threads, Results& results) {
   results.add(hits.data(), kPoints);
 }
 
-// Returns moved onto planes, a sample of columns, cells along rays, and bridges between some of them.
+// Returns moved onto planes, cells along rays, and bridges between some of them.
 void before_the_training(int threads, Results& results) {
   const auto points = test::normal_numbers<float>(3 * kPoints, 3.0, 16);
   const auto directions = test::normal_numbers<float>(3 * kPoints, 1.0, 17);
@@ -274,12 +273,6 @@ void before_the_training(int threads, Results& results) {
   radarsdf::sum_round(radarsdf::CellBlocks(keys.data(), num_keys), keys.data(), num_keys, ones.data(), 1, 1.0,
                       around.data(), threads);
   results.add(around.data(), num_keys);
-
-  std::vector<std::uint8_t> chosen(kPoints);
-  const int axes[2] = {0, 2};
-  radarsdf::sample_rays({16, 0.3}, 0.2, points.data(), directions.data(), kPoints, offsets.data(), 5, axes, 2,
-                        chosen.data(), threads);
-  results.add(chosen.data(), kPoints);
 
   constexpr std::int64_t kPlanes = 300, kScans = 7;
   const auto planes = test::normal_numbers<double>(7 * kPlanes, 1.0, 19),
