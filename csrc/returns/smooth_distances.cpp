@@ -5,126 +5,213 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstring>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 
+#include "kernels/plate_kernels.hpp"
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
 #include "lattice/morton.hpp"
-#include "returns/ray_average.hpp"
+#include "util/instruction_set.hpp"
+#include "util/large_array.hpp"
 #include "util/parallel.hpp"
 #include "util/stable_order.hpp"
 
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kBlock = 1 << 13;  // vertices or cells of a thread, at least
-constexpr int kPlaces = 3;                // of a plane where its distance is known
-constexpr double kBend = 2;               // leaf cells: second difference of a distance whose slope turns from -1 to 1
-constexpr double kClear = 0.25;           // leaf cells: least distance of a vertex whose side is known
+constexpr std::int64_t kBlocks = 1 << 8, kPlacesOfThread = 1 << 13;  // of a thread, at least
+constexpr int kPlaces = 3;                                           // of a plane where its distance is known
+constexpr double kBend = 2;      // leaf cells: second difference of a distance whose slope turns from -1 to 1
+constexpr double kClear = 0.25;  // leaf cells: least distance of a vertex whose side is known
+constexpr int kEdge = 4;         // of a block of vertices
 
-// A place where the distance is known, and the corners of the cell that it is in.
-struct Place {
-  float fraction[3];  // of the cell's edges
-  float weight, target_m;
-
-  std::array<float, 8> shares() const {  // bit `axis` of a corner: whether it is the upper one
-    std::array<float, 8> found;
-    for (int c = 0; c < 8; ++c) {
-      float share = 1;
-      for (int axis = 0; axis < 3; ++axis) share *= (c >> axis & 1) != 0 ? fraction[axis] : 1 - fraction[axis];
-      found[static_cast<std::size_t>(c)] = share;
-    }
-    return found;
+// Position of a vertex in its block, from that of Morton order.
+constexpr std::array<std::uint8_t, kPlateVertices> linear_positions() {
+  std::array<std::uint8_t, kPlateVertices> positions{};
+  for (unsigned i = 0; i < kPlateVertices; ++i) {
+    unsigned position = 0;
+    for (unsigned axis = 0; axis < 3; ++axis) position += ((i >> axis & 1) + 2 * (i >> (axis + 3) & 1)) << (2 * axis);
+    positions[i] = static_cast<std::uint8_t>(position);
   }
-};
+  return positions;
+}
+constexpr std::array<std::uint8_t, kPlateVertices> kPosition = linear_positions();
 
 class Plates {
  public:
   Plates(const VertexTable& table, const KnownPlanes& planes, int num_threads)
-      : table_(&table), num_threads_(num_threads), vertices_(static_cast<std::size_t>(table.num_rows())) {
+      : table_(&table), num_threads_(num_threads) {
+    number();
     place(planes);
     connect();
   }
 
   void relax(const std::int8_t* sides, int iterations, float* distances_m) {
-    // Errors whose eigenvalues are in [least, 1] shrink to 1 / cosh(4). No eigenvalue is above 1: see
-    // Vertex::stiffness.
+    // Errors whose eigenvalues are in [least, 1] shrink to 1 / cosh(4). No eigenvalue is above 1: see `stiffness`.
     const float least = 4 / std::max(4.1F, static_cast<float>(iterations) * static_cast<float>(iterations));
     const float middle = (1 + least) / 2, half = (1 - least) / 2;
-    const auto least_m = static_cast<float>(kClear * table_->leaf_size_m());
-    std::vector<float> step(vertices_.size(), 0.0F);
+    const std::size_t size = kPlateVertices * num_blocks_;
+    LargeVector<float> before_m(size + kPlateVertices, 0.0F), after_m(size + kPlateVertices, 0.0F);
+    LargeVector<float> steps_m(size, 0.0F), pulls_m(size, 0.0F);
+    LargeVector<std::int8_t> side(size, 0);
+    for (std::size_t row = 0; row < vertices_.size(); ++row) {
+      const auto v = static_cast<std::size_t>(vertices_[row]);
+      before_m[v] = distances_m[row];
+      if (compliance_[v] > 0) side[v] = sides[row];
+    }
+    const PlateKernels kernels = RADARSDF_KERNEL(plate_kernels)();
+    const PlatePlaces places{corners_.data(), first_.data(), shares_.data(), targets_m_.data()};
+    PlateSweep sweep{neighbours_.data(),
+                     is_bent_.data(),
+                     compliance_.data(),
+                     side.data(),
+                     nullptr,
+                     nullptr,
+                     steps_m.data(),
+                     pulls_m.data(),
+                     0,
+                     0,
+                     0};
+    sweep.least_m = static_cast<float>(kClear * table_->leaf_size_m());
     float rho = half / middle;
     for (int k = 0; k < iterations; ++k) {
       const float next = 1 / (2 * middle / half - rho);
-      const float keep = k == 0 ? 0 : next * rho, gain = k == 0 ? 1 / middle : 2 * next / half;
+      sweep.keep = k == 0 ? 0 : next * rho;
+      sweep.gain = k == 0 ? 1 / middle : 2 * next / half;
       if (k > 0) rho = next;
-      pull(distances_m);
-      parallel_blocks(static_cast<std::int64_t>(vertices_.size()), kBlock, num_threads_,
-                      [&](std::int64_t begin, std::int64_t end) {
-                        for (auto v = static_cast<std::size_t>(begin); v < static_cast<std::size_t>(end); ++v) {
-                          const Vertex& vertex = vertices_[v];
-                          if (!(vertex.stiffness > 0)) continue;
-                          const float before_m = distances_m[v];
-                          float after_m = before_m + keep * step[v] - gain * (slope(vertex, v) / vertex.stiffness);
-                          if (sides[v] == kInFront) after_m = std::max(after_m, least_m);
-                          if (sides[v] == kBehind) after_m = std::min(after_m, -least_m);
-                          step[v] = after_m - before_m;
-                          distances_m[v] = after_m;
-                        }
-                      });
+      sweep.before_m = before_m.data();
+      sweep.after_m = after_m.data();
+      for (const std::vector<Range>& apart : regions_) {
+        parallel_tasks(static_cast<std::int64_t>(apart.size()), num_threads_, [&](std::int64_t i) {
+          const Range& cells = apart[static_cast<std::size_t>(i)];
+          kernels.pull(places, before_m.data(), pulls_m.data(), cells.first, cells.second);
+        });
+      }
+      parallel_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks, num_threads_,
+                      [&](std::int64_t begin, std::int64_t end) { kernels.sweep(sweep, begin, end); });
+      std::swap(before_m, after_m);
     }
+    for (std::size_t row = 0; row < vertices_.size(); ++row)
+      distances_m[row] = before_m[static_cast<std::size_t>(vertices_[row])];
   }
 
  private:
-  struct Vertex {
-    std::int32_t before[3] = {-1, -1, -1}, after[3] = {-1, -1, -1};  // neighbours along the axes
-    std::int32_t pulls[8] = {-1, -1, -1, -1, -1, -1, -1, -1};        // by the cell whose corner c it is
-    // The matrix is at most a diagonal of these: (sum of a x)^2 <= (sum of |a|) (sum of |a| x^2), row by row.
-    float stiffness = 0;
-  };
+  using Range = std::pair<std::int64_t, std::int64_t>;
 
-  const std::int32_t* rows_of(std::int32_t cell) const { return table_->cells()[static_cast<std::size_t>(cell)].rows; }
+  const std::int32_t* rows_of(std::size_t cell) const { return table_->cells()[cell].rows; }
+
+  // Rows are numbered in Morton order, so those of a block follow each other.
+  void number() {
+    const std::vector<std::uint64_t>& leaf_keys = table_->leaf_keys();
+    std::int32_t last = -1;
+    for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell)
+      last = std::max(last, *std::max_element(rows_of(cell), rows_of(cell) + 8));
+    LargeVector<std::uint64_t> keys(static_cast<std::size_t>(last + 1));
+    for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell) {
+      std::array<std::uint64_t, 8> corners;
+      corners[0] = leaf_keys[cell];
+      for (std::size_t c = 1; c < 8; ++c) {
+        const int axis = c >= 4 ? 2 : c >= 2 ? 1 : 0;
+        corners[c] = morton_neighbour(corners[c - (std::size_t{1} << axis)], axis, 1);
+      }
+      for (std::size_t c = 0; c < 8; ++c) keys[static_cast<std::size_t>(rows_of(cell)[c])] = corners[c];
+    }
+    FlatMap numbers;
+    std::vector<std::uint64_t> blocks;
+    vertices_.reserve(keys.size());
+    for (const std::uint64_t key : keys) {
+      const std::uint64_t block = CellBlocks::block_key(key);
+      if (blocks.empty() || blocks.back() != block) {
+        numbers.insert(block, static_cast<std::int32_t>(blocks.size()));
+        blocks.push_back(block);
+      }
+      vertices_.push_back(static_cast<std::int32_t>(kPlateVertices * (blocks.size() - 1) + kPosition[key & 63]));
+    }
+    num_blocks_ = blocks.size();
+    if (kPlateVertices * (num_blocks_ + 1) > (std::size_t{1} << 31)) throw std::invalid_argument("too many vertices");
+    neighbours_.reserve(6 * num_blocks_);
+    for (const std::uint64_t block : blocks) {
+      for (int axis = 0; axis < 3; ++axis) {
+        for (const int step : {-1, 1}) {
+          const std::int32_t found = numbers.find(morton_neighbour(block, axis, step));
+          neighbours_.push_back(found >= 0 ? found : static_cast<std::int32_t>(num_blocks_));
+        }
+      }
+    }
+  }
 
   // The places in the order of their cells, in each in the order of the planes.
   void place(const KnownPlanes& planes) {
     const std::int64_t count = kPlaces * planes.count;
     const double size_m = table_->leaf_size_m();
-    std::vector<float> points(static_cast<std::size_t>(3 * count));
+    UninitialisedVector<float> points(static_cast<std::size_t>(3 * count));
     for (std::int64_t i = 0; i < count; ++i) {
       const float *point = planes.points + 3 * (i / kPlaces), *normal = planes.normals + 3 * (i / kPlaces);
       const auto before_m = static_cast<float>(static_cast<double>(i % kPlaces - 1) * size_m);
       for (int axis = 0; axis < 3; ++axis)
         points[static_cast<std::size_t>(3 * i + axis)] = point[axis] + before_m * normal[axis];
     }
-    std::vector<std::uint64_t> keys(static_cast<std::size_t>(count));
+    UninitialisedVector<std::uint64_t> keys(static_cast<std::size_t>(count));
     cell_keys(points.data(), count, size_m, keys.data(), num_threads_);
     const CellBlocks leaves(table_->leaf_keys().data(), static_cast<std::int64_t>(table_->leaf_keys().size()));
-    std::vector<std::int32_t> cells(static_cast<std::size_t>(count));
+    UninitialisedVector<std::int32_t> cells(static_cast<std::size_t>(count));
     leaves.rows(keys.data(), count, cells.data(), num_threads_);
     drop_beyond_thin_walls(planes, cells);
-    const auto scale = static_cast<float>(kBend * kBend * size_m * size_m / kPlaces);
-    for (const std::int32_t at : stable_order(keys.data(), count)) {
-      const auto i = static_cast<std::size_t>(at);
-      if (cells[i] < 0) continue;
-      if (cells_.empty() || cells_.back() != cells[i]) {
-        cells_.push_back(cells[i]);
-        first_.push_back(places_.size());
-      }
-      Place& found = places_.emplace_back();
-      for (int axis = 0; axis < 3; ++axis) {
-        const auto cell = static_cast<std::int32_t>(morton_coordinate(keys[i], axis)) - kAxisBias;
-        const double fraction = points[3 * i + static_cast<std::size_t>(axis)] / size_m - cell;
-        found.fraction[axis] = static_cast<float>(std::clamp(fraction, 0.0, 1.0));
-      }
-      found.weight = scale * planes.information[i / kPlaces];
-      found.target_m = static_cast<float>(static_cast<double>(at % kPlaces - 1) * size_m);
+    std::vector<std::int32_t> used = stable_order(keys.data(), count);
+    used.erase(std::remove_if(used.begin(), used.end(),
+                              [&](std::int32_t i) { return cells[static_cast<std::size_t>(i)] < 0; }),
+               used.end());
+    for (std::size_t k = 0; k < used.size(); ++k) {
+      const auto i = static_cast<std::size_t>(used[k]);
+      if (k == 0 || cells[i] != cells[static_cast<std::size_t>(used[k - 1])]) begin_cell(keys[i], cells[i], k);
     }
-    first_.push_back(places_.size());
+    first_.push_back(static_cast<std::int64_t>(used.size()));
+    shares_.resize(8 * used.size());
+    targets_m_.resize(used.size());
+    const double scale = kBend * kBend * size_m * size_m / kPlaces;
+    parallel_blocks(
+        static_cast<std::int64_t>(used.size()), kPlacesOfThread, num_threads_,
+        [&](std::int64_t begin, std::int64_t end) {
+          for (auto k = static_cast<std::size_t>(begin); k < static_cast<std::size_t>(end); ++k) {
+            const auto i = static_cast<std::size_t>(used[k]);
+            const auto root =
+                static_cast<float>(std::sqrt(scale * static_cast<double>(planes.information[i / kPlaces])));
+            float upper[3];
+            for (int axis = 0; axis < 3; ++axis) {
+              const auto cell = static_cast<std::int32_t>(morton_coordinate(keys[i], axis)) - kAxisBias;
+              const double fraction = points[3 * i + static_cast<std::size_t>(axis)] / size_m - cell;
+              upper[axis] = static_cast<float>(std::clamp(fraction, 0.0, 1.0));
+            }
+            for (std::size_t c = 0; c < 8; ++c) {  // bit `axis` of a corner: whether it is the upper one
+              float share = root;
+              for (int axis = 0; axis < 3; ++axis) share *= (c >> axis & 1) != 0 ? upper[axis] : 1 - upper[axis];
+              shares_[8 * k + c] = share;
+            }
+            targets_m_[k] =
+                root * static_cast<float>(static_cast<double>(static_cast<std::int64_t>(i % kPlaces) - 1) * size_m);
+          }
+        });
+  }
+
+  // Regions of which no coordinate follows on another's share no vertex, so threads may add to several at once. The
+  // order in which a vertex is added to is the same for all numbers of threads, and for a part of the cells.
+  void begin_cell(std::uint64_t key, std::int32_t cell, std::size_t first_place) {
+    const std::uint64_t region = CellBlocks::region_key(key);
+    const auto number = static_cast<std::int64_t>(first_.size());
+    std::vector<Range>& apart = regions_[region & 7];
+    if (first_.empty() || region != last_region_) apart.emplace_back(number, number);
+    last_region_ = region;
+    ++apart.back().second;
+    first_.push_back(static_cast<std::int64_t>(first_place));
+    for (int c = 0; c < 8; ++c)
+      corners_.push_back(vertices_[static_cast<std::size_t>(rows_of(static_cast<std::size_t>(cell))[c])]);
   }
 
   // cells: of the places, -1 for those that do not count.
-  void drop_beyond_thin_walls(const KnownPlanes& planes, std::vector<std::int32_t>& cells) const {
+  void drop_beyond_thin_walls(const KnownPlanes& planes, UninitialisedVector<std::int32_t>& cells) const {
     std::vector<std::int64_t> plane_of(table_->leaf_keys().size(), -1);
     for (std::int64_t i = 0; i < planes.count; ++i) {
       const std::int32_t own = cells[static_cast<std::size_t>(kPlaces * i + 1)];
@@ -139,105 +226,84 @@ class Plates {
     }
   }
 
-  // Neighbours are vertices of the same cell.
+  // Neighbours are vertices of the same cell. A distance is bent where there are some on both sides.
   void connect() {
-    const auto num_leaves = static_cast<std::int32_t>(table_->leaf_keys().size());
-    for (std::int32_t cell = 0; cell < num_leaves; ++cell) {
-      const std::int32_t* rows = rows_of(cell);
-      for (int c = 0; c < 8; ++c) {
-        for (int axis = 0; axis < 3; ++axis) {
-          const std::int32_t other = rows[c ^ 1 << axis];
-          Vertex& vertex = vertices_[static_cast<std::size_t>(rows[c])];
-          ((c >> axis & 1) != 0 ? vertex.before : vertex.after)[axis] = other;
-        }
+    const std::size_t size = kPlateVertices * num_blocks_;
+    LargeVector<std::uint8_t> edges(size + kPlateVertices, 0);  // bit `axis`: one before, bit `axis` + 3: one after
+    for (std::size_t cell = 0; cell < table_->leaf_keys().size(); ++cell) {
+      for (unsigned c = 0; c < 8; ++c) {  // upper corners have neighbours before them
+        const auto v = static_cast<std::size_t>(vertices_[static_cast<std::size_t>(rows_of(cell)[c])]);
+        edges[v] = static_cast<std::uint8_t>(edges[v] | c | (7U & ~c) << 3);
       }
     }
-    pulls_.resize(8 * cells_.size());
-    for (std::size_t i = 0; i < cells_.size(); ++i) {
-      const std::int32_t* rows = rows_of(cells_[i]);
-      for (int c = 0; c < 8; ++c)
-        vertices_[static_cast<std::size_t>(rows[c])].pulls[c] = static_cast<std::int32_t>(8 * i) + c;
+    LargeVector<float> stiffness(size, 0.0F);
+    for (std::size_t i = 0; i + 1 < first_.size(); ++i) {
+      for (std::int64_t k = first_[i]; k < first_[i + 1]; ++k) {
+        const float* shares = shares_.data() + 8 * k;
+        float root = 0;
+        for (int c = 0; c < 8; ++c) root += shares[c];
+        for (std::size_t c = 0; c < 8; ++c)
+          stiffness[static_cast<std::size_t>(corners_[8 * i + c])] += root * shares[c];
+      }
     }
-    // pulls_ holds the weights for now.
-    for_each_cell([&](std::size_t i, float* weights) {
-      std::fill_n(weights, 8, 0.0F);
-      for (std::size_t k = first_[i]; k < first_[i + 1]; ++k) {
-        const std::array<float, 8> shares = places_[k].shares();
-        for (std::size_t c = 0; c < 8; ++c) weights[c] += places_[k].weight * shares[c];
+    // Bit by bit, along each axis.
+    std::vector<std::array<std::uint64_t, 3>> bent(num_blocks_ + 1, {0, 0, 0});
+    is_bent_.resize(kPlateBends * num_blocks_);
+    compliance_.resize(size);
+    const auto for_each_block = [&](const auto& visit) {
+      parallel_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks, num_threads_,
+                      [&](std::int64_t begin, std::int64_t end) {
+                        for (auto b = static_cast<std::size_t>(begin); b < static_cast<std::size_t>(end); ++b) visit(b);
+                      });
+    };
+    for_each_block([&](std::size_t block) {
+      for (std::size_t i = 0; i < kPlateVertices; ++i) {
+        const unsigned own = edges[kPlateVertices * block + i], both = own & own >> 3;
+        for (std::size_t axis = 0; axis < 3; ++axis) bent[block][axis] |= std::uint64_t{both >> axis & 1U} << i;
       }
     });
-    for (Vertex& vertex : vertices_) {
-      for (const std::int32_t pull : vertex.pulls)
-        vertex.stiffness += pull >= 0 ? pulls_[static_cast<std::size_t>(pull)] : 0;
-      for (int axis = 0; axis < 3; ++axis) {
-        vertex.stiffness += is_bent(vertex, axis) ? 8.0F : 0.0F;
-        for (const std::int32_t other : {vertex.before[axis], vertex.after[axis]}) {
-          if (other >= 0 && is_bent(vertices_[static_cast<std::size_t>(other)], axis)) vertex.stiffness += 4;
-        }
-      }
-    }
-    for (std::vector<float>& bends : bends_) bends.assign(vertices_.size(), 0.0F);
+    for_each_block([&](std::size_t block) { connect(block, bent, stiffness.data() + kPlateVertices * block); });
   }
 
-  static bool is_bent(const Vertex& vertex, int axis) { return vertex.before[axis] >= 0 && vertex.after[axis] >= 0; }
-
-  template <typename Visit>
-  void for_each_cell(const Visit& visit) {
-    parallel_blocks(static_cast<std::int64_t>(cells_.size()), kBlock, num_threads_,
-                    [&](std::int64_t begin, std::int64_t end) {
-                      for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i)
-                        visit(i, pulls_.data() + 8 * i);
-                    });
-  }
-
-  // What the places of each cell, and each axis, say at these distances.
-  void pull(const float* distances_m) {
-    for_each_cell([&](std::size_t i, float* pulls) {
-      const std::int32_t* rows = rows_of(cells_[i]);
-      float corners_m[8];
-      for (int c = 0; c < 8; ++c) corners_m[c] = distances_m[rows[c]];
-      std::fill_n(pulls, 8, 0.0F);
-      for (std::size_t k = first_[i]; k < first_[i + 1]; ++k) {
-        const std::array<float, 8> shares = places_[k].shares();
-        float off_m = -places_[k].target_m;
-        for (std::size_t c = 0; c < 8; ++c) off_m += shares[c] * corners_m[c];
-        off_m *= places_[k].weight;
-        for (std::size_t c = 0; c < 8; ++c) pulls[c] += off_m * shares[c];
-      }
-    });
-    parallel_blocks(static_cast<std::int64_t>(vertices_.size()), kBlock, num_threads_,
-                    [&](std::int64_t begin, std::int64_t end) {
-                      for (auto v = static_cast<std::size_t>(begin); v < static_cast<std::size_t>(end); ++v) {
-                        for (int axis = 0; axis < 3; ++axis) {
-                          const Vertex& vertex = vertices_[v];
-                          if (!is_bent(vertex, axis)) continue;
-                          bends_[static_cast<std::size_t>(axis)][v] =
-                              distances_m[vertex.before[axis]] + distances_m[vertex.after[axis]] - 2 * distances_m[v];
-                        }
-                      }
-                    });
-  }
-
-  float slope(const Vertex& vertex, std::size_t v) const {
-    float sum = 0;
-    for (const std::int32_t pull : vertex.pulls) sum += pull >= 0 ? pulls_[static_cast<std::size_t>(pull)] : 0;
+  // The matrix is at most a diagonal of `stiffness`: (sum of a x)^2 <= (sum of |a|) (sum of |a| x^2), row by row.
+  void connect(std::size_t block, const std::vector<std::array<std::uint64_t, 3>>& bent, float* stiffness) {
+    std::uint8_t* is_bent = is_bent_.data() + kPlateBends * block;
     for (std::size_t axis = 0; axis < 3; ++axis) {
-      const std::vector<float>& bends = bends_[axis];
-      const std::int32_t before = vertex.before[axis], after = vertex.after[axis];
-      sum += (before >= 0 ? bends[static_cast<std::size_t>(before)] : 0) +
-             (after >= 0 ? bends[static_cast<std::size_t>(after)] : 0) - 2 * bends[v];
+      const auto at = [&](std::size_t side) {
+        return bent[static_cast<std::size_t>(neighbours_[6 * block + 2 * axis + side])][axis];
+      };
+      const std::uint64_t before = at(0), own = bent[block][axis], after = at(1);
+      for (unsigned i = 0; i < 16; ++i) {
+        // Positions of a line along the axis.
+        const unsigned stride = 1U << (2 * axis), first = axis == 0 ? 4 * i : axis == 1 ? i % 4 + 16 * (i / 4) : i;
+        std::uint8_t line[6] = {static_cast<std::uint8_t>(before >> (first + 3 * stride) & 1U)};
+        for (unsigned k = 0; k < 4; ++k) line[k + 1] = static_cast<std::uint8_t>(own >> (first + k * stride) & 1U);
+        line[5] = static_cast<std::uint8_t>(after >> first & 1U);
+        for (unsigned k = 0; k < 4; ++k)
+          stiffness[first + k * stride] += static_cast<float>(4 * line[k] + 8 * line[k + 1] + 4 * line[k + 2]);
+        if (axis == 0) {
+          std::copy_n(line, 6, is_bent + 8 * i);
+        } else {
+          for (std::size_t k = 0; k < 6; ++k) is_bent[kBendsAlongX + (axis - 1) * kBendsAlongYZ + 16 * k + i] = line[k];
+        }
+      }
     }
-    return sum;
+    float* compliance = compliance_.data() + kPlateVertices * block;
+    for (std::size_t i = 0; i < kPlateVertices; ++i) compliance[i] = stiffness[i] > 0 ? 1 / stiffness[i] : 0;
   }
 
   const VertexTable* table_;
   int num_threads_;
-  std::vector<Vertex> vertices_;
-  std::vector<std::int32_t> cells_;  // with places
-  std::vector<std::size_t> first_;   // place of each of them, and their number
-  std::vector<Place> places_;
-  std::vector<float> pulls_;                 // (cells_.size(), 8)
-  std::array<std::vector<float>, 3> bends_;  // second differences along each axis, 0 where there are none
+  LargeVector<std::int32_t> vertices_;  // position of each row in the blocks
+  std::size_t num_blocks_ = 0;
+  std::vector<std::int32_t> neighbours_;
+  UninitialisedVector<std::uint8_t> is_bent_;
+  UninitialisedVector<float> compliance_;
+  LargeVector<std::int32_t> corners_;  // of the cells with places
+  std::vector<std::int64_t> first_;
+  UninitialisedVector<float> shares_, targets_m_;
+  std::array<std::vector<Range>, 8> regions_;  // of cells, by the parity of their coordinates
+  std::uint64_t last_region_ = 0;
 };
 
 }  // namespace
