@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "bindings/subjects.hpp"
+#include "surface/grid_distances.hpp"
 #include "surface/marching_cubes.hpp"
 #include "surface/mesh_components.hpp"
 #include "surface/sparse_lattice.hpp"
@@ -154,6 +155,35 @@ Arrays<std::int32_t, std::int64_t> components(const Array<std::int32_t>& faces, 
                         py::array_t<std::int64_t>(static_cast<py::ssize_t>(result.sizes.size()), result.sizes.data()));
 }
 
+py::array_t<double> areas_of_vertices(const Array<double>& vertices, const Array<std::int32_t>& faces) {
+  check_columns(vertices, 3, "vertices must have shape (V, 3)");
+  check_columns(faces, 3, "faces must have shape (F, 3)");
+  const std::int64_t num_vertices = vertices.shape(0), num_faces = faces.shape(0);
+  py::array_t<double> areas(static_cast<py::ssize_t>(num_vertices));
+  double* found = areas.mutable_data();
+  const double* positions = vertices.data();
+  const std::int32_t* rows = faces.data();
+  const py::gil_scoped_release nogil;
+  vertex_areas(positions, num_vertices, rows, num_faces, found);
+  return areas;
+}
+
+Array<float> distances_at_corners(const VertexTable& table, const Array<float>& distances_m,
+                                  const Array<std::int32_t>& corners, int parts, int num_threads) {
+  check_columns(corners, 3, "corners must have shape (K, 3)");
+  if (distances_m.ndim() != 1 || distances_m.shape(0) != table.num_rows()) {
+    throw std::invalid_argument("distances_m must have shape (num_rows,)");
+  }
+  Array<float> found(corners.shape(0));
+  float* result = found.mutable_data();
+  const float* distances = distances_m.data();
+  const std::int32_t* positions = corners.data();
+  const std::int64_t num_corners = corners.shape(0);
+  const py::gil_scoped_release nogil;
+  grid_distances(table, distances, positions, num_corners, parts, result, num_threads);
+  return found;
+}
+
 template <typename T>
 void bind_for_type(py::module_& m) {
   using py::arg;
@@ -172,10 +202,17 @@ void bind_for_type(py::module_& m) {
 
 }  // namespace
 
-void bind_surfaces(py::module_& m) {
+void bind_surfaces(py::module_& m, VertexTableClass& table) {
+  table.def(
+      "distances_at", &distances_at_corners, py::arg("distances_m").noconvert(), py::arg("corners").noconvert(),
+      py::arg("parts"), py::arg("num_threads") = 0,
+      "Of an octree: `distances_m` (num_rows,) float32 interpolated trilinearly at `corners` (K, 3) int32 of voxels "
+      "of which `parts` make the edge of a leaf cell, (K,) float32. NaN in no cell.");
   bind_for_type<float>(m);
   bind_for_type<double>(m);
   m.def("sparse_lattice", &lattice, py::arg("cells").noconvert(), py::arg("num_threads") = 0);
+  m.def("vertex_areas", &areas_of_vertices, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
+        "A third of the areas of the triangles (F, 3) at each vertex (V, 3): (V,) float64.");
   m.def("mesh_components", &components, py::arg("faces").noconvert(), py::arg("num_vertices"));
 }
 

@@ -16,7 +16,7 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_mlp(m);
   radarsdf::bind_field_loss(m);
   radarsdf::bind_soap(m);
-  radarsdf::bind_surfaces(m);
+  radarsdf::bind_surfaces(m, table);
   radarsdf::bind_cell_means(m);
   radarsdf::bind_cell_sums(m);
   radarsdf::bind_growing_sums(m);

@@ -22,7 +22,7 @@ void bind_encodings(pybind11::module_& m);
 void bind_mlp(pybind11::module_& m);
 void bind_field_loss(pybind11::module_& m);
 void bind_soap(pybind11::module_& m);
-void bind_surfaces(pybind11::module_& m);
+void bind_surfaces(pybind11::module_& m, VertexTableClass& table);
 void bind_cell_means(pybind11::module_& m);
 void bind_cell_sums(pybind11::module_& m);
 void bind_growing_sums(pybind11::module_& m);

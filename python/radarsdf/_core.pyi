@@ -64,6 +64,7 @@ __all__: list[str] = [
     "spherical_harmonics",
     "stable_order",
     "sum_returns",
+    "vertex_areas",
 ]
 
 class Crew:
@@ -269,6 +270,16 @@ class VertexTable:
     ) -> None:
         """
         Writes the gradient of (interpolate . out_grad) by the points to `points_grad` (N, 3), 1/m.
+        """
+    def distances_at(
+        self,
+        distances_m: numpy.typing.NDArray[numpy.float32],
+        corners: numpy.typing.NDArray[numpy.int32],
+        parts: typing.SupportsInt | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float32]:
+        """
+        Of an octree: `distances_m` (num_rows,) float32 interpolated trilinearly at `corners` (K, 3) int32 of voxels of which `parts` make the edge of a leaf cell, (K,) float32. NaN in no cell.
         """
     @typing.overload
     def encode(
@@ -1352,6 +1363,13 @@ def sum_returns(
 ) -> numpy.typing.NDArray[numpy.int64]:
     """
     Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. Lengths are in quanta, positions from the corners (C, 3) int64 of the cells, in quanta; directions are times DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, the row of each return's cell.
+    """
+
+def vertex_areas(
+    vertices: numpy.typing.NDArray[numpy.float64], faces: numpy.typing.NDArray[numpy.int32]
+) -> numpy.typing.NDArray[numpy.float64]:
+    """
+    A third of the areas of the triangles (F, 3) at each vertex (V, 3): (V,) float64.
     """
 
 DIRECTION_QUANTA: float = 16777216.0

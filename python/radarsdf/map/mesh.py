@@ -225,19 +225,25 @@ def sample_lattice(
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    stored = contents.field.leaf_corners() if voxel_size == leaf_size_m and box is None else None
-    if stored is not None:
+    parts, even = _per_cell(voxel_size, leaf_size_m)
+    stored = contents.field.leaf_corners() if box is None else None
+    if stored is not None and even and parts == 1:
         return SampledLattice(*stored, len(cells))
-    if voxel_size < leaf_size_m and contents.field.smooth_in_cells:
+    if stored is not None and voxel_size < leaf_size_m:
+        cells = cells[_near_surface(stored.distances_m[stored.of_cells], leaf_size_m)]
+    elif voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
     voxels = _voxels_of(cells, voxel_size, config)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
-    if voxel_size < leaf_size_m and not _per_cell(voxel_size, leaf_size_m)[1]:
+    if voxel_size < leaf_size_m and not even:
         voxels = _in_map(contents, voxels, voxel_size)
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
-    distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
+    if stored is not None and even:
+        distances_m = contents.field.table.distances_at(stored.distances_m, corners, parts, num_threads)
+    else:
+        distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return SampledLattice(corners, voxel_corners, distances_m, len(cells))
 
 
@@ -251,9 +257,16 @@ def crossed(
     `distances_at`: signed distances (K,), m, of what :func:`sparse_lattice` gives.
     """
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
-    values = distances_at(unique, corners, cell_corners)[cell_corners]
+    found: NDArray[np.int32] = unique[
+        _near_surface(distances_at(unique, corners, cell_corners)[cell_corners], leaf_size_m)
+    ]
+    return found
+
+
+def _near_surface(values_m: NDArray[Any], leaf_size_m: float) -> NDArray[np.bool_]:
+    """(M,) whether the distances (M, 8) at the corners of leaf cells are not all clearly on one side."""
     margin_m = _CLEARLY * leaf_size_m
-    found: NDArray[np.int32] = unique[(values.min(axis=1) <= margin_m) & (values.max(axis=1) >= -margin_m)]
+    found: NDArray[np.bool_] = (values_m.min(axis=1) <= margin_m) & (values_m.max(axis=1) >= -margin_m)
     return found
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf._core import vertex_areas
 from radarsdf.checks import number, whole_number
 from radarsdf.map.queries import VOXEL_M
 
@@ -179,5 +180,4 @@ def across_triangles(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats
 
 def areas_round(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
     """(V,) a third of the area of the triangles (F, 3) at each vertex (V, 3), m, in m²."""
-    thirds = np.repeat(across_triangles(vertices, faces)[1] / 6, 3)
-    return np.bincount(faces.ravel(), thirds, len(vertices)).astype(np.float64)
+    return vertex_areas(vertices, faces)
