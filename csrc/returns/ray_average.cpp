@@ -80,9 +80,10 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
     }
   };
 
-  // Groups of rays have sums of their own.
+  // Groups of rays have sums of their own: of integers, so that their number changes no bit.
   const auto num_rows = static_cast<std::size_t>(table.num_rows());
-  const std::int64_t num_groups = std::clamp<std::int64_t>(rays.count / kRaysOfGroup, 1, kMaxGroups);
+  const std::int64_t most = std::min<std::int64_t>(kMaxGroups, resolve_num_threads(num_threads));
+  const std::int64_t num_groups = std::clamp<std::int64_t>(rays.count / kRaysOfGroup, 1, most);
   std::vector<std::vector<Sum>> groups(static_cast<std::size_t>(num_groups));
   parallel_tasks(num_groups, num_threads, [&](std::int64_t g) {
     std::vector<Sum>& sums = groups[static_cast<std::size_t>(g)];
