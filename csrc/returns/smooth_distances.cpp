@@ -22,8 +22,8 @@
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kBlocks = 1 << 8, kPlacesOfThread = 1 << 13;  // of a thread, at least
-constexpr int kPlaces = 3;                                           // of a plane where its distance is known
+constexpr std::int64_t kBlocks = 1 << 8, kCells = 1 << 12, kPlacesOfThread = 1 << 13;  // of a thread, at least
+constexpr int kPlaces = 3;       // of a plane where its distance is known
 constexpr double kBend = 2;      // leaf cells: second difference of a distance whose slope turns from -1 to 1
 constexpr double kClear = 0.25;  // leaf cells: least distance of a vertex whose side is known
 constexpr int kEdge = 4;         // of a block of vertices
@@ -64,18 +64,18 @@ class Plates {
     }
     const PlateKernels kernels = RADARSDF_KERNEL(plate_kernels)();
     const PlatePlaces places{corners_.data(), first_.data(), shares_.data(), targets_m_.data()};
-    PlateSweep sweep{neighbours_.data(),
-                     is_bent_.data(),
-                     compliance_.data(),
-                     side.data(),
-                     nullptr,
-                     nullptr,
-                     steps_m.data(),
-                     pulls_m.data(),
-                     0,
-                     0,
-                     0};
+    PlateSweep sweep{};
+    sweep.neighbours = neighbours_.data();
+    sweep.is_bent = is_bent_.data();
+    sweep.compliance = compliance_.data();
+    sweep.sides = side.data();
+    sweep.steps_m = steps_m.data();
+    sweep.pulls_m = pulls_m.data();
     sweep.least_m = static_cast<float>(kClear * table_->leaf_size_m());
+    std::size_t num_regions = 0;
+    for (const std::vector<Range>& apart : regions_) num_regions += apart.size();
+    const auto regions_of_thread =
+        1 + kCells * static_cast<std::int64_t>(num_regions) / static_cast<std::int64_t>(first_.size());
     float rho = half / middle;
     for (int k = 0; k < iterations; ++k) {
       const float next = 1 / (2 * middle / half - rho);
@@ -85,9 +85,12 @@ class Plates {
       sweep.before_m = before_m.data();
       sweep.after_m = after_m.data();
       for (const std::vector<Range>& apart : regions_) {
-        parallel_tasks(static_cast<std::int64_t>(apart.size()), num_threads_, [&](std::int64_t i) {
-          const Range& cells = apart[static_cast<std::size_t>(i)];
-          kernels.pull(places, before_m.data(), pulls_m.data(), cells.first, cells.second);
+        const auto count = static_cast<std::int64_t>(apart.size());
+        parallel_blocks(count, regions_of_thread, num_threads_, [&](std::int64_t begin, std::int64_t end) {
+          for (std::int64_t i = begin; i < end; ++i) {
+            const Range& cells = apart[static_cast<std::size_t>(i)];
+            kernels.pull(places, before_m.data(), pulls_m.data(), cells.first, cells.second);
+          }
         });
       }
       parallel_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks, num_threads_,
