@@ -9,12 +9,12 @@ import itertools
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.options import Recording, Settings, Surface
 from radarsdf.cli.results import Results
-from radarsdf.cli.scans import add_segments, finding_poses, scans_or_unposed, warn_or_refuse
+from radarsdf.cli.scans import finding_poses, scans_or_unposed, warn_or_refuse
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -96,7 +96,7 @@ def run(
     """
     plan(recording, out=out, cut=cut, where=where, settings=settings, results=results)
     missing = fit(out, where=where, results=results)
-    mesh(out, where=where, surface=surface, results=results)
+    mesh(out, surface=surface, results=results)
     return missing
 
 
@@ -140,12 +140,10 @@ def plan(
 
 
 def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
-    from radarsdf.tiles.drive_poses import TRAJECTORY, DrivePoses
+    from radarsdf.tiles.planning import TRAJECTORY
 
-    if (poses := DrivePoses.load(folder)) is not None:
-        way: dict[str, Any] = poses.posed.way or {}
-        results.add(way["verdict"], poses=folder / TRAJECTORY, improved=way["improved"])
-        add_segments(results, poses.posed)
+    if plan.poses is not None:
+        results.add(plan.poses["verdict"], poses=folder / TRAJECTORY, improved=plan.poses["improved"])
     returns, rays = (sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays"))
     seconds, most = sum(tile.seconds for tile in plan.tiles), max(tile.memory_bytes for tile in plan.tiles)
     results.add(
@@ -178,11 +176,11 @@ def fit(folder: Path, *, tile: list[str] | None = None, where: Where, results: R
     return status(folder, tile=tile, results=results)
 
 
-def mesh(folder: Path, *, out: Path | None = None, where: Where, surface: Surface, results: Results) -> None:
+def mesh(folder: Path, *, out: Path | None = None, surface: Surface, results: Results) -> None:
     """Write the surface of all tiles as one mesh.
 
     folder: What radarsdf tiles fit wrote.
-    out: The mesh to write: a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder.
+    out: The mesh to write: one file, or a .json file for 3D Tiles; default: mesh.ply in the folder.
     """
     from radarsdf.io.files import check_outputs
     from radarsdf.tiles.tiled_map import TiledMap
@@ -190,10 +188,7 @@ def mesh(folder: Path, *, out: Path | None = None, where: Where, surface: Surfac
     out = folder / "mesh.ply" if out is None else out
     check_outputs([out])
     city = TiledMap(folder)
-    with where.executor(folder) as executor:
-        vertices, triangles = city.export(
-            out, surface.voxel, **surface.limits, executor=executor, progress=results.progress
-        )
+    vertices, triangles = city.export(out, surface.voxel, **surface.limits, progress=results.progress)
     line = f"{vertices} vertices and {triangles} triangles written to {out}"
     results.add(line, vertices=vertices, triangles=triangles, out=out)
     results.add_threshold(city.threshold(surface.voxel, **surface.limits).metadata)
@@ -215,14 +210,3 @@ def status(folder: Path, *, tile: list[str] | None = None, results: Results) -> 
     for name, reason in missing.items():
         warn(f"error: {name}: {reason}")
     return int(bool(missing))
-
-
-def clean(folder: Path, *, results: Results) -> None:
-    """Remove what is no longer needed.
-
-    folder: What radarsdf tiles fit wrote.
-    """
-    from radarsdf.tiles.tiled_map import TiledMap
-
-    freed = TiledMap(folder).clean()
-    results.add(f"{freed / 1e6:.1f} MB of rays and parts of meshes removed from {folder}", bytes=freed)
