@@ -72,8 +72,7 @@ def test_areas_round_vertices_of_several_regions_are_those_of_all_their_triangle
         live.mesh()
     growing = live._state._surface
     assert len(growing._triangles._parts) > 2
-    found = growing.triangles().surface
-    scene = growing.triangles().scene
+    scene, found = growing.surface()
     whole = Surface.told_by(scene, found.vertices, found.faces, found.evidence, found.cells_searched)
     np.testing.assert_allclose(found.tally.sums(), whole.tally.sums(), rtol=1e-9, atol=1e-12)
     assert found.tally.area_m2.sum() > 10

@@ -24,8 +24,8 @@ from radarsdf.live.regions import (
     region_places,
     regions_of,
 )
-from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, Stored, held_by
-from radarsdf.live.surface import ChangedSums, GrowingSurface
+from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, Stored
+from radarsdf.live.surface import GrowingSurface
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
 from radarsdf.returns.intensities import IntensityScale, Plausible
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -36,17 +36,12 @@ from radarsdf.threads import resolve_num_threads
 
 _MARKS = 64  # lists of changed blocks, before they are joined
 _BYTES_OF_SUMS = 350  # of a cell with returns, in a table with room for twice as many
-_LEFT = 0.75  # of the cells that there may be, so that regions are not put away for each scan
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
 _NOISE_RETURNS = 100_000  # for the noise: as many as those on flat surfels that are wanted, and more
 
 
 class GrowingState:
-    """Sums over scans, the scans themselves, and the surface that follows. One thread at a time.
-
-    `origin` (3,): of the local frame, world, m; None: it follows from the first scan. Beyond `max_bytes`, scans are let go,
-    to `folder` if there is one.
-    """
+    """Sums over scans, the scans themselves, and the surface that follows. One thread at a time."""
 
     def __init__(
         self,
@@ -80,7 +75,7 @@ class GrowingState:
 
     @property
     def num_bytes(self) -> int:
-        """Memory that all takes, bytes."""
+        """Memory that all takes."""
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
@@ -90,10 +85,7 @@ class GrowingState:
         gone: Iterable[ScanId],
         origin: NDArray[np.float64] | None = None,
     ) -> Keys:
-        """Takes scans out and puts others in, also of the same ids: all of it, or nothing if an error is raised.
-
-        `origin`: of a map that has none yet. Returns the keys of the blocks whose returns changed.
-        """
+        """Takes scans out and puts others in, also of the same ids, all or none. Returns the keys of the changed blocks."""
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         before, self.origin = self.origin, self.origin if origin is None else origin
         done = False
@@ -118,7 +110,7 @@ class GrowingState:
         return blocks
 
     def _apply(self, come: Iterable[LoggedScan], gone: Iterable[LoggedScan]) -> Keys:
-        """Changes the sums, or leaves all as it was. Returns the keys of the blocks whose returns changed."""
+        """Changes the sums, or leaves all as it was."""
         change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
         for scans, sign in ((gone, -1), (come, 1)):
             for scan in scans:
@@ -138,27 +130,23 @@ class GrowingState:
             return
         if self._store is not None and len(self._in_use):
             # The surface grows and shrinks with the next mesh.
-            surface = 0.0 if self._surface is None else self._surface.num_bytes_of_cell
-            if self.sums.num_bytes + surface * self.sums.num_cells > self.max_bytes:
-                self._put_farthest_away(int(self.max_bytes / (_BYTES_OF_SUMS + surface)))
+            of_surface = 0.0 if self._surface is None else self._surface.num_bytes_of_cell
+            if self.sums.num_cells * (_BYTES_OF_SUMS + of_surface) > self.max_bytes:
+                self._put_farthest_away()
         if self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans that tell it may go
                 self._settle_noise()
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
-    def _put_farthest_away(self, most: int) -> None:
-        """Puts regions away if there are more than `most` cells, but for those that the last change reached."""
-        if self.sums.num_cells <= most:
-            return
+    def _put_farthest_away(self) -> None:
+        """Puts the farther half of the regions away, but for those that the last change reached."""
         regions = np.setdiff1d(regions_of(self.sums.block_keys() << BLOCK_BITS), self._in_use)
         away = region_places(regions) - region_places(self._in_use).mean(axis=0)
-        for region in regions[np.argsort(-np.square(away).sum(axis=1), kind="stable")]:
-            self._put_away(region[None])
-            if self.sums.num_cells <= _LEFT * most:
-                break
+        farthest = np.argsort(-np.square(away).sum(axis=1), kind="stable")
+        self._put_away(np.sort(regions[farthest[: (len(regions) + 1) // 2]]))
 
     def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
-        """Forgets blocks beyond a ball, or puts the regions away that lie beyond it. Returns the keys of the blocks."""
+        """See :meth:`LiveMap.clear_outside`."""
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
@@ -194,8 +182,8 @@ class GrowingState:
         self._mark(blocks, blocks)
         return blocks
 
-    def changes(self) -> tuple[GrowingSurface, ChangedSums, SensorNoise]:
-        """The surface as it was derived last, and what it has to take in."""
+    def changes(self) -> tuple[GrowingSurface, tuple[Any, ...]]:
+        """The surface as it was derived last, and the first arguments of its update."""
         if self._surface is None:
             surface = GrowingSurface(self.quick, np.zeros(3) if self.origin is None else self.origin)
             self._surface = None if self.origin is None else surface
@@ -206,15 +194,11 @@ class GrowingState:
             np.unique(np.concatenate([NO_KEYS, *keys]))
             for keys in (self._returns_changed, self._visibility_changed)
         )
-        changes = ChangedSums(
-            returns,
-            ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(returns))),
-            seen,
-            Looks(*self.sums.looks_of(_blocks_of_regions(seen))),
-        )
+        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(returns)))
+        looks = Looks(*self.sums.looks_of(_blocks_of_regions(seen)))
         self._returns_changed, self._visibility_changed = [], []
         self._settle_noise()
-        return surface, changes, self.noise
+        return surface, (returns, sums, seen, looks, self.noise)
 
     def forget_surface(self) -> None:
         """The surface is derived again from all sums."""
@@ -236,7 +220,6 @@ class GrowingState:
             "max_bytes": self.max_bytes,
             "sealed": sealed,
             "ids": self.log.ids,
-            "held": held_by(scans),
         }
         sums = (*self.sums.sums_of(keys), *self.sums.looks_of(keys))
         return Stored(Described(**described), dict(zip(self.log.ids, scans, strict=True)), sums)
@@ -261,12 +244,15 @@ class GrowingState:
         return scans
 
     def fit_input(self) -> Callable[[], FitInput]:
-        """What a fit of all scans starts from, with the sums that were kept up. It is made of a copy of the state, when called."""
+        """What a fit of all scans starts from, with the sums that were kept up."""
         scans, sums, origin = self.scans(), self._all_sums(), self.origin
         looks = Looks(*self.sums.looks_of(self.sums.block_keys()))
 
         def read() -> FitInput:
-            rays = _without_outliers(_rays_of(scans, self.config, origin))
+            rays = _rays_of(scans, self.config, origin)
+            if rays.intensities is not None:
+                known = Plausible.of(rays.intensities).kept(rays.intensities)
+                rays = dataclasses.replace(rays, intensities=known)
             poses = np.stack([scan.pose for scan in scans])
             moving = sum(int((~scan.standing).sum()) for scan in scans if scan.standing is not None)
             scale = IntensityScale.of(rays.intensities)
@@ -313,13 +299,6 @@ def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.
         whole=False,
         **config.preparation,
     )
-
-
-def _without_outliers(rays: Rays) -> Rays:
-    """The rays of all scans, with the intensities that can belong to the others."""
-    if rays.intensities is None:
-        return rays
-    return dataclasses.replace(rays, intensities=Plausible.of(rays.intensities).kept(rays.intensities))
 
 
 def _blocks_of_regions(blocks: Keys) -> Keys:
