@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.options import Recording, Settings, Surface
 from radarsdf.cli.results import Results
-from radarsdf.cli.scans import finding_poses, scans_or_unposed, warn_or_refuse
+from radarsdf.cli.scans import warn_or_refuse
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -30,14 +30,12 @@ class Cut:
 
     tile_size: Edge of a tile, m; default: 512 leaf cells.
     halo: Margin around a tile that its fit sees, m.
-    refine: Refine the poses by the returns before the plan is made; they are written into the folder, poses.tum.
     geometry_only: Do not use the intensities.
     no_check: Do not check the first scans.
     """
 
     tile_size: float | None = None
     halo: float | None = None
-    refine: bool = False
     geometry_only: bool = False
     no_check: bool = False
 
@@ -111,8 +109,8 @@ def plan(
     from radarsdf.tiles.fit_tiles import plan_tiles
 
     config = settings.load()
-    scans, missing = scans_or_unposed(recording)
-    if not cut.no_check and missing is None:  # a city of wrong poses would take hours
+    scans = recording.read()
+    if not cut.no_check:  # a city of wrong poses would take hours
         first = list(itertools.islice(iter(scans), _FIRST_SCANS))
         if len(first) > 1:
             some = scans_in_memory(first)
@@ -122,28 +120,19 @@ def plan(
         used = Scans.of_source(
             lambda: (dataclasses.replace(scan, intensities=None) for scan in scans),
             Notes(str(recording.scans)),
-            imu=lambda: scans.imu,
         )
-    with finding_poses(missing):
-        planned = plan_tiles(
-            used,
-            out,
-            tile_size=cut.tile_size,
-            halo=cut.halo,
-            config=config,
-            threads=None if where.is_here else 1,
-            refine=cut.refine,
-            find=missing is not None,
-            progress=results.progress,
-        )
+    planned = plan_tiles(
+        used,
+        out,
+        tile_size=cut.tile_size,
+        halo=cut.halo,
+        config=config,
+        threads=None if where.is_here else 1,
+    )
     _add_plan(results, planned, out)
 
 
 def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
-    from radarsdf.tiles.planning import TRAJECTORY
-
-    if plan.poses is not None:
-        results.add(plan.poses["verdict"], poses=folder / TRAJECTORY, improved=plan.poses["improved"])
     returns, rays = (sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays"))
     seconds, most = sum(tile.seconds for tile in plan.tiles), max(tile.memory_bytes for tile in plan.tiles)
     results.add(

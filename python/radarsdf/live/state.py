@@ -129,9 +129,11 @@ class GrowingState:
         if self.max_bytes is None:
             return
         if self._store is not None and len(self._in_use):
-            # The surface grows and shrinks with the next mesh.
-            of_surface = 0.0 if self._surface is None else self._surface.num_bytes_of_cell
-            if self.sums.num_cells * (_BYTES_OF_SUMS + of_surface) > self.max_bytes:
+            cells = self.sums.num_cells
+            needed = min(self.sums.num_bytes, _BYTES_OF_SUMS * cells)
+            if self._surface is not None:  # it grows and shrinks with the next mesh
+                needed += round(self._surface.num_bytes_of_cell * cells)
+            if needed > self.max_bytes:
                 self._put_farthest_away()
         if self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans that tell it may go

@@ -14,24 +14,22 @@ from pathlib import Path
 
 import torch
 
-from radarsdf.checks import flag, instance, path_of, positive
+from radarsdf.checks import instance, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import take_lock, write_whole
-from radarsdf.io.poses.trajectory import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
-from radarsdf.tiles.planning import SCANS_FILE, TRAJECTORY, GivenScans, make_plan, read_rays
+from radarsdf.tiles.planning import SCANS_FILE, CheckedScans, make_plan, read_rays
 from radarsdf.tiles.tasks import run_tasks
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
 _LOCK = "plan.lock"
-_OURS = {PLAN, _LOCK, TRAJECTORY, TILES, SCANS_FILE}
-_POSE_SETTINGS = ("pose_sigma_m", "pose_sigma_rad")
+_OURS = {PLAN, _LOCK, TILES, SCANS_FILE}
 
 
 def fit_tiles(
@@ -42,8 +40,6 @@ def fit_tiles(
     halo: float | None = None,
     executor: Executor | None = None,
     config: FitConfig | None = None,
-    refine: bool = False,
-    find: bool = False,
     progress: bool | None = None,
 ) -> TiledMap:
     """Fits a map in tiles. Neither all returns nor all of the map are ever in memory.
@@ -54,8 +50,7 @@ def fit_tiles(
     Parameters
     ----------
     scans : path-like, Scans, or iterable of Scan
-        A path is read by :func:`radarsdf.io.read`. Scans may come one after another; they are read once, unless poses are
-        refined or found.
+        A path is read by :func:`radarsdf.io.read`. Scans may come one after another; they are read once.
     out : path-like
         A folder, which is made.
     tile_size : float, optional
@@ -68,13 +63,6 @@ def fit_tiles(
         By default one after another in this process.
     config : FitConfig, optional
         Settings of the fits. With an executor, each has one thread unless ``num_threads`` says otherwise.
-    refine : bool
-        Whether poses are refined before the plan is made, as by :func:`radarsdf.refine_poses`, in windows of some hundred
-        scans. The poses used are kept in the folder, ``poses.tum``, and their deviations become ``pose_sigma_m`` and
-        ``pose_sigma_rad`` of the maps, unless `config` states some.
-    find : bool
-        Whether poses are found from the radar alone, as by :func:`radarsdf.odometry`, and those of the scans are not used.
-        This is done for scans in a path without poses, too. Of a drive in several segments, the longest is used.
     progress : bool, optional
         Whether to show progress bars. By default only on a terminal.
 
@@ -97,9 +85,6 @@ def fit_tiles(
         halo=halo,
         config=config,
         threads=None if executor is None else 1,
-        refine=refine,
-        find=find,
-        progress=progress,
     )
     return run_fits(out, executor=executor, progress=progress)
 
@@ -112,9 +97,6 @@ def plan_tiles(
     halo: float | None = None,
     config: FitConfig | None = None,
     threads: int | None = None,
-    refine: bool = False,
-    find: bool = False,
-    progress: bool | None = None,
 ) -> Plan:
     """The first step of :func:`fit_tiles`: writes the plan and the rays of each tile, in one pass over the scans.
 
@@ -123,7 +105,7 @@ def plan_tiles(
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
-    given = _given(scans, refine=flag(refine, "refine"), find=flag(find, "find"))
+    given = CheckedScans(read(scans) if isinstance(scans, (str, PathLike)) else scans)
     if not (folder / PLAN).is_file():
         if folder.is_dir() and not {path.name for path in folder.iterdir()} <= _OURS:
             msg = f"{folder} holds other files: give a new folder"
@@ -134,7 +116,7 @@ def plan_tiles(
             if not (folder / PLAN).is_file():  # another process may just have made it
                 shutil.rmtree(folder / TILES, ignore_errors=True)  # of a plan that was not finished
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
-                plan = make_plan(given, folder, config, grid, progress)
+                plan = make_plan(given, folder, config, grid)
                 plan.save(folder)
                 return plan
         finally:
@@ -142,15 +124,16 @@ def plan_tiles(
     return _known_plan(folder, config, grid, given)
 
 
-def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: GivenScans) -> Plan:
+def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: CheckedScans) -> Plan:
     """The plan in a folder. Raises a ValueError if it is of other scans or settings."""
     plan = Plan.load(folder)
     if config.num_threads not in (0, plan.config.num_threads):
         msg = f"{folder} was planned for {plan.config.num_threads} threads a tile, not {config.num_threads}"
         raise ValueError(msg)
-    estimated = NOISE_SETTINGS + (_POSE_SETTINGS if given.refine or given.find else ())
     found = {
-        name: getattr(plan.config.returns, name) for name in estimated if not getattr(config.returns, name)
+        name: getattr(plan.config.returns, name)
+        for name in NOISE_SETTINGS
+        if getattr(config.returns, name) is None
     }
     ours, theirs = (settings_of_results(own) for own in (config.override(returns=found), plan.config))
     different = [name for name in ours if ours[name] != theirs[name]]
@@ -158,26 +141,11 @@ def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: GivenSca
     if not different:
         for _ in given:
             pass
-        different += ["scans or how poses are made"] * (given.digest != plan.input_digest)
+        different += ["scans"] * (given.digest != plan.input_digest)
     if different:
         msg = f"{folder} holds another plan: {', '.join(different)} differ; give a new folder"
         raise ValueError(msg)
     return plan
-
-
-def _given(scans: str | PathLike[str] | Scans | Iterable[Scan], *, refine: bool, find: bool) -> GivenScans:
-    """The scans, checked as they are read. Poses are also found of scans in files that have none."""
-    if isinstance(scans, (str, PathLike)):
-        path = scans
-        try:
-            scans = read(path, UNPOSED if find else None)
-        except NoPoses:
-            scans, find = read(path, UNPOSED), True
-    if (refine or find) and iter(scans) is scans:
-        msg = "poses can be refined or found of scans that can be read again: give a path, Scans or a list"
-        raise ValueError(msg)
-    imu = scans.imu if isinstance(scans, Scans) else None
-    return GivenScans(scans, imu, refine=refine, find=find)
 
 
 def run_fits(

@@ -28,13 +28,12 @@ from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.progress import hides_bar
+from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import Tile, folder_of, neighbours
 from radarsdf.tiles.tileset import content_folder, write_tileset
 
 if TYPE_CHECKING:
     import trimesh
-
-    from radarsdf.tiles.tiled_map import TiledMap
 
 _ON_LATTICE = 1e-4  # voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # in the file of a part
@@ -83,7 +82,7 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
 
 
 def _parts_of(
-    city: TiledMap, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
+    city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
 ) -> tuple[list[Path], Limits]:
     """Meshes all tiles: the files of the parts, and the limits of a mesh of them, as `wanted` of :meth:`Map.mesh`."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
@@ -106,7 +105,7 @@ def _parts_of(
     return paths, limits
 
 
-def _part_of(city: TiledMap, tile: Tile, settings: PartSettings) -> Part:
+def _part_of(city: TileBlend, tile: Tile, settings: PartSettings) -> Part:
     """The triangles near returns in the leaf cells of a tile."""
     config, steps = city.config, settings.voxels_per_cell
     position = config.lattice.position
@@ -142,7 +141,7 @@ def _part_of(city: TiledMap, tile: Tile, settings: PartSettings) -> Part:
     return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
 
 
-def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
+def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
     """(C, 3) leaf cells of a tile, as the lattice numbers them: those of its map, and of others with a weight there."""
     plan = city.plan
     parts = []
@@ -155,13 +154,13 @@ def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
     return found
 
 
-def _on_borders(city: TiledMap, vertices: _Floats) -> NDArray[np.int64]:
+def _on_borders(city: TileBlend, vertices: _Floats) -> NDArray[np.int64]:
     """(B,) rows of the vertices (V, 3) on the borders of tiles, which the next tile may have, too."""
     tiles = city.config.lattice.cells(vertices)[:, :2] / city.plan.tile_cells
     return np.flatnonzero((np.abs(tiles - np.round(tiles)) * city.plan.tile_cells < _ON_LATTICE).any(axis=1))
 
 
-def _welded(city: TiledMap, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
+def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
     """The vertices (V, 3) of all parts, and the faces (F, 3), of which no two use different vertices in one place."""
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0, *[len(part.vertices) for part in parts]], dtype=np.int32)
@@ -180,7 +179,7 @@ def _allowed(
     return with_all(certain & (confidence >= least), faces)
 
 
-def mesh_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
+def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
     paths, found = _parts_of(city, voxel_size, progress, **limits)
     size = sum(path.stat().st_size for path in paths)
@@ -206,7 +205,7 @@ def mesh_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: 
 
 
 def export_mesh(
-    city: TiledMap, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
+    city: TileBlend, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
 ) -> tuple[int, int]:
     """See :meth:`TiledMap.export`. What cannot be written is noticed before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
@@ -221,7 +220,7 @@ def export_mesh(
 
 
 def _separate(
-    city: TiledMap, paths: Sequence[Path], limits: Limits
+    city: TileBlend, paths: Sequence[Path], limits: Limits
 ) -> Iterator[tuple[_Floats, NDArray[np.int32]]]:
     """Vertices (V, 3), world, m, and faces (F, 3) of one tile after another. Components that reach a border stay."""
     least = _tally_of(paths).threshold(limits.min_confidence).min_confidence
@@ -237,7 +236,7 @@ def _separate(
         yield part.vertices[used], faces
 
 
-def threshold_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: Any) -> Threshold:
+def threshold_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> Threshold:
     """See :meth:`TiledMap.threshold`."""
     paths, found = _parts_of(city, voxel_size, progress, **limits)
     return _tally_of(paths).threshold(found.min_confidence)
@@ -247,7 +246,7 @@ def _tally_of(paths: Iterable[Path]) -> Tally:
     return Tally.of_sums(sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS)))
 
 
-def viewed_tiles(city: TiledMap, tiles: list[Tile]) -> ViewedMap:
+def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     """What views need of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)

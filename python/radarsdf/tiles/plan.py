@@ -154,7 +154,6 @@ class Plan:
     returns_per_cell: Annotated[float, Field(ge=0)]  # mean of the cells of surfels of these
     sensor: Sensor
     scans: Annotated[_Count, Field(ge=1)]
-    poses: dict[str, Any] | None  # trajectory of poses that were refined or found, for the report
     input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # of all scans
     tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]  # those that own a return, ascending
 
@@ -216,8 +215,6 @@ class Plan:
             if {name: described.pop(name, None) for name in FORMAT} != FORMAT:
                 msg = f"it is not a plan of {FORMAT}"
                 raise ValueError(msg)
-            if described["poses"] is not None:
-                checked_report({"poses": described["poses"]})
             return cls(
                 config=FitConfig.from_dict(described.pop("config")),
                 sensor=Sensor.from_dict(described.pop("sensor")),

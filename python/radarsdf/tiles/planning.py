@@ -21,12 +21,8 @@ from radarsdf.checks import are_rigid, one_for_each_scan
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.average import SurfaceReturns
 from radarsdf.fitting.estimate import estimate_rays
-from radarsdf.io.imu import Imu
 from radarsdf.io.npz import array_in
-from radarsdf.io.poses.files import write_poses
 from radarsdf.io.scans import Scan, scans_in_memory
-from radarsdf.poses.posed import Posed
-from radarsdf.poses.windows import find_in_windows, refine_in_windows
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import Standing
 from radarsdf.returns.noise import SensorNoise
@@ -37,7 +33,7 @@ from radarsdf.threads import Workers
 from radarsdf.tiles.plan import Plan, Tile, TileGrid, TilePlan, folder_of
 
 _LOG = logging.getLogger("radarsdf.tiles")
-SCANS_FILE, TRAJECTORY = "scans.npy", "poses.tum"
+SCANS_FILE = "scans.npy"
 _RECORD = np.dtype([("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")])
 """A return in the frame of its tile, m; its scan; its intensity, sensor units, NaN if there are none."""
 _CHUNK_SCANS = 256  # in memory at a time
@@ -47,20 +43,15 @@ _SENSOR_SCANS = 512  # at most, from which the sensor is described
 _SAMPLED_TILES = 4  # whose noise and clutter ratio stand for all
 
 
-class GivenScans:
+class CheckedScans:
     """Scans, checked one after another each time that they are read. Those without a rigid pose are left out."""
 
-    def __init__(self, scans: Iterable[Any], imu: Imu | None = None, *, refine: bool, find: bool) -> None:
-        self._scans, self._mode = scans, f"{refine} {find}"
-        self.imu = imu if find else None
-        self.refine, self.find = refine, find  # whether poses are refined, or found without the given ones
-        self.times_s: list[float | None] = []  # of the scans, once they were read
-        self.digest = ""  # of all that the plan follows from but for the settings, once they were read
+    def __init__(self, scans: Iterable[Any]) -> None:
+        self._scans = scans
+        self.digest = ""  # of all, once they were read
 
     def __iter__(self) -> Iterator[Scan]:
-        digest, times_s = hashlib.blake2b(self._mode.encode(), digest_size=16), []
-        for array in () if self.imu is None else vars(self.imu).values():
-            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+        digest = hashlib.blake2b(digest_size=16)
         rigid = []
         for i, scan in enumerate(one_for_each_scan(self._scans, "scans")):
             if not isinstance(scan, Scan):
@@ -69,11 +60,10 @@ class GivenScans:
             if np.shape(scan.T_world_sensor) != (4, 4):
                 msg = f"scan {i} has no pose: T_world_sensor must be (4, 4), not {np.shape(scan.T_world_sensor)}"
                 raise ValueError(msg)
-            for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps, scan.time_s):
+            for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
                 digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
-            rigid.append(self.find or bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
+            rigid.append(bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
             if rigid[-1]:
-                times_s.append(scan.time_s)
                 yield scan
         bad = np.flatnonzero(~np.array(rigid, bool)).tolist()
         if bad and 2 * len(bad) >= len(rigid):
@@ -81,42 +71,11 @@ class GivenScans:
             raise ValueError(msg)
         for note in LeftOut(poses=bad).notes:
             _LOG.warning(note)
-        self.digest, self.times_s = digest.hexdigest(), times_s
+        self.digest = digest.hexdigest()
 
 
-def _pose_scans(given: GivenScans, folder: Path, config: FitConfig, progress: bool | None) -> Posed:
-    """Refines or finds the poses of scans, and writes them for other programs; without times, scans are numbered."""
-    if given.find:
-        posed = Posed.found(find_in_windows(given, given.imu, config, progress))
-    else:
-        posed = Posed.refined(*refine_in_windows(given, config, progress))
-    known = [time_s for time_s in given.times_s[posed.rows] if time_s is not None]
-    rows = range(posed.rows.start, posed.rows.stop)
-    write_poses(folder / TRAJECTORY, posed.poses, known if len(known) == len(rows) else list(rows))
-    for note in posed.notes:
-        _LOG.warning(note)
-    if posed.pieces > 1:
-        _LOG.warning("the scans %d to %d are used, the longest segment", rows.start, rows.stop - 1)
-    return posed
-
-
-def _scans_at(posed: Posed, given: Iterable[Scan]) -> Iterator[Scan]:
-    """The scans with these poses, without those that have none."""
-    for number, scan in enumerate(given):
-        if posed.rows.start <= number < posed.rows.stop:
-            yield dataclasses.replace(scan, T_world_sensor=posed.poses[number - posed.rows.start])
-
-
-def make_plan(
-    given: GivenScans, folder: Path, config: FitConfig, grid: TileGrid, progress: bool | None = False
-) -> Plan:
-    """Reads all scans, writes the rays of each tile, and returns the plan."""
-    (folder / TRAJECTORY).unlink(missing_ok=True)  # of a plan that was not finished
-    scans: Iterable[Scan] = given
-    posed = None
-    if given.refine or given.find:
-        posed = _pose_scans(given, folder, config, progress)
-        scans, config = _scans_at(posed, given), posed.config(config)
+def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
+    """Reads all scans once, writes the rays of each tile, and returns the plan."""
     planner, number = _Planner(folder, config, grid), 0
     for chunk in _chunks(scans, config.returns.accumulate_scans):
         planner.add(chunk, number)
@@ -124,7 +83,7 @@ def make_plan(
     if number == 0:
         msg = "there are no scans"
         raise ValueError(msg)
-    return planner.plan(given.digest, None if posed is None else posed.way)
+    return planner.plan(scans.digest)
 
 
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
@@ -223,7 +182,7 @@ class _Planner:
         static = Standing.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
         return prepare(static.points, held.poses, static.intensities, whole=False, **self._config.preparation)
 
-    def plan(self, input_digest: str, poses: dict[str, Any] | None) -> Plan:
+    def plan(self, input_digest: str) -> Plan:
         """The plan, once all scans are given. Tiles without a return of their own are left out."""
         tiles = []
         for tile, (returns, rays) in sorted(self._counts.items()):
@@ -246,7 +205,6 @@ class _Planner:
             returns_per_cell=0.0,
             sensor=self._sensor(SensorNoise(0.0, 0.0, 0.0)),
             scans=len(axes),
-            poses=poses,
             input_digest=input_digest,
             tiles=tuple(tiles),
         )

@@ -259,7 +259,6 @@ class TiledMap(TileBlend):
             "scans": self.plan.scans,
             "returns": sum(tile.returns for tile in self.plan.tiles),
             "leaf_cells": self.num_cells,
-            **({} if self.plan.poses is None else {"poses": self.plan.poses}),
             **{name: value for name, value in reports[0].items() if name == "noise"},
             "skipped": list(
                 dict.fromkeys(words for report in reports for words in report.get("skipped", []))
