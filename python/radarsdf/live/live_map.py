@@ -33,7 +33,7 @@ from radarsdf.fitting.fit import fit
 from radarsdf.fitting.steps import fit_rays
 from radarsdf.live.regions import Keys
 from radarsdf.live.state import GrowingState
-from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder, save_state
+from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
 from radarsdf.live.tracking import Follower
 from radarsdf.returns.moving import Movers
 from radarsdf.returns.rays import check_scans
@@ -79,12 +79,11 @@ class LiveMap:
         Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
         ``config.lattice``.
     max_bytes : int, optional
-        Memory that the map may take, bytes. Beyond it, the oldest scans are let go: they stay in the map, but can no
-        longer be moved or taken out. None: all are kept.
+        Memory, bytes, beyond which the oldest scans are let go: they stay in the map, but can no longer be moved or taken
+        out. None: all are kept.
     folder : path-like, optional
-        An empty or new folder, or one that a map has used before. Scans are written there instead of being let go, and far
-        regions of the map instead of being forgotten, by :meth:`clear_outside` or beyond `max_bytes`. It is locked as long
-        as the map lives.
+        An empty or new folder, or one that a map has used before. Scans are written there instead of being let go, and
+        regions instead of being forgotten by :meth:`clear_outside`. It is locked as long as the map lives.
 
     Raises
     ------
@@ -386,8 +385,7 @@ class LiveMap:
             If the file cannot be written.
         """
         with self._lock, self._state.whole():
-            state = self._state.stored()
-        save_state(state, path)
+            self._state.save(path)
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> LiveMap:
@@ -412,11 +410,11 @@ class LiveMap:
         OSError
             If it cannot be read, or another map uses `folder`.
         """
-        stored = load_state(path)
-        config, described = FitConfig.from_dict(stored.described.config), stored.described
+        described, scans, sums = load_state(path)
+        config = FitConfig.from_dict(described.config)
         live = cls(config, origin=described.origin, max_bytes=described.max_bytes, folder=folder)
-        live._state.restore(stored)
-        for scan_id, scan in stored.scans.items():
+        live._state.restore(described, scans, sums)
+        for scan_id, scan in zip(described.ids, scans, strict=True):
             live._follower.place(scan_id, scan)
         return live
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from radarsdf.live.regions import (
     region_places,
     regions_of,
 )
-from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, Stored
+from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
 from radarsdf.live.surface import GrowingSurface
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
 from radarsdf.returns.intensities import IntensityScale, Plausible
@@ -35,7 +36,6 @@ from radarsdf.returns.sums import QUANTA, ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
 _MARKS = 64  # lists of changed blocks, before they are joined
-_BYTES_OF_SUMS = 350  # of a cell with returns, in a table with room for twice as many
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
 _NOISE_RETURNS = 100_000  # for the noise: as many as those on flat surfels that are wanted, and more
 
@@ -63,7 +63,6 @@ class GrowingState:
         self.max_bytes = max_bytes
         self.log = ScanLog(folder)
         self._store = None if folder is None else RegionStore(folder)
-        self._in_use = NO_KEYS  # regions that the last change reached
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
@@ -88,64 +87,40 @@ class GrowingState:
         """Takes scans out and puts others in, also of the same ids, all or none. Returns the keys of the changed blocks."""
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         before, self.origin = self.origin, self.origin if origin is None else origin
-        done = False
+        blocks = None
         try:
-            blocks = self._apply(come.values(), left.values())
-            done = True
-            for scan_id in left.keys() - come.keys():
-                self.log.drop(scan_id)
-            for scan_id, scan in come.items():
-                self.log.put(scan_id, scan)
+            blocks = self._apply(come, left)
             if come:
                 self._bound()
         except BaseException:  # the disk is full, say
-            if done:
-                self._apply(left.values(), come.values())
-                for scan_id in come.keys() - left.keys():
-                    self.log.drop(scan_id)
-                for scan_id, scan in left.items():
-                    self.log.put(scan_id, scan)
+            if blocks is not None:
+                self._apply(left, come)
             self.origin = before
             raise
         return blocks
 
-    def _apply(self, come: Iterable[LoggedScan], gone: Iterable[LoggedScan]) -> Keys:
-        """Changes the sums, or leaves all as it was."""
+    def _apply(self, come: dict[ScanId, LoggedScan], gone: dict[ScanId, LoggedScan]) -> Keys:
+        """Changes the sums and the log, or leaves all as it was. Returns the keys of the changed blocks."""
         change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
         for scans, sign in ((gone, -1), (come, 1)):
-            for scan in scans:
+            for scan in scans.values():
                 rays = _rays_of([scan], self.config, self.origin)
                 change.collect(rays.points, rays.directions, rays.ranges_m, sign)
-        if self._store is not None:
-            blocks = change.block_keys()
-            self._bring_back(self._store.reached_by(blocks))
-            self._in_use = regions_of(blocks << BLOCK_BITS)
+        self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
         returns, visibility = self.sums.apply(change)
         self._mark(returns, visibility)
+        for scan_id in gone.keys() - come.keys():
+            self.log.drop(scan_id)
+        for scan_id, scan in come.items():
+            self.log.put(scan_id, scan)
         return returns
 
     def _bound(self) -> None:
-        """Puts regions away if there is a folder, and lets scans go, where memory is short."""
-        if self.max_bytes is None:
-            return
-        if self._store is not None and len(self._in_use):
-            cells = self.sums.num_cells
-            needed = min(self.sums.num_bytes, _BYTES_OF_SUMS * cells)
-            if self._surface is not None:  # it grows and shrinks with the next mesh
-                needed += round(self._surface.num_bytes_of_cell * cells)
-            if needed > self.max_bytes:
-                self._put_farthest_away()
-        if self.num_bytes > self.max_bytes:
+        """Lets scans go, to the folder if there is one, where memory is short."""
+        if self.max_bytes is not None and self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans that tell it may go
                 self._settle_noise()
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
-
-    def _put_farthest_away(self) -> None:
-        """Puts the farther half of the regions away, but for those that the last change reached."""
-        regions = np.setdiff1d(regions_of(self.sums.block_keys() << BLOCK_BITS), self._in_use)
-        away = region_places(regions) - region_places(self._in_use).mean(axis=0)
-        farthest = np.argsort(-np.square(away).sum(axis=1), kind="stable")
-        self._put_away(np.sort(regions[farthest[: (len(regions) + 1) // 2]]))
 
     def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
         """See :meth:`LiveMap.clear_outside`."""
@@ -176,7 +151,7 @@ class GrowingState:
 
     def _bring_back(self, regions: Keys) -> None:
         if self._store is not None:
-            blocks = self._store.bring_back(self.sums, regions)
+            blocks = self._store.bring_back(self.sums, np.intersect1d(regions, self._store.regions))
             self._mark(blocks, blocks)
 
     def _put_away(self, regions: Keys) -> Keys:
@@ -206,10 +181,10 @@ class GrowingState:
         """The surface is derived again from all sums."""
         self._surface = None
 
-    def stored(self) -> Stored:
-        """All that a file has to hold. Raises a ValueError for ids of scans that are neither numbers nor strings."""
-        keys, scans, sealed = self.sums.block_keys(), list(self.log.scans()), list(self.log.sealed)
-        if not all(type(scan_id) in (int, str) for scan_id in [*self.log.ids, *sealed]):
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes all to a file. Raises a ValueError for ids of scans that are neither numbers nor strings."""
+        keys, ids, sealed = self.sums.block_keys(), self.log.ids, list(self.log.sealed)
+        if not all(type(scan_id) in (int, str) for scan_id in [*ids, *sealed]):
             msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
             raise ValueError(msg)
         described: dict[str, Any] = {
@@ -221,18 +196,17 @@ class GrowingState:
             "with_intensities": self.with_intensities,
             "max_bytes": self.max_bytes,
             "sealed": sealed,
-            "ids": self.log.ids,
+            "ids": ids,
         }
         sums = (*self.sums.sums_of(keys), *self.sums.looks_of(keys))
-        return Stored(Described(**described), dict(zip(self.log.ids, scans, strict=True)), sums)
+        save_state(path, Described(**described), list(self.log.scans()), sums)
 
-    def restore(self, stored: Stored) -> None:
-        """Makes a new state that which was stored."""
-        described = stored.described
-        self.sums.insert(*stored.sums)
+    def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[NDArray[Any]]) -> None:
+        """Makes a new state that which was saved."""
+        self.sums.insert(*sums)
         self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
         self.next_id, self.with_intensities = described.next_id, described.with_intensities
-        for scan_id, scan in stored.scans.items():
+        for scan_id, scan in zip(described.ids, scans, strict=True):
             self.log.put(scan_id, scan)
         self.log.sealed |= set(described.sealed)
         self._bound()

@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from radarsdf._core import GrowingSums
 from radarsdf.checks import MAX_POSITION_M, check_poses, check_values_of_scan, positions
 from radarsdf.io.files import take_lock
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
-from radarsdf.live.regions import NO_KEYS, REGION_BITS, Keys, regions_of
+from radarsdf.live.regions import NO_KEYS, REGION_BITS, Keys
 from radarsdf.returns.evidence import BLOCK_BITS
 
 ScanId = Hashable
@@ -219,23 +219,19 @@ class RegionStore:
         return gone
 
     def bring_back(self, sums: GrowingSums, regions: Keys) -> Keys:
-        """Moves those of `regions` that are put away into `sums`, all or none. Returns the keys of their blocks, ascending."""
-        found = np.intersect1d(regions, self.regions).tolist()
-        if not found:
+        """Moves `regions` that are put away into `sums`, all or none. Returns the keys of their blocks, ascending."""
+        if len(regions) == 0:
             return NO_KEYS
-        paths = [self._paths[region] for region in found]
+        paths = [self._paths[region] for region in regions.tolist()]
         read = [_checked_sums(path, arrays_of(path, tuple(_CELL_COLUMNS))) for path in paths]
-        joined = [np.concatenate(columns) for columns in zip(*read, strict=True)]
-        sums.insert(*joined)
-        for region in found:
+        keys, counts, scans, look_keys, looks = (
+            np.concatenate(columns) for columns in zip(*read, strict=True)
+        )
+        sums.insert(keys, counts, scans, look_keys, looks)
+        for region in regions.tolist():
             with suppress(OSError):  # a file that stays harms nothing
                 self._paths.pop(region).unlink()
-        keys, _, _, look_keys, _ = joined
         return np.union1d(look_keys, keys >> BLOCK_BITS)
-
-    def reached_by(self, blocks: Keys) -> Keys:
-        """Those of the regions of `blocks` (B,) that are put away."""
-        return np.intersect1d(regions_of(blocks << BLOCK_BITS), self.regions, assume_unique=True)
 
 
 def _checked_sums(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], ...]:
@@ -273,18 +269,14 @@ class Described(BaseModel):
     ids: list[int | str]
 
 
-class Stored(NamedTuple):
-    """The state of a map."""
-
-    described: Described
-    scans: dict[ScanId, LoggedScan]
-    sums: tuple[NDArray[Any], ...]  # columns of cells and of blocks, as the core gives and takes them
-
-
-def save_state(stored: Stored, path: str | PathLike[str]) -> None:
-    """Writes a state whole or not at all."""
-    scans = list(stored.scans.values())
-    arrays: dict[str, NDArray[Any]] = dict(zip(_CELL_COLUMNS, stored.sums, strict=True))
+def save_state(
+    path: str | PathLike[str],
+    described: Described,
+    scans: Sequence[LoggedScan],
+    sums: Sequence[NDArray[Any]],
+) -> None:
+    """Writes a state whole or not at all. `sums`: columns of cells and of blocks, as the core gives and takes them."""
+    arrays: dict[str, NDArray[Any]] = dict(zip(_CELL_COLUMNS, sums, strict=True))
     arrays["poses"] = np.array([scan.pose for scan in scans]).reshape(-1, 4, 4)
     arrays["times_s"] = np.array([np.nan if scan.time_s is None else scan.time_s for scan in scans], float)
     columns = [[getattr(scan, name) for scan in scans] for name in FIELDS]
@@ -293,11 +285,13 @@ def save_state(stored: Stored, path: str | PathLike[str]) -> None:
     for name, column in zip(FIELDS, columns, strict=True):
         if held := [array for array in column if array is not None]:
             arrays[name] = np.concatenate(held)
-    arrays["described"] = np.frombuffer(stored.described.model_dump_json().encode(), np.uint8)
+    arrays["described"] = np.frombuffer(described.model_dump_json().encode(), np.uint8)
     write_arrays(path, arrays)
 
 
-def load_state(path: str | PathLike[str]) -> Stored:
+def load_state(
+    path: str | PathLike[str],
+) -> tuple[Described, list[LoggedScan], tuple[NDArray[Any], ...]]:
     """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
     arrays = arrays_of(Path(path), ("described", "poses", "times_s", "counts", *_CELL_COLUMNS, *FIELDS))
     try:
@@ -306,10 +300,10 @@ def load_state(path: str | PathLike[str]) -> Stored:
     except (KeyError, TypeError, ValueError) as error:
         msg = f"{path} is not the state of a live map of this version, or it is damaged: {error}"
         raise ValueError(msg) from error
-    return Stored(described, scans, _checked_sums(Path(path), arrays))
+    return described, scans, _checked_sums(Path(path), arrays)
 
 
-def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> dict[ScanId, LoggedScan]:
+def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> list[LoggedScan]:
     ids = described.ids
     if len({*ids, *described.sealed}) < len(ids) + len(described.sealed) or described.next_id in ids:
         msg = "ids are there twice"
@@ -320,14 +314,14 @@ def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> dict[Sca
     check_arrays(arrays, {"counts": (np.int64, len(FIELDS), len(ids)), "times_s": (np.float64, len(ids))})
     poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
     columns = [_by_scan(name, arrays, counts) for name, counts in zip(FIELDS, arrays["counts"], strict=True)]
-    scans: dict[ScanId, LoggedScan] = {}
+    scans = []
     for i, own in enumerate(zip(*columns, strict=True)):
         points = positions(own[0], f"points of scan {i}")
         for name, column in zip(FIELDS[1:], own[1:], strict=True):
             if column is not None:
                 check_values_of_scan(column, points, name, i)
         time_s = float(arrays["times_s"][i])
-        scans[ids[i]] = LoggedScan(poses[i].copy(), *own, time_s=time_s if np.isfinite(time_s) else None)
+        scans.append(LoggedScan(poses[i].copy(), *own, time_s=time_s if np.isfinite(time_s) else None))
     return scans
 
 

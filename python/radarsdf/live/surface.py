@@ -93,11 +93,6 @@ class GrowingSurface:
         tables = (self._leaves, self._cells, self._crossed, self.distances, self._visibility)
         return sum(table.num_bytes for table in tables) + self._triangles.num_bytes
 
-    @property
-    def num_bytes_of_cell(self) -> float:
-        """The same, for each leaf cell with returns."""
-        return self.num_bytes / max(self._leaves.num_rows, 1)
-
     def update(
         self, blocks: Keys, sums: ScanSums, seen: Keys, looks: Looks, noise: SensorNoise, num_threads: int
     ) -> Keys:
