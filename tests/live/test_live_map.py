@@ -108,7 +108,7 @@ def test_a_change_far_along_a_drive_is_all_that_is_made_anew():
     live.mesh()
     live.integrate(SCENE.points[7], poses[6], SCENE.intensities[7])
     surface, changes = live._state.changes()
-    redone = surface.update(*changes, 1)
+    redone = surface.update(*changes)
     assert 0 < len(redone) < 0.4 * len(surface.distances.regions)
     grown = mesh_bits(live.mesh())
     live._state.forget_surface()

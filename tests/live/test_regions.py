@@ -45,15 +45,15 @@ def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
 
 
 def test_ghosts_are_those_of_all_rays_and_planes():
-    scans = radarsdf.simulate.oculii(seed=6, frames=24)
+    scans = radarsdf.simulate.oculii(seed=6, frames=16)
     known = {"range_noise_m": 0.09, "azimuth_noise_rad": 0.012, "elevation_noise_rad": 0.02}
     live = LiveMap(FitConfig(num_threads=1, returns=known), origin=(0, 0, 0))
     found = []
-    for i in range(24):
+    for i in range(16):
         live.integrate(scans.points[i], scans.poses[i], scan_id=i)
-        if i >= 12:
-            live.remove(2 * (i - 12))
-        if i % 6 == 5:
+        if i >= 8:
+            live.remove(2 * (i - 8))
+        if i % 8 == 7:
             live.mesh()
             surface = live._state._surface
             leaves, cells = (table.gather(table.regions) for table in (surface._leaves, surface._cells))

@@ -76,7 +76,7 @@ def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
 
 
 def test_trained_tiles(drive, tmp_path):
-    config = FitConfig(num_threads=1, training={"sdf_iterations": 60, "intensity_iterations": 30})
+    config = FitConfig(num_threads=1, training={"sdf_iterations": 20, "intensity_iterations": 10})
     some = drive.select(np.arange(4))
     city = tiles_of(some, tmp_path / "city", config=config)
     whole = radarsdf.fit(some, config=config, progress=False)

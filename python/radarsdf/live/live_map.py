@@ -37,7 +37,6 @@ from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_
 from radarsdf.live.tracking import Follower
 from radarsdf.returns.moving import Movers
 from radarsdf.returns.rays import check_scans
-from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
     import trimesh
@@ -443,7 +442,7 @@ class LiveMap:
             with self._lock:
                 growing, changes = self._state.changes()
             try:
-                growing.update(*changes, resolve_num_threads(self.config.num_threads))
+                growing.update(*changes)
                 scene, surface = growing.surface()
             except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
                 self._state.forget_surface()

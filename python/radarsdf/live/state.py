@@ -160,7 +160,7 @@ class GrowingState:
         return blocks
 
     def changes(self) -> tuple[GrowingSurface, tuple[Any, ...]]:
-        """The surface as it was derived last, and the first arguments of its update."""
+        """The surface as it was derived last, and the arguments of its update."""
         if self._surface is None:
             surface = GrowingSurface(self.quick, np.zeros(3) if self.origin is None else self.origin)
             self._surface = None if self.origin is None else surface
@@ -175,7 +175,8 @@ class GrowingState:
         looks = Looks(*self.sums.looks_of(_blocks_of_regions(seen)))
         self._returns_changed, self._visibility_changed = [], []
         self._settle_noise()
-        return surface, (returns, sums, seen, looks, self.noise)
+        num_threads = resolve_num_threads(self.config.num_threads)
+        return surface, (returns, sums, seen, looks, self.noise, num_threads)
 
     def forget_surface(self) -> None:
         """The surface is derived again from all sums."""

@@ -321,7 +321,8 @@ def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> list[Log
             if column is not None:
                 check_values_of_scan(column, points, name, i)
         time_s = float(arrays["times_s"][i])
-        scans.append(LoggedScan(poses[i].copy(), *own, time_s=time_s if np.isfinite(time_s) else None))
+        known_s = time_s if np.isfinite(time_s) else None
+        scans.append(LoggedScan(poses[i].copy(), **dict(zip(FIELDS, own, strict=True)), time_s=known_s))
     return scans
 
 

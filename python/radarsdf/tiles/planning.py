@@ -226,8 +226,8 @@ class _Planner:
 
     def _completed(self, plan: Plan) -> Plan:
         """The plan with the noise and the clutter ratio of the largest tiles, and with the cost of each."""
-        noises, clutter, returns, cells = [], 0.0, 0, 0
-        tiles = []
+        noises: list[SensorNoise] = []
+        tiles, clutter, returns, cells = [], 0.0, 0, 0
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns):
             rays, inside = read_rays(self._folder, plan, tile)
             cost = estimate_rays(rays, plan.config, inside)
