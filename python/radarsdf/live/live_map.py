@@ -35,13 +35,13 @@ from radarsdf.live.regions import Keys
 from radarsdf.live.state import GrowingState
 from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
 from radarsdf.live.tracking import Follower
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.threshold import Limits
 from radarsdf.returns.moving import Movers
 from radarsdf.returns.rays import check_scans
 
 if TYPE_CHECKING:
     import trimesh
-
-    from radarsdf.map.radar_map import RadarMap
 
 
 @dataclass(frozen=True)
@@ -435,8 +435,6 @@ class LiveMap:
         ValueError
             If a limit is out of range.
         """
-        from radarsdf.map.threshold import Limits  # noqa: PLC0415 - only a mesh needs it
-
         wanted = Limits.of(self.config.leaf_size_m, **limits)
         with self._reading:
             with self._lock:

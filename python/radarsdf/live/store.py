@@ -96,10 +96,6 @@ class _OnDisk:
         return LoggedScan(self.pose, **columns, time_s=self.time_s)
 
 
-class SealedScan(ValueError):
-    """A scan is in the map, but can be neither moved nor taken out: it was let go to bound the memory."""
-
-
 class ScanLog:
     """Scans by their ids, in the order in which they came.
 
@@ -131,10 +127,10 @@ class ScanLog:
         return self._scans.get(scan_id)
 
     def get(self, scan_id: ScanId) -> LoggedScan:
-        """A scan. Raises a KeyError if there is none of this id, SealedScan if it was let go."""
+        """A scan. Raises a KeyError if there is none of this id, a ValueError if it was let go."""
         if scan_id in self.sealed:
             msg = f"scan {scan_id!r} cannot be moved or taken out: it was let go to keep to max_bytes; give the map a folder to keep scans in"
-            raise SealedScan(msg)
+            raise ValueError(msg)
         if scan_id not in self._scans:
             msg = f"the map has no scan {scan_id!r}"
             raise KeyError(msg)

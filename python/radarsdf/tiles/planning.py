@@ -165,22 +165,16 @@ class _Planner:
                 file.write(records.data)
 
     def _rays(self, scans: list[Scan], first: int) -> Rays:
-        """Static returns, checked, in a frame of their own. An error names the scan."""
-        try:
-            return self._prepared(scans)
-        except (ValueError, TypeError) as error:
-            for number, scan in enumerate(scans, first):
-                try:
-                    self._prepared([scan])
-                except (ValueError, TypeError) as of_one:
-                    msg = f"scan {number}: {of_one}"
-                    raise ValueError(msg) from error
-            raise
-
-    def _prepared(self, scans: list[Scan]) -> Rays:
+        """Static returns, checked, in a frame of their own."""
         held = scans_in_memory(scans)
-        static = Standing.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
-        return prepare(static.points, held.poses, static.intensities, whole=False, **self._config.preparation)
+        try:
+            static = Standing.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
+            return prepare(
+                static.points, held.poses, static.intensities, whole=False, **self._config.preparation
+            )
+        except (ValueError, TypeError) as error:
+            msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
+            raise ValueError(msg) from error
 
     def plan(self, input_digest: str) -> Plan:
         """The plan, once all scans are given. Tiles without a return of their own are left out."""
