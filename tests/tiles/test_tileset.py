@@ -60,6 +60,22 @@ def test_a_viewer_finds_the_mesh_where_it_is(city, tmp_path):
     np.testing.assert_allclose(*normals, atol=0.01)  # turned, not mirrored
 
 
+def test_small_components_go_unless_they_reach_a_border(city, tmp_path):
+    whole, most, none = (
+        city.export(tmp_path / "city.json", 0.2, min_component_triangles=least, progress=False)[1]
+        for least in (0, 40, 10**9)
+    )
+    mesh = city.mesh(0.2, min_component_triangles=40, progress=False)
+    assert 0 < none <= len(mesh.faces) <= most < whole
+    tileset = json.loads((tmp_path / "city.json").read_bytes())  # what is left is all at borders
+    for leaf, transform in leaves_of(tileset["root"]):
+        part = trimesh.load_mesh(tmp_path / leaf["content"]["uri"], process=False)
+        world = (part.vertices @ Z_UP.T + transform[:3, 3])[:, :2] - city.plan.grid.corner_m
+        away_m = np.abs(world - city.plan.tile_m * np.round(world / city.plan.tile_m)).min(axis=1)
+        for component in trimesh.graph.connected_components(part.edges, nodes=np.arange(len(world))):
+            assert away_m[component].min() < 1e-3
+
+
 def test_a_file_in_the_way_is_said_before_the_work(city, tmp_path):
     (tmp_path / "city").write_text("not a folder")
     with pytest.raises(FileExistsError):

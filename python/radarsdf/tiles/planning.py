@@ -108,13 +108,9 @@ class _Planner:
 
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
         self._folder, self._config, self._grid = folder, config, grid
-        self._origins: dict[
-            Tile, NDArray[np.int64]
-        ] = {}  # (3,) of the tiles' maps, leaf cells of the lattice
+        self._origins: dict[Tile, NDArray[np.int64]] = {}  # (3,) of the tiles' maps, leaf cells
         self._counts: dict[Tile, NDArray[np.int64]] = {}  # of returns in each tile, and of rays
-        self._axes: list[
-            NDArray[np.float64]
-        ] = []  # (F, 6) from where scans were seen, and their z axes, world
+        self._axes: list[NDArray[np.float64]] = []  # (F, 6) where scans were seen from, and z axes, world
         self._samples: list[Scan] = []  # every n-th scan
         self._every = 1
         self._intensities = Intensities()
