@@ -22,7 +22,7 @@ from radarsdf.map import queries, storage
 from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
 from radarsdf.returns.sums import lattice_of
-from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path
+from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path, neighbours
 
 _MEMORY_BYTES = 1 << 30
 _OF_FEATURES = 2.4  # bytes in memory for each of the features: measured; tables of cells, evidence
@@ -136,9 +136,9 @@ class TileBlend(Map):
         for share in self._shares(world):
             _, inside = queries.into_cells(share.contents, share.local)
             owners = self.plan.grid.tiles_of(world[share.rows])
-            owners, which = np.unique(owners, axis=0, return_inverse=True)
-            decides = [tile == share.tile or not self.has(tile) for tile in map(tuple, owners.tolist())]
-            found[share.rows] |= inside.numpy() & np.array(decides, bool)[which.ravel()]
+            for tile in neighbours(share.tile):
+                if tile == share.tile or not self.has(tile):
+                    found[share.rows] |= inside.numpy() & (owners == tile).all(axis=1)
         return found
 
     def _known_shares(self, world: _Floats, extrapolate: bool) -> Iterator[Share]:

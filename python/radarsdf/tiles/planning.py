@@ -141,10 +141,11 @@ class _Planner:
         owner = self._grid.tiles_of(points)
         pairs = list(self._grid.crossed(points, sensors))
         rows = np.concatenate([pair[0] for pair in pairs])
-        tiles, which = np.unique(np.concatenate([pair[1] for pair in pairs]), axis=0, return_inverse=True)
-        order = np.lexsort((rows, which.ravel()))
-        ends = np.cumsum(np.bincount(which.ravel(), minlength=len(tiles)))
-        for (i, j), own in zip(tiles.tolist(), np.split(rows[order], ends[:-1]), strict=True):
+        tiles = np.concatenate([pair[1] for pair in pairs])
+        order = np.lexsort((rows, tiles[:, 1], tiles[:, 0]))
+        rows, tiles = rows[order], tiles[order]
+        starts = np.flatnonzero((tiles[1:] != tiles[:-1]).any(axis=1)) + 1
+        for (i, j), own in zip(tiles[np.append(0, starts)].tolist(), np.split(rows, starts), strict=True):
             tile = (i, j)
             path = rays_path(self._folder, tile)
             if tile not in self._origins:
