@@ -42,7 +42,7 @@ def fit_tiles(
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> TiledMap:
-    """Fits a map in tiles. Neither all returns nor all of the map are ever in memory.
+    """Fit a map in tiles. Neither all returns nor all of the map are ever in memory.
 
     If `out` holds a plan of the same scans and settings, tiles that are done are kept: call it again after anything went
     wrong. The result has the same bits with any executor, if ``config.num_threads`` is given.

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import itertools
 import shutil
 from collections.abc import Callable
 from functools import cached_property, partial
@@ -116,19 +115,16 @@ class TiledMap(TileBlend):
         last = np.floor(lattice.cells(upper)).astype(np.int64) + 1
         shape = tuple((last - first).tolist())
         passed, returns, observed = np.zeros(shape, np.uint8), np.zeros(shape, bool), np.zeros(shape, bool)
-        begin, end = first[:2] // edge, (last[:2] - 1) // edge
-        for tile in itertools.product(range(begin[0], end[0] + 1), range(begin[1], end[1] + 1)):
-            if not self.has(tile):
-                continue
-            own = np.array(tile) * edge
+        for planned in self.tiles:
+            own = np.array(planned.tile) * edge
             start = np.array([*np.maximum(own, first[:2]), first[2]])
             stop = np.array([*np.minimum(own + edge, last[:2]), last[2]])
-            place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
-            x, y, z = (stop - start).tolist()
-            found = queries.dense_cells(
-                self.contents_of(tile), start - self.plan.origin_cells(tile), (x, y, z)
-            )
-            passed[place], returns[place], observed[place] = found
+            if (start < stop).all():
+                x, y, z = (stop - start).tolist()
+                here = start - self.plan.origin_cells(planned.tile)
+                found = queries.dense_cells(self.contents_of(planned.tile), here, (x, y, z))
+                place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
+                passed[place], returns[place], observed[place] = found
         return queries.CellsInBox(lattice.position(first), passed, returns, observed)
 
     def echoes(self) -> EchoesAt:
@@ -290,7 +286,7 @@ class TiledMap(TileBlend):
 
 
 def load(path: str | PathLike[str]) -> Map:
-    """Reads a map: a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
+    """Read a map: a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
 
     Parameters
     ----------
