@@ -11,7 +11,6 @@ from radarsdf import FitConfig, LiveMap
 from radarsdf._core import cell_keys
 from radarsdf.live.ghosts import means_of, surfels_of
 from radarsdf.live.regions import REGION_CELLS, RegionTable, region_places
-from radarsdf.map.mesh import Surface
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.sums import lattice_of
 
@@ -62,17 +61,3 @@ def test_ghosts_are_those_of_all_rays_and_planes():
             np.testing.assert_array_equal(cells["ghosts"], ghosts)
             found.append(int(ghosts.sum()))
     assert min(found) > 50
-
-
-def test_areas_round_vertices_of_several_regions_are_those_of_all_their_triangles():
-    scans = radarsdf.simulate.wall(seed=6, frames=4)
-    live = LiveMap(FitConfig(num_threads=1), origin=(0, 0, 0))
-    for i in range(4):
-        live.integrate(scans.points[i], scans.poses[i])
-        live.mesh()
-    growing = live._state._surface
-    assert len(growing._triangles._parts) > 2
-    scene, found = growing.surface()
-    whole = Surface.told_by(scene, found.vertices, found.faces, found.evidence, found.cells_searched)
-    np.testing.assert_allclose(found.tally.sums(), whole.tally.sums(), rtol=1e-9, atol=1e-12)
-    assert found.tally.area_m2.sum() > 10
