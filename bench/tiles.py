@@ -160,7 +160,7 @@ def growth_row(count: int) -> Row:
             with timed() as fitting:
                 city = run_fits(out, executor=executor, progress=False)
             with timed() as meshing:
-                _, triangles = city.export(out / "mesh.ply", 0.2, executor=executor, progress=False)
+                _, triangles = city.export(out / "mesh.ply", 0.2, progress=False)
         used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         processor_s = sum(of.ru_utime + of.ru_stime for of in used)
         disk_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6

@@ -23,7 +23,7 @@ def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> 
 
 def check_triangles(count: int, max_memory_bytes: int | None) -> None:
     """Raises a MemoryError if the mesh of a map in tiles has more triangles than memory holds."""
-    way_out = "take a part, by a box, or write it tile by tile (radarsdf tiles mesh)"
+    way_out = "take a part, by a box, or write 3D Tiles (radarsdf tiles mesh -o NAME.json)"
     _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, way_out)
 
 

@@ -61,16 +61,6 @@ def test_step_by_step_gives_the_same_mesh(city, scans_file, tmp_path, capsys):
     assert values(capsys, "tiles", "status", out)["missing"] == {}
 
 
-def test_a_clean_folder(city, copied, tmp_path, capsys):
-    ply = tmp_path / "mesh.ply"
-    freed = values(capsys, "tiles", "clean", copied)["bytes"]
-    assert freed > 20 * 9000  # at least a ray for each return
-    assert not list(copied.glob("tiles/*/rays.bin"))
-    assert values(capsys, "tiles", "status", copied)["missing"] == {}
-    assert call("tiles", "mesh", copied, "-o", ply, *VOXEL, "--quiet") == 0
-    assert ply.read_bytes() == (city / "mesh.ply").read_bytes()
-
-
 @pytest.mark.usefixtures("small_pictures")
 def test_a_tile_that_failed_is_named_by_every_command(copied, scans_file, tmp_path, capsys):
     name = max(radarsdf.load(copied).plan.tiles, key=lambda tile: tile.returns).name

@@ -50,25 +50,6 @@ def test_a_map_that_was_put_away_comes_back_where_scans_reach_it(tmp_path):
     assert live.sealed_scans == 0
 
 
-def test_the_farthest_regions_go_where_memory_is_short(tmp_path):
-    numbers = [0, 4, 1, 5, 2, 6, 3, 7]  # here and there
-    whole = map_of(numbers)
-    whole.mesh()
-    max_bytes = int(0.85 * whole.num_bytes)  # more than one place takes
-    bounded = map_of([], max_bytes=max_bytes, folder=tmp_path / "kept")
-    moved, before = 0, []
-    for i in numbers:
-        bounded.integrate(SCENE.points[i], FAR[i], SCENE.intensities[i], scan_id=i)
-        bounded.mesh()
-        assert bounded.num_bytes <= 1.02 * max_bytes  # the last mesh may have grown a little
-        after = put_away(tmp_path / "kept")
-        moved += after != before
-        before = after
-    assert moved > 2  # away and back
-    bounded.save(tmp_path / "live.npz")
-    assert state(LiveMap.load(tmp_path / "live.npz")) == state(whole)
-
-
 def test_a_state_has_what_is_put_away(tmp_path):
     live = map_of(range(7), folder=tmp_path / "kept")
     whole = state(live)

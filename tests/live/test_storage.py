@@ -76,8 +76,8 @@ def test_damaged_files_are_refused(tmp_path):
             LiveMap.load(file)
     described = json.loads(arrays["described"].tobytes())
     for name, value in (
-        ("format", 2), ("origin", None), ("noise", [math.nan] * 3), ("next_id", 1), ("max_bytes", -1), ("sealed", [0]),
-        ("ids", [0, 0]), ("held", [["points"]] * 3), ("config", []),
+        ("format", 1), ("origin", None), ("noise", [math.nan] * 3), ("next_id", 1), ("max_bytes", -1), ("sealed", [0]),
+        ("ids", [0, 0]), ("config", []),
     ):  # fmt: skip
         text = json.dumps(described | {name: value}).encode()
         np.savez(file, **arrays | {"described": np.frombuffer(text, np.uint8)})

@@ -42,17 +42,18 @@ def rms_m(live, true):
 def test_scans_are_put_where_they_were_taken(drive, sign, most_mps):
     scans, motion = drive
     live = LiveMap(SETTINGS)
-    follow(live, scans, motion, range(25), sign, most_mps)
+    follow(live, scans, motion, range(16), sign, most_mps)
     assert rms_m(live, scans.poses) < 0.015
-    assert len(live.mesh().faces) > 3_000
+    assert len(live.mesh().faces) > 2_000
 
 
-@pytest.mark.parametrize("seed", [9, 11])  # 3 to 16 m off, or lost, while first scans were not placed again
-def test_a_drive_that_begins_fast_is_placed_as_by_odometry(seed):
-    scans = radarsdf.simulate.oculii(seed=seed, frames=20)
+def test_a_drive_that_begins_fast_is_placed_as_by_odometry():
+    """3 to 16 m off, or lost, while first scans were not placed again."""
+    seed = 11
+    scans = first(radarsdf.simulate.oculii, 12, seed=seed, frames=20)
     motion = radarsdf.simulate.measured_motion(scans, seed=seed)
     live = LiveMap(SETTINGS)
-    moved = [follow(live, scans, motion, [i], sign=-1).moved for i in range(20)]
+    moved = [follow(live, scans, motion, [i], sign=-1).moved for i in range(12)]
     assert live._follower._steps[-1].sign == -1
     assert moved[3] == (1, 2)
     assert moved[7] == (1, 2, 3, 4, 5, 6)
@@ -91,15 +92,15 @@ def test_what_cannot_be_followed_is_refused_and_leaves_nothing(drive):
         scan = {"points": scans.points[i], "doppler_mps": motion.doppler_mps[i], "time_s": motion.times_s[i]}
         return to.integrate(**scan | changes)
 
-    for i in range(8):
+    for i in range(4):
         add(other, i)
         add(live, i)
         with pytest.raises(ValueError, match="must be later"):
             add(live, i)
     noise = np.random.default_rng(0).uniform(-30, 30, (2000, 3))
     with pytest.raises(Lost, match="nowhere near"):  # a scan of clutter, after a gap in time
-        add(live, 8, points=noise, doppler_mps=None, time_s=motion.times_s[8] + 3)
-    assert add(live, 8).pose.tobytes() == add(other, 8).pose.tobytes()
+        add(live, 4, points=noise, doppler_mps=None, time_s=motion.times_s[4] + 3)
+    assert add(live, 4).pose.tobytes() == add(other, 4).pose.tobytes()
 
 
 def test_the_way_along_a_wall_is_not_guessed():
@@ -126,7 +127,7 @@ def test_a_sensor_that_stands_leaves_the_sign_of_its_doppler_open(drive):
         noisy = scans.points[0] + rng.normal(0, 0.02, scans.points[0].shape)
         live.integrate(noisy, doppler_mps=rng.normal(0, 0.05, len(noisy)), time_s=motion.times_s[i])
         assert live._follower._steps[-1].sign == 0
-    for i in range(1, 25):
+    for i in range(1, 14):
         live.integrate(scans.points[i], doppler_mps=-motion.doppler_mps[i], time_s=motion.times_s[i] + 0.5)
     assert live._follower._steps[-1].sign == -1
 
@@ -137,16 +138,16 @@ def test_the_next_scan_is_placed_where_the_map_has_the_others(drive, tmp_path):
     shift = np.eye(4)
     shift[:3, :3], shift[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [30.0, -20.0, 4.0]
     live = LiveMap(SETTINGS)
-    follow(live, scans, motion, range(12))
-    live.move_all({i: shift @ T[i] for i in range(12)})  # a closed loop
+    follow(live, scans, motion, range(8))
+    live.move_all({i: shift @ T[i] for i in range(8)})  # a closed loop
     live.save(tmp_path / "live.npz")
     loaded = LiveMap.load(tmp_path / "live.npz")
     for one in (live, loaded):
-        done = follow(one, scans, motion, [12])
-        assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[12])[:3, 3]) < 0.1
+        done = follow(one, scans, motion, [8])
+        assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[8])[:3, 3]) < 0.1
     wrong = shift.copy()
     wrong[:3, 3] += [20.0, 0.0, 0.0]
-    live.integrate(scans.points[13], wrong @ T[13], time_s=motion.times_s[13], scan_id="bad")
+    live.integrate(scans.points[9], wrong @ T[9], time_s=motion.times_s[9], scan_id="bad")
     live.remove("bad")
-    done = follow(live, scans, motion, [13])
-    assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[13])[:3, 3]) < 0.1
+    done = follow(live, scans, motion, [9])
+    assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[9])[:3, 3]) < 0.1

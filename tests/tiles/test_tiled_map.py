@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -35,6 +36,26 @@ def test_answers_are_those_of_one_map(city, whole, points):
     assert 0.9 < np.median(ratio) < 1.1
     difference = np.abs(city.confidence(points) - whole.confidence(points))
     assert np.median(difference) < 0.05
+    gradients = city.gradient(points), whole.gradient(points)
+    assert np.quantile(np.linalg.norm(gradients[0] - gradients[1], axis=1), 0.95) < 0.05
+
+
+def test_beyond_a_tile_that_is_missing_its_neighbours_answer_within_half_a_halo(
+    folder, city, points, tmp_path
+):
+    shutil.copytree(folder, tmp_path / "city")
+    gone = max(city.tiles, key=lambda tile: tile.returns)
+    (tmp_path / "city" / "tiles" / gone.name / "map.safetensors").unlink()
+    lacking = radarsdf.load(tmp_path / "city")
+    grid = city.plan.grid
+    owned = points[(grid.tiles_of(points) == gone.tile).all(axis=1)]
+    own_m = np.column_stack([owned[:, :2] - grid.lower_corner(gone.tile)] * 2)
+    to_border_m = np.minimum(own_m, TILE_M - own_m).min(axis=1)
+    seen = lacking.observed(owned)
+    assert not seen[to_border_m > grid.halo_m / 2].any()
+    near = (to_border_m < grid.halo_m / 2 - 0.1) & city.observed(owned)
+    assert seen[near].sum() > 20
+    np.testing.assert_allclose(lacking.sdf(owned[seen]), city.sdf(owned[seen]), atol=0.1)
 
 
 def near_borders(points, offset_m=0.0):

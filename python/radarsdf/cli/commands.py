@@ -38,7 +38,6 @@ TILE_STEPS = {
     "fit": "Fit the tiles of a plan; those that are done are kept.",
     "mesh": "Write the surface of all tiles as one mesh.",
     "status": "Name the tiles that are not done, and why: exit status 1.",
-    "clean": "Remove the rays of tiles that are done, and parts of meshes.",
 }
 """The steps of ``radarsdf tiles``, functions of the module `tiles`, and their help."""
 

@@ -9,12 +9,12 @@ import itertools
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.options import Recording, Settings, Surface
 from radarsdf.cli.results import Results
-from radarsdf.cli.scans import add_segments, finding_poses, scans_or_unposed, warn_or_refuse
+from radarsdf.cli.scans import warn_or_refuse
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -30,14 +30,12 @@ class Cut:
 
     tile_size: Edge of a tile, m; default: 512 leaf cells.
     halo: Margin around a tile that its fit sees, m.
-    refine: Refine the poses by the returns before the plan is made; they are written into the folder, poses.tum.
     geometry_only: Do not use the intensities.
     no_check: Do not check the first scans.
     """
 
     tile_size: float | None = None
     halo: float | None = None
-    refine: bool = False
     geometry_only: bool = False
     no_check: bool = False
 
@@ -96,7 +94,7 @@ def run(
     """
     plan(recording, out=out, cut=cut, where=where, settings=settings, results=results)
     missing = fit(out, where=where, results=results)
-    mesh(out, where=where, surface=surface, results=results)
+    mesh(out, surface=surface, results=results)
     return missing
 
 
@@ -111,8 +109,8 @@ def plan(
     from radarsdf.tiles.fit_tiles import plan_tiles
 
     config = settings.load()
-    scans, missing = scans_or_unposed(recording)
-    if not cut.no_check and missing is None:  # a city of wrong poses would take hours
+    scans = recording.read()
+    if not cut.no_check:  # a city of wrong poses would take hours
         first = list(itertools.islice(iter(scans), _FIRST_SCANS))
         if len(first) > 1:
             some = scans_in_memory(first)
@@ -122,30 +120,19 @@ def plan(
         used = Scans.of_source(
             lambda: (dataclasses.replace(scan, intensities=None) for scan in scans),
             Notes(str(recording.scans)),
-            imu=lambda: scans.imu,
         )
-    with finding_poses(missing):
-        planned = plan_tiles(
-            used,
-            out,
-            tile_size=cut.tile_size,
-            halo=cut.halo,
-            config=config,
-            threads=None if where.is_here else 1,
-            refine=cut.refine,
-            find=missing is not None,
-            progress=results.progress,
-        )
+    planned = plan_tiles(
+        used,
+        out,
+        tile_size=cut.tile_size,
+        halo=cut.halo,
+        config=config,
+        threads=None if where.is_here else 1,
+    )
     _add_plan(results, planned, out)
 
 
 def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
-    from radarsdf.tiles.drive_poses import TRAJECTORY, DrivePoses
-
-    if (poses := DrivePoses.load(folder)) is not None:
-        way: dict[str, Any] = poses.posed.way or {}
-        results.add(way["verdict"], poses=folder / TRAJECTORY, improved=way["improved"])
-        add_segments(results, poses.posed)
     returns, rays = (sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays"))
     seconds, most = sum(tile.seconds for tile in plan.tiles), max(tile.memory_bytes for tile in plan.tiles)
     results.add(
@@ -178,11 +165,11 @@ def fit(folder: Path, *, tile: list[str] | None = None, where: Where, results: R
     return status(folder, tile=tile, results=results)
 
 
-def mesh(folder: Path, *, out: Path | None = None, where: Where, surface: Surface, results: Results) -> None:
+def mesh(folder: Path, *, out: Path | None = None, surface: Surface, results: Results) -> None:
     """Write the surface of all tiles as one mesh.
 
     folder: What radarsdf tiles fit wrote.
-    out: The mesh to write: a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder.
+    out: The mesh to write: one file, or a .json file for 3D Tiles; default: mesh.ply in the folder.
     """
     from radarsdf.io.files import check_outputs
     from radarsdf.tiles.tiled_map import TiledMap
@@ -190,10 +177,7 @@ def mesh(folder: Path, *, out: Path | None = None, where: Where, surface: Surfac
     out = folder / "mesh.ply" if out is None else out
     check_outputs([out])
     city = TiledMap(folder)
-    with where.executor(folder) as executor:
-        vertices, triangles = city.export(
-            out, surface.voxel, **surface.limits, executor=executor, progress=results.progress
-        )
+    vertices, triangles = city.export(out, surface.voxel, **surface.limits, progress=results.progress)
     line = f"{vertices} vertices and {triangles} triangles written to {out}"
     results.add(line, vertices=vertices, triangles=triangles, out=out)
     results.add_threshold(city.threshold(surface.voxel, **surface.limits).metadata)
@@ -215,14 +199,3 @@ def status(folder: Path, *, tile: list[str] | None = None, results: Results) -> 
     for name, reason in missing.items():
         warn(f"error: {name}: {reason}")
     return int(bool(missing))
-
-
-def clean(folder: Path, *, results: Results) -> None:
-    """Remove what is no longer needed.
-
-    folder: What radarsdf tiles fit wrote.
-    """
-    from radarsdf.tiles.tiled_map import TiledMap
-
-    freed = TiledMap(folder).clean()
-    results.add(f"{freed / 1e6:.1f} MB of rays and parts of meshes removed from {folder}", bytes=freed)

@@ -16,9 +16,6 @@ from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels
 from radarsdf.returns.sums import MeanRays, merged_keys
 
-NOWHERE = np.uint64(2**64 - 1)
-"""In the place of the key of a cell: a ray crosses no plane."""
-
 _Boxes = NDArray[np.float64]  # (R, 2, 3) lower and upper corners, local frame, m
 
 
@@ -48,12 +45,6 @@ def means_of(rows: Rows) -> MeanRays:
 class GrowingGhosts:
     """The four steps of :func:`find_ghosts`, each repeated only where its result may differ.
 
-    1. Which flat plane does each ray cross first? Columns `first` of leaf cells: the key of the plane's cell, or
-       :data:`NOWHERE`; `passed` of cells of surfels: how many rays cross its plane first.
-    2. Which planes do most rays end at? `opaque` of cells of surfels.
-    3. How many rays of each cell end behind an opaque plane? `behind` of cells of surfels.
-    4. Round which cells are most returns behind one? `ghosts` of cells of surfels.
-
     The result for a ray depends on the planes along it, which may be in other regions than its end. So each region has a box
     that holds all rays that end in it: a plane matters to them only if the region of the plane meets the box.
     """
@@ -69,33 +60,37 @@ class GrowingGhosts:
 
         Returns the keys of the cells of surfels that became ghosts or are none any more, ascending.
         """
-        boxes_before = self._boxes_of(of_rays)
+        before = self._boxes_of(of_rays)
         self._find_boxes(of_rays)
         rays = np.union1d(of_rays, self._ends_of_rays_through(of_planes))
+        self._find_first(rays, noise, num_threads)
         # Rays that are gone passed planes, too.
-        planes = self._planes_in(np.concatenate([self._boxes_of(rays), boxes_before]))
-        self._find_first(rays, planes, noise, num_threads)
-        of_opaque = np.union1d(of_planes, self._find_opaque(planes, num_threads))
-        rays = np.union1d(rays, self._ends_of_rays_through(of_opaque))
+        opaque = self._find_opaque(
+            self._planes_in(np.concatenate([self._boxes_of(rays), before])), num_threads
+        )
+        rays = np.union1d(rays, self._ends_of_rays_through(np.union1d(of_planes, opaque)))
         self._find_behind(rays, noise, num_threads)
-        return self._find_ghosts(rays, num_threads)
+        cells = self._cells.gather(regions_near(rays, 2))
+        ghosts = mostly_behind(surfels_of(cells, self._leaf_size_m), cells["behind"], num_threads)
+        differs = self._put_own(regions_near(rays, 1), "ghosts", ghosts, cells)
+        found: Keys = cells["keys"][differs]
+        return found
 
     def _boxes_of(self, regions: Keys) -> _Boxes:
-        """Those that hold the rays that end in these regions; of regions without rays none."""
         found = [self._boxes[region] for region in regions.tolist() if region in self._boxes]
         return np.array(found).reshape(-1, 2, 3)
 
     def _find_boxes(self, regions: Keys) -> None:
         for region in regions:
             rows = self._leaves.gather(region[None])
-            if len(rows["keys"]) == 0:
-                self._boxes.pop(int(region), None)
-                continue
-            ends = rows["points"].astype(np.float64)
-            sensors = ends - rows["directions"] * rows["ranges_m"][:, None].astype(np.float64)
-            both = np.concatenate([ends, sensors])
-            margin_m = self._leaf_size_m  # more than rounding
-            self._boxes[int(region)] = np.stack([both.min(axis=0) - margin_m, both.max(axis=0) + margin_m])
+            self._boxes.pop(int(region), None)
+            if len(rows["keys"]):
+                ends = rows["points"].astype(np.float64)
+                sensors = ends - rows["directions"] * rows["ranges_m"][:, None].astype(np.float64)
+                both, margin_m = np.concatenate([ends, sensors]), self._leaf_size_m  # more than rounding
+                self._boxes[int(region)] = np.stack(
+                    [both.min(axis=0) - margin_m, both.max(axis=0) + margin_m]
+                )
 
     def _cubes(self, regions: Keys) -> _Boxes:
         """What the regions themselves span."""
@@ -118,74 +113,57 @@ class GrowingGhosts:
         return surfels, np.flatnonzero(surfels.is_flat())
 
     def _put_own(self, regions: Keys, column: str, found: NDArray[Any], cells: Rows) -> NDArray[np.bool_]:
-        """Keeps what was found of `cells`, those in `regions` and round them. Returns which of those in them differ from before."""
+        """Keeps what was found of `cells`, those in `regions` and near them. Returns which of those in them differ from before."""
         own = np.isin(self._cells.regions_of(cells["keys"]), regions)
         differs: NDArray[np.bool_] = own & (found != cells[column])
         cells[column] = found
         self._cells.put(regions, {name: values[own] for name, values in cells.items()})
         return differs
 
-    def _find_first(self, rays: Keys, planes: Keys, noise: SensorNoise, num_threads: int) -> None:
-        """Step 1, of the rays that end in the regions `rays`. `planes`: all regions that they pass, or passed before."""
-        rows, cells = self._leaves.gather(rays), self._cells.gather(planes)
-        surfels, flat = self._surfels(cells)
-        found = first_crossed(surfels, flat, means_of(rows), noise, num_threads)
-        keys = np.append(surfels.keys[surfels.cell_of_plane[flat]], NOWHERE)  # the last is that of -1
-        first = rows["first"] = keys[found]
-        # Of rays that end in other regions, the counts stay. They are whole numbers, so that what is taken away and added
-        # leaves the bits of a new count. The last is that of cells that are there no more.
-        passed = np.append(cells["passed"], 0.0)
-        ends = np.searchsorted(self._leaves.regions_of(rows["keys"]), rays, side="right").tolist()
-        starts = [0, *ends[:-1]]
-        for region, start, end in zip(rays.tolist(), starts, ends, strict=True):
-            old = self._crossings.pop(region, None)
-            if old is not None:
-                passed[surfels.blocks.rows(old[0], 1)] -= old[1]
-            if start == end:
-                continue
-            crossed, which = np.unique(first[start:end], return_inverse=True)
-            counted = np.bincount(which, rows["counts"][start:end], len(crossed))
-            new = self._crossings[region] = crossed[crossed != NOWHERE], counted[crossed != NOWHERE]
-            passed[surfels.blocks.rows(new[0], 1)] += new[1]
-        cells["passed"] = passed[:-1]
+    def _find_first(self, rays: Keys, noise: SensorNoise, num_threads: int) -> None:
+        """Which plane does each ray that ends in these regions cross first?"""
+        rows = self._leaves.gather(rays)
+        surfels, flat = self._surfels(self._cells.gather(self._planes_in(self._boxes_of(rays))))
+        first = first_crossed(surfels, flat, means_of(rows), noise, num_threads)
+        rows["crosses"] = first >= 0
         self._leaves.put(rays, rows)
-        self._cells.put(planes, cells)
+        keys, regions = surfels.keys[surfels.cell_of_plane[flat]], self._leaves.regions_of(rows["keys"])
+        for region in rays:
+            own = (regions == region) & rows["crosses"]
+            crossed, which = np.unique(first[own], return_inverse=True)
+            counts = np.bincount(which, rows["counts"][own], len(crossed))
+            self._crossings[int(region)] = keys[crossed], counts.astype(np.float64)
 
     def _find_opaque(self, planes: Keys, num_threads: int) -> Keys:
-        """Step 2, of the planes in these regions. Returns the regions in which an answer differs, ascending."""
-        cells = self._cells.gather(regions_near(planes, 1))  # rays past the cells round a plane count, too
+        """Which planes in these regions do most rays end at? Returns the regions in which an answer differs, ascending."""
+        near = regions_near(planes, 1)  # rays past the cells around a plane count, too
+        cells = self._cells.gather(near)
         surfels, flat = self._surfels(cells)
+        passed = np.zeros(len(surfels.keys))
+        through = [self._crossings[region] for region in self._ends_of_rays_through(near).tolist()]
+        if through:
+            keys, counts = (np.concatenate(columns) for columns in zip(*through, strict=True))
+            rows = surfels.blocks.rows(keys, num_threads)
+            passed = np.bincount(rows[rows >= 0], counts[rows >= 0], len(passed)).astype(np.float64)
         opaque = np.zeros(len(surfels.keys), bool)
-        opaque[surfels.cell_of_plane[flat]] = are_opaque(surfels, flat, cells["passed"], num_threads)
+        opaque[surfels.cell_of_plane[flat]] = are_opaque(surfels, flat, passed, num_threads)
         differs = self._put_own(planes, "opaque", opaque, cells)
         return np.unique(self._cells.regions_of(cells["keys"])[differs])
 
     def _find_behind(self, rays: Keys, noise: SensorNoise, num_threads: int) -> None:
-        """Step 3, of the rays that end in these regions."""
+        """How many rays of each cell in these regions end behind an opaque plane?"""
         rows, cells = self._leaves.gather(rays), self._cells.gather(self._planes_in(self._boxes_of(rays)))
         surfels, flat = self._surfels(cells)
-        opaque = cells["opaque"][surfels.cell_of_plane[flat]]
-        behind = are_behind(
-            surfels, flat[opaque], rows["first"] != NOWHERE, means_of(rows), noise, num_threads
-        )
+        opaque = flat[cells["opaque"][surfels.cell_of_plane[flat]]]
+        behind = are_behind(surfels, opaque, rows["crosses"], means_of(rows), noise, num_threads)
         own = self._cells.gather(rays)
         cell_of_ray = CellBlocks(own["keys"]).rows(merged_keys(rows["keys"]), num_threads)
         own["behind"] = np.bincount(cell_of_ray[behind], rows["counts"][behind], len(own["keys"]))
         self._cells.put(rays, own)
 
-    def _find_ghosts(self, rays: Keys, num_threads: int) -> Keys:
-        """Step 4, of the cells in the regions in which these rays end, and round them. Returns the keys of those that differ."""
-        cells = self._cells.gather(regions_near(rays, 2))
-        ghosts = mostly_behind(surfels_of(cells, self._leaf_size_m), cells["behind"], num_threads)
-        differs = self._put_own(regions_near(rays, 1), "ghosts", ghosts, cells)
-        found: Keys = cells["keys"][differs]
-        return found
-
 
 def _meet(boxes: _Boxes, others: _Boxes) -> NDArray[np.bool_]:
     """(R,) which of the boxes meet one of the others."""
-    if len(boxes) == 0 or len(others) == 0:
-        return np.zeros(len(boxes), bool)
     apart = (boxes[:, None, 0] > others[None, :, 1]) | (boxes[:, None, 1] < others[None, :, 0])
     in_touch: Any = ~apart.any(axis=2)
     found: NDArray[np.bool_] = in_touch.any(axis=1)

@@ -33,16 +33,15 @@ from radarsdf.fitting.fit import fit
 from radarsdf.fitting.steps import fit_rays
 from radarsdf.live.regions import Keys
 from radarsdf.live.state import GrowingState
-from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder, save_state
+from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
 from radarsdf.live.tracking import Follower
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.threshold import Limits
 from radarsdf.returns.moving import Movers
 from radarsdf.returns.rays import check_scans
-from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
     import trimesh
-
-    from radarsdf.map.radar_map import RadarMap
 
 
 @dataclass(frozen=True)
@@ -56,20 +55,19 @@ class Integrated:
     blocks: NDArray[np.uint64]
     """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
     movers: int
-    """Number of its returns that were left out, because they move."""
+    """Number of moving returns, which were left out."""
     moved: tuple[ScanId, ...] = ()
-    """Earlier scans without poses that were placed again, since only now it is clear how the sensor moves. Where they are,
-    :meth:`LiveMap.pose` says."""
+    """Earlier scans without poses that were placed again, as it is clear only now how the sensor moves; see
+    :meth:`LiveMap.pose`."""
 
 
 class LiveMap:
     """A map that grows scan by scan. Scans can be moved, and taken out again, without a trace.
 
     A scan adds integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken out of has
-    the bits of one that never saw it, in any order. What is found from single returns depends on the order of scans: the
-    noise of the sensor, if it is not given, intensities, what :meth:`finish` trains, and the order of scans in files. All
-    methods may be called from any thread; those that change the map wait for each other, and readers see it before a change
-    or after it.
+    the bits of one that never saw it, in any order. The noise of the sensor, if it is not given, intensities, what
+    :meth:`finish` trains, and files depend on the order of scans. All methods may be called from any thread; readers see the
+    map before a change or after it.
 
     Parameters
     ----------
@@ -80,12 +78,11 @@ class LiveMap:
         Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
         ``config.lattice``.
     max_bytes : int, optional
-        Memory that the map may take, bytes. Beyond it, the oldest scans are let go: they stay in the map, but can no
-        longer be moved or taken out. None: all are kept.
+        Memory, bytes, beyond which the oldest scans are let go: they stay in the map, but can no longer be moved or taken
+        out. None: all are kept.
     folder : path-like, optional
-        An empty or new folder, or one that a map has used before. Scans are written there instead of being let go, and far
-        regions of the map instead of being forgotten, by :meth:`clear_outside` or beyond `max_bytes`. It is locked as long
-        as the map lives.
+        An empty or new folder, or one that a map has used before. Scans are written there instead of being let go, and
+        regions instead of being forgotten by :meth:`clear_outside`. It is locked as long as the map lives.
 
     Raises
     ------
@@ -171,7 +168,23 @@ class LiveMap:
             return self._state.num_bytes
 
     def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
-        """(4, 4) T_world_sensor of a scan, m. Raises a KeyError if it cannot be taken out."""
+        """Pose of a scan that can be taken out.
+
+        Parameters
+        ----------
+        scan_id : hashable
+            As of :meth:`integrate`.
+
+        Returns
+        -------
+        (4, 4) ndarray
+            T_world_sensor, m, float64.
+
+        Raises
+        ------
+        KeyError
+            If there is no such scan, or it was let go.
+        """
         with self._lock:
             entry = self._state.log.entry(scan_id)
             if entry is None:
@@ -188,7 +201,7 @@ class LiveMap:
         time_s: float | None = None,
         scan_id: ScanId | None = None,
     ) -> Integrated:
-        """Adds a scan, of N returns.
+        """Add a scan, of N returns.
 
         Without its pose, it is placed where its returns agree with the last scans, near where its Doppler, or the motion so
         far, lead. The world is then the frame of the first scan. Where poses drift, :func:`radarsdf.refine_poses` refines them
@@ -239,10 +252,11 @@ class LiveMap:
             if state.with_intensities not in (None, with_intensities):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
-            steps = [] if given is not None else self._follower.seek(state.log, scan_id, scan)
-            come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
             if given is not None:
-                come = {scan_id: scan.at(given)}
+                steps, come = [], {scan_id: scan.at(given)}
+            else:
+                steps = self._follower.seek(state.log, scan_id, scan)
+                come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
             origin = None
             if state.origin is None:
@@ -260,12 +274,17 @@ class LiveMap:
         return Integrated(scan_id, scan.pose.copy(), blocks, moving, again)
 
     def remove(self, scan_id: ScanId) -> Keys:
-        """Takes a scan out. The map then has the bits of one that never saw it.
+        """Take a scan out. The map then has the bits of one that never saw it.
+
+        Parameters
+        ----------
+        scan_id : hashable
+            As of :meth:`integrate`.
 
         Returns
         -------
         (B,) ndarray
-            Keys of the blocks whose returns changed, uint64.
+            Keys of the blocks whose returns changed, uint64, ascending.
 
         Raises
         ------
@@ -278,13 +297,34 @@ class LiveMap:
             return self._state.exchange({}, [scan_id])
 
     def move(self, scan_id: ScanId, pose: ArrayLike) -> Keys:
-        """Moves a scan to another `pose` (4, 4). Returns and raises as :meth:`remove`."""
+        """Move a scan to another pose.
+
+        Parameters
+        ----------
+        scan_id : hashable
+            As of :meth:`integrate`.
+        pose : (4, 4) array_like
+            T_world_sensor, m.
+
+        Returns
+        -------
+        (B,) ndarray
+            As of :meth:`remove`, whose errors it raises, too.
+        """
         return self.move_all({scan_id: pose})
 
     def move_all(self, poses: Mapping[ScanId, ArrayLike]) -> Keys:
-        """Moves scans to other poses, (4, 4) each: after a closed loop. All of them, or none if one cannot be moved.
+        """Move scans to other poses at once, as after a closed loop: all of them, or none if one cannot be moved.
 
-        Readers see the map before, or with all scans moved. Returns and raises as :meth:`remove`.
+        Parameters
+        ----------
+        poses : mapping
+            T_world_sensor, (4, 4), m, of each scan by its id.
+
+        Returns
+        -------
+        (B,) ndarray
+            As of :meth:`remove`, whose errors it raises, too.
         """
         checked = {
             scan_id: check_pose(pose, f"the pose of scan {scan_id!r:.50}").copy()
@@ -300,7 +340,7 @@ class LiveMap:
             return self._state.exchange(moved, moved)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
-        """Forgets the map beyond a ball. Scans that reach beyond it can then be neither moved nor taken out.
+        """Forget the map beyond a ball. Scans that reach beyond it can then be neither moved nor taken out.
 
         With a folder, nothing is forgotten: regions of 64³ leaf cells that lie beyond the ball go there, and come back, with
         the same bits, when a scan that reaches them is added, moved or taken out. Until then :meth:`mesh` is without them.
@@ -315,14 +355,26 @@ class LiveMap:
         Returns
         -------
         (B,) ndarray
-            Keys of these blocks, uint64.
+            Keys of these blocks, uint64, ascending.
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range.
+        OSError
+            If a region cannot be written to the folder. The map is as before.
         """
         middle, radius = positions([np.asarray(centre)], "centre")[0], not_negative(radius_m, "radius_m")
         with self._lock:
             return self._state.clear_outside(middle, radius)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the state to a file, from which :meth:`load` goes on. An old file is replaced once the new one is complete.
+        """Write the state to a file, from which :meth:`load` goes on.
+
+        Parameters
+        ----------
+        path : path-like
+            An ``.npz`` file. An old one is replaced once the new one is complete.
 
         Raises
         ------
@@ -332,37 +384,41 @@ class LiveMap:
             If the file cannot be written.
         """
         with self._lock, self._state.whole():
-            state = self._state.stored()
-        save_state(state, path)
+            self._state.save(path)
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> LiveMap:
-        """A map as it was saved. Scans without poses go on from a scan that is given with its pose and time.
+        """Read a map as it was saved. Scans without poses go on from the last scans with times.
 
         Parameters
         ----------
         path : path-like
             A file that :meth:`save` wrote.
         folder : path-like, optional
-            Where scans are to be written if memory is short, as of the constructor.
+            As of the constructor.
+
+        Returns
+        -------
+        LiveMap
+            With the settings, `origin` and `max_bytes` of the one that was saved, and its bits.
 
         Raises
         ------
         ValueError
-            If the file is none, is damaged, or comes from another version.
+            If the file holds no live map, is damaged, or comes from another version, or `folder` holds other files.
         OSError
-            If it cannot be read.
+            If it cannot be read, or another map uses `folder`.
         """
-        stored = load_state(path)
-        config, described = FitConfig.from_dict(stored.described.config), stored.described
+        described, scans, sums = load_state(path)
+        config = FitConfig.from_dict(described.config)
         live = cls(config, origin=described.origin, max_bytes=described.max_bytes, folder=folder)
-        live._state.restore(stored)
-        for scan_id, scan in stored.scans.items():
+        live._state.restore(described, scans, sums)
+        for scan_id, scan in zip(described.ids, scans, strict=True):
             live._follower.place(scan_id, scan)
         return live
 
     def mesh(self, **limits: Any) -> trimesh.Trimesh:
-        """The surface as triangles, in voxels of the size of leaf cells. Only what changed is derived again.
+        """Extract the surface as triangles, in voxels of the size of leaf cells. Only what changed is derived again.
 
         Parameters
         ----------
@@ -372,38 +428,56 @@ class LiveMap:
         Returns
         -------
         trimesh.Trimesh
-            As of :meth:`Map.mesh`. It is empty if there is no surface.
-        """
-        from radarsdf.map.threshold import Limits  # noqa: PLC0415 - only a mesh needs it
+            World frame, m, as of :meth:`Map.mesh`. It is empty if there is no surface.
 
+        Raises
+        ------
+        ValueError
+            If a limit is out of range.
+        """
+        wanted = Limits.of(self.config.leaf_size_m, **limits)
         with self._reading:
-            num_threads = resolve_num_threads(self._state.config.num_threads)
             with self._lock:
-                surface, changes, noise = self._state.changes()
+                growing, changes = self._state.changes()
             try:
-                surface.update(changes, noise, num_threads)
-                found = surface.triangles()
+                growing.update(*changes)
+                scene, surface = growing.surface()
             except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
                 self._state.forget_surface()
                 raise
-        voxel_m = found.scene.config.leaf_size_m
-        wanted = Limits.of(voxel_m, **limits)
-        return found.surface.mesh(found.scene.origin, wanted, found.leaf_cells)
+        return surface.mesh(scene.origin, wanted, surface.cells_searched)
 
     def map(self) -> RadarMap:
-        """What is known now, as a map that does not grow: the quick fit of all scans, smoothed. Intensities are in closed form.
+        """Fit a map to all scans that could be taken out, by :meth:`FitConfig.quick`, with the sums that were kept up.
+
+        Returns
+        -------
+        RadarMap
+            A map that does not grow, with intensities in closed form.
 
         Raises
         ------
         ValueError
             If there is no scan that could be taken out.
+        OSError
+            If regions or scans in the folder cannot be read.
         """
         with self._lock, self._state.whole():
             read = self._state.fit_input()
         return fit_rays(read, self._state.quick, progress=False)
 
     def finish(self, *, progress: bool | None = None) -> RadarMap:
-        """The fit of all scans with all settings, as :func:`radarsdf.fit` makes it with this `origin`.
+        """Fit a map to all scans with all settings, as :func:`radarsdf.fit` does with this `origin`.
+
+        Parameters
+        ----------
+        progress : bool, optional
+            Whether to show a progress bar. Default: only on a terminal.
+
+        Returns
+        -------
+        RadarMap
+            A map that does not grow.
 
         Raises
         ------

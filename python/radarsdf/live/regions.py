@@ -17,12 +17,8 @@ from radarsdf.returns.sums import lattice_of
 Keys = NDArray[np.uint64]
 Rows = dict[str, NDArray[Any]]
 
-REGION_CELLS = 64
-"""Leaf cells along the edge of a region."""
-
-REGION_BITS = np.uint64(18)
-"""Bits by which the key of a leaf cell is longer than that of its region."""
-
+REGION_CELLS = 64  # leaf cells along the edge of a region
+REGION_BITS = np.uint64(18)  # by which the key of a leaf cell is longer than that of its region
 NO_KEYS = np.zeros(0, np.uint64)
 _FARTHEST = 15_600  # region along each axis: keys reach a million cells
 
@@ -34,9 +30,7 @@ def steps_near(reach: int) -> NDArray[np.int64]:
 
 def shifted(keys: Keys, steps: NDArray[np.int64]) -> Keys:
     """Keys of the cells that are `steps` (S, 3) away from those with these keys (N,), ascending, each once."""
-    cells = (lattice_of(keys)[:, None] + steps).reshape(-1, 3)
-    # The middle of a cell of 1 m is exact in float64.
-    return np.unique(cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0, 1))
+    return np.unique(_keys_at((lattice_of(keys)[:, None] + steps).reshape(-1, 3)))
 
 
 def cubes_near(leaf_keys: Keys, edge: int, reach: int) -> Keys:
@@ -55,9 +49,9 @@ def regions_of(leaf_keys: Keys) -> Keys:
 
 
 def regions_near(regions: Keys, reach: int) -> Keys:
-    """Keys of these regions, and of those at most `reach` away along each axis."""
+    """Keys of these regions, and of those at most `reach` away along each axis, ascending."""
     places = (region_places(regions)[:, None] + steps_near(reach)).reshape(-1, 3)
-    return np.unique(_regions_at(np.unique(np.clip(places, -_FARTHEST, _FARTHEST - 1), axis=0)))
+    return np.unique(_keys_at(REGION_CELLS * np.clip(places, -_FARTHEST, _FARTHEST - 1)) >> REGION_BITS)
 
 
 def region_places(regions: Keys) -> NDArray[np.int64]:
@@ -65,21 +59,16 @@ def region_places(regions: Keys) -> NDArray[np.int64]:
     return lattice_of(regions << REGION_BITS) // REGION_CELLS
 
 
-def _regions_at(places: NDArray[np.int64]) -> Keys:
-    """(R,) keys of the regions at these positions (R, 3)."""
-    cells = (REGION_CELLS * places).astype(np.float64) + 0.5
-    return cell_keys(np.ascontiguousarray(cells), 1.0, 1) >> REGION_BITS
+def _keys_at(cells: NDArray[np.int64]) -> Keys:
+    """(N,) keys of cells (N, 3)."""
+    # The middle of a cell of 1 m is exact in float64.
+    return cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0, 1)
 
 
 class RegionTable:
     """Rows by the Morton keys of their cells, ascending, in regions.
 
-    Parameters
-    ----------
-    leaves_per_cell : int
-        Edge of a cell, leaf cells: 1, or 2.
-    columns : ndarray
-        One row of each column, as a new cell has it.
+    `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2. `columns`: one row of each, as a new cell has it.
     """
 
     def __init__(self, leaves_per_cell: int = 1, **columns: NDArray[Any]) -> None:
@@ -87,7 +76,6 @@ class RegionTable:
         self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}
         self.num_bytes = 0
-        """Memory of the rows, bytes."""
 
     @property
     def regions(self) -> Keys:
@@ -123,10 +111,9 @@ class RegionTable:
         starts = np.searchsorted(of_rows, regions).tolist()
         for region, start, end in zip(regions.tolist(), starts, ends, strict=True):
             self.num_bytes -= sum(column.nbytes for column in self._parts.pop(region, {}).values())
-            if start == end:
-                continue
-            part = self._parts[region] = {name: rows[name][start:end].copy() for name in self._new}
-            self.num_bytes += sum(column.nbytes for column in part.values())
+            if start < end:
+                part = self._parts[region] = {name: rows[name][start:end].copy() for name in self._new}
+                self.num_bytes += sum(column.nbytes for column in part.values())
 
     def regions_of(self, keys: Keys) -> Keys:
         """(N,) keys of the regions of cells with these `keys` (N,), ascending, of this table."""
@@ -134,4 +121,5 @@ class RegionTable:
             return keys >> REGION_BITS
         bits = REGION_BITS - np.uint64(3 * self._merged)
         regions, rows = np.unique(keys >> bits, return_inverse=True)
-        return _regions_at(lattice_of(regions << bits) // (REGION_CELLS >> self._merged))[rows]
+        places = lattice_of(regions << bits) // (REGION_CELLS >> self._merged)
+        return (_keys_at(REGION_CELLS * places) >> REGION_BITS)[rows]

@@ -21,18 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class Replay:
-    """Results of a replay of F scans."""
+    """Results of a replay."""
 
-    rows: list[int] = field(default_factory=list)
-    """Of the scans that were integrated."""
-    poses: list[NDArray[np.float64]] = field(default_factory=list)
-    """(4, 4) of each of these."""
-    seconds: list[float] = field(default_factory=list)
-    """Wall time that each of these took."""
-    dropped: list[int] = field(default_factory=list)
-    """Rows of the scans that were skipped because the map was not ready."""
-    lost: list[int] = field(default_factory=list)
-    """Rows of the scans without poses that could not be tracked."""
+    rows: list[int] = field(default_factory=list)  # of the scans that were integrated
+    poses: list[NDArray[np.float64]] = field(default_factory=list)  # (4, 4) of each of these
+    seconds: list[float] = field(default_factory=list)  # wall time that each of these took
+    dropped: list[int] = field(default_factory=list)  # rows of the scans for which the map was not ready
+    lost: list[int] = field(default_factory=list)  # rows of the scans without poses that could not be tracked
 
     @property
     def hertz(self) -> float:

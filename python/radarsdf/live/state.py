@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,8 @@ from radarsdf.live.regions import (
     region_places,
     regions_of,
 )
-from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, Stored, held_by
-from radarsdf.live.surface import ChangedSums, GrowingSurface
+from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
+from radarsdf.live.surface import GrowingSurface
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
 from radarsdf.returns.intensities import IntensityScale, Plausible
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -35,18 +36,12 @@ from radarsdf.returns.sums import QUANTA, ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
 _MARKS = 64  # lists of changed blocks, before they are joined
-_BYTES_OF_SUMS = 350  # of a cell with returns, in a table with room for twice as many
-_LEFT = 0.75  # of the cells that there may be, so that regions are not put away for each scan
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
 _NOISE_RETURNS = 100_000  # for the noise: as many as those on flat surfels that are wanted, and more
 
 
 class GrowingState:
-    """Sums over scans, the scans themselves, and the surface that follows. One thread at a time.
-
-    `origin` (3,): of the local frame, world, m; None: it follows from the first scan. Beyond `max_bytes`, scans are let go,
-    to `folder` if there is one.
-    """
+    """Sums over scans, the scans themselves, and the surface that follows. One thread at a time."""
 
     def __init__(
         self,
@@ -68,7 +63,6 @@ class GrowingState:
         self.max_bytes = max_bytes
         self.log = ScanLog(folder)
         self._store = None if folder is None else RegionStore(folder)
-        self._in_use = NO_KEYS  # regions that the last change reached
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
@@ -80,7 +74,7 @@ class GrowingState:
 
     @property
     def num_bytes(self) -> int:
-        """Memory that all takes, bytes."""
+        """Memory that all takes."""
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
@@ -90,75 +84,46 @@ class GrowingState:
         gone: Iterable[ScanId],
         origin: NDArray[np.float64] | None = None,
     ) -> Keys:
-        """Takes scans out and puts others in, also of the same ids: all of it, or nothing if an error is raised.
-
-        `origin`: of a map that has none yet. Returns the keys of the blocks whose returns changed.
-        """
+        """Takes scans out and puts others in, also of the same ids, all or none. Returns the keys of the changed blocks."""
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         before, self.origin = self.origin, self.origin if origin is None else origin
-        done = False
+        blocks = None
         try:
-            blocks = self._apply(come.values(), left.values())
-            done = True
-            for scan_id in left.keys() - come.keys():
-                self.log.drop(scan_id)
-            for scan_id, scan in come.items():
-                self.log.put(scan_id, scan)
+            blocks = self._apply(come, left)
             if come:
                 self._bound()
         except BaseException:  # the disk is full, say
-            if done:
-                self._apply(left.values(), come.values())
-                for scan_id in come.keys() - left.keys():
-                    self.log.drop(scan_id)
-                for scan_id, scan in left.items():
-                    self.log.put(scan_id, scan)
+            if blocks is not None:
+                self._apply(left, come)
             self.origin = before
             raise
         return blocks
 
-    def _apply(self, come: Iterable[LoggedScan], gone: Iterable[LoggedScan]) -> Keys:
-        """Changes the sums, or leaves all as it was. Returns the keys of the blocks whose returns changed."""
+    def _apply(self, come: dict[ScanId, LoggedScan], gone: dict[ScanId, LoggedScan]) -> Keys:
+        """Changes the sums and the log, or leaves all as it was. Returns the keys of the changed blocks."""
         change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
         for scans, sign in ((gone, -1), (come, 1)):
-            for scan in scans:
+            for scan in scans.values():
                 rays = _rays_of([scan], self.config, self.origin)
                 change.collect(rays.points, rays.directions, rays.ranges_m, sign)
-        if self._store is not None:
-            blocks = change.block_keys()
-            self._bring_back(self._store.reached_by(blocks))
-            self._in_use = regions_of(blocks << BLOCK_BITS)
+        self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
         returns, visibility = self.sums.apply(change)
         self._mark(returns, visibility)
+        for scan_id in gone.keys() - come.keys():
+            self.log.drop(scan_id)
+        for scan_id, scan in come.items():
+            self.log.put(scan_id, scan)
         return returns
 
     def _bound(self) -> None:
-        """Puts regions away if there is a folder, and lets scans go, where memory is short."""
-        if self.max_bytes is None:
-            return
-        if self._store is not None and len(self._in_use):
-            # The surface grows and shrinks with the next mesh.
-            surface = 0.0 if self._surface is None else self._surface.num_bytes_of_cell
-            if self.sums.num_bytes + surface * self.sums.num_cells > self.max_bytes:
-                self._put_farthest_away(int(self.max_bytes / (_BYTES_OF_SUMS + surface)))
-        if self.num_bytes > self.max_bytes:
+        """Lets scans go, to the folder if there is one, where memory is short."""
+        if self.max_bytes is not None and self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans that tell it may go
                 self._settle_noise()
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
-    def _put_farthest_away(self, most: int) -> None:
-        """Puts regions away if there are more than `most` cells, but for those that the last change reached."""
-        if self.sums.num_cells <= most:
-            return
-        regions = np.setdiff1d(regions_of(self.sums.block_keys() << BLOCK_BITS), self._in_use)
-        away = region_places(regions) - region_places(self._in_use).mean(axis=0)
-        for region in regions[np.argsort(-np.square(away).sum(axis=1), kind="stable")]:
-            self._put_away(region[None])
-            if self.sums.num_cells <= _LEFT * most:
-                break
-
     def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
-        """Forgets blocks beyond a ball, or puts the regions away that lie beyond it. Returns the keys of the blocks."""
+        """See :meth:`LiveMap.clear_outside`."""
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
@@ -186,7 +151,7 @@ class GrowingState:
 
     def _bring_back(self, regions: Keys) -> None:
         if self._store is not None:
-            blocks = self._store.bring_back(self.sums, regions)
+            blocks = self._store.bring_back(self.sums, np.intersect1d(regions, self._store.regions))
             self._mark(blocks, blocks)
 
     def _put_away(self, regions: Keys) -> Keys:
@@ -194,8 +159,8 @@ class GrowingState:
         self._mark(blocks, blocks)
         return blocks
 
-    def changes(self) -> tuple[GrowingSurface, ChangedSums, SensorNoise]:
-        """The surface as it was derived last, and what it has to take in."""
+    def changes(self) -> tuple[GrowingSurface, tuple[Any, ...]]:
+        """The surface as it was derived last, and the arguments of its update."""
         if self._surface is None:
             surface = GrowingSurface(self.quick, np.zeros(3) if self.origin is None else self.origin)
             self._surface = None if self.origin is None else surface
@@ -206,24 +171,21 @@ class GrowingState:
             np.unique(np.concatenate([NO_KEYS, *keys]))
             for keys in (self._returns_changed, self._visibility_changed)
         )
-        changes = ChangedSums(
-            returns,
-            ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(returns))),
-            seen,
-            Looks(*self.sums.looks_of(_blocks_of_regions(seen))),
-        )
+        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(returns)))
+        looks = Looks(*self.sums.looks_of(_blocks_of_regions(seen)))
         self._returns_changed, self._visibility_changed = [], []
         self._settle_noise()
-        return surface, changes, self.noise
+        num_threads = resolve_num_threads(self.config.num_threads)
+        return surface, (returns, sums, seen, looks, self.noise, num_threads)
 
     def forget_surface(self) -> None:
         """The surface is derived again from all sums."""
         self._surface = None
 
-    def stored(self) -> Stored:
-        """All that a file has to hold. Raises a ValueError for ids of scans that are neither numbers nor strings."""
-        keys, scans, sealed = self.sums.block_keys(), list(self.log.scans()), list(self.log.sealed)
-        if not all(type(scan_id) in (int, str) for scan_id in [*self.log.ids, *sealed]):
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes all to a file. Raises a ValueError for ids of scans that are neither numbers nor strings."""
+        keys, ids, sealed = self.sums.block_keys(), self.log.ids, list(self.log.sealed)
+        if not all(type(scan_id) in (int, str) for scan_id in [*ids, *sealed]):
             msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
             raise ValueError(msg)
         described: dict[str, Any] = {
@@ -235,19 +197,17 @@ class GrowingState:
             "with_intensities": self.with_intensities,
             "max_bytes": self.max_bytes,
             "sealed": sealed,
-            "ids": self.log.ids,
-            "held": held_by(scans),
+            "ids": ids,
         }
         sums = (*self.sums.sums_of(keys), *self.sums.looks_of(keys))
-        return Stored(Described(**described), dict(zip(self.log.ids, scans, strict=True)), sums)
+        save_state(path, Described(**described), list(self.log.scans()), sums)
 
-    def restore(self, stored: Stored) -> None:
-        """Makes a new state that which was stored."""
-        described = stored.described
-        self.sums.insert(*stored.sums)
+    def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[NDArray[Any]]) -> None:
+        """Makes a new state that which was saved."""
+        self.sums.insert(*sums)
         self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
         self.next_id, self.with_intensities = described.next_id, described.with_intensities
-        for scan_id, scan in stored.scans.items():
+        for scan_id, scan in zip(described.ids, scans, strict=True):
             self.log.put(scan_id, scan)
         self.log.sealed |= set(described.sealed)
         self._bound()
@@ -261,12 +221,15 @@ class GrowingState:
         return scans
 
     def fit_input(self) -> Callable[[], FitInput]:
-        """What a fit of all scans starts from, with the sums that were kept up. It is made of a copy of the state, when called."""
+        """What a fit of all scans starts from, with the sums that were kept up."""
         scans, sums, origin = self.scans(), self._all_sums(), self.origin
         looks = Looks(*self.sums.looks_of(self.sums.block_keys()))
 
         def read() -> FitInput:
-            rays = _without_outliers(_rays_of(scans, self.config, origin))
+            rays = _rays_of(scans, self.config, origin)
+            if rays.intensities is not None:
+                known = Plausible.of(rays.intensities).kept(rays.intensities)
+                rays = dataclasses.replace(rays, intensities=known)
             poses = np.stack([scan.pose for scan in scans])
             moving = sum(int((~scan.standing).sum()) for scan in scans if scan.standing is not None)
             scale = IntensityScale.of(rays.intensities)
@@ -313,13 +276,6 @@ def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.
         whole=False,
         **config.preparation,
     )
-
-
-def _without_outliers(rays: Rays) -> Rays:
-    """The rays of all scans, with the intensities that can belong to the others."""
-    if rays.intensities is None:
-        return rays
-    return dataclasses.replace(rays, intensities=Plausible.of(rays.intensities).kept(rays.intensities))
 
 
 def _blocks_of_regions(blocks: Keys) -> Keys:

@@ -4,32 +4,29 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from radarsdf._core import GrowingSums
-from radarsdf.checks import MAX_POSITION_M, check_poses, check_values_of_scan, instance, positions
+from radarsdf.checks import MAX_POSITION_M, check_poses, check_values_of_scan, positions
 from radarsdf.io.files import take_lock
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
-from radarsdf.live.regions import NO_KEYS, REGION_BITS, Keys, regions_of
+from radarsdf.live.regions import NO_KEYS, REGION_BITS, Keys
 from radarsdf.returns.evidence import BLOCK_BITS
 
 ScanId = Hashable
-FIELDS = ("points", "intensities", "doppler_mps", "standing")
-"""What a `LoggedScan` holds besides its pose and time, in this order."""
+FIELDS = ("points", "intensities", "doppler_mps", "standing")  # of a `LoggedScan`, besides its pose and time
 
 _LOCK = "live.lock"  # also the mark of a folder that a map has used
 _BYTES_OF_SCAN = 1000  # of the objects that hold a scan, about
-_BYTES_ON_DISK = 500  # of those that hold one on the disk
 _CELL_COLUMNS: dict[str, tuple[Any, ...]] = {
     "keys": (np.uint64, None),
     "sums": (np.int64, None, 14),
@@ -40,10 +37,7 @@ _CELL_COLUMNS: dict[str, tuple[Any, ...]] = {
 
 
 def locked_folder(folder: Path) -> int:
-    """Makes a folder that one map uses, and locks it until the descriptor is closed. Files of an earlier map are overwritten.
-
-    Raises a ValueError if it holds anything else, an OSError if another map uses it.
-    """
+    """Makes a folder that one map uses, and locks it until the descriptor is closed. Files of an earlier map are overwritten."""
     folder.mkdir(exist_ok=True)
     ours = (_LOCK, "*scan-*.npz*", "*region-*.npz*") if (folder / _LOCK).is_file() else ()
     if not all(any(path.match(name) for name in ours) for path in folder.iterdir()):
@@ -62,29 +56,22 @@ def compact(points: NDArray[np.float64]) -> NDArray[Any]:
 class LoggedScan:
     """One scan as it was given."""
 
-    pose: NDArray[np.float64]
-    """(4, 4) T_world_sensor, m."""
-    points: NDArray[Any]
-    """(N, 3) sensor frame, m: float32 if that holds all bits, else float64."""
-    intensities: NDArray[np.float32] | None
-    """(N,) sensor units."""
-    doppler_mps: NDArray[Any] | None
-    """(N,) along the ray."""
-    standing: NDArray[np.bool_] | None
-    """(N,) the static returns, which the map has. None: all."""
+    pose: NDArray[np.float64]  # (4, 4) T_world_sensor, m
+    points: NDArray[Any]  # (N, 3) sensor frame, m: float32 if that holds all bits, else float64
+    intensities: NDArray[np.float32] | None  # (N,) sensor units
+    doppler_mps: NDArray[Any] | None  # (N,) along the ray
+    standing: NDArray[np.bool_] | None  # (N,) the static returns, which the map has. None: all
     time_s: float | None = None
-    """When it was taken."""
 
     @property
     def num_bytes(self) -> int:
-        """Memory that it takes, bytes."""
-        arrays = [self.pose, *(getattr(self, name) for name in FIELDS)]
-        held: int = sum(array.nbytes for array in arrays if array is not None)
+        """Memory that it takes."""
+        held: int = sum(array.nbytes for name in FIELDS if (array := getattr(self, name)) is not None)
         return held + _BYTES_OF_SCAN
 
     @property
     def reach_m(self) -> float:
-        """Range of the farthest return, m."""
+        """Range of the farthest return."""
         return float(np.sqrt(np.square(self.points, dtype=np.float64).sum(axis=1).max()))
 
     def at(self, pose: NDArray[np.float64]) -> LoggedScan:
@@ -98,6 +85,7 @@ class _OnDisk:
     path: Path
     reach_m: float
     time_s: float | None
+    num_bytes: int = _BYTES_OF_SCAN // 2
 
     def read(self) -> LoggedScan:
         arrays = arrays_of(self.path, FIELDS)
@@ -106,10 +94,6 @@ class _OnDisk:
             raise ValueError(msg)
         columns: dict[str, Any] = {name: arrays.get(name) for name in FIELDS}
         return LoggedScan(self.pose, **columns, time_s=self.time_s)
-
-
-class SealedScan(ValueError):
-    """A scan is in the map, but can be neither moved nor taken out: it was let go to bound the memory."""
 
 
 class ScanLog:
@@ -122,13 +106,10 @@ class ScanLog:
     def __init__(self, folder: Path | None = None) -> None:
         self._folder = folder
         self._scans: dict[ScanId, LoggedScan | _OnDisk] = {}
-        self.sealed: set[ScanId] = set()
-        """Ids of the scans that cannot be taken out."""
-        # Ids of those in memory, the oldest first. A list of all for each scan would wake Python's collector of garbage.
-        self._in_memory: OrderedDict[ScanId, None] = OrderedDict()
+        self._in_memory: dict[ScanId, None] = {}  # ids, the oldest first
+        self.sealed: set[ScanId] = set()  # ids of the scans that cannot be taken out
         self._written = 0
-        self.num_bytes = 0
-        """Memory of what is held, bytes."""
+        self.num_bytes = 0  # memory of what is held
 
     def __len__(self) -> int:
         return len(self._scans) + len(self.sealed)
@@ -146,11 +127,10 @@ class ScanLog:
         return self._scans.get(scan_id)
 
     def get(self, scan_id: ScanId) -> LoggedScan:
-        """A scan. Raises a KeyError if there is none of this id, SealedScan if it was let go."""
-        instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
+        """A scan. Raises a KeyError if there is none of this id, a ValueError if it was let go."""
         if scan_id in self.sealed:
             msg = f"scan {scan_id!r} cannot be moved or taken out: it was let go to keep to max_bytes; give the map a folder to keep scans in"
-            raise SealedScan(msg)
+            raise ValueError(msg)
         if scan_id not in self._scans:
             msg = f"the map has no scan {scan_id!r}"
             raise KeyError(msg)
@@ -161,11 +141,12 @@ class ScanLog:
         """Every n-th of those that can be taken out, in their order."""
         return (self.get(scan_id) for scan_id in list(self._scans)[::every])
 
-    def put(self, scan_id: ScanId, scan: LoggedScan) -> None:
+    def put(self, scan_id: ScanId, scan: LoggedScan | _OnDisk) -> None:
         """Adds a scan, or changes one in its place."""
         self._forget(scan_id)
         self._scans[scan_id] = scan
-        self._in_memory[scan_id] = None
+        if isinstance(scan, LoggedScan):
+            self._in_memory[scan_id] = None
         self.num_bytes += scan.num_bytes
 
     def drop(self, scan_id: ScanId) -> None:
@@ -176,42 +157,38 @@ class ScanLog:
     def _forget(self, scan_id: ScanId) -> None:
         """Frees what it takes of the memory and of the disk."""
         there = self._scans.get(scan_id)
+        self._in_memory.pop(scan_id, None)
+        self.num_bytes -= 0 if there is None else there.num_bytes
         if isinstance(there, _OnDisk):
             with suppress(OSError):  # a file that stays harms nothing
                 there.path.unlink()
-            self.num_bytes -= _BYTES_ON_DISK
-        elif there is not None:
-            del self._in_memory[scan_id]
-            self.num_bytes -= there.num_bytes
 
     def shrink(self, max_bytes: int) -> None:
         """Lets the oldest scans in memory go, to the disk if there is a folder, until all take at most so much."""
         while self.num_bytes > max_bytes and self._in_memory:
             scan_id = next(iter(self._in_memory))
-            scan = self._scans[scan_id]
-            assert isinstance(scan, LoggedScan)
             if self._folder is None:
-                self.drop(scan_id)
-                self.sealed.add(scan_id)
+                self._seal(scan_id)
                 continue
+            scan = self.get(scan_id)
             path = self._folder / f"scan-{self._written:09d}.npz"
-            columns = {name: getattr(scan, name) for name in FIELDS}
-            write_arrays(path, {name: array for name, array in columns.items() if array is not None})
+            write_arrays(path, {name: a for name in FIELDS if (a := getattr(scan, name)) is not None})
             self._written += 1
-            self._forget(scan_id)
-            self._scans[scan_id] = _OnDisk(scan.pose, path, scan.reach_m, scan.time_s)
-            self.num_bytes += _BYTES_ON_DISK
+            self.put(scan_id, _OnDisk(scan.pose, path, scan.reach_m, scan.time_s))
 
     def seal_beyond(self, centre: NDArray[np.float64], radius_m: float) -> None:
-        """Lets those go for good that reach beyond a ball round `centre` (3,), world, m: a part of what they gave is forgotten."""
+        """Lets those go for good that reach beyond a ball around `centre` (3,), world, m: a part of what they gave is forgotten."""
         for scan_id, scan in list(self._scans.items()):
             if float(np.linalg.norm(scan.pose[:3, 3] - centre)) + scan.reach_m > radius_m:
-                self.drop(scan_id)
-                self.sealed.add(scan_id)
+                self._seal(scan_id)
+
+    def _seal(self, scan_id: ScanId) -> None:
+        self.drop(scan_id)
+        self.sealed.add(scan_id)
 
 
 class RegionStore:
-    """Sums of regions that were put away, in a file each, which come back with the same bits. `folder`: where to."""
+    """Sums of regions that were put away, in a file each in `folder`, which come back with the same bits."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -238,36 +215,32 @@ class RegionStore:
         return gone
 
     def bring_back(self, sums: GrowingSums, regions: Keys) -> Keys:
-        """Moves those of `regions` that are put away into `sums`, all or none. Returns the keys of their blocks, ascending."""
-        found = np.intersect1d(regions, self.regions).tolist()
-        if not found:
+        """Moves `regions` that are put away into `sums`, all or none. Returns the keys of their blocks, ascending."""
+        if len(regions) == 0:
             return NO_KEYS
-        read = [_checked_sums(self._paths[region]) for region in found]
-        joined = {name: np.concatenate([arrays[name] for arrays in read]) for name in _CELL_COLUMNS}
-        sums.insert(*joined.values())
-        for region in found:
+        paths = [self._paths[region] for region in regions.tolist()]
+        read = [_checked_sums(path, arrays_of(path, tuple(_CELL_COLUMNS))) for path in paths]
+        keys, counts, scans, look_keys, looks = (
+            np.concatenate(columns) for columns in zip(*read, strict=True)
+        )
+        sums.insert(keys, counts, scans, look_keys, looks)
+        for region in regions.tolist():
             with suppress(OSError):  # a file that stays harms nothing
                 self._paths.pop(region).unlink()
-        return np.union1d(joined["look_keys"], joined["keys"] >> BLOCK_BITS)
-
-    def reached_by(self, blocks: Keys) -> Keys:
-        """Those of the regions of `blocks` (B,) that are put away."""
-        return np.intersect1d(regions_of(blocks << BLOCK_BITS), self.regions, assume_unique=True)
+        return np.union1d(look_keys, keys >> BLOCK_BITS)
 
 
-def _checked_sums(path: Path, arrays: dict[str, NDArray[Any]] | None = None) -> dict[str, NDArray[Any]]:
+def _checked_sums(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], ...]:
     """The columns of cells and blocks in a file. The core trusts that keys ascend and that no cell is empty."""
-    arrays = arrays_of(path, tuple(_CELL_COLUMNS)) if arrays is None else arrays
     try:
         check_arrays(arrays, _CELL_COLUMNS)
+        if (arrays["keys"][1:] < arrays["keys"][:-1]).any() or (arrays["sums"][:, 0] < 1).any():
+            msg = "keys or counts are wrong"
+            raise ValueError(msg)
     except ValueError as error:
         msg = f"{path} does not hold the sums of a live map, or it is damaged: {error}"
         raise ValueError(msg) from error
-    sums = {name: np.ascontiguousarray(arrays[name]) for name in _CELL_COLUMNS}
-    if (sums["keys"][1:] < sums["keys"][:-1]).any() or (sums["sums"][:, 0] < 1).any():
-        msg = f"{path} does not hold the sums of a live map, or it is damaged"
-        raise ValueError(msg)
-    return sums
+    return tuple(np.ascontiguousarray(arrays[name]) for name in _CELL_COLUMNS)
 
 
 _Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
@@ -280,7 +253,7 @@ class Described(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-    format: Literal[1] = 1
+    format: Literal[2] = 2
     config: dict[str, Any]
     origin: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
     noise: Annotated[list[_Deviation], Field(min_length=3, max_length=3)]
@@ -290,40 +263,31 @@ class Described(BaseModel):
     max_bytes: Annotated[int, Field(ge=1, le=2**63 - 1)] | None
     sealed: list[int | str]
     ids: list[int | str]
-    held: list[list[Literal["points", "intensities", "doppler_mps", "standing"]]]
-    """Of each scan, the columns that it has."""
 
 
-class Stored(NamedTuple):
-    """The state of a map."""
-
-    described: Described
-    scans: dict[ScanId, LoggedScan]
-    sums: tuple[NDArray[Any], ...]
-    """Columns of cells and of blocks, as the core gives and takes them."""
-
-
-def held_by(scans: Iterable[LoggedScan]) -> list[list[str]]:
-    """The columns that each scan has."""
-    return [[name for name in FIELDS if getattr(scan, name) is not None] for scan in scans]
-
-
-def save_state(stored: Stored, path: str | PathLike[str]) -> None:
-    """Writes a state whole or not at all."""
-    scans = list(stored.scans.values())
-    arrays: dict[str, NDArray[Any]] = dict(zip(_CELL_COLUMNS, stored.sums, strict=True))
-    arrays["poses"] = np.stack([scan.pose for scan in scans]) if scans else np.zeros((0, 4, 4))
-    arrays["times_s"] = np.array([np.nan if scan.time_s is None else scan.time_s for scan in scans])
-    arrays["counts"] = np.array([len(scan.points) for scan in scans], np.int64)
-    for name in FIELDS:
-        held = [array for array in (getattr(scan, name) for scan in scans) if array is not None]
-        if held:
+def save_state(
+    path: str | PathLike[str],
+    described: Described,
+    scans: Sequence[LoggedScan],
+    sums: Sequence[NDArray[Any]],
+) -> None:
+    """Writes a state whole or not at all. `sums`: columns of cells and of blocks, as the core gives and takes them."""
+    arrays: dict[str, NDArray[Any]] = dict(zip(_CELL_COLUMNS, sums, strict=True))
+    arrays["poses"] = np.array([scan.pose for scan in scans]).reshape(-1, 4, 4)
+    arrays["times_s"] = np.array([np.nan if scan.time_s is None else scan.time_s for scan in scans], float)
+    columns = [[getattr(scan, name) for scan in scans] for name in FIELDS]
+    counts = [[-1 if array is None else len(array) for array in column] for column in columns]
+    arrays["counts"] = np.array(counts, np.int64)  # -1: the scan has none
+    for name, column in zip(FIELDS, columns, strict=True):
+        if held := [array for array in column if array is not None]:
             arrays[name] = np.concatenate(held)
-    arrays["described"] = np.frombuffer(stored.described.model_dump_json().encode(), np.uint8)
+    arrays["described"] = np.frombuffer(described.model_dump_json().encode(), np.uint8)
     write_arrays(path, arrays)
 
 
-def load_state(path: str | PathLike[str]) -> Stored:
+def load_state(
+    path: str | PathLike[str],
+) -> tuple[Described, list[LoggedScan], tuple[NDArray[Any], ...]]:
     """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
     arrays = arrays_of(Path(path), ("described", "poses", "times_s", "counts", *_CELL_COLUMNS, *FIELDS))
     try:
@@ -332,10 +296,10 @@ def load_state(path: str | PathLike[str]) -> Stored:
     except (KeyError, TypeError, ValueError) as error:
         msg = f"{path} is not the state of a live map of this version, or it is damaged: {error}"
         raise ValueError(msg) from error
-    return Stored(described, scans, tuple(_checked_sums(Path(path), arrays).values()))
+    return described, scans, _checked_sums(Path(path), arrays)
 
 
-def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> dict[ScanId, LoggedScan]:
+def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> list[LoggedScan]:
     ids = described.ids
     if len({*ids, *described.sealed}) < len(ids) + len(described.sealed) or described.next_id in ids:
         msg = "ids are there twice"
@@ -343,33 +307,29 @@ def _scans_of(described: Described, arrays: dict[str, NDArray[Any]]) -> dict[Sca
     if ids and described.origin is None:
         msg = "the origin is missing"
         raise ValueError(msg)
-    check_arrays(arrays, {"counts": (np.int64, len(described.held)), "times_s": (np.float64, len(ids))})
+    check_arrays(arrays, {"counts": (np.int64, len(FIELDS), len(ids)), "times_s": (np.float64, len(ids))})
     poses = check_poses(arrays["poses"], len(ids)) if ids else np.zeros((0, 4, 4))
-    columns = {name: _by_scan(arrays, name, described.held) for name in FIELDS}
-    scans: dict[ScanId, LoggedScan] = {}
-    for i, (scan_id, pose, time_s) in enumerate(zip(ids, poses, arrays["times_s"].tolist(), strict=True)):
-        points = positions(columns["points"][i], f"points of scan {i}")
-        for name in FIELDS[1:]:
-            if (column := columns[name][i]) is not None:
+    columns = [_by_scan(name, arrays, counts) for name, counts in zip(FIELDS, arrays["counts"], strict=True)]
+    scans = []
+    for i, own in enumerate(zip(*columns, strict=True)):
+        points = positions(own[0], f"points of scan {i}")
+        for name, column in zip(FIELDS[1:], own[1:], strict=True):
+            if column is not None:
                 check_values_of_scan(column, points, name, i)
+        time_s = float(arrays["times_s"][i])
         known_s = time_s if np.isfinite(time_s) else None
-        own = {name: column[i] for name, column in columns.items()}
-        scans[scan_id] = LoggedScan(pose.copy(), **own, time_s=known_s)
+        scans.append(LoggedScan(poses[i].copy(), **dict(zip(FIELDS, own, strict=True)), time_s=known_s))
     return scans
 
 
-def _by_scan(arrays: dict[str, NDArray[Any]], name: str, held: list[list[Any]]) -> list[Any]:
+def _by_scan(name: str, arrays: dict[str, NDArray[Any]], counts: NDArray[np.int64]) -> list[Any]:
     """A column of each scan. None: the scan has none."""
-    has = [name in names for names in held]
-    if not any(has):
-        return [None] * len(has)
-    column, counts = arrays[name], np.where(has, arrays["counts"], 0)
-    if counts.sum() != len(column) or column.dtype.kind != ("b" if name == "standing" else "f"):
+    if (counts < 0).all():
+        return [None] * len(counts)
+    column, ends = arrays[name], np.cumsum(np.maximum(counts, 0))
+    if ends[-1] != len(column) or column.dtype.kind != ("b" if name == "standing" else "f"):
         msg = f"{name} are of another number or type"
         raise ValueError(msg)
     # Some scans may have float32, others not.
-    parts = [
-        part.copy() if name == "standing" else compact(part)
-        for part in np.split(column, np.cumsum(counts)[:-1])
-    ]
-    return [part if own else None for part, own in zip(parts, has, strict=True)]
+    parts = [part if name == "standing" else compact(part) for part in np.split(column, ends[:-1])]
+    return [part.copy() if count >= 0 else None for part, count in zip(parts, counts, strict=True)]

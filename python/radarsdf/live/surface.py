@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,40 +19,27 @@ from radarsdf.fitting.average import (
     normals_at,
     returns_of_means,
 )
-from radarsdf.live.ghosts import NOWHERE, GrowingGhosts, means_of, surfels_of
+from radarsdf.live.ghosts import GrowingGhosts, means_of, surfels_of
 from radarsdf.live.regions import (
     NO_KEYS,
     REGION_BITS,
     Keys,
     RegionTable,
-    Rows,
     cubes_near,
     regions_near,
     regions_of,
     shifted,
     steps_near,
 )
-from radarsdf.live.triangles import GrowingTriangles, Triangles
+from radarsdf.live.triangles import GrowingTriangles
+from radarsdf.map.contents import WholeMap
+from radarsdf.map.mesh import Surface
 from radarsdf.returns.evidence import BLOCK_BITS, Looks, bridged, sums_round
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, planes_round, support_round
 from radarsdf.returns.sums import MeanRays, ScanSums, merged_keys
 
 _BLOCK_CELLS, _LARGE_CELLS = 8, 16  # edges of cubes, in which distances from changes are counted
-
-
-@dataclass(frozen=True)
-class ChangedSums:
-    """The sums in which something changed since the surface was derived last."""
-
-    blocks: Keys
-    """(B,) keys of the blocks whose sums changed, ascending."""
-    sums: ScanSums
-    """Of all cells of the regions of these blocks."""
-    seen_blocks: Keys
-    """(L,) keys of the blocks whose visibility counts changed, ascending."""
-    looks: Looks
-    """Visibility counts of all blocks of the regions of these."""
 
 
 class GrowingSurface:
@@ -67,7 +53,7 @@ class GrowingSurface:
         self._config = config
         self._noise: SensorNoise | None = None
         vector, number = np.full((1, 3), np.nan, np.float32), np.zeros(1, np.float32)
-        # Leaf cells with returns: mean rays, normals, and the key of the first plane that the ray crosses.
+        # Leaf cells with returns: mean rays, normals, and whether the ray crosses a plane.
         self._leaves = RegionTable(
             points=vector,
             directions=vector,
@@ -75,7 +61,7 @@ class GrowingSurface:
             scans=np.zeros(1, np.uint32),
             ranges_m=number,
             normals=vector,
-            first=np.array([NOWHERE]),
+            crosses=np.zeros(1, bool),
         )
         # Cells of surfels. Planes (centre, normal, variances) are NaN without support.
         self._cells = RegionTable(
@@ -83,7 +69,6 @@ class GrowingSurface:
             moments=np.zeros((1, 13)),
             support=np.zeros(1),
             planes=np.full((1, 9), np.nan),
-            passed=np.zeros(1),
             opaque=np.zeros(1, bool),
             behind=np.zeros(1),
             ghosts=np.zeros(1, bool),
@@ -99,8 +84,7 @@ class GrowingSurface:
             information=np.zeros(1, np.float32),
             detections=np.zeros(1, np.uint32),
         )
-        # Blocks, by the keys of their first leaf cells.
-        self._visibility = RegionTable(scans=np.zeros(1, np.uint32))
+        self._visibility = RegionTable(scans=np.zeros(1, np.uint32))  # by the first leaf cells of blocks
         self._triangles = GrowingTriangles(config, origin)
 
     @property
@@ -109,15 +93,17 @@ class GrowingSurface:
         tables = (self._leaves, self._cells, self._crossed, self.distances, self._visibility)
         return sum(table.num_bytes for table in tables) + self._triangles.num_bytes
 
-    @property
-    def num_bytes_of_cell(self) -> float:
-        """The same, for each leaf cell with returns."""
-        return self.num_bytes / max(self._leaves.num_rows, 1)
+    def update(
+        self, blocks: Keys, sums: ScanSums, seen: Keys, looks: Looks, noise: SensorNoise, num_threads: int
+    ) -> Keys:
+        """Derives again what changes reach. Returns the keys of the regions with other distances, ascending.
 
-    def update(self, changes: ChangedSums, noise: SensorNoise, num_threads: int) -> Keys:
-        """Takes changes in. Returns the keys of the regions whose distances were derived again, ascending."""
-        seen = self._put_visibility(changes)
-        changed = self._put_sums(changes)
+        `blocks` (B,) and `seen` (L,): keys of the blocks whose sums and visibility counts changed, ascending; `sums` and
+        `looks`: all of the regions of these.
+        """
+        seen = regions_of(seen << BLOCK_BITS)
+        self._visibility.put(seen, {"keys": looks.keys << BLOCK_BITS, "scans": looks.scans})
+        changed = self._put_sums(blocks, sums)
         if noise != self._noise:  # ghosts and evidence depend on it everywhere
             self._noise = noise
             changed = np.union1d(changed, self._leaves.gather(self._leaves.regions)["keys"])
@@ -129,34 +115,27 @@ class GrowingSurface:
                 ghosts = self._ghosts.update(of_rays, of_planes, noise, num_threads)
                 near = self._leaves.gather(np.unique(self._cells.regions_of(ghosts)))["keys"]
                 changed = np.union1d(changed, near[np.isin(merged_keys(near), ghosts)])
-            changed = np.union1d(changed, self._turn(of_planes, num_threads))
+            changed = np.union1d(changed, self._find_normals(of_planes, num_threads))
             redone = self._derive_distances(changed, noise, num_threads)
         stale = regions_near(np.union1d(seen, redone), 1)
         self._triangles.cut(stale, self.distances, self._visibility, num_threads)
         return redone
 
-    def triangles(self) -> Triangles:
-        """All triangles, with what the returns tell of their vertices."""
-        none = (0.0, 0.0, 0.0, 0)
-        on_planes, on_flat, returns, cells = map(sum, zip(none, *self._counts.values(), strict=True))
+    def surface(self) -> tuple[WholeMap, Surface]:
+        """All triangles, with the evidence of their vertices."""
+        counts = np.array([*self._counts.values(), (0.0, 0.0, 0.0, 0)]).sum(axis=0)
+        on_planes, on_flat, returns, cells = counts.tolist()
         clutter_ratio = 1 - on_flat / on_planes if on_planes else 0.0
         return self._triangles.joined(clutter_ratio, returns / max(cells, 1), self.distances.num_rows)
 
-    def _put_visibility(self, changes: ChangedSums) -> Keys:
-        """Takes visibility counts in. Returns the regions in which they changed."""
-        regions = regions_of(changes.seen_blocks << BLOCK_BITS)
-        rows = {"keys": changes.looks.keys << BLOCK_BITS, "scans": changes.looks.scans}
-        self._visibility.put(regions, rows)
-        return regions
-
-    def _put_sums(self, changes: ChangedSums) -> Keys:
+    def _put_sums(self, blocks: Keys, sums: ScanSums) -> Keys:
         """Takes sums in. Returns the keys of the leaf cells in changed blocks that have returns, or had some."""
-        regions, sums = regions_of(changes.blocks << BLOCK_BITS), changes.sums
+        regions = regions_of(blocks << BLOCK_BITS)
         either = np.union1d(self._leaves.gather(regions)["keys"], sums.keys)
         self._leaves.put(regions, self._leaves.carried(regions, sums.keys) | vars(MeanRays.of_sums(sums)))
         keys, moments = sums.merged_moments()
         self._cells.put(regions, self._cells.carried(regions, keys) | {"moments": moments})
-        found: Keys = either[np.isin(either >> BLOCK_BITS, changes.blocks)]
+        found: Keys = either[np.isin(either >> BLOCK_BITS, blocks)]
         return found
 
     def _fit_planes(self, changed: Keys, num_threads: int) -> Keys:
@@ -179,22 +158,17 @@ class GrowingSurface:
         for region in regions:
             surfels = surfels_of(self._cells.gather(region[None]), self._config.leaf_size_m)
             returns = surfels.counts[surfels.cell_of_plane]
-            self._counts[int(region)] = (
-                float(returns.sum()),
-                float(returns[surfels.is_flat()].sum()),
-                float(surfels.counts.sum()),
-                len(surfels.keys),
-            )
+            on_planes, on_flat = float(returns.sum()), float(returns[surfels.is_flat()].sum())
+            self._counts[int(region)] = on_planes, on_flat, float(surfels.counts.sum()), len(surfels.keys)
         return regions
 
-    def _turn(self, regions: Keys, num_threads: int) -> Keys:
+    def _find_normals(self, regions: Keys, num_threads: int) -> Keys:
         """Finds the normals of the leaf cells in these regions. Returns the keys of those that differ from before."""
         leaves = self._leaves.gather(regions)
         surfels = surfels_of(self._cells.gather(regions), self._config.leaf_size_m)
         normals = normals_at(means_of(leaves), surfels, num_threads)
         differs = (normals != leaves["normals"]).any(axis=1)
-        leaves["normals"] = normals
-        self._leaves.put(regions, leaves)
+        self._leaves.put(regions, leaves | {"normals": normals})
         found: Keys = leaves["keys"][differs]
         return found
 
@@ -209,9 +183,14 @@ class GrowingSurface:
         centre = regions_of(reached)
         # Bridges depend on medians of blocks of 32 cells, and on their two ends.
         own, around = regions_near(centre, 2), regions_near(centre, 3)
-        means, normals = self._true_returns(around)
+        leaves, cells = self._leaves.gather(around), self._cells.gather(around)
+        is_true = ~cells["ghosts"][CellBlocks(cells["keys"]).rows(merged_keys(leaves["keys"]), 1)]
+        means, normals = means_of(leaves).select(is_true), leaves["normals"][is_true]
         before = self.distances.gather(around)["keys"]
-        crossed = self._find_crossed(centre, around, means, num_threads)
+        rays = means.select(np.isin(means.keys >> REGION_BITS, regions_near(centre, 1)))
+        keys = rays.leaf_keys(config.leaf_size_m, config.metres(BAND_CELLS), num_threads)
+        self._crossed.put(centre, {"keys": keys})
+        crossed = self._crossed.gather(around)["keys"]
         counts = means.counts.astype(np.float64)
         found = bridged(crossed, means.keys, counts, config.encoding.bridge_cells, num_threads)
         # At the rim of what was gathered, bridges lack an end.
@@ -227,47 +206,19 @@ class GrowingSurface:
         near = regions_near(redone, 1)
         leaf_keys = leaf_keys[np.isin(leaf_keys >> REGION_BITS, near)]
         here = np.isin(means.keys >> REGION_BITS, near)
-        rows = self._distances_of(leaf_keys, redone, means.select(here), normals[here], noise, num_threads)
-        self.distances.put(redone, rows)
-        return redone
-
-    def _true_returns(self, regions: Keys) -> tuple[MeanRays, NDArray[np.float32]]:
-        """Mean rays and normals of the leaf cells in these regions whose returns are no ghosts: what distances are made of."""
-        leaves, cells = self._leaves.gather(regions), self._cells.gather(regions)
-        is_true = ~cells["ghosts"][CellBlocks(cells["keys"]).rows(merged_keys(leaves["keys"]), 1)]
-        return means_of(leaves).select(is_true), leaves["normals"][is_true]
-
-    def _find_crossed(self, regions: Keys, around: Keys, means: MeanRays, num_threads: int) -> Keys:
-        """Keys of the leaf cells in `around` that rays cross near their returns: found anew in `regions`."""
-        rays = means.select(np.isin(means.keys >> REGION_BITS, regions_near(regions, 1)))
-        keys = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
-        self._crossed.put(regions, {"keys": keys})
-        found: Keys = self._crossed.gather(around)["keys"]
-        return found
-
-    def _distances_of(
-        self,
-        leaf_keys: Keys,
-        regions: Keys,
-        means: MeanRays,
-        normals: NDArray[np.float32],
-        noise: SensorNoise,
-        num_threads: int,
-    ) -> Rows:
-        """Columns of the leaf cells in these regions. `leaf_keys`, `means`, `normals`: of these and of the regions round them."""
-        config = self._config
-        own = np.isin(leaf_keys >> REGION_BITS, regions)
-        told = returns_of_means(means, noise, config.returns)
+        means, normals = means.select(here), normals[here]
+        weighted = returns_of_means(means, noise, config.returns)
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_corners(table, means, told, normals, config, num_threads)
-        _, vertices = table.leaf_vertices()
-        values = distances_m[vertices[own]]
-        crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
-        information, detections = sums_round(told, leaf_keys[own], num_threads)
-        return {
-            "keys": leaf_keys[own],
+        distances_m = average_at_corners(table, means, weighted, normals, config, num_threads)
+        own_cells = np.isin(leaf_keys >> REGION_BITS, redone)
+        values = distances_m[table.leaf_vertices()[1][own_cells]]
+        information, detections = sums_round(weighted, leaf_keys[own_cells], num_threads)
+        rows = {
+            "keys": leaf_keys[own_cells],
             "values": values,
-            "crossed": crossed,
+            "crossed": (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0),
             "information": information,
             "detections": detections,
         }
+        self.distances.put(redone, rows)
+        return redone

@@ -45,15 +45,11 @@ class Step:
     """A scan, and where it was found."""
 
     scan_id: ScanId
-    logged: LoggedScan
-    """With its time. Where the map has it now, `found` says."""
-    velocity: SensorVelocity | None
-    """By its Doppler. None: it gives none."""
+    logged: LoggedScan  # with its time. Where the map has it now, `found` says
+    velocity: SensorVelocity | None  # by its Doppler. None: it gives none
     found: Tracked
-    given: bool = True
-    """Whether the pose was given, and is not found again."""
-    sign: int = 0
-    """Of the Doppler, as known then: -1 if it is positive as the sensor comes nearer, 0 if that is not known."""
+    given: bool = True  # whether the pose was given, and is not found again
+    sign: int = 0  # of the Doppler, as known then: -1 if positive as the sensor comes nearer, 0 if not known
 
     @property
     def time_s(self) -> float:
@@ -67,13 +63,20 @@ class Step:
         points, static = self.logged.points, self.logged.standing
         return np.ascontiguousarray(points if static is None else points[static], np.float64)
 
+    @property
+    def covariance(self) -> Floats:
+        """(3, 3) of the velocity, m²/s²."""
+        assert self.velocity is not None
+        covariance: Floats = self.velocity.covariance + LEAST_MPS**2 * np.eye(3)
+        return covariance
+
     @cached_property
     def moves(self) -> bool:
         """Whether its Doppler does not show that the sensor stands."""
         if self.velocity is None:
             return True
-        v, covariance = self.velocity.velocity_mps, self.velocity.covariance + LEAST_MPS**2 * np.eye(3)
-        return float(np.einsum("i,i->", v, np.linalg.solve(covariance, v))) > _MOVES**2
+        v = self.velocity.velocity_mps
+        return float(v @ np.linalg.solve(self.covariance, v)) > _MOVES**2
 
 
 @dataclass
@@ -90,10 +93,7 @@ class Follower:
         self._begin([])
 
     def seek(self, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
-        """Where a scan is, whose own pose does not count: the last of the steps. Those before it are scans to be placed again.
-
-        Raises a ValueError if it is late, Lost if it is nowhere near.
-        """
+        """Where a scan is, whose own pose does not count: the last of the steps. Those before it are scans to be placed again."""
         self._synchronise(log)
         new = Step(scan_id, logged, self._velocity(logged), begun(np.eye(4)), given=False)
         if not self._steps:
@@ -108,23 +108,17 @@ class Follower:
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
-        if by_doppler:
-            missing = "its pose"
-        elif logged.doppler_mps is None:
-            missing = "its pose, or its Doppler (doppler_mps)"
-        else:
-            why = (
-                "the last two scans agree on no velocity"
-                if new.velocity is None
-                else "its sign is not known yet"
-            )
-            missing = f"its pose. {NOT_USED}: {why}"
+        needed = "give its pose"
+        if logged.doppler_mps is None:
+            needed += ", or its Doppler (doppler_mps)"
+        elif not by_doppler:
+            needed += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
         if any(step.found.piece for step in found):
-            msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places: give {missing}"
+            msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places: {needed}"
             raise Lost(msg)
         told = [step.found.told[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
         if not by_doppler and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
-            msg = f"the returns alone do not tell how the sensor moves: give {missing}"
+            msg = f"the returns alone do not tell how the sensor moves: {needed}"
             raise Lost(msg)
         return found
 
@@ -147,10 +141,8 @@ class Follower:
         if len(steps) < len(self._steps) or not all(map(operator.is_, steps.values(), self._steps)):
             self._begin(list(steps.values()))
         for scan_id, logged in self._given:
-            step = Step(
-                scan_id, logged, self._velocity(logged), Tracked(logged.pose, _GIVEN, 1.0, 0, np.zeros(3))
-            )
-            now = _now(step, log)
+            found = Tracked(logged.pose, _GIVEN, 1.0, 0, np.zeros(3))
+            now = _now(Step(scan_id, logged, self._velocity(logged), found), log)
             if now is not None and not (self._steps and now.time_s <= self._steps[-1].time_s):
                 self._add(now)
         self._given.clear()
@@ -205,19 +197,14 @@ class Follower:
         """By their Doppler. None: one of the last two gives none."""
         if any(step.velocity is None for step in steps[-2:]):
             return None
-        mean, covariance = np.zeros((len(steps), 3)), np.tile(np.eye(3), (len(steps), 1, 1))
-        for i, step in enumerate(steps):
-            if step.velocity is not None:
-                mean[i] = step.velocity.velocity_mps
-                covariance[i] = step.velocity.covariance + LEAST_MPS**2 * np.eye(3)
-        mean, covariance, _ = upright(mean, covariance)
-        known = [
-            (step.time_s, step.velocity.velocity_mps)
-            for step in [*self._steps, steps[-1]]
-            if step.velocity is not None
+        none = np.zeros(3), np.eye(3)
+        each = [
+            none if one.velocity is None else (one.velocity.velocity_mps, one.covariance) for one in steps
         ]
-        speeds = np.array([velocity_mps for _, velocity_mps in known])
-        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (known[-1][0] - known[0][0])
+        mean, covariance, _ = upright(*(np.array(columns) for columns in zip(*each, strict=True)))
+        known = [step for step in [*self._steps, steps[-1]] if step.velocity is not None]
+        speeds = np.array([step.velocity.velocity_mps for step in known if step.velocity is not None])
+        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (known[-1].time_s - known[0].time_s)
         static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
         return _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
@@ -239,14 +226,14 @@ class Follower:
             return [self._next(new, sign)]
         frame = steps[first].found.pose
         both = np.kron(np.eye(2), frame[:3, :3])
-        return [
-            dataclasses.replace(
-                step,
-                found=dataclasses.replace(
-                    found, pose=frame @ found.pose, covariance=both @ found.covariance @ both.T
-                ),
-                sign=sign,
+
+        def placed(found: Tracked) -> Tracked:
+            return dataclasses.replace(
+                found, pose=frame @ found.pose, covariance=both @ found.covariance @ both.T
             )
+
+        return [
+            dataclasses.replace(step, found=placed(found), sign=sign)
             for step, found in zip(steps[first + 1 :], tracked[1:], strict=True)
         ]
 

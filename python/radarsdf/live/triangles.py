@@ -15,8 +15,7 @@ from radarsdf.live.regions import REGION_CELLS, Keys, RegionTable, regions_near
 from radarsdf.map import queries
 from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
-from radarsdf.map.mesh import Surface, local
-from radarsdf.map.threshold import areas_round
+from radarsdf.map.mesh import Surface, local, one_for_equal
 from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks
 from radarsdf.returns.sums import lattice_of
 
@@ -24,27 +23,14 @@ _ON_BORDER = 1e-4  # leaf cells: vertices are at least 1e-3 from the corners of 
 
 
 @dataclass(frozen=True)
-class Triangles:
-    """All triangles of the surface, and what decides which of them are kept."""
-
-    scene: WholeMap
-    surface: Surface
-    leaf_cells: int
-    """Number of leaf cells near the surface."""
-
-
-@dataclass(frozen=True)
 class _Part:
     vertices: NDArray[np.float64]  # (V, 3) local, m
     faces: NDArray[np.int32]  # (F, 3)
     evidence: torch.Tensor  # (V, 3) as of queries.EvidenceAt
-    areas_m2: NDArray[np.float64]  # (V,) of the triangles here round each vertex
-    border: NDArray[np.int64]  # (B,) rows of vertices that another region may have, too
 
     @property
     def num_bytes(self) -> int:
-        held = (self.vertices, self.faces, self.evidence, self.areas_m2, self.border)
-        return sum(array.nbytes for array in held)
+        return self.vertices.nbytes + self.faces.nbytes + self.evidence.nbytes
 
 
 class GrowingTriangles:
@@ -53,15 +39,12 @@ class GrowingTriangles:
     def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
         self._config, self._origin = config, origin
         self._parts: dict[int, _Part] = {}
-        self._joined: Triangles | None = None
-        self.num_bytes = 0
-        """Memory of the parts, bytes."""
+        self.num_bytes = 0  # of the parts
 
     def cut(self, regions: Keys, surface: RegionTable, visibility: RegionTable, num_threads: int) -> None:
         """Cuts `regions` (R,), ascending, again, from the tables of distances and of visibility counts."""
         if len(regions) == 0:
             return
-        self._joined = None
         found = {}
         for region in regions:
             if int(region) in self._parts:
@@ -81,42 +64,30 @@ class GrowingTriangles:
         at = queries.interpolated(evidence, cells["keys"], self._config.leaf_size_m, local(scene, world))
         split = torch.split(torch.stack(list(at), 1), [len(vertices) for vertices, _ in found.values()])
         for (region, (vertices, faces)), own in zip(found.items(), split, strict=True):
-            areas_m2, border = areas_round(vertices, faces), self._border(vertices)
-            part = self._parts[region] = _Part(vertices, faces, own.clone(), areas_m2, border)
+            part = self._parts[region] = _Part(vertices, faces, own.clone())
             self.num_bytes += part.num_bytes
 
-    def joined(self, clutter_ratio: float, returns_per_cell: float, leaf_cells: int) -> Triangles:
+    def joined(
+        self, clutter_ratio: float, returns_per_cell: float, leaf_cells: int
+    ) -> tuple[WholeMap, Surface]:
         """All triangles, those of neighbours with common vertices. The first two numbers: see :class:`WholeMap`."""
         scene = WholeMap(self._origin, self._config, clutter_ratio, returns_per_cell)
-        joined = self._joined
-        if joined is not None and (joined.scene.rough_share, joined.scene.returns_per_cell) == (
-            clutter_ratio,
-            returns_per_cell,
-        ):
-            return joined
         parts = [self._parts[region] for region in sorted(self._parts)]
         starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
         vertices = np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)])
         faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
-        border = [part.border + start for part, start in zip(parts, starts, strict=False)]
-        rows = np.concatenate([np.zeros(0, np.int64), *border])
         # What two regions make of an edge of the lattice has the same bits.
-        bits = np.ascontiguousarray(vertices[rows]).view([("", np.uint64)] * 3)[:, 0]
-        _, first, which = np.unique(bits, return_index=True, return_inverse=True)
-        one = np.arange(len(vertices), dtype=np.int32)
-        one[rows] = rows[first][which]
-        areas_m2 = np.concatenate([np.zeros(0), *(part.areas_m2 for part in parts)])
+        places = vertices / (REGION_CELLS * self._config.leaf_size_m)
+        on_border = np.abs(places - np.round(places)).min(axis=1, initial=1.0) < _ON_BORDER / REGION_CELLS
+        one = one_for_equal(vertices, np.flatnonzero(on_border))
         evidence = torch.cat([torch.zeros((0, 3)), *(part.evidence for part in parts)])
-        surface = Surface.told_by(
+        return scene, Surface.told_by(
             scene,
             vertices,
             one[np.concatenate([np.zeros((0, 3), np.int32), *faces])],
             queries.EvidenceAt(*evidence.unbind(1)),
             leaf_cells,
-            np.bincount(one, areas_m2, len(vertices)).astype(np.float64),
         )
-        self._joined = Triangles(scene, surface, leaf_cells)
-        return self._joined
 
     def _cut(
         self, surface: RegionTable, region: np.uint64, num_threads: int
@@ -133,8 +104,3 @@ class GrowingTriangles:
             corners, values, of_cells, spacing=[self._config.leaf_size_m] * 3, num_threads=num_threads
         )
         return vertices + 0.0, faces  # -0.0 has other bits than 0.0
-
-    def _border(self, vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-        places = vertices / (REGION_CELLS * self._config.leaf_size_m)
-        away = np.abs(places - np.round(places)).min(axis=1)
-        return np.flatnonzero(away < _ON_BORDER / REGION_CELLS)

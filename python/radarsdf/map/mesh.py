@@ -203,6 +203,14 @@ def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.
     return used, renumbered[faces]
 
 
+def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(V,) the first of the vertices at `rows` (B,) in the same place as each of these; the others themselves."""
+    found = np.arange(len(vertices), dtype=np.int32)
+    _, first, which = np.unique(vertices[rows], axis=0, return_index=True, return_inverse=True)
+    found[rows] = rows[first][which.ravel()]
+    return found
+
+
 # Voxels
 
 

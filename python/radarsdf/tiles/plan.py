@@ -29,15 +29,13 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.settings import by_name, settings
 
-FORMAT = "radarsdf.tiles"
-FORMAT_VERSION = 1
+FORMAT = {"format": "radarsdf.tiles", "format_version": 2}
 PLAN, TILES = "plan.json", "tiles"
 
 Tile = tuple[int, int]
 """Number of a tile along x and along y. Tile (0, 0) begins where the lattice of the world does."""
 
 _Floats = NDArray[np.float64]
-_MOST_TILES = 2**31  # to either side: far beyond what a float64 of metres tells apart
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Number = Annotated[int, Field(ge=-(2**53), le=2**53)]  # of a tile or a cell
 _Length = Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
@@ -47,14 +45,11 @@ _MAX_REASON_BYTES = 10_000
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Squares of the horizontal plane, of any height, and a halo round each."""
+    """Squares of the horizontal plane, of any height, and a halo around each."""
 
-    tile_m: float
-    """Edge of a tile, m: a multiple of the block."""
-    halo_m: float
-    """What a tile knows beyond its edges, m: at most its edge."""
-    corner_m: float
-    """Where tile (0, 0) begins along x and along y, world, m."""
+    tile_m: float  # edge of a tile: a multiple of the block
+    halo_m: float  # what a tile knows beyond its edges: at most its edge
+    corner_m: float  # where tile (0, 0) begins along x and along y, world
 
     def lower_corner(self, tile: Tile) -> _Floats:
         """(2,) where a tile begins, world, m."""
@@ -83,48 +78,28 @@ class TileGrid:
         """Whether segments, from the corner of tile (0, 0), meet the boxes of their tiles, all (M, 2), by slabs."""
         lower = tiles * self.tile_m - self.halo_m
         upper = (tiles + 1) * self.tile_m + self.halo_m
-        way = b - a
+        extent = b - a
         with np.errstate(divide="ignore", invalid="ignore"):
-            near, far = (lower - a) / way, (upper - a) / way
+            near, far = (lower - a) / extent, (upper - a) / extent
         enter, leave = np.minimum(near, far), np.maximum(near, far)
-        along = way == 0  # parallel to the slab, and within: the tiles are those of its own limits
+        along = extent == 0  # parallel to the slab, and within: the tiles are those of its own limits
         enter, leave = np.where(along, -np.inf, enter), np.where(along, np.inf, leave)
         meets: NDArray[np.bool_] = np.maximum(enter.max(axis=1), 0) <= np.minimum(leave.min(axis=1), 1)
         return meets
 
-    def weights(self, tile: Tile, positions: _Floats) -> tuple[_Floats, _Floats]:
-        """Weights of a tile at positions (N, 3), world, m: (N,), and the derivatives (N, 2) by x and y, 1/m.
+    def weights(self, tile: Tile, positions: _Floats) -> _Floats:
+        """(N,) weights of a tile at positions (N, 3), world, m. Those of all tiles add up to one.
 
-        Those of all tiles add up to one. They rise smoothly within half a halo round each edge: the outer half of a halo,
-        where a tile knows less than its owner, does not count.
+        They rise smoothly within half a halo around each edge: the outer half of a halo, where a tile knows less than its
+        owner, does not count.
         """
-        along = self._along(positions)
-        factors, slopes = np.ones((len(positions), 2)), np.zeros((len(positions), 2))
-        for axis in range(2):
-            x = along[:, axis]
-            for edge, sign in ((tile[axis], 1.0), (tile[axis] + 1, -1.0)):
-                t = np.clip(sign * (x - edge * self.tile_m) / self.halo_m + 0.5, 0.0, 1.0)
-                rise = t * t * (3 - 2 * t)
-                slopes[:, axis] = (
-                    slopes[:, axis] * rise + factors[:, axis] * sign * 6 * t * (1 - t) / self.halo_m
-                )
-                factors[:, axis] *= rise
-        return factors[:, 0] * factors[:, 1], slopes * factors[:, ::-1]
-
-    def counting(self, positions: _Floats) -> list[Tile]:
-        """The tiles with a weight at any of the positions (N, 3), world, m, in ascending order."""
-        found: set[Tile] = set()
-        # What is no place, or too far away for a number, is in no tile.
-        is_place = (np.abs(self._along(positions)) < _MOST_TILES * self.tile_m).all(axis=1)
-        positions = positions if is_place.all() else positions[is_place]
-        if len(positions) == 0:
-            return []
-        for shift in itertools.product((-0.5, 0.5), repeat=2):
-            tiles = self.tiles_of(positions[:, :2] + np.array(shift) * self.halo_m)
-            # Neighbours in the list are mostly of one tile: what is left to sort is a thousandth.
-            changes = np.any(tiles[1:] != tiles[:-1], axis=1).nonzero()[0] + 1
-            found |= set(map(tuple, np.unique(tiles[np.append(0, changes)], axis=0).tolist()))
-        return sorted(found)
+        beyond_lower = self._along(positions) - np.array(tile) * self.tile_m
+        factors = np.ones((len(positions), 2))
+        for inwards in (beyond_lower, self.tile_m - beyond_lower):
+            t = np.clip(inwards / self.halo_m + 0.5, 0.0, 1.0)
+            factors *= t * t * (3 - 2 * t)
+        weights: _Floats = factors.prod(axis=1)
+        return weights
 
     def within_half_a_halo(self, tile: Tile, positions: _Floats) -> NDArray[np.int64]:
         """(M,) rows of positions (N, 3), world, m, at which a tile has a weight."""
@@ -148,19 +123,13 @@ class TilePlan:
     """What is known of one tile before its fit."""
 
     tile: Annotated[tuple[_Number, _Number], _FromList]
-    """Its number along x and y."""
-    returns: _Count
-    """Returns that it owns: those in the tile itself."""
-    rays: Annotated[_Count, Field(ge=1)]
-    """Rays that cross it or its halo."""
-    origin_cells: Annotated[tuple[_Number, _Number, _Number], _FromList]
-    """Origin of its map: the corner of a block, in leaf cells of the lattice."""
-    scans: Annotated[tuple[_Count, _Count], _FromList]
-    """The first and the last scan with a ray here."""
-    memory_bytes: _Count = 0
-    """Estimate of what its fit takes."""
+    returns: _Count  # in the tile itself
+    rays: Annotated[_Count, Field(ge=1)]  # that cross it or its halo
+    origin_cells: Annotated[
+        tuple[_Number, _Number, _Number], _FromList
+    ]  # of its map, a block's corner; lattice
+    memory_bytes: _Count = 0  # estimates of what its fit takes
     seconds: Annotated[float, Field(ge=0)] = 0.0
-    """Estimate of the time of its fit."""
 
     @property
     def name(self) -> str:
@@ -170,32 +139,23 @@ class TilePlan:
 
 @settings
 class Plan:
-    """What the tasks have in common, and a list of tiles. A map of a tile is a pure function of its plan and its rays.
+    """What the tasks have in common, and the tiles. A tile's map is a pure function of its plan and its rays.
 
     Folders are named by these numbers, so their types are checked: nothing else must come in from a file.
     """
 
-    config: FitConfig
-    """Settings of all fits, with the noise of the sensor and the number of threads, on which bits may depend."""
+    config: (
+        FitConfig  # of all fits, with the sensor's noise and the number of threads, on which bits may depend
+    )
     tile_m: _Length
-    """Edge of a tile, m."""
     halo_m: _Length
-    """What a tile knows beyond its edges, m."""
-    intensity_range: Annotated[tuple[float, float], _FromList] | None
-    """Lowest and highest intensity of those that can belong to the others, sensor units; a fit leaves out what is beyond.
-    None: there are none."""
-    rough_share: Annotated[float, Field(ge=0, le=1)]
-    """Share of the returns that lie on no thin surface, of the largest tiles."""
-    returns_per_cell: Annotated[float, Field(ge=0)]
-    """Mean number of returns in the cells of surfels of these tiles."""
+    intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, sensor units
+    rough_share: Annotated[float, Field(ge=0, le=1)]  # clutter ratio of the largest tiles
+    returns_per_cell: Annotated[float, Field(ge=0)]  # mean of the cells of surfels of these
     sensor: Sensor
-    """The radar."""
     scans: Annotated[_Count, Field(ge=1)]
-    """Number of scans."""
-    input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
-    """Of all scans, poses and intensities."""
-    tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]
-    """The tiles that own a return, in ascending order."""
+    input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # of all scans
+    tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]  # those that own a return, ascending
 
     @cached_property
     def grid(self) -> TileGrid:
@@ -223,9 +183,9 @@ class Plan:
 
     def box_cells(self, tile: Tile) -> NDArray[np.int64]:
         """(2, 3) first leaf cell of a tile, and the one after the last, from the origin of its map. Of any height."""
-        first = np.array([*(np.array(tile) * self.tile_cells), -MAX_CELLS_FROM_ORIGIN])
-        first[:2] -= self.origin_cells(tile)[:2]
-        return np.stack([first, [*(first[:2] + self.tile_cells), MAX_CELLS_FROM_ORIGIN]])
+        first = np.array(tile) * self.tile_cells - self.origin_cells(tile)[:2]
+        height = MAX_CELLS_FROM_ORIGIN
+        return np.array([[*first, -height], [*(first + self.tile_cells), height]])
 
     @cached_property
     def digest(self) -> str:
@@ -233,21 +193,10 @@ class Plan:
         return hashlib.blake2b(self._to_json(), digest_size=16).hexdigest()
 
     def _to_json(self) -> bytes:
-        described = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "config": self.config.to_dict(),
-            "tile_m": self.tile_m,
-            "halo_m": self.halo_m,
-            "intensity_range": self.intensity_range,
-            "rough_share": self.rough_share,
-            "returns_per_cell": self.returns_per_cell,
-            "sensor": self.sensor.to_dict(),
-            "scans": self.scans,
-            "input_digest": self.input_digest,
-            "tiles": [dataclasses.asdict(planned) for planned in self.tiles],
-        }
-        return json.dumps(described, indent=1).encode()
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        own |= {"config": self.config.to_dict(), "sensor": self.sensor.to_dict()}
+        own["tiles"] = [dataclasses.asdict(planned) for planned in self.tiles]
+        return json.dumps(FORMAT | own, indent=1).encode()
 
     def save(self, folder: Path) -> None:
         """Writes the plan, whole or not at all."""
@@ -255,15 +204,7 @@ class Plan:
 
     @classmethod
     def load(cls, folder: Path) -> Plan:
-        """Reads the plan of a folder.
-
-        Raises
-        ------
-        ValueError
-            If the folder has none, or it is damaged, or of another version.
-        OSError
-            If it cannot be read.
-        """
+        """The plan of a folder. Raises a ValueError if it has none, or it is damaged, or of another version."""
         path = folder / PLAN
         if folder.is_dir() and not path.exists():
             msg = f"{folder} is no map: a folder that radarsdf tiles wrote has a {PLAN}"
@@ -271,11 +212,8 @@ class Plan:
         check_regular_file(path)
         try:
             described = by_name(json.loads(path.read_bytes()), "the plan")
-            if (described.pop("format", None), described.pop("format_version", None)) != (
-                FORMAT,
-                FORMAT_VERSION,
-            ):
-                msg = f"it is not a plan of format {FORMAT}, version {FORMAT_VERSION}"
+            if {name: described.pop(name, None) for name in FORMAT} != FORMAT:
+                msg = f"it is not a plan of {FORMAT}"
                 raise ValueError(msg)
             return cls(
                 config=FitConfig.from_dict(described.pop("config")),
@@ -316,21 +254,17 @@ def failure_of(folder: Path, tile: TilePlan) -> str:
 def is_done(folder: Path, plan: Plan, tile: TilePlan) -> bool:
     """Whether the map of a tile is there, and of this plan. Only the beginning of its file is read."""
     try:
-        return bool(_report(map_path(folder, tile))["plan"] == plan.digest)
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError):
+        return bool(report_of(folder, tile)["plan"] == plan.digest)
+    except (OSError, KeyError, ValueError):
         return False
 
 
 def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
-    """The report of the fit of a tile that is done, see :attr:`Map.report`, without its map. Raises a ValueError if it is damaged."""
+    """The report of the fit of a tile that is done, see :attr:`Map.report`. Raises a ValueError if it is damaged."""
     path = map_path(folder, tile)
     try:
-        return checked_report(_report(path))
+        with open_tensors(path, "np") as file:
+            return checked_report(json.loads(file.metadata["description"])["report"])
     except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
-
-
-def _report(path: Path) -> Any:
-    with open_tensors(path, "np") as file:
-        return json.loads(file.metadata["description"])["report"]

@@ -1,16 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The mesh of a map in tiles as 3D Tiles 1.1, which viewers stream: a GLB file for each tile, and one JSON that says where.
-
-Source: the Open Geospatial Consortium's "3D Tiles Specification", 22-025r4.
-"""
+"""The mesh of a map in tiles as 3D Tiles 1.1 (Open Geospatial Consortium, 22-025r4): a GLB file a tile, and a JSON."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +16,6 @@ from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.products import turned
 from radarsdf.tiles.blend import TileBlend
-from radarsdf.tiles.plan import Tile
 
 with whole_import():
     import trimesh
@@ -28,14 +24,6 @@ with whole_import():
 _ERROR_OF_EDGE = 1 / 16
 # glTF has y up and 3D Tiles z: a viewer turns each file by 90 degrees about x. This is the way back.
 _GLTF_TILE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-
-
-class _Node(NamedTuple):
-    described: dict[str, Any]
-    lower: NDArray[np.float64]
-    """(3,) world, m."""
-    upper: NDArray[np.float64]
-    """(3,) world, m."""
 
 
 def content_folder(path: Path) -> Path:
@@ -50,28 +38,45 @@ def content_folder(path: Path) -> Path:
 def write_tileset(
     city: TileBlend, path: Path, meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int32]]]
 ) -> tuple[int, int]:
-    """Writes ``NAME.json`` and, in its :func:`content_folder`, a GLB file for each tile with triangles.
+    """Writes ``NAME.json`` and a GLB file for each tile with triangles. Returns the numbers of vertices and triangles.
 
-    `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. Coordinates in GLB files are float32 from the origin
-    of the tile, and the JSON has that origin in float64: tiles far from the world's origin are as precise as others. Returns
-    the numbers of vertices and triangles; vertices on borders are in both tiles.
+    `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. GLB files have float32 from the origin of the tile,
+    which the JSON has in float64: tiles far from the world's origin are as precise as others.
     """
     folder = content_folder(path)
-    leaves: dict[Tile, _Node] = {}
-    num_vertices = num_faces = 0
+    children, corners, count = [], [], np.zeros(2, np.int64)
     for planned, (vertices, faces) in zip(city.tiles, meshes, strict=True):
-        if len(faces):
-            name, origin = f"{planned.name}.glb", city.config.lattice.position(planned.origin_cells)
-            write_whole(folder / name, _glb(vertices - origin, faces))
-            leaves[planned.tile] = _leaf(vertices, origin, f"{folder.name}/{name}")
-            num_vertices, num_faces = num_vertices + len(vertices), num_faces + len(faces)
-    if not leaves:
+        if len(faces) == 0:
+            continue
+        name, origin = f"{planned.name}.glb", city.config.lattice.position(planned.origin_cells)
+        local = vertices - origin
+        write_whole(folder / name, _glb(local, faces))
+        T_world_tile = np.eye(4)
+        T_world_tile[:3, 3] = origin
+        children.append(
+            {
+                "boundingVolume": _box(local),
+                "geometricError": 0.0,
+                "content": {"uri": f"{folder.name}/{name}"},
+                "transform": T_world_tile.T.ravel().tolist(),  # column by column
+            }
+        )
+        corners += [vertices.min(axis=0), vertices.max(axis=0)]
+        count += len(vertices), len(faces)
+    if not children:
         msg = "no tile has a triangle, so there is nothing to write"
         raise ValueError(msg)
-    root = _root(leaves, city.plan.tile_m)
+    error_m = float(np.ptp(corners, axis=0).max()) * _ERROR_OF_EDGE
+    root = {
+        "boundingVolume": _box(np.array(corners)),
+        "geometricError": error_m,
+        "refine": "ADD",
+        "children": children,
+    }
     # The JSON comes last: once it is there, all that it names is.
-    described = {"asset": {"version": "1.1"}, "geometricError": root["geometricError"], "root": root}
+    described = {"asset": {"version": "1.1"}, "geometricError": error_m, "root": root}
     write_whole(path, json.dumps(described, allow_nan=False).encode())
+    num_vertices, num_faces = count.tolist()
     return num_vertices, num_faces
 
 
@@ -86,45 +91,7 @@ def _glb(local: NDArray[np.float64], faces: NDArray[np.int32]) -> bytes:
     return bytes(data)
 
 
-def _leaf(vertices: NDArray[np.float64], origin: NDArray[np.float64], uri: str) -> _Node:
-    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
-    T_world_tile = np.eye(4)
-    T_world_tile[:3, 3] = origin
-    described = {
-        "boundingVolume": _box(lower - origin, upper - origin),
-        "geometricError": 0.0,
-        "content": {"uri": uri},
-        "transform": T_world_tile.T.ravel().tolist(),  # column by column
-    }
-    return _Node(described, lower, upper)
-
-
-def _root(leaves: dict[Tile, _Node], edge_m: float) -> dict[str, Any]:
-    """The root of a tree in which each node has up to four below it, so that viewers need not look at all tiles."""
-    first = np.min(list(leaves), axis=0)  # halved, numbers below zero would never meet those above
-    nodes = {(i - int(first[0]), j - int(first[1])): leaf for (i, j), leaf in leaves.items()}
-    while True:
-        edge_m *= 2
-        groups: dict[Tile, list[_Node]] = {}
-        for (i, j), node in nodes.items():
-            groups.setdefault((i // 2, j // 2), []).append(node)
-        nodes = {number: _above(children, edge_m) for number, children in groups.items()}
-        if len(nodes) == 1:
-            return next(iter(nodes.values())).described
-
-
-def _above(children: list[_Node], edge_m: float) -> _Node:
-    lower = np.min([child.lower for child in children], axis=0)
-    upper = np.max([child.upper for child in children], axis=0)
-    described = {
-        "boundingVolume": _box(lower, upper),
-        "geometricError": edge_m * _ERROR_OF_EDGE,
-        "refine": "ADD",
-        "children": [child.described for child in children],
-    }
-    return _Node(described, lower, upper)
-
-
-def _box(lower: NDArray[np.float64], upper: NDArray[np.float64]) -> dict[str, Any]:
+def _box(points: NDArray[np.float64]) -> dict[str, Any]:
+    lower, upper = points.min(axis=0), points.max(axis=0)
     half = np.maximum((upper - lower) / 2, 1e-3)  # a flat box has no inside
     return {"box": [*((lower + upper) / 2).tolist(), *np.diag(half).ravel().tolist()]}
