@@ -16,7 +16,7 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.io import read
 from radarsdf.io.meshes import read_ground_truth, read_mesh
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.trajectory import trajectory_of
+from radarsdf.io.poses import trajectory_of
 from radarsdf.io.text import read_numbers
 
 from .. import samples

@@ -8,8 +8,8 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from radarsdf.io.clouds.reading import read_columns, read_points
-from radarsdf.io.clouds.writing import CLOUD_OUT_SUFFIXES, write_cloud
+from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
+from radarsdf.io.clouds import read_columns, read_points
 from radarsdf.io.files import origin_path
 from radarsdf.io.scans import Notes, Scan, Scans
 

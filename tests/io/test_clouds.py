@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read, read_points
-from radarsdf.io.clouds.reading import read_columns, unpack_lzf
+from radarsdf.io.clouds import read_columns, unpack_lzf
 
 from .test_folders import write_pcd
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from radarsdf.io.clouds.fields import Fields
+from radarsdf.io.fields import Fields
 from radarsdf.io.scans import Notes
 
 CLOUDS = {

@@ -7,8 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from radarsdf.io.poses.files import poses_of, read_poses
-from radarsdf.io.poses.trajectory import Trajectory, TransformChain
+from radarsdf.io.poses import Trajectory, TransformChain, poses_of, read_poses
 from radarsdf.io.scans import Notes
 from scipy.spatial.transform import Rotation
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.clouds.reading import read_columns
-from radarsdf.io.poses.files import read_poses
-from radarsdf.io.poses.trajectory import trajectory_of
+from radarsdf.io.clouds import read_columns
+from radarsdf.io.poses import read_poses, trajectory_of
 from radarsdf.io.scans import Notes
 from radarsdf.io.text import read_numbers
 

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: MIT
 """Published data sets, found by the shape of their folders; `DATASETS` lists them.
 
-Each entry states where the scans, the poses and the pose of the radar on its platform are. What a user passes to
-:func:`radarsdf.io.read` comes first: poses, extrinsic, topics, fields. `T_a_b` transforms points of frame b to frame a, and
-so does the matrix in a file `a_T_b.txt`.
+Each reader states where the scans, the poses and the pose of the radar on its platform are. What a user passes to
+:func:`radarsdf.io.read` comes first. `T_a_b` transforms points of frame b to frame a.
 """
 
 from __future__ import annotations
@@ -24,14 +23,21 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf._core import cell_keys
 from radarsdf.checks import check_pose
-from radarsdf.io.bags.files import bags_in
-from radarsdf.io.bags.reading import read_bags
-from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.clouds.reading import read_columns
+from radarsdf.io.bag_messages import bags_in
+from radarsdf.io.bags import read_bags
+from radarsdf.io.clouds import read_columns
+from radarsdf.io.fields import Fields
 from radarsdf.io.files import reading
 from radarsdf.io.folders import BASE_T_RADAR, lidar_map, natural, scans_of_files
-from radarsdf.io.poses.files import poses_of, read_calibration, read_transform
-from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, pose_matrices_of, trajectory_of
+from radarsdf.io.poses import (
+    MAX_GAP_S,
+    Trajectory,
+    pose_matrices_of,
+    poses_of,
+    read_calibration,
+    read_transform,
+    trajectory_of,
+)
 from radarsdf.io.recordings import Request, Truth
 from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text
@@ -41,21 +47,13 @@ class Dataset(NamedTuple):
     """A published data set."""
 
     name: str
-    fits: Callable[[Path], bool]
-    """Whether a folder has its shape."""
+    fits: Callable[[Path], bool]  # whether a folder has its shape
     read: Callable[[Path, Request], Scans]
-    """The scans of a folder; see :func:`radarsdf.io.read`."""
 
 
 def find(folder: Path) -> Dataset | None:
     """The data set whose shape a folder has; None if it has none."""
     return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
-
-
-def _has(*parts: str, bags: bool = False) -> Callable[[Path], bool]:
-    return lambda folder: (
-        all((folder / part).exists() for part in parts) and (not bags or _bags(folder) != [])
-    )
 
 
 def _bags(folder: Path) -> list[Path]:
@@ -115,10 +113,8 @@ def _coloradar(folder: Path, request: Request) -> Scans:
     def poses() -> Trajectory:
         table = read_numbers(truth / "groundtruth_poses.txt", 7)
         stamps = read_numbers(truth / "timestamps.txt", 1)
-        if len(stamps) != len(table):
-            msg = f"{truth} has {len(stamps)} times for {len(table)} poses"
-            raise ValueError(msg)
-        return trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
+        with reading(truth, "a time for each pose"):
+            return trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
 
     def T_base_sensor() -> NDArray[np.float64] | None:
         for place in (folder, *folder.resolve().parents[:2]):
@@ -127,9 +123,7 @@ def _coloradar(folder: Path, request: Request) -> Scans:
                 with reading(file, "two lines x y z and qx qy qz qw"):
                     numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
                     return check_pose(pose_matrices_of(numbers)[0], "it")
-        request.notes.add(
-            "there is no calib/transforms/base_to_single_chip.txt: the poses are taken as those of the radar"
-        )
+        request.notes.add("there is no base_to_single_chip.txt: the poses are taken as those of the radar")
         return None
 
     times_s = read_numbers(clouds / "timestamps.txt", 1)[:, 0].tolist()
@@ -191,14 +185,12 @@ def _delft_pose(
 #     ars548/points/1706001762.429354169.pcd      ARS548 frame (forward, left, up); intensity: RCS + 128
 #     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
 #     xt32/1706001766.715735580.pcd               optional: lidar scan, lidar frame (left, back, up)
-#     body_T_oculii.txt, body_T_ars548.txt,       optional: 4 x 4, instead of the published calibration
-#     body_T_xt32.txt
 #     lidar.pcd or lidar.ply                      optional: ground truth instead of xt32
 
 _SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
 _SNAIL_TRAJECTORY = "utm50r_T_xt32.txt"
 
-# The published calibration, for sequences without calibration files. The axes of the body point forward, left and up; its
+# The published calibration. The axes of the body point forward, left and up; its
 # origin is that of the lidar. Source: matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m, multiplied out,
 # of github.com/snail-radar/dataset_tools, commit 2f82c2c.
 _BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -226,7 +218,6 @@ _DAY = re.compile(r"(\d{8})(_aft|_eve)?$")
 _LIDAR_RANGE_M = (1.0, 60.0)  # nearer points are on the platform or its operator; the radar sees no farther
 _LIDAR_CELL_M = 0.05  # a lidar point a cell: else most would lie on the ground where the platform stood
 _LIDAR_BATCH = 50  # scans from one thinning to the next; bounds the memory
-_MAX_SWEEP_S = 1.0  # larger differences between the times of a point and of its scan mean different clocks
 
 
 def _snail_parts(folder: Path) -> tuple[Path, str] | None:
@@ -269,13 +260,8 @@ def _snail_trajectory(sequence: Path) -> Trajectory:
 
 def _T_xt32_radar(sequence: Path, radar: str) -> NDArray[np.float64]:
     """The radar in the frame of the lidar, (4, 4). Raises a ValueError if it is not known."""
-    T_body_xt32 = read_transform(sequence / "body_T_xt32.txt", _BODY_T_XT32)
-    if radar.startswith("ars548"):
-        file = sequence / "body_T_ars548.txt"
-        T_body_radar = read_transform(file, np.eye(4)) if file.is_file() else _body_T_ars548(sequence)
-    else:
-        T_body_radar = read_transform(sequence / "body_T_oculii.txt", _BODY_T_OCULII)
-    T_xt32_radar: NDArray[np.float64] = np.linalg.inv(T_body_xt32) @ T_body_radar
+    T_body_radar = _body_T_ars548(sequence) if radar.startswith("ars548") else _BODY_T_OCULII
+    T_xt32_radar: NDArray[np.float64] = np.linalg.inv(_BODY_T_XT32) @ T_body_radar
     return T_xt32_radar
 
 
@@ -288,7 +274,7 @@ def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
     if not known:
         msg = (
             f"{sequence}: the calibration of the ARS548 depends on the day, which is the name of the folder above, such "
-            f"as 20231105_aft, but that is {name}: give extrinsic, or body_T_ars548.txt (4 x 4)"
+            f"as 20231105_aft, but that is {name}: give extrinsic"
         )
         raise ValueError(msg)
     T_body_ars548 = np.eye(4)
@@ -329,9 +315,6 @@ def _lidar_scans(
         times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
         ranges_m = np.linalg.norm(xyz, axis=1)
         used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
-        if (np.abs(times_s[used] - time_s) > _MAX_SWEEP_S).any():
-            msg = f"{path}: the times of its points differ by more than {_MAX_SWEEP_S} s from the time in its name"
-            raise ValueError(msg)
         used &= trajectory.covers(times_s, MAX_GAP_S)
         if used.any():
             T_world_lidar = trajectory.poses(times_s[used])
@@ -340,17 +323,8 @@ def _lidar_scans(
 
 def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
     """Times, s, and paths of the PCD files of a folder, in the order of time."""
-    files = []
-    for path in folder.glob("*.pcd"):
-        try:
-            time_s = float(path.stem)
-        except ValueError:
-            time_s = np.nan
-        if not np.isfinite(time_s):
-            msg = f"{path} is not named by its time in seconds"
-            raise ValueError(msg)
-        files.append((time_s, path))
-    return sorted(files)
+    with reading(folder, "a folder of PCD files that are named by their times in seconds"):
+        return sorted((float(path.stem), path) for path in folder.glob("*.pcd"))
 
 
 def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -363,9 +337,12 @@ def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
 DATASETS = (
     Dataset("SNAIL-Radar", lambda folder: _snail_parts(folder) is not None, _snail_radar),
     Dataset("View-of-Delft", lambda folder: _delft_parts(folder) is not None, _view_of_delft),
-    Dataset("ColoRadar", _has("single_chip/pointclouds/data"), _coloradar),
-    Dataset("MSC-RAD4R", _has("3_RADAR/PCD", "3_RADAR/timestamp_radar.txt"), _msc_rad4r),
-    Dataset("NTU4DRadLM", _has("gt_odom.txt", bags=True), _ntu4dradlm),
-    Dataset("Viking Hill", _has(BASE_T_RADAR, bags=True), _viking_hill),
-)
-"""The data sets. The first that fits a folder reads it."""
+    Dataset("ColoRadar", lambda folder: (folder / "single_chip/pointclouds/data").exists(), _coloradar),
+    Dataset("MSC-RAD4R", lambda folder: (folder / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
+    Dataset(
+        "NTU4DRadLM", lambda folder: (folder / "gt_odom.txt").exists() and _bags(folder) != [], _ntu4dradlm
+    ),
+    Dataset(
+        "Viking Hill", lambda folder: (folder / BASE_T_RADAR).exists() and _bags(folder) != [], _viking_hill
+    ),
+)  # the first that fits a folder reads it

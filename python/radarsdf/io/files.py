@@ -42,10 +42,9 @@ def check_regular_file(path: str | PathLike[str]) -> None:
 @contextmanager
 def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> Iterator[None]:
     """Turns a ValueError, or one of these errors, in its block into a ValueError that names the file: it is not `what`."""
-    kinds: tuple[type[Exception], ...] = (ValueError, *errors)
     try:
         yield
-    except kinds as error:
+    except (ValueError, *errors) as error:
         msg = f"{path} is not {what}: {error}"
         raise ValueError(msg) from error
 
@@ -100,21 +99,16 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(OSError):  # its folder may be gone, or the disk; the first error says so
             temporary.unlink()
         # A full disk names no file. An error without a number is not the system's, one with another file is the block's.
-        if (
-            isinstance(error, OSError)
-            and error.errno is not None
-            and error.filename in (None, str(temporary))
-        ):
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
 def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
     """Permissions of the file that would be replaced; None if there is none."""
-    try:
-        mode = target.stat().st_mode
-    except FileNotFoundError:
+    if not target.exists():
         return None
+    mode = target.stat().st_mode
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(named))
     if not stat.S_ISREG(mode):
@@ -132,12 +126,10 @@ def _open_temporary(target: Path) -> tuple[int, Path]:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
         return os.open(temporary, flags, 0o666), temporary
-    except FileNotFoundError as error:
-        folder = target.parent
-        why = "nothing can be written here" if folder.is_dir() else f"there is no folder {folder}"
-        raise FileNotFoundError(error.errno, why, str(target)) from error
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(target)) from error
+        missing = isinstance(error, FileNotFoundError) and not target.parent.is_dir()
+        why = f"there is no folder {target.parent}" if missing else error.strerror
+        raise OSError(error.errno, why, str(target)) from error
 
 
 def take_lock(path: Path, use: str) -> int:
@@ -152,9 +144,8 @@ def take_lock(path: Path, use: str) -> int:
             if sys.platform == "win32":
                 import msvcrt  # noqa: PLC0415
 
-                os.lseek(
-                    descriptor, 1 << 30, os.SEEK_SET
-                )  # far beyond the text: nobody could read what is locked
+                # Far beyond the text: nobody could read what is locked.
+                os.lseek(descriptor, 1 << 30, os.SEEK_SET)
                 msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
                 os.lseek(descriptor, 0, os.SEEK_SET)
             else:

@@ -15,35 +15,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.clouds.bin import KITTI, bin_layout
-from radarsdf.io.clouds.fields import names_of, plain_name
-from radarsdf.io.clouds.reading import (
-    CLOUD_SUFFIXES,
-    TEXT_SUFFIXES,
-    read_columns,
-    read_points,
-    read_viewpoint,
-)
-from radarsdf.io.poses.files import FIND_POSES, POSE_FILES, poses_of, read_transform
-from radarsdf.io.poses.trajectory import UNPOSED, NoPoses, StampedPoses
+from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points, read_viewpoint
+from radarsdf.io.fields import plain_name
+from radarsdf.io.files import reading
+from radarsdf.io.poses import FIND_POSES, POSE_FILES, UNPOSED, NoPoses, StampedPoses, poses_of, read_transform
 from radarsdf.io.recordings import RawScan, Request, Truth, posed, scan_poses
 from radarsdf.io.scans import Columns, Notes, Scans
-from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970, without_unit
+from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970
 
 BASE_T_RADAR = "base_T_radar.txt"
 """A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
 
-TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")
-"""Names of files with a time, s, for each scan, one a line."""
-
+TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")  # with a time, s, for each scan, one a line
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
-"""Names of folders of scans that are found within the folder that is read."""
-
 _CALIBRATIONS = ("calib.txt", "calibration.txt")
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
-_SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "scan_number", "frame_number",
-                "sweep", "sweep_id", "cycle", "cycle_id")  # fmt: skip
+_SCAN_FIELDS = (
+    "frame",
+    "scan",
+    "scan_id",
+    "frame_id",
+    "scan_index",
+    "frame_index",
+    "sweep",
+    "sweep_id",
+    "cycle",
+)
 _TIME_FIELDS = ("time", "timestamp", "stamp", "t")
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
@@ -97,14 +95,16 @@ def scans_of_files(
     truth: Truth = lambda: None,
 ) -> Scans:
     """Scans of one file each, or of the one table of a recording; `truth` counts if the request has none."""
-    columns: Any = request.columns
-    if any(path.suffix.lower() == ".bin" for path in files):
-        columns = _bin_columns(files, columns, request.notes)
+    columns = request.columns
+    if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
+        with reading(request.notes.about, "points of KITTI"):
+            check_kitti(raw)
+        columns = 4
     reads = [partial(read_columns, path, columns) for path in files]
     names = [str(path) for path in files]
     if len(files) == 1:
         parts, times_s, poses = _split(files[0], columns, times_s, poses, request.notes)
-        if parts is not None:
+        if parts:
             reads = [partial(dict, part) for part in parts]
             names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
     matched, known_s = scan_poses(poses, len(reads), times_s, T_base_sensor, request)
@@ -115,21 +115,15 @@ def scans_of_files(
 
 
 def cloud_files(folder: Path) -> list[Path]:
-    """The scans of a folder, or of a folder of `SCAN_FOLDERS` in it, in natural order: of the kind with most files."""
+    """The scans of a folder, or of a folder of `SCAN_FOLDERS` in it, in natural order: of the suffix with most files."""
     for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
-        if not inner.is_dir():
-            continue
         kinds: dict[str, list[Path]] = {}
-        for path in inner.iterdir():
-            suffix = path.suffix.lower()
-            if suffix not in CLOUD_SUFFIXES or path.name.startswith(".") or not path.is_file():
-                continue
-            if path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM:
-                continue
-            kinds.setdefault("text" if suffix in TEXT_SUFFIXES else suffix, []).append(path)
+        for path in inner.iterdir() if inner.is_dir() else ():
+            other = path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM or path.name.startswith(".")
+            if path.suffix.lower() in CLOUD_SUFFIXES and not other and path.is_file():
+                kinds.setdefault(path.suffix.lower(), []).append(path)
         if kinds:
-            most = max(kinds.values(), key=len)
-            return sorted(most, key=natural)
+            return sorted(max(kinds.values(), key=len), key=natural)
     return []
 
 
@@ -153,41 +147,26 @@ def _in_order_of_time(
     Poses without times belong to the files by number: in the order of the times in their names, or, where a file has the
     times line by line, in the order of these lines.
     """
-    times, listed = _times_of(files, notes)
-    if times is None:
-        return files, None, poses
-    order = np.argsort(times, kind="stable")
-    if (np.diff(order) < 0).any():
-        if listed is not None:
-            notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
-            if isinstance(poses, np.ndarray) and len(poses) == len(files):
-                poses = poses[order]
-        elif isinstance(poses, np.ndarray):
-            notes.add(
-                "the times in the names of the scans are in another order than the names: poses are in that of times"
-            )
-    return [files[i] for i in order], [times[i] for i in order], poses
-
-
-def _times_of(files: list[Path], notes: Notes) -> tuple[list[float] | None, Path | None]:
-    """Times of scans, s, by their names, or by a file of times near them, and this file; None if there are none."""
     times = [time for path in files if (time := _time_in(path.stem)) is not None]
-    if len(times) == len(files):
-        if len(set(times)) == len(files):
-            return times, None
-        notes.add("several scans have the same time in their names: these times are not used")
-    places = [folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES]
-    path = next((path for path in places if path.is_file()), None)
-    if path is None:
-        return None, None
-    listed = read_numbers(path)[:, -1]
-    if len(listed) != len(files):
-        msg = f"{path} has {len(listed)} times for {len(files)} scans"
-        raise ValueError(msg)
-    seconds: list[float] = in_seconds(listed, path.name, notes).tolist()
-    if len(set(seconds)) < len(files):
-        notes.add(f"{path.name} has the same time for several scans")
-    return seconds, path
+    listed = None
+    if len(set(times)) < len(files):
+        places = [
+            folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES
+        ]
+        listed = next((path for path in places if path.is_file()), None)
+        if listed is None:
+            return files, None, poses
+        numbers = read_numbers(listed)[:, -1]
+        if len(numbers) != len(files):
+            msg = f"{listed} has {len(numbers)} times for {len(files)} scans"
+            raise ValueError(msg)
+        times = in_seconds(numbers, listed.name, notes).tolist()
+    order = np.argsort(times, kind="stable")
+    if listed is not None and (np.diff(order) < 0).any():
+        notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
+        if isinstance(poses, np.ndarray) and len(poses) == len(files):
+            poses = poses[order]
+    return [files[i] for i in order], [times[i] for i in order], poses
 
 
 def _time_in(stem: str) -> float | None:
@@ -202,49 +181,31 @@ def _time_in(stem: str) -> float | None:
 
 def _split(
     path: Path, columns: Any, times_s: Sequence[float] | None, poses: Poses, notes: Notes
-) -> tuple[list[Columns] | None, Sequence[float] | None, Poses]:
-    """The scans in the one table of a recording, by a column with their numbers or times; None if it is one scan."""
-    whole = None, times_s, poses
+) -> tuple[list[Columns], Sequence[float] | None, Poses]:
+    """The scans in the one table of a recording, by a column with their numbers; none if it is one scan."""
     try:
         table = read_columns(path, columns)
     except ValueError:  # which is noted when the scan is read
-        return whole
+        return [], times_s, poses
     plain = {plain_name(name)[0]: name for name in reversed(table)}
-    number = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
-    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
-    one_pose = isinstance(poses, np.ndarray) and len(poses) == 1
-    key = number if number is not None or one_pose else time
+    key = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
     if key is None or table[key].dtype.kind not in "biuf":
-        return whole
+        return [], times_s, poses
     rows = np.flatnonzero(np.isfinite(table[key]))
     values, first, part = np.unique(table[key][rows], return_index=True, return_inverse=True)
-    if len(values) < 2 or (key != number and 2 * len(values) > len(rows)):
-        return whole
+    if len(values) < 2:
+        return [], times_s, poses
     notes.add(f"{path.name} is read as {len(values)} scans, by its field {key}")
     if len(rows) < len(table[key]):
         notes.add(f"{path.name}: {len(table[key]) - len(rows)} rows left out: their {key} is not a number")
-    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
+    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
     if time is not None and table[time].dtype.kind in "iuf":
-        scale = SCALES.get(without_unit(time)[1], 1.0)
+        scale = SCALES.get(plain_name(time)[1], 1.0)
         times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
     if isinstance(poses, np.ndarray) and 0 <= values[0] <= values[-1] < len(poses) > len(values):
         poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
+    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
     return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
-
-
-def _bin_columns(files: list[Path], columns: Any, notes: Notes) -> Any:
-    """What :func:`read_columns` needs to know of files ``.bin``, by the content of several of them."""
-    if columns is not None and not isinstance(columns, int):
-        return columns
-    try:
-        layout = bin_layout([path for path in files if path.suffix.lower() == ".bin"], columns)
-    except ValueError as error:
-        msg = f"{notes.about}: {error}"
-        raise ValueError(msg) from error
-    if layout != KITTI:
-        names, kind = ", ".join(names_of(layout.width, None)), np.dtype(layout.dtype).name
-        notes.add(f"the .bin files have {layout.width} numbers a return, {kind}, taken as {names}")
-    return layout
 
 
 def _viewpoint(path: Path) -> NDArray[np.float64] | None:

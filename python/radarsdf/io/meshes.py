@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of, positions
 from radarsdf.interrupts import whole_import
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, has_faces, ply_bytes, read_points
-from radarsdf.io.clouds.writing import face_records, ply_header, records
+from radarsdf.io.cloud_writing import face_records, ply_header, records
+from radarsdf.io.clouds import CLOUD_SUFFIXES, has_faces, ply_bytes, read_points
 from radarsdf.io.files import check_regular_file, origin_for, origin_of, write_origin, write_whole
 from radarsdf.io.npz import arrays_of
 from radarsdf.io.scans import Columns

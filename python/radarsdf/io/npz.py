@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance, path_of
-from radarsdf.io.files import check_regular_file, reading, write_whole
+from radarsdf.io.files import check_regular_file, reading, whole_file
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 
@@ -38,7 +37,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
-    """Reads scans from a file.
+    """Reads scans with poses from an ``.npz`` file.
 
     Parameters
     ----------
@@ -105,16 +104,15 @@ def read_scans(path: str | PathLike[str]) -> Scans:
 
 def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raises a ValueError unless the arrays fit together."""
+    known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
     for name, array in arrays.items():
         if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
             msg = f"{name} must be real numbers, not {array.dtype}"
             raise ValueError(msg)
-    known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
-    for name, (first, *rest) in _SHAPES.items():
-        shape = arrays[name].shape if name in arrays else None
-        expected = (*known.get(str(first), (shape or ("M",))[:1]), *rest)
-        if shape not in (None, expected):
-            msg = f"{name} must have shape {expected}, not {shape}"
+        first, *rest = _SHAPES.get(name, (None,))
+        expected = (*known.get(str(first), array.shape[:1]), *rest)
+        if name in _SHAPES and array.shape != expected:
+            msg = f"{name} must have shape {expected}, not {array.shape}"
             raise ValueError(msg)
     frame, num_poses = arrays["frame"], len(arrays["poses"])
     if not ((frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)).all():
@@ -128,12 +126,16 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     Parameters
     ----------
     path : path-like
-        Where the file goes. ``.npz`` is appended where it is missing.
+        The file. ``.npz`` is appended where it is missing.
     scans : Scans
-        At least one scan. What is None of it, the file lacks.
+        At least one scan. Attributes that are None are omitted.
 
     Raises
     ------
+    TypeError
+        If `scans` are no :class:`Scans`.
+    ValueError
+        If `path` is no regular file.
     OSError
         If the file cannot be written.
     """
@@ -174,7 +176,7 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
     """The arrays of an ``.npz`` file that have these names, in this order. Raises as :func:`read_scans`."""
     check_regular_file(path)
     arrays = {}
-    # Damaged files raise exceptions of many kinds, among them OSError.
+    # Damaged files raise exceptions of many kinds, OSError among them.
     with reading(path, "a whole .npz file", Exception), zipfile.ZipFile(path) as file:
         held = set(file.namelist())
         members = {name: file.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in held}
@@ -206,11 +208,6 @@ def write_arrays(
     path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
 ) -> None:
     """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all."""
-    for name, array in arrays.items():
-        if np.asarray(array).dtype.hasobject:
-            msg = f"{name} has objects of Python, which are not written"
-            raise ValueError(msg)
-    file = io.BytesIO()
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
-    save(file, **arrays)
-    write_whole(path, file.getvalue())
+    with whole_file(path) as file:
+        save(file, **arrays)

@@ -16,14 +16,13 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import check_pose, path_of, positions, positive
 from radarsdf.io import datasets
-from radarsdf.io.bags.files import bags_in, is_bag
-from radarsdf.io.bags.reading import read_bags
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
+from radarsdf.io.bag_messages import bags_in, is_bag
+from radarsdf.io.bags import read_bags
+from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
 from radarsdf.io.folders import read_files, read_folder
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.files import POSE_FILES, poses_of
-from radarsdf.io.poses.trajectory import MAX_GAP_S, UNPOSED, StampedPoses
+from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, StampedPoses, poses_of
 from radarsdf.io.recordings import WITHOUT_POSES, Request, Truth, scan_poses
 from radarsdf.io.scans import Notes, Scan, Scans, finite_returns
 
@@ -58,10 +57,10 @@ def read(
         One of
 
         - our ``.npz`` (see :func:`read_scans`);
-        - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
+        - a folder with one file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
           file, which a column such as frame or scan_id splits into scans. Files are read in natural order, or in the order
           of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
-        - a folder of a data set that :mod:`radarsdf.io.datasets` knows by its shape;
+        - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
         (F, 4, 4) T_world_sensor, m, or a file: TUM, KITTI, 4 x 4 matrices, or a table that names its columns. By default
@@ -73,15 +72,16 @@ def read(
         In a bag, the topics of the scans, merged in the order of their times. By default the radar's, if there is one.
         Each message has the pose of the frame in its header.
     pose_topic : str, optional
-        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one that covers the times
-        of the scans; what was passed over is noted. Goals, plans and initial poses never count.
+        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one; of several, the only
+        one whose child frame leads to that of the scans, or else TF. What was passed over is noted. Goals, plans and
+        initial poses are never used.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
         Rotation from the axes of the IMU to those of the radar. By default that of the file, or of the static transforms of
         a bag.
     world_frame : str, optional
-        With poses of TF, the frame of the world. By default the root of its tree.
+        With poses of TF, the world frame. By default the root of its tree.
     stamps : {"header", "record"}, optional
         In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
         are zero or stand still.
@@ -90,8 +90,8 @@ def read(
         None leaves a role out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth
         and sigma_elevation.
     columns : int or sequence of str, optional
-        Of files without names of columns: how many a point has, or their names. By default the content of several files
-        decides for ``.bin``.
+        Of files without column names: how many a point has, or their names. By default ``.bin`` files are those of KITTI:
+        float32 x, y, z, intensity.
     max_gap_s : float
         Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
     ground_truth : path-like or (M, 3) array_like, optional
@@ -100,8 +100,8 @@ def read(
     Returns
     -------
     Scans
-        They are read while they are iterated, in memory bounded by a scan. Points keep the precision of the file;
-        intensities, Doppler and deviations are float32.
+        Scans that are read while they are iterated, in memory bounded by one scan. Points keep the precision of the file;
+        intensities, Doppler and standard deviations are float32.
 
     Raises
     ------

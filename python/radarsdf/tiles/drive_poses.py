@@ -16,7 +16,7 @@ from radarsdf.checks import check_poses
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.io.imu import Imu
 from radarsdf.io.npz import arrays_of, write_arrays
-from radarsdf.io.poses.files import write_poses
+from radarsdf.io.poses import write_poses
 from radarsdf.io.scans import Scan
 from radarsdf.map.storage import checked_report
 from radarsdf.poses.posed import Posed

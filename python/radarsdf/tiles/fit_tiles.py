@@ -21,7 +21,7 @@ from radarsdf.checks import are_rigid, flag, instance, one_for_each_scan, path_o
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import take_lock, write_whole
-from radarsdf.io.poses.trajectory import UNPOSED, NoPoses
+from radarsdf.io.poses import UNPOSED, NoPoses
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
 from radarsdf.returns.noise import NOISE_SETTINGS

@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from radarsdf.checks import check_box, path_of, positive
-from radarsdf.io.clouds.writing import face_records, ply_header, records
+from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.files import whole_file
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice

@@ -35,15 +35,10 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
     "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
 }  # fmt: skip
-"""Names that sensors, drivers and data sets give to a role, in lower case and without what separates words.
+"""Names that sensors, drivers and data sets give to a role, in lower case and without what separates words."""
 
-Of Sensrad Hugin, Oculii Eagle, Continental ARS548 (nebula, SNAIL-Radar, HKUST RIO), smartmicro, TI mmWave (ti_mmwave,
-reve), radar_msgs, View-of-Delft, TJ4DRadSet, and others.
-"""
 ROLES = tuple(_ALIASES)
 """What a field can be. Positions are x, y and z, or else range, azimuth and elevation."""
-
-_SNAIL_ARS548 = {"x", "doppler", "intensity", "range_std", "azimuth_std", "elevation_std"}
 
 COLUMNS: dict[int, tuple[str, ...]] = {
     3: ("x", "y", "z"),
@@ -64,9 +59,6 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
         return list(columns)
     if width in COLUMNS:
         return list(COLUMNS[width])
-    if width < 3:
-        msg = f"there are {width} columns; points have three or more"
-        raise ValueError(msg)
     return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
 
 
@@ -74,10 +66,8 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
 class Fields:
     """Which field of a cloud plays which role."""
 
-    names: dict[str, str]
-    """Field by role, of `ROLES`."""
-    in_degrees: bool = False
-    """Whether angles whose names have no unit are in degrees."""
+    names: dict[str, str]  # by role
+    in_degrees: bool = False  # angles whose names have no unit
 
     @classmethod
     def of(
@@ -114,8 +104,6 @@ class Fields:
             wanted = _POLAR if "range" in found and "x" not in found else _XYZ
             missing = ", ".join(role for role in wanted if role not in found)
             msg = f"{what} lacks the fields {missing}: it has {', '.join(names) or 'none'}"
-            if {"theta", "phi"} & set(lower):
-                msg += "; theta and phi have several meanings: name the azimuth and the elevation above the horizon"
             raise ValueError(msg)
         return cls(found)
 
@@ -124,19 +112,13 @@ class Fields:
         """Whether positions are of range and angles."""
         return not set(_XYZ) <= set(self.names)
 
-    @property
-    def position_names(self) -> set[str]:
-        """The fields of the positions."""
-        return {self.names[role] for role in (_POLAR if self.polar else _XYZ)}
-
-    def judged(self, clouds: Iterable[Mapping[str, NDArray[Any]]], notes: Notes) -> Fields:
-        """These fields with the unit of their angles: of their names, or else by the numbers in some clouds."""
+    def judged(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
+        """These fields with the unit of their angles: of their names, or else by the numbers in a cloud."""
         units = {role: plain_name(self.names[role])[1] for role in _POLAR[1:] if role in self.names}
         if not self.polar or all(units.values()):
             return self
         names = [self.names[role] for role in units]
-        angles = [np.stack([cloud[name] for name in names]) for cloud in clouds if set(names) <= set(cloud)]
-        azimuth, elevation = np.concatenate([np.zeros((2, 0)), *angles], axis=1).astype(np.float64)
+        azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
         named = next((role for role, unit in units.items() if unit), None)
         in_degrees = are_degrees(azimuth, elevation, units[named] if named else "")
         by = f"as {named} is by its name" if named else "by their numbers"
@@ -147,16 +129,14 @@ class Fields:
             )
         return replace(self, in_degrees=in_degrees)
 
-    def note_use(self, names: Iterable[str], notes: Notes, *, chosen: bool) -> None:
-        """Notes what to know of the numbers, and which fields are not used, unless a user has chosen some."""
-        if {name.lower() for name in names} >= _SNAIL_ARS548:
-            notes.add("the intensities of ARS548 clouds with these fields are RCS + 128")
+    def note_use(self, names: Iterable[str], notes: Notes) -> None:
+        """Notes which fields are not used, and intensities that would be better in dB."""
         if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
             notes.add(
                 f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
             )
         unused = [name for name in names if name and name not in self.names.values()]
-        if unused and not chosen:
+        if unused:
             notes.add(
                 f"fields that are not used: {', '.join(unused)}; fields={{role: name}} or --field chooses others"
             )
@@ -171,9 +151,8 @@ class Fields:
     ) -> Scan:
         """The finite returns in the columns, (N,) each, of the cloud `what`."""
         for name in self.names.values():
-            if name not in columns or columns[name].dtype.kind not in "biuf":
-                why = "holds no numbers" if name in columns else "is missing, which other scans have"
-                msg = f"{what}: the field {name} {why}; it has {', '.join(columns)}"
+            if columns[name].dtype.kind not in "biuf":
+                msg = f"{what}: the field {name} holds no numbers"
                 raise ValueError(msg)
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is dropped
             intensities, doppler_mps = (
@@ -197,10 +176,7 @@ class Fields:
         if not self.polar:
             parts = [self._values(columns, axis) for axis in _XYZ]
             dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
-            points = np.zeros((len(parts[0]), 3), dtype)
-            for axis, part in enumerate(parts):
-                points[:, axis] = part
-            return points
+            return np.stack(parts, axis=1).astype(dtype)
         ranges, azimuth, elevation = (self._values(columns, role).astype(np.float64) for role in _POLAR)
         flat = ranges * np.cos(elevation)
         xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]

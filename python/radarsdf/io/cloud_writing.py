@@ -1,13 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""All returns of all scans as one point cloud in the world frame, written scan by scan."""
+"""All returns of all scans as one point cloud in the world frame, and the parts of PLY files."""
 
 from __future__ import annotations
 
-import io
-import itertools
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -18,20 +15,15 @@ from tqdm import tqdm
 
 from radarsdf.checks import path_of
 from radarsdf.extras import require
-from radarsdf.io.clouds.reading import LAS_INTENSITY
+from radarsdf.io.clouds import LAS_INTENSITY
 from radarsdf.io.files import origin_for, whole_file, write_origin
 from radarsdf.io.scans import Columns, Scan, Scans
 from radarsdf.progress import hides_bar
 
-_FLOAT32_SUFFIX = ".pcd"
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back
-_COUNT_BYTES = 20  # of the largest number of points
-
 _LAS_SCALE_M = 1e-4
 _LAS_FORMAT = 6  # the first of LAS 1.4, with a time
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-
-Rows = Iterator[NDArray[Any]]
 
 
 class CloudWritten(NamedTuple):
@@ -53,7 +45,7 @@ def check_cloud_path(path: str | PathLike[str]) -> None:
 
 
 def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | None = False) -> CloudWritten:
-    """Writes all returns of scans as one point cloud, whole or not at all, in memory bounded by a scan.
+    """Writes all returns of scans as one point cloud, whole or not at all.
 
     The cloud has x, y, z in the world frame, m; intensity in sensor units and doppler in m/s where the first scan has
     them; scan, the number of the scan; and time, s, where the first scan has one. What a later scan lacks is NaN.
@@ -64,7 +56,7 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
     Parameters
     ----------
     path : path-like
-        One of `CLOUD_OUT_SUFFIXES`. NumPy's file holds one record a return.
+        It ends in .ply, .pcd, .las, .laz, .npy or .csv. NumPy's file holds one record a return.
     scans : Scans
         They are read once.
     progress : bool, optional
@@ -88,17 +80,22 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
     suffix = Path(path).suffix.lower()
     # Of an iterator: the number of scans is not known before the first pass through their files.
     bar = tqdm(iter(scans), desc="convert", unit="scan", disable=hides_bar(progress))
-    columns = map(_columns, itertools.count(), bar)
-    first, origin = next(columns), None
-    rows = _rows(itertools.chain([first], columns), tuple(first))
+    parts = [_columns(number, scan) for number, scan in enumerate(bar)]
+    missing = [np.full(len(part["scan"]), np.nan, np.float32) for part in parts]
+    columns = {
+        name: np.concatenate([part.get(name, nan) for part, nan in zip(parts, missing, strict=True)])
+        for name in parts[0]
+    }
+    origin = None
     with whole_file(path) as file:
-        if suffix == _FLOAT32_SUFFIX:
-            origin = origin_for(np.stack([first[axis] for axis in "xyz"], axis=1))
-            rows = _in_float32(rows, np.zeros(3) if origin is None else origin)
-        written = _WRITERS[suffix](file, rows)
-        if suffix == _FLOAT32_SUFFIX:
+        if suffix == ".pcd":
+            origin = origin_for(np.stack([columns[axis] for axis in "xyz"], axis=1))
+            for axis, shift in zip("xyz", np.zeros(3) if origin is None else origin, strict=True):
+                columns[axis] = (columns[axis] - shift).astype(np.float32)
+        _WRITERS[suffix](file, records(columns))
+        if suffix == ".pcd":
             write_origin(path, origin)
-    return CloudWritten(written, len(scans), origin)
+    return CloudWritten(len(columns["scan"]), len(parts), origin)
 
 
 def _columns(number: int, scan: Scan) -> Columns:
@@ -113,100 +110,49 @@ def _columns(number: int, scan: Scan) -> Columns:
     return columns
 
 
-def _rows(scans: Iterable[Columns], names: tuple[str, ...]) -> Rows:
-    """One record a return, an array a scan."""
-    for columns in scans:
-        missing = np.full(len(columns["scan"]), np.nan, np.float32)
-        yield records({name: columns.get(name, missing) for name in names})
+def _ply(file: BinaryIO, rows: NDArray[Any]) -> None:
+    file.write(ply_header(rows.dtype, len(rows)))
+    file.write(rows.tobytes())
 
 
-def _in_float32(rows: Rows, origin: NDArray[np.float64]) -> Rows:
-    """The same records with positions in a local frame."""
-    for part in rows:
-        columns = {name: part[name] for name in part.dtype.names or ()}
-        local = {
-            axis: (part[axis] - shift).astype(np.float32) for axis, shift in zip("xyz", origin, strict=True)
-        }
-        yield records(columns | local)
-
-
-def _ply(dtype: np.dtype[Any], count: int) -> bytes:
-    # The number of points is known in the end: the header keeps its length, as its comment makes up for the digits.
-    return ply_header(dtype, count, comment="." * (_COUNT_BYTES - len(str(count))))
-
-
-def _pcd(dtype: np.dtype[Any], count: int) -> bytes:
-    kinds = [dtype[name].str[1:] for name in dtype.names or ()]
+def _pcd(file: BinaryIO, rows: NDArray[Any]) -> None:
+    names = rows.dtype.names or ()
+    kinds = [rows.dtype[name].str[1:] for name in names]
     header = f"""\
-# .PCD v0.7, radarsdf: world frame, m {"." * 2 * (_COUNT_BYTES - len(str(count)))}
+# .PCD v0.7, radarsdf: world frame, m
 VERSION 0.7
-FIELDS {" ".join(dtype.names or ())}
+FIELDS {" ".join(names)}
 SIZE {" ".join(kind[1] for kind in kinds)}
 TYPE {" ".join(kind[0].upper() for kind in kinds)}
 COUNT {" ".join("1" for _ in kinds)}
-WIDTH {count}
+WIDTH {len(rows)}
 HEIGHT 1
 VIEWPOINT 0 0 0 1 0 0 0
-POINTS {count}
+POINTS {len(rows)}
 DATA binary
 """
-    return header.encode("ascii")
+    file.write(header.encode("ascii") + rows.tobytes())
 
 
-def _npy(dtype: np.dtype[Any], count: int) -> bytes:
-    header = io.BytesIO()  # NumPy leaves space for the digits of the number
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": dtype.descr, "fortran_order": False, "shape": (count,)}
-    )
-    return header.getvalue()
+def _csv(file: BinaryIO, rows: NDArray[Any]) -> None:
+    names = rows.dtype.names or ()
+    formats = ",".join(_CSV_FORMATS[rows.dtype[name].str[1:]] for name in names)
+    np.savetxt(file, rows, formats, header=",".join(names), comments="")
 
 
-def _binary(file: BinaryIO, rows: Rows, header: Callable[[np.dtype[Any], int], bytes]) -> int:
-    """Writes records behind a header, whose length does not depend on their number."""
-    first = next(rows)
-    file.write(header(first.dtype, 0))
-    count = 0
-    for part in itertools.chain([first], rows):
-        file.write(part.tobytes())
-        count += len(part)
-    file.seek(0)
-    file.write(header(first.dtype, count))
-    return count
-
-
-def _csv(file: BinaryIO, rows: Rows) -> int:
-    count = 0
-    for part in rows:
-        names = part.dtype.names or ()
-        if not count:
-            file.write((",".join(names) + "\n").encode("ascii"))
-        np.savetxt(file, part, ",".join(_CSV_FORMATS[part.dtype[name].str[1:]] for name in names))
-        count += len(part)
-    return count
-
-
-def write_las(file: Any, rows: Iterator[NDArray[Any]], *, compressed: bool) -> int:
-    """Writes records, an array a scan, to an open file, and returns their number."""
+def _las(file: BinaryIO, rows: NDArray[Any], *, compressed: bool) -> None:
     laspy = require("laspy", what="LAS and LAZ files are written by")
-    first = next(rows)
-    names = {name: name for name in first.dtype.names or ()} | {
-        "intensity": LAS_INTENSITY,
-        "time": "gps_time",
-    }
-    extra = [name for name in first.dtype.names or () if name not in ("x", "y", "z", "time")]
+    as_names = {"intensity": LAS_INTENSITY, "time": "gps_time"}
     header = laspy.LasHeader(point_format=_LAS_FORMAT, version="1.4")
-    header.add_extra_dims([laspy.ExtraBytesParams(names[name], first.dtype[name]) for name in extra])
-    header.offsets = np.round([first[axis].mean() for axis in "xyz"])
+    extra = [name for name in rows.dtype.names or () if name not in ("x", "y", "z", "time")]
+    header.add_extra_dims([laspy.ExtraBytesParams(as_names.get(n, n), rows.dtype[n]) for n in extra])
+    header.offsets = np.round([rows[axis].mean() for axis in "xyz"])
     header.scales = np.full(3, _LAS_SCALE_M)
-    count = 0
+    points = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
+    for name in rows.dtype.names or ():
+        points[as_names.get(name, name)] = rows[name]
     with laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed) as writer:
-        for part in itertools.chain([first], rows):
-            points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
-            for name in part.dtype.names or ():
-                points[names[name]] = part[name]
-            writer.write_points(points)
-            count += len(part)
-    return count
+        writer.write_points(points)
 
 
 def records(columns: Columns) -> NDArray[Any]:
@@ -238,14 +184,13 @@ def ply_header(
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-_WRITERS: dict[str, Callable[[Any, Rows], int]] = {
-    ".ply": partial(_binary, header=_ply),
-    ".pcd": partial(_binary, header=_pcd),
-    ".las": partial(write_las, compressed=False),
-    ".laz": partial(write_las, compressed=True),
-    ".npy": partial(_binary, header=_npy),
+_WRITERS: dict[str, Callable[[BinaryIO, NDArray[Any]], None]] = {
+    ".ply": _ply,
+    ".pcd": _pcd,
+    ".las": lambda file, rows: _las(file, rows, compressed=False),
+    ".laz": lambda file, rows: _las(file, rows, compressed=True),
+    ".npy": np.save,
     ".csv": _csv,
 }
 
 CLOUD_OUT_SUFFIXES = tuple(_WRITERS)
-"""What :func:`write_cloud` writes."""

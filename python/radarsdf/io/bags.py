@@ -10,43 +10,43 @@ import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.bags.files import Message, Topic, by_record, is_bag, read_messages, topics_of, topics_with
-from radarsdf.io.bags.messages import CLOUD_TYPES, IMU, PACKETS, POINT_A_MESSAGE, POINT_ID, CloudMessage
-from radarsdf.io.bags.poses import attached, poses_in_bags, transforms_in
-from radarsdf.io.clouds.fields import Fields
+from radarsdf.io.bag_messages import (
+    CLOUD_TYPES,
+    IMU,
+    PACKETS,
+    CloudMessage,
+    Topic,
+    by_record,
+    is_bag,
+    read_messages,
+    topics_of,
+    topics_with,
+)
+from radarsdf.io.bag_poses import attached, poses_in_bags, transforms_in
+from radarsdf.io.fields import Fields
 from radarsdf.io.imu import Imu
-from radarsdf.io.poses.files import poses_of
-from radarsdf.io.poses.trajectory import UNPOSED, ScanPoses, StampedPoses
+from radarsdf.io.poses import UNPOSED, ScanPoses, StampedPoses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
-from radarsdf.io.scans import Columns, Notes, Scans
+from radarsdf.io.scans import Notes, Scans
 
+# Topics of radars in data sets, and of the poses there. They are preferred to others.
 KNOWN_TOPICS = {
     "/hugin_raf_1/radar_data": "/icp_odom",  # Viking Hill
     "/radar_enhanced_pcl": None,  # NTU4DRadLM and others with an Oculii Eagle
     "/radar_enhanced_pcl2": None,  # SNAIL-Radar
     "/ti_mmwave/radar_scan_pcl": None,
 }
-"""Topics of radars in data sets, and of the poses there. They are preferred to others."""
-
 _RADAR = re.compile(r"radar|ars_?\d{3}|srr_?\d{3}|oculii|mmwave", re.IGNORECASE)
-_POINTS = re.compile(_RADAR.pattern + "|lidar|cloud|points|detection|target|packets", re.IGNORECASE)
-_NO_POINTS = re.compile(
-    r"^(((std|sensor|nav|geometry|visualization|diagnostic|lifecycle|tf2)_msgs|tf|rcl_interfaces|dynamic_reconfigure|bond)/[^ ]+$)"
-    "|status|info|config|diagnos|imu|odom|twist|velocity|speed|rate|accel|steer|direction",
-    re.IGNORECASE,
-)
-"""Types of messages that are no scans: of packages without others, or by their names."""
-_PAUSE_S = 0.02  # the points of a scan are sent at once; scans are 30 ms apart or more
-_PEEKED_SCANS, _PEEKED_POINTS = 10, 400  # messages that are looked at for the clock: several scans
+_PEEKED_SCANS = 10  # whose stamps and fields are looked at
 
 
 def read_bags(paths: list[Path], request: Request) -> Scans:
@@ -70,13 +70,10 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
         return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
-    def scan_times_s() -> NDArray[np.float64]:
-        return np.array([raw.time_s for raw in raw_scans()], np.float64)
-
     poses = request.poses
     if poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses))):
         pose_paths = paths if poses is None else [Path(poses)]
-        find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name), scan_times_s)
+        find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
         find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     of_imu = _imu_topic(topics, request)
@@ -86,8 +83,9 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
             return None
         return _read_imu(paths, of_imu, frames[0], by_recording[scan_topics[0].name], request)
 
-    truth = request.truth or (lambda: None)
-    return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
+    return Scans.of_source(
+        posed(raw_scans, find, request), request.notes, request.truth or (lambda: None), imu
+    )
 
 
 def _given(
@@ -100,8 +98,7 @@ def _given(
 ) -> FindPoses:
     """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
     if isinstance(poses, np.ndarray):
-        numbered = len(topics) == 1 and topics[0].message_type != POINT_A_MESSAGE
-        count = topics[0].num_messages if numbered else sum(1 for _ in raw_scans())
+        count = topics[0].num_messages if len(topics) == 1 else sum(1 for _ in raw_scans())
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
         return lambda _: numbered_poses
     if poses is UNPOSED:
@@ -110,48 +107,37 @@ def _given(
             request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
         unposed = ScanPoses(poses, np.eye(4), request.max_gap_s)
         return lambda _: unposed
-    return attached(poses, frames[0], cache(lambda: transforms_in(paths, request)), request)
+    return attached(poses, frames[0], transforms_in(paths, request), request)
 
 
 def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
     """The topics of the scans: the wanted ones, or the only one that can be meant. The others are noted."""
     about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
-    if missing := [name for name in request.topic if name not in fitting]:
-        has = topics[missing[0]].message_type if missing[0] in topics else ""
-        what = f": {missing[0]} has messages {has}, or none" if has else f" has no topic {missing[0]}"
-        msg = f"{about}{what}: topics with points are {_listed(fitting.values()) or 'none'}"
-        raise ValueError(msg)
+    for name in request.topic:
+        if name not in fitting:
+            what = (
+                f"{name} has messages {topics[name].message_type}, or none"
+                if name in topics
+                else f"has no topic {name}"
+            )
+            msg = f"{about}: {what}: topics with points are {_listed(fitting.values()) or 'none'}"
+            raise ValueError(msg)
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
     if not fitting:
         msg = f"{about} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {_listed(topics.values()) or 'no topics'}"
         raise ValueError(msg)
     decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
-    has_doppler = partial(_has_doppler, paths)
-    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar, has_doppler):
-        chosen = [t for t in decoded if fits(t)]
+    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar, partial(_has_doppler, paths)):
+        chosen = [topic for topic in decoded if fits(topic)]
         if len(chosen) == 1:
             break
     else:
         msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
         raise ValueError(msg)
-    unread = [
-        t
-        for t in topics.values()
-        if t.num_messages
-        and t.name not in fitting
-        and _POINTS.search(_words(t))
-        and not _NO_POINTS.search(t.message_type)
-    ]
-    radars = [t for t in unread if _is_radar(t)]
-    if radars and not _is_radar(chosen[0]) and not has_doppler(chosen[0]):
-        msg = (
-            f"{about}: messages of the radar cannot be read, {_listed(radars)}. The only points are those of {_listed(chosen)}, whose "
-            f"name and fields are not a radar's: give topic {chosen[0].name} to map them"
-        )
-        raise ValueError(msg)
-    if others := [t for t in (*fitting.values(), *unread) if t is not chosen[0]]:
+    unknown = [t for t in topics.values() if t.num_messages and _is_radar(t) and not _is_standard(t)]
+    if others := {*fitting.values(), *unknown} - set(chosen):
         request.notes.add(f"scans: those of {_listed(chosen)}; not read: {_listed(others)}")
     return chosen
 
@@ -160,27 +146,29 @@ def _listed(topics: Iterable[Topic]) -> str:
     return ", ".join(f"{t.name} ({t.message_type})" for t in sorted(topics))
 
 
-def _words(topic: Topic) -> str:
-    return f"{topic.name} {topic.message_type}"
-
-
 def _is_radar(topic: Topic) -> bool:
-    return bool(_RADAR.search(_words(topic)))
+    return bool(_RADAR.search(f"{topic.name} {topic.message_type}"))
+
+
+def _is_standard(topic: Topic) -> bool:
+    """Whether its type, such as diagnostics, is of a package that has no other points."""
+    return topic.message_type.partition("/")[0].endswith(
+        ("std_msgs", "nav_msgs", "geometry_msgs", "sensor_msgs")
+    )
 
 
 def _has_doppler(paths: list[Path], topic: Topic) -> bool:
-    quiet = Notes(log=False)
-    with closing(read_messages(paths, {topic.name}, quiet)) as messages, suppress(ValueError):
-        for message in messages:
-            return "doppler" in Fields.of(list(message.content.columns)).names
-    return False
+    try:
+        clouds = _peek(paths, topic, Request())
+        return "doppler" in Fields.of(list(clouds[0].columns)).names
+    except ValueError:
+        return False
 
 
 def _peek(paths: list[Path], topic: Topic, request: Request) -> list[CloudMessage]:
-    """The first messages of a topic, as many as it takes to know its clock."""
-    count = _PEEKED_POINTS if topic.message_type == POINT_A_MESSAGE else _PEEKED_SCANS
+    """The first messages of a topic."""
     with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
-        peeked = [message.content for message in itertools.islice(messages, count)]
+        peeked = [message.content for message in itertools.islice(messages, _PEEKED_SCANS)]
     if not peeked:
         msg = f"{paths[0]}: the topic {topic.name} has no messages that can be read{request.notes.ending()}"
         raise ValueError(msg)
@@ -188,9 +176,6 @@ def _peek(paths: list[Path], topic: Topic, request: Request) -> list[CloudMessag
 
 
 def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
-    if topic.message_type == POINT_A_MESSAGE:
-        yield from _grouped(paths, topic, recorded, request)
-        return
     for message in read_messages(paths, {topic.name}, request.notes):
         cloud: CloudMessage = message.content
         time_s = message.recorded_s if recorded else cloud.header.stamp_s
@@ -198,37 +183,6 @@ def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request
         yield RawScan(
             partial(dict, cloud.columns), time_s, name, cloud.header.frame, topic.name, message.number
         )
-
-
-def _grouped(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
-    """Scans of messages of one point each. A scan begins where the number of the point does not grow, or after a pause."""
-    scan: list[Message] = []
-
-    def whole(number: int) -> RawScan:
-        first, clouds = scan[0], [message.content for message in scan]
-        time_s = first.recorded_s if recorded else first.content.header.stamp_s
-        name = f"{first.bag}: scan {number} of {topic.name}"
-        return RawScan(partial(_joined, clouds), time_s, name, first.content.header.frame, topic.name)
-
-    number = 0
-    for message in read_messages(paths, {topic.name}, request.notes):
-        last = scan[-1] if scan else message
-        pause = message.recorded_s > last.recorded_s + _PAUSE_S
-        if scan and (pause or _point_id(message) <= _point_id(last)):
-            yield whole(number)
-            scan, number = [], number + 1
-        scan.append(message)
-    if scan:
-        yield whole(number)
-
-
-def _joined(points: list[CloudMessage]) -> Columns:
-    fields = [field for field in points[0].columns if field != POINT_ID]
-    return {field: np.concatenate([point.columns[field] for point in points]) for field in fields}
-
-
-def _point_id(message: Message) -> int:
-    return int(message.content.columns[POINT_ID][0])
 
 
 def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
@@ -260,22 +214,21 @@ def _read_imu(
         if rates is None:
             request.notes.add(f"{topic} has no angular velocity: it is not used")
             return None
-        frame = header.frame if not numbers else frame
+        frame = frame or header.frame
         numbers.extend((header.stamp_s, message.recorded_s, *rates, *(force or (np.nan,) * 3)))
     table = np.array(numbers).reshape(-1, 8)
+    table = table[np.isfinite(table[:, :5]).all(axis=1)]
+    if len(table) == 0:
+        return None
     stamps, recorded = table[:, 0], table[:, 1]
     times_s = recorded
-    notes = Notes(log=False) if recorded_scans else request.notes
-    if not by_record(stamps, topic, None, notes):
+    if not by_record(stamps, topic, None, Notes(log=False) if recorded_scans else request.notes):
         times_s = stamps + np.median(recorded - stamps) if recorded_scans else stamps
     order = np.argsort(times_s, kind="stable")
-    rows = order[np.isfinite(table[order, 2:5]).all(axis=1)]
-    if len(rows) == 0:
-        return None
-    rates, forces = table[rows, 2:5], table[rows, 5:]
-    has_force = np.isfinite(table[rows]).all() and forces.any()
+    forces = table[order, 5:]
+    has_force = np.isfinite(forces).all() and forces.any()
     R_sensor_imu = request.R_sensor_imu
     if R_sensor_imu is None and frame:
         T_imu_sensor = transforms_in(paths, request).fixed(frame, sensor_frame)
         R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
-    return Imu(times_s[rows], rates, forces if has_force else None, R_sensor_imu)
+    return Imu(times_s[order], table[order, 2:5], forces if has_force else None, R_sensor_imu)

@@ -10,45 +10,41 @@ import re
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtrc
 
 from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.interrupts import whole_import
-from radarsdf.io.clouds.bin import read_bin
-from radarsdf.io.clouds.fields import Fields, names_of
+from radarsdf.io.fields import Fields, names_of
 from radarsdf.io.files import check_regular_file, origin_of
 from radarsdf.io.scans import Columns, Notes
 from radarsdf.io.text import read_table
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
-_PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
 LAS_INTENSITY = "radar_intensity"  # an extra dimension: LAS's own are whole numbers from 0 to 65535
-_MAX_HEADER_LINES = 64  # a header has eleven
-_MAX_LINE = 1 << 16
-_LITERALS = 32  # control bytes of LZF below this are followed by so many bytes, and one more, as they are
-_FACES = re.compile(rb"element\s+face\s+0*[1-9]")
-_PLY_HEADER_BYTES = 1 << 16
-_LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
-_VARIABLE = 2**32 - 1  # in place of the number of points in each chunk
+_PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
 _MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth
-_HEADER_BYTES, _COUNT_AT, _RECORD_BYTES = (
-    227,
+_VLRS_AT, _VLR_BYTES = (
     100,
     54,
-)  # of the least LAS header, and the least record behind it
+)  # place of the number of variable records in a LAS header, and the least size of one
+_MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a header of PCD has eleven lines
+_PLY_HEADER_BYTES = 1 << 16
+_KITTI_WIDTH, _WIDTHS = 4, range(3, 21)  # columns of .bin files
+_JUDGED_FILES, _MAX_POSITION_M = 20, 1e7
+_LESS, _CHANCE = 0.8, 1e-4  # of the variance within four columns is left by others, not by chance
+
+GivenColumns: TypeAlias = int | Sequence[str] | None
+"""The columns of files without names, as a user gives them: how many numbers a point has, or their names."""
 
 
-def read_columns(path: Path, columns: int | Sequence[str] | None = None) -> Columns:
-    """The columns of a file of points, (N,) each, by name.
-
-    `columns` are those of files without names: how many numbers a point has, or their names. By default the content of
-    a ``.bin`` file decides.
-    """
+def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
+    """The columns of a file of points, (N,) each, by name."""
     check_regular_file(path)
     suffix = path.suffix.lower()
     if suffix not in CLOUD_SUFFIXES:
@@ -77,9 +73,9 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
 
     Returns
     -------
-    ndarray
-        (M, 3) float64, frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places them; the world's, if
-        :func:`radarsdf.io.write_cloud` wrote an origin next to it. Points that are not finite are left out.
+    (M, 3) float64 ndarray
+        Frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places the points; the world's, if
+        :func:`write_cloud` wrote an origin next to it. Points that are not finite are left out.
 
     Raises
     ------
@@ -90,12 +86,13 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     ImportError
         If it takes a library that is not installed; the message says which.
     """
-    columns = read_columns(path_of(path, "path"))
+    file = path_of(path, "path")
+    columns = read_columns(file)
     fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
-    fields = fields.judged([columns], Notes(str(path)))
+    fields = fields.judged(columns, Notes())
     points = fields.scan(columns, str(path), np.eye(4), None, Notes()).points.astype(np.float64)
-    if path_of(path, "path").suffix.lower() == ".pcd":
-        T_world_sensor = read_viewpoint(path_of(path, "path"))
+    if file.suffix.lower() == ".pcd":
+        T_world_sensor = read_viewpoint(file)
         points = points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
     if len(points) == 0:
         msg = f"{path} holds no points"
@@ -104,7 +101,55 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     return points if origin is None else points + origin
 
 
-def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
+# Files .bin: float32, x, y, z, intensity, as KITTI has them, or as many columns as a user says.
+
+
+def _bin(path: Path, columns: GivenColumns) -> Columns:
+    if columns is None:
+        check_kitti([path])
+    width = columns if isinstance(columns, int) else len(columns or range(_KITTI_WIDTH))
+    if path.stat().st_size % (4 * width):
+        msg = f"its size is no whole number of points of {width} float32 each: give columns (--columns)"
+        raise ValueError(msg)
+    table = np.fromfile(path, "<f4").reshape(-1, width)
+    return dict(zip(names_of(width, columns), table.T, strict=True))
+
+
+def check_kitti(paths: Sequence[Path]) -> None:
+    """Raises a ValueError if most ``.bin`` files of a recording do not look like points of four float32."""
+    paths = [path for path in paths if path.stat().st_size][:_JUDGED_FILES]
+    fitting = [path for path in paths if path.stat().st_size % (4 * _KITTI_WIDTH) == 0]
+    remedy = "give columns (--columns), how many float32 a point has, or their names"
+    if 2 * len(fitting) < len(paths):
+        msg = f"the sizes of the .bin files are no whole numbers of points of four float32 each: {remedy}"
+        raise ValueError(msg)
+    if not fitting:
+        return
+    tables = [np.fromfile(path, "<f4").reshape(-1, _KITTI_WIDTH).astype(np.float64) for path in fitting]
+    table = np.concatenate(tables)
+    if (np.abs(table[np.isfinite(table).all(axis=1), :3]) > _MAX_POSITION_M).any():
+        msg = f"numbers in the .bin files are no positions in m, as float32: {remedy}"
+        raise ValueError(msg)
+    # Logarithms, so that no column has all of the variance; numbers of one column are alike.
+    numbers = np.nan_to_num(np.sign(table) * np.log1p(np.abs(table))).ravel()
+    within, freedom = _variance(numbers, _KITTI_WIDTH)
+    for width in _WIDTHS:
+        other, other_freedom = _variance(numbers, width)
+        if other_freedom <= 0 or other > _LESS * within:
+            continue
+        if other == 0 or fdtrc(freedom, other_freedom, within / other) < _CHANCE:
+            msg = f"the .bin files look like points of {width} float32, not of four: {remedy}"
+            raise ValueError(msg)
+
+
+def _variance(numbers: NDArray[np.float64], width: int) -> tuple[float, int]:
+    """Variance within columns, unbiased, and its degrees of freedom."""
+    table = numbers[: len(numbers) // width * width].reshape(-1, width)
+    freedom = table.size - width
+    return float(table.var(axis=0).sum()) * len(table) / max(freedom, 1), freedom
+
+
+def _npy(path: Path, columns: GivenColumns) -> Columns:
     # A memory map: a header that claims more than the file holds is refused before anything is allocated.
     array = np.load(path, mmap_mode="r", allow_pickle=False)
     if array.dtype.names is not None and array.ndim == 1:
@@ -115,40 +160,31 @@ def _npy(path: Path, columns: int | Sequence[str] | None) -> Columns:
     return dict(zip(names_of(array.shape[1], columns), np.array(array).T, strict=True))
 
 
-def _text(path: Path, columns: int | Sequence[str] | None) -> Columns:
+def _text(path: Path, columns: GivenColumns) -> Columns:
     table = read_table(path)
-    names = table.header
-    if names is None:  # CloudCompare writes names of columns after a comment sign
-        named = [head for head in table.heads if {"x", "y", "z"} <= {word.lower() for word in head}]
-        names = named[0] if named else names_of(table.values.shape[1] or 3, columns)
-    if len(table.lines) == 0:
-        return {name: np.zeros(0) for name in names}
-    if table.values.shape[1] != len(names) or len(set(names)) != len(names):
-        msg = f"its header has {len(names)} names for {table.values.shape[1]} columns, or a name twice"
+    width = table.values.shape[1]
+    # CloudCompare writes names of columns after a comment sign.
+    named = (head for head in table.heads if {"x", "y", "z"} <= {word.lower() for word in head})
+    names = table.header or next(named, None) or names_of(width or 3, columns)
+    if len(table.lines) and (width != len(names) or len(set(names)) != len(names)):
+        msg = f"its header has {len(names)} names for {width} columns, or a name twice"
         raise ValueError(msg)
-    return dict(zip(names, table.values.T, strict=True))
+    values = table.values if len(table.lines) else np.zeros((0, len(names)))
+    return dict(zip(names, values.T, strict=True))
 
 
 # PCD: pointclouds.org/documentation/tutorials/pcd_file_format.html
 
 
-def read_pcd(path: Path) -> Columns:
-    """The fields with one number a point: of ascii, binary or binary_compressed files to version 0.7.
-
-    ``VIEWPOINT`` is not applied: :func:`read_viewpoint` has it.
-    """
+def _pcd(path: Path, _: GivenColumns) -> Columns:
+    """The fields with one number a point: of ascii, binary or binary_compressed files to version 0.7."""
     with path.open("rb") as file:
         header = _pcd_header(file)
         body = file.read()
-    if missing := {"FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA"} - {
-        key for key in header if header[key]
-    }:
-        msg = f"its header lacks {', '.join(sorted(missing))}"
-        raise ValueError(msg)
     names, points = header["FIELDS"], int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-    fields = zip(names, header["TYPE"], header["SIZE"], counts, strict=True)
-    dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for _, kind, size, count in fields]
+    fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
+    dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for kind, size, count in fields]
     readers = {"binary": _pcd_binary, "ascii": _pcd_ascii, "binary_compressed": _pcd_compressed}
     columns = readers[header["DATA"][0]](body, dtypes, points)
     # The name _ means padding, and several fields may have it.
@@ -156,11 +192,11 @@ def read_pcd(path: Path) -> Columns:
 
 
 def read_viewpoint(path: Path) -> NDArray[np.float64]:
-    """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a file, which is tx ty tz qw qx qy qz; the identity without one."""
+    """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a PCD file, tx ty tz qw qx qy qz; the identity without one."""
     with path.open("rb") as file:
         numbers = np.array(_pcd_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
     if numbers.shape != (7,) or not np.isfinite(numbers).all():
-        msg = "its VIEWPOINT is not seven finite numbers: tx ty tz qw qx qy qz"
+        msg = f"{path}: its VIEWPOINT is not seven finite numbers: tx ty tz qw qx qy qz"
         raise ValueError(msg)
     T_world_sensor = np.eye(4)
     T_world_sensor[:3, 3] = numbers[:3]
@@ -190,52 +226,38 @@ def _pcd_binary(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[N
 
 def _pcd_compressed(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
     """Compressed by LZF, one field after another."""
-    packed, unpacked = (int(size) for size in np.frombuffer(body[:8], "<u4"))
+    packed = int.from_bytes(body[:4], "little")
     sizes = [dtype.itemsize * points for dtype in dtypes]
-    if unpacked != sum(sizes):
-        msg = f"its {unpacked} unpacked bytes are not {points} points of {sum(sizes)} bytes"
-        raise ValueError(msg)
-    data = unpack_lzf(body[8 : 8 + packed], unpacked)
+    data = unpack_lzf(body[8 : 8 + packed], sum(sizes))
     starts = np.cumsum([0, *sizes[:-1]]).tolist()
-    return [
-        np.frombuffer(data, dtype, points, start)[:, 0] for dtype, start in zip(dtypes, starts, strict=True)
-    ]
+    fields = zip(dtypes, starts, strict=True)
+    return [np.frombuffer(data, dtype, points, start)[:, 0] for dtype, start in fields]
 
 
 def _pcd_ascii(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
     widths = [dtype.shape[0] for dtype in dtypes]
-    text = body.decode("ascii")
-    table = np.zeros((0, sum(widths)))
-    if text and not text.isspace():  # of no rows, NumPy warns
-        table = np.loadtxt(io.StringIO(text), np.float64, comments=None, ndmin=2)
-    if table.shape != (points, sum(widths)):
-        msg = f"the file does not hold {points} rows of {sum(widths)} values, as its header says"
-        raise ValueError(msg)
+    table = np.array(body.split(), np.float64).reshape(points, sum(widths))
     return [table[:, i] for i in np.cumsum([0, *widths[:-1]])]
 
 
 def unpack_lzf(data: bytes, size: int) -> bytes:
-    """Unpacks `size` bytes of the LZF compression."""
-    msg = f"its compressed data do not unpack to {size} bytes"
+    """Unpacks `size` bytes of the LZF compression: literals, and references to what was unpacked before."""
     out = bytearray()
     stream = iter(data)
-    # What a damaged stream lacks at its end reads as 0; the size then differs.
     for control in stream:
-        if control < _LITERALS:
+        if control < 32:
             out += bytes(itertools.islice(stream, control + 1))
-        else:
-            length = 2 + (control >> 5)
-            if length == 2 + 7:  # a longer one: the next byte adds to it
-                length += next(stream, 0)
-            start = len(out) - ((control & 0x1F) << 8) - next(stream, size) - 1
-            if start < 0:
-                raise ValueError(msg)
-            # It may overlap with what it writes: the same bytes again and again.
-            part = bytes(out[start : start + length])
-            out += (part * (length // len(part) + 1))[:length]
-        if len(out) > size:
+            continue
+        length = control >> 5
+        if length == 7:  # a longer one: the next byte adds to it
+            length += next(stream, 0)
+        start = len(out) - ((control & 0x1F) << 8) - next(stream, size) - 1
+        if start < 0:
             break
+        for at in range(start, start + length + 2):  # one by one: it may overlap with what it writes
+            out.append(out[at])
     if len(out) != size:
+        msg = f"its compressed data do not unpack to {size} bytes"
         raise ValueError(msg)
     return bytes(out)
 
@@ -249,11 +271,12 @@ def ply_bytes(path: Path) -> io.BytesIO:
 def has_faces(path: Path) -> bool:
     """Whether a PLY file is a mesh, by its header."""
     with path.open("rb") as file:
-        return _FACES.search(file.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]) is not None
+        header = file.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
+    return re.search(rb"element\s+face\s+0*[1-9]", header) is not None
 
 
-def read_ply(path: Path) -> Columns:
-    """The columns of the vertices of a PLY file."""
+def _ply(path: Path, _: GivenColumns) -> Columns:
+    """The columns of the vertices."""
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
@@ -271,13 +294,14 @@ def read_ply(path: Path) -> Columns:
     return columns
 
 
-def read_las(path: Path) -> dict[str, NDArray[Any]]:
-    """The columns (N,) of a file by their names. Those of radars that :func:`write_las` wrote have the names as there."""
+def _las(path: Path, _: GivenColumns) -> Columns:
+    """Columns by their names; those that :func:`write_cloud` wrote have the names as there."""
     laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
     size = path.stat().st_size
-    with path.open("rb") as raw:  # laspy would count to four billion
-        records = int.from_bytes(raw.read(_HEADER_BYTES)[_COUNT_AT : _COUNT_AT + 4], "little")
-    if records * _RECORD_BYTES > size:
+    with path.open("rb") as raw:
+        raw.seek(_VLRS_AT)
+        records = int.from_bytes(raw.read(4), "little")
+    if records * _VLR_BYTES > size:  # laspy would count to four billion
         msg = f"its header says {records} records, for which the file is too small"
         raise ValueError(msg)
     # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
@@ -287,63 +311,22 @@ def read_las(path: Path) -> dict[str, NDArray[Any]]:
         if header.point_count * header.point_format.size > size * compression:
             msg = f"its header says {header.point_count} points, for which the file is too small"
             raise ValueError(msg)
-        if header.are_points_compressed:
-            _check_chunks(path, header)
         cloud = file.read_points(header.point_count)
     # Scaled and shifted, in double precision: the integers in the file are no metres.
     columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
-    if "intensity" in header.point_format.dimension_names:
-        columns["intensity"] = np.asarray(cloud.intensity)
-    if "gps_time" in header.point_format.dimension_names:
-        columns["time"] = np.asarray(cloud.gps_time)
-    for name in header.point_format.extra_dimension_names:
-        columns["intensity" if name == LAS_INTENSITY else str(name)] = np.asarray(cloud[name])
-    return columns
+    names = {"intensity": "intensity", "gps_time": "time"}
+    names |= {name: str(name) for name in header.point_format.extra_dimension_names}
+    names |= {LAS_INTENSITY: "intensity"}
+    known = set(header.point_format.dimension_names)
+    return columns | {as_name: np.asarray(cloud[name]) for name, as_name in names.items() if name in known}
 
 
-def _check_chunks(path: Path, header: Any) -> None:
-    """Raises a ValueError for chunks that the file cannot hold: lazrs allocates what they claim, or ends the process."""
-    import lazrs  # noqa: PLC0415 - an extra
-
-    point, file_bytes, at = header.point_format, path.stat().st_size, header.offset_to_point_data
-    record = bytes(header.vlrs.get("LasZipVlr")[0].record_data)
-    usual = bytes(lazrs.LazVlr.new_for_compression(point.id, point.num_extra_bytes).record_data())
-    # Compressor, then type, size and version of each part of a point.
-    parts, usual_parts = (np.frombuffer(data[34:], "<u2").reshape(-1, 3)[:, :2] for data in (record, usual))
-    possible = record[:2] == usual[:2] and np.array_equal(parts, usual_parts)
-    with path.open("rb") as file:
-        for place in (at, file_bytes - 8):  # of the place of the chunk table: before the points or at the end
-            file.seek(place)
-            table_at = int.from_bytes(file.read(8), "little", signed=True)
-            if table_at > at:
-                possible &= table_at + 8 <= file_bytes
-                file.seek(min(table_at, file_bytes))
-                chunks = int.from_bytes(file.read(8)[4:], "little")
-                # Each begins with a point as it is.
-                possible &= chunks * point.size <= file_bytes and chunks <= max(header.point_count, 1)
-                break
-        chunk_size, left = int.from_bytes(record[12:16], "little"), header.point_count
-        layers = _LAZ_LAYERS.get(point.id, 0) + point.num_extra_bytes
-        at += 8
-        # In a chunk, the first point, the number of points, and the sizes of its layers are before these.
-        while possible and left > 0 and point.id in _LAZ_LAYERS:
-            file.seek(at + point.size)
-            count, *sizes = np.frombuffer(file.read(4 * (1 + layers)), "<u4").tolist() or [0]
-            at += point.size + 4 * (1 + layers) + sum(sizes)
-            expected = count if chunk_size == _VARIABLE else min(chunk_size, left)
-            possible = len(sizes) == layers and at <= file_bytes and 0 < count == expected
-            left -= count
-    if not possible:
-        msg = "its chunks of compressed points are damaged, or it is too small for them"
-        raise ValueError(msg)
-
-
-READERS: dict[str, Callable[[Path, int | Sequence[str] | None], Columns]] = {
-    ".pcd": lambda path, _: read_pcd(path),
-    ".ply": lambda path, _: read_ply(path),
-    ".las": lambda path, _: read_las(path),
-    ".laz": lambda path, _: read_las(path),
-    ".bin": read_bin,
+READERS: dict[str, Callable[[Path, GivenColumns], Columns]] = {
+    ".pcd": _pcd,
+    ".ply": _ply,
+    ".las": _las,
+    ".laz": _las,
+    ".bin": _bin,
     ".npy": _npy,
     **dict.fromkeys(TEXT_SUFFIXES, _text),
 }
