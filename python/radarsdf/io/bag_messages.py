@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.extras import require
-from radarsdf.io.files import check_regular_file
+from radarsdf.io.files import check, check_regular_file
 from radarsdf.io.scans import Columns, Notes
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -48,34 +48,34 @@ _PACKET_BYTES, _RETURNS_AT, _COUNT_AT, _MAX_RETURNS = 35336, 101, 35309, 800
 _NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
 
 
-class Header(NamedTuple):
-    """Stamp and frame of a message."""
+class Topic(NamedTuple):
+    """A topic of bags."""
+
+    name: str
+    message_type: str
+    num_messages: int
+
+
+class Pose(NamedTuple):
+    """A pose T_parent_child."""
 
     stamp_s: float
-    frame: str
-
-
-class CloudMessage(NamedTuple):
-    """A message with points."""
-
-    header: Header
-    columns: Columns
-
-
-class PoseMessage(NamedTuple):
-    """A pose T_frame_child."""
-
-    header: Header
+    parent: str
     child: str  # empty where the message does not name it
     values: tuple[float, ...]  # x, y, z, m; qx, qy, qz, qw
 
 
-class ImuMessage(NamedTuple):
-    """Rates, rad/s, and specific force, m/s², in the axes of the IMU. None: it does not measure it."""
+class Message(NamedTuple):
+    """A message of a bag."""
 
-    header: Header
-    angular_velocity: tuple[float, ...] | None
-    specific_force: tuple[float, ...] | None
+    bag: Path
+    topic: str
+    message_type: str
+    recorded_s: float
+    number: int  # of its topic, from 0
+    stamp_s: float
+    frame: str
+    content: Any  # columns of a cloud, a list of poses, or rates, rad/s, and forces, m/s², of an IMU
 
 
 @cache
@@ -89,40 +89,26 @@ def _types(cdr: bool) -> Any:
     return store
 
 
-def read_message(raw: bytes | memoryview, message_type: str, cdr: bool) -> Any:
-    """The content of a message of ROS 2 (`cdr`) or ROS 1, by its type.
-
-    Returns a `CloudMessage`, a list of `PoseMessage` or an `ImuMessage`. Raises a ValueError for a damaged one.
-    """
-    try:
-        store = _types(cdr)
-        message = (store.deserialize_cdr if cdr else store.deserialize_ros1)(raw, message_type)
-    except Exception as error:  # damaged messages raise exceptions of many kinds
-        raise ValueError(str(error)) from error
-    if message_type in _CLOUDS:
-        return CloudMessage(_header(message), _CLOUDS[message_type](message))
-    return _OTHERS[message_type](message)
-
-
-def _header(message: Any) -> Header:
+def _stamp(message: Any) -> tuple[float, str]:
+    """Time, s, and frame; of messages without a header, 0 and none."""
+    if not hasattr(message, "header"):
+        return 0.0, ""
     stamp = message.header.stamp
-    return Header(stamp.sec + 1e-9 * stamp.nanosec, message.header.frame_id.lstrip("/"))
+    return stamp.sec + 1e-9 * stamp.nanosec, message.header.frame_id.lstrip("/")
 
 
 def _point_cloud2(message: Any) -> Columns:
-    height, width, step, row_step, data = (
-        message.height, message.width, message.point_step, message.row_step, message.data
-    )  # fmt: skip
-    row_step = row_step if height > 1 else step * width  # of one row, some drivers leave it 0
-    if step * width > row_step or row_step * height > len(data):
-        msg = f"{height} x {width} points of {step} bytes do not fit into its {len(data)} bytes"
-        raise ValueError(msg)
+    height, width, step, data = message.height, message.width, message.point_step, message.data
+    row_step = message.row_step if height > 1 else step * width  # of one row, some drivers leave it 0
+    fits = step * width <= row_step and row_step * height <= len(data)
+    check(fits, f"{height} x {width} points of {step} bytes do not fit into its {len(data)} bytes")
     columns: Columns = {}
     for field in message.fields:
-        kind = _POINT_FIELD_TYPES.get(field.datatype)
-        if kind is None or field.offset + int(kind[1]) > step:
-            msg = f"its field {field.name} has an unknown type, or lies outside of a point"
-            raise ValueError(msg)
+        kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")
+        check(
+            field.offset + int(kind[1:]) <= step,
+            f"its field {field.name} is of no type, or beyond its points",
+        )
         if field.count > 1 or not field.name or field.name in columns:  # 0 is what some drivers write for 1
             continue
         dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
@@ -163,43 +149,39 @@ def _ars548_packets(message: Any) -> Columns:
     invalid = np.unpackbits(returns["invalid"][None], axis=0, bitorder="little") != 0
     columns = {name: returns[name] for name in ("rcs", "range_std", "azimuth_std", "elevation_std")}
     for i, name in enumerate(("range", "azimuth_rad", "elevation_rad", "range_rate")):
-        columns[name] = np.where(
-            invalid[2 * i], np.nan, returns[name]
-        )  # each flag is before that of its deviation
+        columns[name] = np.where(invalid[2 * i], np.nan, returns[name])  # odd flags are of deviations
     return columns
 
 
-def _pose(header: Header, child: str, position: Any, rotation: Any) -> PoseMessage:
+def _pose(message: Any, position: Any, rotation: Any) -> Pose:
     values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
-    return PoseMessage(header, child.lstrip("/"), values)
+    return Pose(*_stamp(message), getattr(message, "child_frame_id", "").lstrip("/"), values)
 
 
-def _pose_stamped(message: Any) -> list[PoseMessage]:
+def _pose_stamped(message: Any) -> list[Pose]:
     """Also of messages with a covariance, within which is the pose."""
     pose = getattr(message.pose, "pose", message.pose)
-    child = getattr(message, "child_frame_id", "")
-    return [_pose(_header(message), child, pose.position, pose.orientation)]
+    return [_pose(message, pose.position, pose.orientation)]
 
 
-def _transform(message: Any) -> list[PoseMessage]:
-    transform = message.transform
-    return [_pose(_header(message), message.child_frame_id, transform.translation, transform.rotation)]
+def _transform(message: Any) -> list[Pose]:
+    return [_pose(message, message.transform.translation, message.transform.rotation)]
 
 
-def _path(message: Any) -> list[PoseMessage]:
+def _path(message: Any) -> list[Pose]:
     return [pose for stamped in message.poses for pose in _pose_stamped(stamped)]
 
 
-def _transforms(message: Any) -> list[PoseMessage]:
+def _transforms(message: Any) -> list[Pose]:
     return [pose for stamped in message.transforms for pose in _transform(stamped)]
 
 
-def _imu(message: Any) -> ImuMessage:
+def _imu(message: Any) -> list[tuple[float, ...] | None]:
     measured: list[tuple[float, ...] | None] = []
     for name in ("angular_velocity", "linear_acceleration"):
         vector, covariance = getattr(message, name), getattr(message, f"{name}_covariance")
         measured.append(None if covariance[0] == _NOT_MEASURED else (vector.x, vector.y, vector.z))
-    return ImuMessage(_header(message), *measured)
+    return measured
 
 
 PACKETS = "nebula_msgs/msg/NebulaPackets"
@@ -212,7 +194,7 @@ _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "radar_msgs/msg/RadarScan": _radar_scan,
     PACKETS: _ars548_packets,
 }
-_POSES: dict[str, Callable[[Any], list[PoseMessage]]] = {
+_POSES: dict[str, Callable[[Any], list[Pose]]] = {
     "nav_msgs/msg/Odometry": _pose_stamped,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
@@ -220,27 +202,8 @@ _POSES: dict[str, Callable[[Any], list[PoseMessage]]] = {
     PATH: _path,
 }
 _TRANSFORMS = dict.fromkeys(("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), _transforms)
-_OTHERS: dict[str, Callable[[Any], Any]] = {**_POSES, **_TRANSFORMS, IMU: _imu}
+_READERS: dict[str, Callable[[Any], Any]] = {**_CLOUDS, **_POSES, **_TRANSFORMS, IMU: _imu}
 CLOUD_TYPES, POSE_TYPES, TRANSFORM_TYPES = tuple(_CLOUDS), tuple(_POSES), tuple(_TRANSFORMS)
-
-
-class Topic(NamedTuple):
-    """A topic of bags."""
-
-    name: str
-    message_type: str
-    num_messages: int
-
-
-class Message(NamedTuple):
-    """A message of a bag."""
-
-    bag: Path
-    topic: str
-    message_type: str
-    recorded_s: float
-    number: int  # of its topic, from 0
-    content: Any  # of read_message
 
 
 def is_bag(path: Path) -> bool:
@@ -287,14 +250,17 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
         for recorded_s, path, connection, raw in heapq.merge(*streams, key=itemgetter(0)):
             topic, message_type = connection.topic, connection.msgtype
             number, numbers[topic] = numbers[topic], numbers[topic] + 1
+            cdr = hasattr(connection.ext, "serialization_format")
             try:
-                content = read_message(raw, message_type, hasattr(connection.ext, "serialization_format"))
-            except ValueError as error:
-                damaged.setdefault(topic, []).append(
-                    f"{path}: message {number} of {topic}, at {recorded_s:.3f} s, is not a whole {message_type}: {error}"
+                message = (_types(cdr).deserialize_cdr if cdr else _types(cdr).deserialize_ros1)(
+                    raw, message_type
                 )
+                content = _READERS[message_type](message)
+            except Exception as error:  # noqa: BLE001 - damaged messages raise exceptions of many kinds
+                at = f"message {number} of {topic}, at {recorded_s:.3f} s"
+                damaged.setdefault(topic, []).append(f"{path}: {at}, is not a whole {message_type}: {error}")
                 continue
-            yield Message(path, topic, message_type, recorded_s, number, content)
+            yield Message(path, topic, message_type, recorded_s, number, *_stamp(message), content)
     for topic, texts in damaged.items():
         notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
 
@@ -328,9 +294,8 @@ def _stream(
         try:
             for connection, recorded_ns, raw in reader.messages(connections=connections):
                 # A database of SQLite may hold values of any type.
-                if not (isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))):
-                    msg = "a message has no time or no bytes"
-                    raise ValueError(msg)  # noqa: TRY004 - the file is damaged
+                known = isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))
+                check(known, "a message has no time or no bytes")
                 yield 1e-9 * recorded_ns, path, connection, raw
         except Exception as error:  # damaged bags raise exceptions of many kinds
             raise _damaged(path, error) from error

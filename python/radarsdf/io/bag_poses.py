@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -22,10 +23,10 @@ from radarsdf.io.bag_messages import (
     topics_of,
     topics_with,
 )
+from radarsdf.io.files import check
 from radarsdf.io.poses import (
     FIND_POSES,
     NoPoses,
-    ScanPoses,
     StampedPoses,
     Trajectory,
     TransformChain,
@@ -52,9 +53,7 @@ class Track:
     parent: str
     child: str = ""  # empty where the messages do not name it
     static: bool = False
-    numbers: array[float] = field(
-        default_factory=lambda: array("d")
-    )  # stamp, record time, position, quaternion
+    numbers: array[float] = field(default_factory=lambda: array("d"))  # stamp, record time, pose
 
     @cached_property
     def table(self) -> NDArray[np.float64]:
@@ -89,16 +88,14 @@ class TransformTree:
 
     def __init__(self, tracks: dict[str, Track]) -> None:
         self.tracks = tracks  # by child
-        self.hung: dict[str, TransformChain] = {}  # poses in _WORLD of frames, in place of their tracks
+        self.attached: dict[str, TransformChain] = {}  # poses of frames in _WORLD, in place of their tracks
 
     def chain(self, frame: str) -> list[str]:
         """The frame, its parent, and so on up to the root. Raises a ValueError if they run in a circle."""
         chain = [frame]
-        while chain[-1] in self.hung or chain[-1] in self.tracks:
-            parent = _WORLD if chain[-1] in self.hung else self.tracks[chain[-1]].parent
-            if parent in chain:
-                msg = f"the transforms run in a circle: {' -> '.join([*chain, parent])}"
-                raise ValueError(msg)
+        while chain[-1] in self.attached or chain[-1] in self.tracks:
+            parent = _WORLD if chain[-1] in self.attached else self.tracks[chain[-1]].parent
+            check(parent not in chain, f"the transforms run in a circle: {' -> '.join([*chain, parent])}")
             chain.append(parent)
         return chain
 
@@ -106,7 +103,7 @@ class TransformTree:
         """The highest frame that does not move against this one, and T_top_frame (4, 4)."""
         T_top_frame = np.eye(4)
         for top in self.chain(frame):
-            if top in self.hung or top not in self.tracks or not self.tracks[top].constant:
+            if top in self.attached or top not in self.tracks or not self.tracks[top].constant:
                 break
             T_top_frame = self.tracks[top].matrix @ T_top_frame
         return top, T_top_frame
@@ -116,17 +113,18 @@ class TransformTree:
         (top, T_top_base), (other, T_top_sensor) = self.rigid_top(base), self.rigid_top(sensor)
         return np.linalg.inv(T_top_base) @ T_top_sensor if top == other else None
 
-    def hang(self, poses: StampedPoses, base: str, extrinsic: NDArray[np.float64] | None) -> None:
-        """Lets `base`, and all that does not move against it, have these poses, after the extrinsic of a user."""
+    def attach(self, poses: StampedPoses, base: str, request: Request) -> FindPoses:
+        """Lets `base`, and all that does not move against it, have these poses, before the extrinsic of a user."""
         top, T_top_base = self.rigid_top(base)
-        T_pose_base = np.eye(4) if extrinsic is None else extrinsic
-        self.hung[top] = TransformChain((poses, T_pose_base @ np.linalg.inv(T_top_base)))
+        T_pose_base = np.eye(4) if request.extrinsic is None else request.extrinsic
+        self.attached[top] = TransformChain((poses, T_pose_base @ np.linalg.inv(T_top_base)))
+        return self.finder(_WORLD, request)
 
-    def finder(self, world: str, request: Request) -> FindPoses:
+    def finder(self, world: str, request: Request) -> Callable[[str], TransformChain | None]:
         """Poses of the frames below the world."""
 
         @cache
-        def find(frame: str) -> ScanPoses | None:
+        def find(frame: str) -> TransformChain | None:
             try:
                 chain = self.chain(frame)
                 if world not in chain[1:]:
@@ -134,16 +132,15 @@ class TransformTree:
                 chain = chain[: chain.index(world) + 1]
                 if world != _WORLD:
                     request.notes.add(f"poses: TF, {' -> '.join(reversed(chain))}")
-                links = tuple(self._link(child, request) for child in reversed(chain[:-1]))
+                return TransformChain(tuple(self._link(child, request) for child in reversed(chain[:-1])))
             except ValueError:  # a circle of frames, or a single pose
                 return None
-            return ScanPoses(TransformChain(links), np.eye(4), request.max_gap_s)
 
         return find
 
     def _link(self, child: str, request: Request) -> StampedPoses | NDArray[np.float64]:
-        if child in self.hung:
-            return self.hung[child]
+        if child in self.attached:
+            return self.attached[child]
         track = self.tracks[child]
         return (
             track.matrix
@@ -157,12 +154,6 @@ def transforms_in(paths: list[Path], request: Request) -> TransformTree:
     return _tracks_and_tree(paths, set(), set(topics_with(TRANSFORM_TYPES, topics_of(paths))), request)[1]
 
 
-def attached(poses: StampedPoses, base: str, tree: TransformTree, request: Request) -> FindPoses:
-    """Poses of the frames that do not move against `base`, whose poses are known, but for the extrinsic of the user."""
-    tree.hang(poses, base, request.extrinsic)
-    return tree.finder(_WORLD, request)
-
-
 def poses_in_bags(paths: list[Path], request: Request, frames: list[str], preferred: str | None) -> FindPoses:
     """Poses of each frame of scans, by time; `frames` are those of the first scans, the most frequent first.
 
@@ -173,10 +164,9 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     transforms = set(topics_with(TRANSFORM_TYPES, topics))
     fitting = set(topics_with(POSE_TYPES, topics))
     wants_tf = wanted in transforms or (wanted is not None and wanted.strip("/") == "tf" and bool(transforms))
-    if wanted is not None and not wants_tf and wanted not in fitting:
-        listed = ", ".join(sorted(fitting | transforms))
-        msg = f"{paths[0]} has no poses in {wanted}: topics with poses are {listed or 'none'}"
-        raise ValueError(msg)
+    listed = ", ".join(sorted(fitting | transforms)) or "none"
+    known = wanted is None or wants_tf or wanted in fitting
+    check(known, f"{paths[0]} has no poses in {wanted}: topics with poses are {listed}")
     names = {n for n in fitting if not _WANTED_POSE.search(n)} if wanted is None else fitting & {wanted}
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
@@ -187,13 +177,11 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
             notes.add(f"poses of {other} are passed over; pose_topic chooses them")
     if wants_tf or name is None:
         return _of_tree(tree, sensor, request)
-    if name not in tracks:
-        msg = f"{paths[0]}: {name} holds no poses"
-        raise ValueError(msg)
+    check(name in tracks, f"{paths[0]}: {name} holds no poses")
     trajectory = tracks[name].trajectory(name, request)
     notes.add(f"poses: {len(trajectory.times_s)} of {name}")
     base = sensor if request.extrinsic is not None else _base(tracks[name].child, name, tree, sensor, notes)
-    return attached(trajectory, base, tree, request)
+    return tree.attach(trajectory, base, request)
 
 
 def _tracks_and_tree(
@@ -209,9 +197,9 @@ def _tracks_and_tree(
         for pose in message.content:
             tracks, key = by_topic, message.topic
             if message.topic in transform_topics:
-                tracks, key = parents.setdefault(pose.child, {}), pose.header.frame
-            track = tracks.setdefault(key, Track(pose.header.frame, pose.child, static))
-            track.numbers.extend((pose.header.stamp_s, message.recorded_s, *pose.values))
+                tracks, key = parents.setdefault(pose.child, {}), pose.parent
+            track = tracks.setdefault(key, Track(pose.parent, pose.child, static))
+            track.numbers.extend((pose.stamp_s, message.recorded_s, *pose.values))
     edges = {}
     for child, tracks in parents.items():
         options = [track for track in tracks.values() if len(track.table)]
@@ -314,9 +302,7 @@ def _of_tree(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
             )
             world = frame
             break
-    if world not in chain:
-        msg = f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}"
-        raise ValueError(msg)
+    check(world in chain, f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}")
     if not moving & set(chain[: chain.index(world)]):
         msg = f"{about}: no transform between {world} and {base} moves: TF has no poses of the radar"
         raise NoPoses(msg)
@@ -325,6 +311,4 @@ def _of_tree(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     if poses is None:
         msg = f"{about}: a transform between {world} and {base} has a single pose"
         raise ValueError(msg)
-    if request.extrinsic is None or isinstance(poses.poses, np.ndarray):
-        return find
-    return attached(poses.poses, sensor, tree, request)
+    return find if request.extrinsic is None else tree.attach(poses, sensor, request)

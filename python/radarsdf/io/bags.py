@@ -17,13 +17,12 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf.io.bag_messages import (
     CLOUD_TYPES,
     IMU,
     PACKETS,
-    CloudMessage,
+    Message,
     Topic,
     by_record,
     is_bag,
@@ -31,10 +30,11 @@ from radarsdf.io.bag_messages import (
     topics_of,
     topics_with,
 )
-from radarsdf.io.bag_poses import attached, poses_in_bags, transforms_in
+from radarsdf.io.bag_poses import poses_in_bags, transforms_in
 from radarsdf.io.fields import Fields
+from radarsdf.io.files import check
 from radarsdf.io.imu import Imu
-from radarsdf.io.poses import UNPOSED, ScanPoses, StampedPoses, poses_of
+from radarsdf.io.poses import UNPOSED, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
 from radarsdf.io.scans import Notes, Scans
 
@@ -51,17 +51,15 @@ _PEEKED_SCANS = 10  # whose stamps and fields are looked at
 
 def read_bags(paths: list[Path], request: Request) -> Scans:
     """Scans of one drive in one or several bags; see :func:`radarsdf.io.read`."""
-    if not paths or not all(map(is_bag, paths)):
-        others = ", ".join(str(path) for path in paths if not is_bag(path))
-        msg = f"{others or 'an empty list'} is no bag: only bags can be read together"
-        raise ValueError(msg)
+    others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
+    check(paths and all(map(is_bag, paths)), f"{others} is no bag: only bags can be read together")
     topics = topics_of(paths)
     scan_topics = _scan_topics(topics, paths, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
-    counted = Counter(cloud.header.frame for clouds in peeked.values() for cloud in clouds)
+    counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
     by_recording = {
-        name: by_record(np.array([c.header.stamp_s for c in clouds]), name, request.stamps, request.notes)
+        name: by_record(np.array([c.stamp_s for c in clouds]), name, request.stamps, request.notes)
         for name, clouds in peeked.items()
     }
 
@@ -89,7 +87,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
 
 
 def _given(
-    poses: StampedPoses | NDArray[np.float64],
+    poses: Poses,
     paths: list[Path],
     topics: list[Topic],
     frames: list[str],
@@ -105,9 +103,8 @@ def _given(
         if len(frames) > 1:
             listed = ", ".join(frames)
             request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
-        unposed = ScanPoses(poses, np.eye(4), request.max_gap_s)
-        return lambda _: unposed
-    return attached(poses, frames[0], transforms_in(paths, request), request)
+        return lambda _: poses
+    return transforms_in(paths, request).attach(poses, frames[0], request)
 
 
 def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
@@ -115,26 +112,23 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
     about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
     for name in request.topic:
-        if name not in fitting:
-            what = (
-                f"{name} has messages {topics[name].message_type}, or none"
-                if name in topics
-                else f"has no topic {name}"
-            )
-            msg = f"{about}: {what}: topics with points are {_listed(fitting.values()) or 'none'}"
-            raise ValueError(msg)
+        what = (
+            f"{name} has messages {topics[name].message_type}" if name in topics else f"has no topic {name}"
+        )
+        check(
+            name in fitting, f"{about}: {what}: topics with points are {_listed(fitting.values()) or 'none'}"
+        )
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
-    if not fitting:
-        msg = f"{about} has no topic with points ({', '.join(CLOUD_TYPES)}): it has {_listed(topics.values()) or 'no topics'}"
-        raise ValueError(msg)
+    check(fitting, f"{about} has no topic with points: it has {_listed(topics.values()) or 'no topics'}")
     decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
     for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar, partial(_has_doppler, paths)):
         chosen = [topic for topic in decoded if fits(topic)]
         if len(chosen) == 1:
             break
     else:
-        msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {_listed(fitting.values())}"
+        listed = _listed(fitting.values())
+        msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {listed}"
         raise ValueError(msg)
     unknown = [t for t in topics.values() if t.num_messages and _is_radar(t) and not _is_standard(t)]
     if others := {*fitting.values(), *unknown} - set(chosen):
@@ -160,44 +154,42 @@ def _is_standard(topic: Topic) -> bool:
 def _has_doppler(paths: list[Path], topic: Topic) -> bool:
     try:
         clouds = _peek(paths, topic, Request())
-        return "doppler" in Fields.of(list(clouds[0].columns)).names
+        return "doppler" in Fields.of(list(clouds[0].content)).names
     except ValueError:
         return False
 
 
-def _peek(paths: list[Path], topic: Topic, request: Request) -> list[CloudMessage]:
+def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
     """The first messages of a topic."""
     with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
-        peeked = [message.content for message in itertools.islice(messages, _PEEKED_SCANS)]
-    if not peeked:
-        msg = f"{paths[0]}: the topic {topic.name} has no messages that can be read{request.notes.ending()}"
-        raise ValueError(msg)
+        peeked = list(itertools.islice(messages, _PEEKED_SCANS))
+    check(peeked, f"{paths[0]}: {topic.name} has no messages that can be read{request.notes.ending()}")
     return peeked
 
 
 def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
     for message in read_messages(paths, {topic.name}, request.notes):
-        cloud: CloudMessage = message.content
-        time_s = message.recorded_s if recorded else cloud.header.stamp_s
+        time_s = message.recorded_s if recorded else message.stamp_s
         name = f"{message.bag}: message {message.number} of {topic.name}"
-        yield RawScan(
-            partial(dict, cloud.columns), time_s, name, cloud.header.frame, topic.name, message.number
-        )
+        yield RawScan(partial(dict, message.content), time_s, name, message.frame, topic.name, message.number)
 
 
 def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several."""
     fitting = sorted(topics_with([IMU], topics))
     listed = ", ".join(fitting)
-    if request.imu_topic is not None and request.imu_topic not in fitting:
-        msg = f"{request.notes.about} has no inertial measurements in {request.imu_topic}: topics that have some are {listed or 'none'}"
-        raise ValueError(msg)
-    if request.imu_topic is None and len(fitting) > 1:
+    wanted, about = request.imu_topic, request.notes.about
+    known = wanted is None or wanted in fitting
+    check(
+        known,
+        f"{about} has no inertial measurements in {wanted}: topics that have some are {listed or 'none'}",
+    )
+    if wanted is None and len(fitting) > 1:
         request.notes.add(
-            f"there are several topics of IMUs, of which none is used: say by imu_topic which, of {listed}"
+            f"there are several IMUs, of which none is used: say by imu_topic which, of {listed}"
         )
         return None
-    return request.imu_topic or next(iter(fitting), None)
+    return wanted or next(iter(fitting), None)
 
 
 def _read_imu(
@@ -210,12 +202,12 @@ def _read_imu(
     """
     numbers, frame = array("d"), ""
     for message in read_messages(paths, {topic}, request.notes):
-        header, rates, force = message.content
+        rates, force = message.content
         if rates is None:
             request.notes.add(f"{topic} has no angular velocity: it is not used")
             return None
-        frame = frame or header.frame
-        numbers.extend((header.stamp_s, message.recorded_s, *rates, *(force or (np.nan,) * 3)))
+        frame = frame or message.frame
+        numbers.extend((message.stamp_s, message.recorded_s, *rates, *(force or (np.nan,) * 3)))
     table = np.array(numbers).reshape(-1, 8)
     table = table[np.isfinite(table[:, :5]).all(axis=1)]
     if len(table) == 0:

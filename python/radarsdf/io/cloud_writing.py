@@ -16,7 +16,7 @@ from tqdm import tqdm
 from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
-from radarsdf.io.files import origin_for, whole_file, write_origin
+from radarsdf.io.files import check, origin_for, whole_file, write_origin
 from radarsdf.io.scans import Columns, Scan, Scans
 from radarsdf.progress import hides_bar
 
@@ -39,9 +39,8 @@ class CloudWritten(NamedTuple):
 
 def check_cloud_path(path: str | PathLike[str]) -> None:
     """Raises a ValueError unless `path` ends like a format that :func:`write_cloud` writes."""
-    if path_of(path, "path").suffix.lower() not in CLOUD_OUT_SUFFIXES:
-        msg = f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}"
-        raise ValueError(msg)
+    known = path_of(path, "path").suffix.lower() in CLOUD_OUT_SUFFIXES
+    check(known, f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}")
 
 
 def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | None = False) -> CloudWritten:
@@ -86,6 +85,8 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
         name: np.concatenate([part.get(name, nan) for part, nan in zip(parts, missing, strict=True)])
         for name in parts[0]
     }
+    for name in {"intensity", "doppler"} & set(columns):
+        columns[name] = columns[name].astype(np.float32)
     origin = None
     with whole_file(path) as file:
         if suffix == ".pcd":
@@ -99,15 +100,11 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
 
 
 def _columns(number: int, scan: Scan) -> Columns:
-    columns: Columns = dict(zip("xyz", scan.world_points.T, strict=True))
-    if scan.intensities is not None:
-        columns["intensity"] = scan.intensities.astype(np.float32)
-    if scan.doppler_mps is not None:
-        columns["doppler"] = scan.doppler_mps.astype(np.float32)
-    columns["scan"] = np.full(len(scan), number, np.int32)
-    if scan.time_s is not None:
-        columns["time"] = np.full(len(scan), scan.time_s)
-    return columns
+    columns: dict[str, Any] = dict(zip("xyz", scan.world_points.T, strict=True))
+    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
+    columns |= {"scan": np.full(len(scan), number, np.int32)}
+    columns |= {"time": None if scan.time_s is None else np.full(len(scan), scan.time_s)}
+    return {name: values for name, values in columns.items() if values is not None}
 
 
 def _ply(file: BinaryIO, rows: NDArray[Any]) -> None:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -15,13 +14,12 @@ from typing import Any, BinaryIO, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import fdtrc
 
 from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.interrupts import whole_import
 from radarsdf.io.fields import Fields, names_of
-from radarsdf.io.files import check_regular_file, origin_of
+from radarsdf.io.files import check, check_regular_file, origin_of, reading
 from radarsdf.io.scans import Columns, Notes
 from radarsdf.io.text import read_table
 
@@ -35,9 +33,8 @@ _VLRS_AT, _VLR_BYTES = (
 )  # place of the number of variable records in a LAS header, and the least size of one
 _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a header of PCD has eleven lines
 _PLY_HEADER_BYTES = 1 << 16
-_KITTI_WIDTH, _WIDTHS = 4, range(3, 21)  # columns of .bin files
-_JUDGED_FILES, _MAX_POSITION_M = 20, 1e7
-_LESS, _CHANCE = 0.8, 1e-4  # of the variance within four columns is left by others, not by chance
+_KITTI_WIDTH, _JUDGED_FILES, _MAX_POSITION_M = 4, 20, 1e7  # of .bin files
+_LESS, _ENOUGH_ROWS = 0.8, 30  # of the variance within four columns is left by another number of them
 
 GivenColumns: TypeAlias = int | Sequence[str] | None
 """The columns of files without names, as a user gives them: how many numbers a point has, or their names."""
@@ -47,9 +44,7 @@ def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
     """The columns of a file of points, (N,) each, by name."""
     check_regular_file(path)
     suffix = path.suffix.lower()
-    if suffix not in CLOUD_SUFFIXES:
-        msg = f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}"
-        raise ValueError(msg)
+    check(suffix in READERS, f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}")
     try:
         return READERS[suffix](path, columns)
     except (ImportError, MemoryError):
@@ -88,15 +83,13 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     """
     file = path_of(path, "path")
     columns = read_columns(file)
-    fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
-    fields = fields.judged(columns, Notes())
-    points = fields.scan(columns, str(path), np.eye(4), None, Notes()).points.astype(np.float64)
+    with reading(path, "a file of points"):
+        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler"))).judged(columns, Notes())
+        points = fields.scan(columns, np.eye(4), None, Notes()).points.astype(np.float64)
+        check(len(points), "it holds no points")
     if file.suffix.lower() == ".pcd":
         T_world_sensor = read_viewpoint(file)
         points = points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
-    if len(points) == 0:
-        msg = f"{path} holds no points"
-        raise ValueError(msg)
     origin = origin_of(path)
     return points if origin is None else points + origin
 
@@ -108,45 +101,36 @@ def _bin(path: Path, columns: GivenColumns) -> Columns:
     if columns is None:
         check_kitti([path])
     width = columns if isinstance(columns, int) else len(columns or range(_KITTI_WIDTH))
-    if path.stat().st_size % (4 * width):
-        msg = f"its size is no whole number of points of {width} float32 each: give columns (--columns)"
-        raise ValueError(msg)
-    table = np.fromfile(path, "<f4").reshape(-1, width)
-    return dict(zip(names_of(width, columns), table.T, strict=True))
+    numbers = np.fromfile(path, "<f4")
+    whole = path.stat().st_size % (4 * width) == 0
+    check(whole, f"its size is no whole number of points of {width} float32 each: give columns (--columns)")
+    return dict(zip(names_of(width, columns), numbers.reshape(-1, width).T, strict=True))
 
 
 def check_kitti(paths: Sequence[Path]) -> None:
-    """Raises a ValueError if most ``.bin`` files of a recording do not look like points of four float32."""
+    """Raises a ValueError if ``.bin`` files of a recording do not look like points of four float32."""
     paths = [path for path in paths if path.stat().st_size][:_JUDGED_FILES]
     fitting = [path for path in paths if path.stat().st_size % (4 * _KITTI_WIDTH) == 0]
     remedy = "give columns (--columns), how many float32 a point has, or their names"
-    if 2 * len(fitting) < len(paths):
-        msg = f"the sizes of the .bin files are no whole numbers of points of four float32 each: {remedy}"
-        raise ValueError(msg)
-    if not fitting:
-        return
-    tables = [np.fromfile(path, "<f4").reshape(-1, _KITTI_WIDTH).astype(np.float64) for path in fitting]
-    table = np.concatenate(tables)
-    if (np.abs(table[np.isfinite(table).all(axis=1), :3]) > _MAX_POSITION_M).any():
-        msg = f"numbers in the .bin files are no positions in m, as float32: {remedy}"
-        raise ValueError(msg)
-    # Logarithms, so that no column has all of the variance; numbers of one column are alike.
-    numbers = np.nan_to_num(np.sign(table) * np.log1p(np.abs(table))).ravel()
-    within, freedom = _variance(numbers, _KITTI_WIDTH)
-    for width in _WIDTHS:
-        other, other_freedom = _variance(numbers, width)
-        if other_freedom <= 0 or other > _LESS * within:
-            continue
-        if other == 0 or fdtrc(freedom, other_freedom, within / other) < _CHANCE:
-            msg = f"the .bin files look like points of {width} float32, not of four: {remedy}"
-            raise ValueError(msg)
+    check(2 * len(fitting) >= len(paths), f"most .bin files are no points of four float32 each: {remedy}")
+    numbers = np.concatenate([np.zeros(0, "<f4"), *(np.fromfile(path, "<f4") for path in fitting)])
+    positions = numbers.reshape(-1, _KITTI_WIDTH)[:, :3]
+    near = np.abs(positions[np.isfinite(positions)]) <= _MAX_POSITION_M
+    check(near.all(), f"float32 numbers in the .bin files are no positions in m: {remedy}")
+    # Numbers of one column are alike. Logarithms, so that no column has all of the variance.
+    numbers = np.nan_to_num(np.sign(numbers) * np.log1p(np.abs(numbers)))
+    within = _variance(numbers, _KITTI_WIDTH)
+    for width in range(3, min(21, len(numbers) // 2 + 1)):
+        other, few = _variance(numbers, width), len(numbers) < _ENOUGH_ROWS * width
+        check(
+            other >= _LESS * within or (few and other),
+            f"the .bin files have {width} columns, it seems: {remedy}",
+        )
 
 
-def _variance(numbers: NDArray[np.float64], width: int) -> tuple[float, int]:
-    """Variance within columns, unbiased, and its degrees of freedom."""
-    table = numbers[: len(numbers) // width * width].reshape(-1, width)
-    freedom = table.size - width
-    return float(table.var(axis=0).sum()) * len(table) / max(freedom, 1), freedom
+def _variance(numbers: NDArray[np.float32], width: int) -> float:
+    """Within columns."""
+    return float(numbers[: len(numbers) // width * width].reshape(-1, width).var(axis=0).mean())
 
 
 def _npy(path: Path, columns: GivenColumns) -> Columns:
@@ -154,9 +138,8 @@ def _npy(path: Path, columns: GivenColumns) -> Columns:
     array = np.load(path, mmap_mode="r", allow_pickle=False)
     if array.dtype.names is not None and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names}
-    if array.ndim != 2 or array.dtype.kind not in "iuf":
-        msg = f"it holds an array {array.shape} of {array.dtype}, not one row of numbers a point"
-        raise ValueError(msg)
+    rows = array.ndim == 2 and array.dtype.kind in "iuf"
+    check(rows, f"it holds an array {array.shape} of {array.dtype}, not one row of numbers a point")
     return dict(zip(names_of(array.shape[1], columns), np.array(array).T, strict=True))
 
 
@@ -166,10 +149,9 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
     # CloudCompare writes names of columns after a comment sign.
     named = (head for head in table.heads if {"x", "y", "z"} <= {word.lower() for word in head})
     names = table.header or next(named, None) or names_of(width or 3, columns)
-    if len(table.lines) and (width != len(names) or len(set(names)) != len(names)):
-        msg = f"its header has {len(names)} names for {width} columns, or a name twice"
-        raise ValueError(msg)
-    values = table.values if len(table.lines) else np.zeros((0, len(names)))
+    values = table.values if len(table.values) else np.zeros((0, len(names)))
+    fits = values.shape[1] == len(names) == len(set(names))
+    check(fits, f"its header has {len(names)} names for {width} columns, or a name twice")
     return dict(zip(names, values.T, strict=True))
 
 
@@ -177,7 +159,7 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
 
 
 def _pcd(path: Path, _: GivenColumns) -> Columns:
-    """The fields with one number a point: of ascii, binary or binary_compressed files to version 0.7."""
+    """The fields with one number a point: of ascii or binary files to version 0.7."""
     with path.open("rb") as file:
         header = _pcd_header(file)
         body = file.read()
@@ -185,7 +167,8 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
     dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for kind, size, count in fields]
-    readers = {"binary": _pcd_binary, "ascii": _pcd_ascii, "binary_compressed": _pcd_compressed}
+    readers = {"binary": _pcd_binary, "ascii": _pcd_ascii}
+    check(header["DATA"][0] in readers, f"its DATA is {header['DATA'][0]}: save it as binary")
     columns = readers[header["DATA"][0]](body, dtypes, points)
     # The name _ means padding, and several fields may have it.
     return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
@@ -195,9 +178,10 @@ def read_viewpoint(path: Path) -> NDArray[np.float64]:
     """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a PCD file, tx ty tz qw qx qy qz; the identity without one."""
     with path.open("rb") as file:
         numbers = np.array(_pcd_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
-    if numbers.shape != (7,) or not np.isfinite(numbers).all():
-        msg = f"{path}: its VIEWPOINT is not seven finite numbers: tx ty tz qw qx qy qz"
-        raise ValueError(msg)
+    check(
+        numbers.shape == (7,) and np.isfinite(numbers).all(),
+        f"{path}: its VIEWPOINT is not seven finite numbers",
+    )
     T_world_sensor = np.eye(4)
     T_world_sensor[:3, 3] = numbers[:3]
     if numbers[3:].any():  # some programs write zeros where nothing is known
@@ -224,42 +208,10 @@ def _pcd_binary(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[N
     return [cloud[name][:, 0] for name in record.names or ()]
 
 
-def _pcd_compressed(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
-    """Compressed by LZF, one field after another."""
-    packed = int.from_bytes(body[:4], "little")
-    sizes = [dtype.itemsize * points for dtype in dtypes]
-    data = unpack_lzf(body[8 : 8 + packed], sum(sizes))
-    starts = np.cumsum([0, *sizes[:-1]]).tolist()
-    fields = zip(dtypes, starts, strict=True)
-    return [np.frombuffer(data, dtype, points, start)[:, 0] for dtype, start in fields]
-
-
 def _pcd_ascii(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
     widths = [dtype.shape[0] for dtype in dtypes]
     table = np.array(body.split(), np.float64).reshape(points, sum(widths))
     return [table[:, i] for i in np.cumsum([0, *widths[:-1]])]
-
-
-def unpack_lzf(data: bytes, size: int) -> bytes:
-    """Unpacks `size` bytes of the LZF compression: literals, and references to what was unpacked before."""
-    out = bytearray()
-    stream = iter(data)
-    for control in stream:
-        if control < 32:
-            out += bytes(itertools.islice(stream, control + 1))
-            continue
-        length = control >> 5
-        if length == 7:  # a longer one: the next byte adds to it
-            length += next(stream, 0)
-        start = len(out) - ((control & 0x1F) << 8) - next(stream, size) - 1
-        if start < 0:
-            break
-        for at in range(start, start + length + 2):  # one by one: it may overlap with what it writes
-            out.append(out[at])
-    if len(out) != size:
-        msg = f"its compressed data do not unpack to {size} bytes"
-        raise ValueError(msg)
-    return bytes(out)
 
 
 def ply_bytes(path: Path) -> io.BytesIO:
@@ -288,9 +240,8 @@ def _ply(path: Path, _: GivenColumns) -> Columns:
     data = vertex["data"]
     names = data.keys() if isinstance(data, dict) else data.dtype.names
     columns = {str(name): np.asarray(data[name]).reshape(-1) for name in names}
-    if any(len(column) != vertex["length"] for column in columns.values()):
-        msg = f"its header says {vertex['length']} points, which it does not hold"
-        raise ValueError(msg)
+    whole = all(len(column) == vertex["length"] for column in columns.values())
+    check(whole, f"its header says {vertex['length']} points, which it does not hold")
     return columns
 
 
@@ -301,16 +252,14 @@ def _las(path: Path, _: GivenColumns) -> Columns:
     with path.open("rb") as raw:
         raw.seek(_VLRS_AT)
         records = int.from_bytes(raw.read(4), "little")
-    if records * _VLR_BYTES > size:  # laspy would count to four billion
-        msg = f"its header says {records} records, for which the file is too small"
-        raise ValueError(msg)
+    # laspy would count to four billion.
+    check(records * _VLR_BYTES <= size, f"its header says {records} records, for which the file is too small")
     # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
         header = file.header
-        compression = _MAX_COMPRESSION if header.are_points_compressed else 1
-        if header.point_count * header.point_format.size > size * compression:
-            msg = f"its header says {header.point_count} points, for which the file is too small"
-            raise ValueError(msg)
+        largest = size * (_MAX_COMPRESSION if header.are_points_compressed else 1)
+        fits = header.point_count * header.point_format.size <= largest
+        check(fits, f"its header says {header.point_count} points, for which the file is too small")
         cloud = file.read_points(header.point_count)
     # Scaled and shifted, in double precision: the integers in the file are no metres.
     columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}

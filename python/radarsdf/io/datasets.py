@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,16 +21,12 @@ import torch  # noqa: F401 - before the compiled core, so that both share one Op
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf._core import cell_keys
 from radarsdf.checks import check_pose
 from radarsdf.io.bag_messages import bags_in
 from radarsdf.io.bags import read_bags
-from radarsdf.io.clouds import read_columns
-from radarsdf.io.fields import Fields
-from radarsdf.io.files import reading
+from radarsdf.io.files import check, reading
 from radarsdf.io.folders import BASE_T_RADAR, lidar_map, natural, scans_of_files
 from radarsdf.io.poses import (
-    MAX_GAP_S,
     Trajectory,
     pose_matrices_of,
     poses_of,
@@ -69,9 +65,11 @@ def _scans(
     truth: Truth = lambda: None,
 ) -> Scans:
     """Scans of one file each. The data set's own poses and extrinsic are read only if the user gives none."""
-    if not files or (times_s is not None and len(times_s) != len(files)):
-        msg = f"{request.notes.about} has {len(files)} scans, of which the times or poses are not known for each"
-        raise ValueError(msg)
+    known = files and (times_s is None or len(times_s) == len(files))
+    check(
+        known,
+        f"{request.notes.about} has {len(files)} scans, of which the times or poses are not known for each",
+    )
     found = poses() if request.poses is None else poses_of(request.poses, request.notes)
     extrinsic = T_base_sensor() if request.extrinsic is None else request.extrinsic
     return scans_of_files(files, times_s, found, extrinsic, request, truth)
@@ -171,37 +169,28 @@ def _delft_pose(
         T_map_camera = check_pose(np.array(T_map_camera, np.float64).reshape(4, 4), "mapToCamera")
     calibration = radar / "calib" / f"{frame}.txt"
     T_camera_radar = read_calibration(calibration) if extrinsic is None else extrinsic
-    if T_camera_radar is None:
-        msg = f"{calibration} lacks Tr_velo_to_cam"
-        raise ValueError(msg)
+    check(T_camera_radar is not None, f"{calibration} lacks Tr_velo_to_cam")
     T_map_radar: NDArray[np.float64] = T_map_camera @ T_camera_radar
     return T_map_radar
 
 
-# SNAIL-Radar, snail-radar.github.io: two radars, the poses of its lidar in UTM zone 50R, which is the world frame, and the
-# lidar as ground truth.
+# SNAIL-Radar, snail-radar.github.io: two radars, and the poses of its lidar in UTM zone 50R, which is the world frame.
 #
 #     eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
 #     ars548/points/1706001762.429354169.pcd      ARS548 frame (forward, left, up); intensity: RCS + 128
 #     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
-#     xt32/1706001766.715735580.pcd               optional: lidar scan, lidar frame (left, back, up)
-#     lidar.pcd or lidar.ply                      optional: ground truth instead of xt32
+#     lidar.pcd or lidar.ply                      optional: ground truth
 
 _SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
 _SNAIL_TRAJECTORY = "utm50r_T_xt32.txt"
 
-# The published calibration. The axes of the body point forward, left and up; its
-# origin is that of the lidar. Source: matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m, multiplied out,
+# The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source: matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m, multiplied out,
 # of github.com/snail-radar/dataset_tools, commit 2f82c2c.
 _BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-_BODY_T_OCULII = np.array(
-    [
-        [0.999756831, 0.020010494, -0.009265982, 0.07],
-        [-0.019750133, 0.999429818, 0.027385610, 0.0],
-        [0.009808698, -0.027195946, 0.999581997, -0.115],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
+_BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
+                           [-0.019750133, 0.999429818, 0.027385610, 0.0],
+                           [0.009808698, -0.027195946, 0.999581997, -0.115],
+                           [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
 _ARS548_POSITION_M = (0.0, 0.0, 0.07)
 # Its orientation, qx qy qz qw, was set anew several times: from this day on. Afternoons and evenings are half a day later.
 _ARS548_ORIENTATIONS = (
@@ -214,10 +203,6 @@ _ARS548_ORIENTATIONS = (
     (20240113.0, (-0.001835193, -0.014938248, -0.025422503, 0.999563493)),
 )
 _DAY = re.compile(r"(\d{8})(_aft|_eve)?$")
-
-_LIDAR_RANGE_M = (1.0, 60.0)  # nearer points are on the platform or its operator; the radar sees no farther
-_LIDAR_CELL_M = 0.05  # a lidar point a cell: else most would lie on the ground where the platform stood
-_LIDAR_BATCH = 50  # scans from one thinning to the next; bounds the memory
 
 
 def _snail_parts(folder: Path) -> tuple[Path, str] | None:
@@ -238,23 +223,20 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
     others = [other for other in _SNAIL_RADARS if other != radar and (sequence / other).is_dir()]
     if others and folder.resolve() == sequence:
         request.notes.add(f"{radar} is read; {' and '.join(others)} are read as folders of their own")
-    stamped = _stamped_files(sequence / radar)
-    times_s = [time_s for time_s, _ in stamped]
-    return _scans(
-        [path for _, path in stamped],
-        times_s,
-        partial(_snail_trajectory, sequence),
-        partial(_T_xt32_radar, sequence, radar),
-        request,
-        partial(_snail_ground_truth, sequence, np.array(times_s)),
-    )
+    with reading(sequence / radar, "a folder of PCD files that are named by their times in seconds"):
+        stamped = sorted((float(path.stem), path) for path in (sequence / radar).glob("*.pcd"))
+    times_s, files = [time_s for time_s, _ in stamped], [path for _, path in stamped]
+    T_xt32_radar = partial(_T_xt32_radar, sequence, radar)
+    trajectory = partial(_snail_trajectory, sequence)
+    return _scans(files, times_s, trajectory, T_xt32_radar, request, partial(lidar_map, sequence))
 
 
 def _snail_trajectory(sequence: Path) -> Trajectory:
     path = sequence / _SNAIL_TRAJECTORY
-    if not path.is_file():
-        msg = f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence> of the data set"
-        raise ValueError(msg)
+    check(
+        path.is_file(),
+        f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence> of the data set",
+    )
     return trajectory_of(read_numbers(path, 8), str(path))
 
 
@@ -271,67 +253,12 @@ def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
     found = _DAY.match(name)
     day = float(found[1]) + 0.5 * (found[2] is not None) if found else 0.0
     known = [orientation for first, orientation in _ARS548_ORIENTATIONS if first <= day]
-    if not known:
-        msg = (
-            f"{sequence}: the calibration of the ARS548 depends on the day, which is the name of the folder above, such "
-            f"as 20231105_aft, but that is {name}: give extrinsic"
-        )
-        raise ValueError(msg)
+    what = f"the day, which is the name of the folder above, such as 20231105_aft, but that is {name}: give extrinsic"
+    check(known, f"{sequence}: the calibration of the ARS548 depends on {what}")
     T_body_ars548 = np.eye(4)
     T_body_ars548[:3, :3] = Rotation.from_quat(known[-1]).as_matrix()
     T_body_ars548[:3, 3] = _ARS548_POSITION_M
     return T_body_ars548
-
-
-def _snail_ground_truth(sequence: Path, times_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Lidar points (M, 3), m, of all lidar scans while the radar's were taken, at most one in each cell."""
-    points = lidar_map(sequence)
-    if points is not None or not (sequence / "xt32").is_dir() or not (sequence / _SNAIL_TRAJECTORY).is_file():
-        return points
-    trajectory = _snail_trajectory(sequence)
-    times_s = times_s[trajectory.covers(times_s)]
-    if not len(times_s):
-        return None
-    origin = trajectory.positions[0]  # cell keys are relative to it: UTM coordinates are out of their range
-    found = [np.zeros((0, 3))]
-    for count, world in enumerate(_lidar_scans(sequence / "xt32", trajectory, times_s[0], times_s[-1]), 1):
-        found.append(_thin(world - origin))
-        if count % _LIDAR_BATCH == 0:
-            found = [_thin(np.concatenate(found))]
-    points = _thin(np.concatenate(found)) + origin
-    return points if len(points) else None
-
-
-def _lidar_scans(
-    folder: Path, trajectory: Trajectory, first_s: float, last_s: float
-) -> Iterator[NDArray[np.float64]]:
-    """(K, 3) world, m, of 1 to 60 m range, each point moved with the pose at its own time if it has a ``timestamp``."""
-    for time_s, path in _stamped_files(folder):
-        if not first_s <= time_s <= last_s:
-            continue
-        columns = read_columns(path)
-        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
-        xyz = fields.points(columns).astype(np.float64)
-        times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
-        ranges_m = np.linalg.norm(xyz, axis=1)
-        used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
-        used &= trajectory.covers(times_s, MAX_GAP_S)
-        if used.any():
-            T_world_lidar = trajectory.poses(times_s[used])
-            yield (T_world_lidar[:, :3, :3] @ xyz[used][:, :, None])[:, :, 0] + T_world_lidar[:, :3, 3]
-
-
-def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
-    """Times, s, and paths of the PCD files of a folder, in the order of time."""
-    with reading(folder, "a folder of PCD files that are named by their times in seconds"):
-        return sorted((float(path.stem), path) for path in folder.glob("*.pcd"))
-
-
-def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The first point (K, 3) in each cell of points (N, 3)."""
-    _, first = np.unique(cell_keys(points, _LIDAR_CELL_M), return_index=True)
-    kept: NDArray[np.float64] = points[np.sort(first)]
-    return kept
 
 
 DATASETS = (

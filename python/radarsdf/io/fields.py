@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.io.files import check
 from radarsdf.io.scans import Notes, Scan, finite_returns
 from radarsdf.io.text import SCALES, are_degrees, without_unit
 
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
-_SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+# Names that sensors, drivers and data sets give to a role, in lower case and without what separates words. The first name
+# that a cloud has counts. Files of ours come first.
 _ALIASES: dict[str, tuple[str, ...]] = {
-    # The first name that a cloud has counts. Files of ours come first.
     "x": ("x",),
     "y": ("y",),
     "z": ("z",),
@@ -35,45 +37,34 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
     "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
 }  # fmt: skip
-"""Names that sensors, drivers and data sets give to a role, in lower case and without what separates words."""
-
-ROLES = tuple(_ALIASES)
-"""What a field can be. Positions are x, y and z, or else range, azimuth and elevation."""
-
-COLUMNS: dict[int, tuple[str, ...]] = {
+# Names of columns without names, by their number.
+_COLUMNS: dict[int, tuple[str, ...]] = {
     3: ("x", "y", "z"),
     4: ("x", "y", "z", "intensity"),  # KITTI
     5: ("x", "y", "z", "intensity", "doppler"),  # ColoRadar
     7: ("x", "y", "z", "rcs", "v_r", "v_r_compensated", "time"),  # View-of-Delft
     8: ("x", "y", "z", "v_r", "range", "power", "alpha", "beta"),  # TJ4DRadSet
 }
-"""Names of columns without names, by their number."""
 
 
 def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
     """Names of `width` columns that have none in their file."""
     if columns is not None and not isinstance(columns, int):
-        if len(columns) != width:
-            msg = f"there are {width} columns, but {len(columns)} names"
-            raise ValueError(msg)
+        check(len(columns) == width, f"there are {width} columns, but {len(columns)} names")
         return list(columns)
-    if width in COLUMNS:
-        return list(COLUMNS[width])
-    return ["x", "y", "z", *(f"column_{i}" for i in range(3, width))]
+    return list(_COLUMNS.get(width, ("x", "y", "z", *(f"column_{i}" for i in range(3, width)))[:width]))
 
 
 @dataclass(frozen=True)
 class Fields:
-    """Which field of a cloud plays which role."""
+    """Which field of a cloud plays which role. Positions are x, y and z, or else range, azimuth and elevation."""
 
     names: dict[str, str]  # by role
     in_degrees: bool = False  # angles whose names have no unit
 
     @classmethod
-    def of(
-        cls, names: list[str], overrides: Mapping[str, Any] | None = None, what: str = "the cloud"
-    ) -> Fields:
-        """The roles of the fields with these names, of the cloud `what`.
+    def of(cls, names: list[str], overrides: Mapping[str, Any] | None = None) -> Fields:
+        """The roles of fields by their names.
 
         `overrides` are fields by role, or numbers of columns; None leaves a role out.
         """
@@ -87,9 +78,7 @@ class Fields:
             if name is not None and name not in found.values():
                 found[role] = name
         for role, field in (overrides or {}).items():
-            if role not in ROLES:
-                msg = f"fields has no role {role!r}: roles are {', '.join(ROLES)}"
-                raise ValueError(msg)
+            check(role in _ALIASES, f"fields has no role {role!r}: roles are {', '.join(_ALIASES)}")
             found.pop(role, None)
             if field is None:
                 continue
@@ -97,13 +86,13 @@ class Fields:
             name = by_number.get(field, field if field in names else lower.get(str(field).lower()))
             if name is None:
                 kind = "column" if by_number else "field"
-                msg = f"{what} has no {kind} {field} for {role}: it has {', '.join(names)}"
+                msg = f"there is no {kind} {field} for {role}: there are {', '.join(names)}"
                 raise ValueError(msg)
             found[role] = name
-        if not set(_XYZ) <= set(found) and not set(_POLAR) <= set(found):
-            wanted = _POLAR if "range" in found and "x" not in found else _XYZ
-            missing = ", ".join(role for role in wanted if role not in found)
-            msg = f"{what} lacks the fields {missing}: it has {', '.join(names) or 'none'}"
+        wanted = _POLAR if "range" in found and "x" not in found else _XYZ
+        missing = ", ".join(role for role in wanted if role not in found)
+        if missing and not set(_POLAR) <= set(found):
+            msg = f"the fields {missing} are missing: there are {', '.join(names) or 'none'}"
             raise ValueError(msg)
         return cls(found)
 
@@ -114,46 +103,38 @@ class Fields:
 
     def judged(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in a cloud."""
-        units = {role: plain_name(self.names[role])[1] for role in _POLAR[1:] if role in self.names}
-        if not self.polar or all(units.values()):
+        names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
+        unit_of = {name: unit for name in names if (unit := plain_name(name)[1])}
+        if len(unit_of) == len(names):
             return self
-        names = [self.names[role] for role in units]
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
-        named = next((role for role, unit in units.items() if unit), None)
-        in_degrees = are_degrees(azimuth, elevation, units[named] if named else "")
-        by = f"as {named} is by its name" if named else "by their numbers"
-        if in_degrees or not named:
-            notes.add(
-                f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
-                "names such as azimuth_deg or azimuth_rad decide"
-            )
+        in_degrees = are_degrees(azimuth, elevation, next(iter(unit_of.values()), ""))
+        by = f"as {next(iter(unit_of))} is" if unit_of else "by their numbers"
+        notes.add(
+            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
+            "names such as azimuth_deg or azimuth_rad decide"
+        )
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes) -> None:
         """Notes which fields are not used, and intensities that would be better in dB."""
-        if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
-            notes.add(
-                f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
-            )
-        unused = [name for name in names if name and name not in self.names.values()]
-        if unused:
-            notes.add(
-                f"fields that are not used: {', '.join(unused)}; fields={{role: name}} or --field chooses others"
-            )
+        intensity = self.names.get("intensity", "")
+        if plain_name(intensity)[1] == "linear":
+            notes.add(f"{intensity} is taken as intensity as it is: 10 log10 of it, dB, gives a better map")
+        if unused := [name for name in names if name and name not in self.names.values()]:
+            listed = ", ".join(unused)
+            notes.add(f"fields that are not used: {listed}; fields={{role: name}} or --field chooses others")
 
     def scan(
         self,
         columns: Mapping[str, NDArray[Any]],
-        what: str,
         T_world_sensor: NDArray[np.float64],
         time_s: float | None,
         notes: Notes,
     ) -> Scan:
-        """The finite returns in the columns, (N,) each, of the cloud `what`."""
+        """The finite returns in the columns, (N,) each."""
         for name in self.names.values():
-            if columns[name].dtype.kind not in "biuf":
-                msg = f"{what}: the field {name} holds no numbers"
-                raise ValueError(msg)
+            check(columns[name].dtype.kind in "biuf", f"the field {name} holds no numbers")
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is dropped
             intensities, doppler_mps = (
                 np.ascontiguousarray(self._values(columns, role), np.float32) if role in self.names else None
@@ -167,9 +148,8 @@ class Fields:
         unit = plain_name(self.names[role])[1]
         if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
             unit = "deg"
-        scale = SCALES.get(unit)
         values = columns[self.names[role]]
-        return values if scale is None else values * np.float64(scale)
+        return values * np.float64(SCALES[unit]) if unit in SCALES else values
 
     def points(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
         """(N, 3) sensor frame, m: float64 if the file has it or else float32."""
@@ -183,9 +163,9 @@ class Fields:
         return np.stack(xyz, axis=1).astype(np.float32)
 
     def _sigma(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32] | None:
-        if not set(_SIGMA) <= set(self.names):
+        if not set(SIGMA) <= set(self.names):
             return None
-        sigma = np.stack([self._values(columns, role) for role in _SIGMA], axis=1).astype(np.float32)
+        sigma = np.stack([self._values(columns, role) for role in SIGMA], axis=1).astype(np.float32)
         if _squeezed(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
             sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
         return sigma

@@ -32,11 +32,15 @@ _LOCKED = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 def check_regular_file(path: str | PathLike[str]) -> None:
     """Raises unless `path` can be opened and is no pipe or device: reading those could block or never end."""
-    if not Path(path).is_dir() and not stat.S_ISREG(Path(path).stat().st_mode):
-        msg = f"{path} is not a regular file"
-        raise ValueError(msg)
+    check(Path(path).is_dir() or stat.S_ISREG(Path(path).stat().st_mode), f"{path} is not a regular file")
     with open(path, "rb"):  # noqa: PTH123 - raises the error that names the path, for a folder too
         pass
+
+
+def check(holds: object, message: str) -> None:
+    """Raises a ValueError with this message unless something `holds`."""
+    if not holds:
+        raise ValueError(message)
 
 
 @contextmanager
@@ -61,9 +65,7 @@ def check_outputs(
         if path is None:
             continue
         target = os.path.realpath(path)
-        if target in taken:
-            msg = f"{path} is the same file as {taken[target]}, which would be lost: give another name"
-            raise ValueError(msg)
+        check(target not in taken, f"{path} is the same file as {taken.get(target)}: give another name")
         taken[target] = path
         _mode_to_keep(Path(target), path)
         descriptor, temporary = _open_temporary(Path(target))
@@ -111,9 +113,7 @@ def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
     mode = target.stat().st_mode
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(named))
-    if not stat.S_ISREG(mode):
-        msg = f"{named} is not a regular file"
-        raise ValueError(msg)
+    check(stat.S_ISREG(mode), f"{named} is not a regular file")
     return stat.S_IMODE(mode)
 
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Sequence
 from functools import partial
@@ -15,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points, read_viewpoint
+from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
 from radarsdf.io.fields import plain_name
-from radarsdf.io.files import reading
-from radarsdf.io.poses import FIND_POSES, POSE_FILES, UNPOSED, NoPoses, StampedPoses, poses_of, read_transform
+from radarsdf.io.files import check, reading
+from radarsdf.io.poses import FIND_POSES, POSE_FILES, NoPoses, Poses, poses_of, read_transform
 from radarsdf.io.recordings import RawScan, Request, Truth, posed, scan_poses
 from radarsdf.io.scans import Columns, Notes, Scans
 from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970
@@ -46,16 +45,11 @@ _TIME_FIELDS = ("time", "timestamp", "stamp", "t")
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
-Poses = StampedPoses | NDArray[np.float64]
-"""By time, or (F, 4, 4) in the order of the scans."""
-
 
 def read_folder(folder: Path, request: Request) -> Scans:
     """The scans of the files in a folder; see :func:`radarsdf.io.read`."""
     files = cloud_files(folder)
-    if not files:
-        msg = f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}"
-        raise ValueError(msg)
+    check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     return read_files(files, folder, request, partial(lidar_map, folder))
 
 
@@ -68,21 +62,15 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
         if poses is not None and poses.parent != folder:  # which is easily overlooked
             notes.add(f"poses: of {poses}")
     if poses is None:
-        files, times_s, _ = _in_order_of_time(files, UNPOSED, notes)
-        known: Poses | None = _viewpoint_poses(files, notes)
-        if known is None:
-            what = files[0] if len(files) == 1 else folder
-            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
-            raise NoPoses(msg)
-    else:
-        if isinstance(poses, (str, PathLike)):
-            places = list(dict.fromkeys((Path(poses).parent, *places)))
-        known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
-        if (viewpoint := _viewpoint(files[0])) is not None and (viewpoint != np.eye(4)).any():
-            notes.add("VIEWPOINT of the PCD files is not applied: the given poses place the scans")
-        files, times_s, known = _in_order_of_time(files, known, notes)
-        if T_base_sensor is None:
-            T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
+        what = files[0] if len(files) == 1 else folder
+        msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
+        raise NoPoses(msg)
+    if isinstance(poses, (str, PathLike)):
+        places = list(dict.fromkeys((Path(poses).parent, *places)))
+    known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
+    files, times_s, known = _in_order_of_time(files, known, notes)
+    if T_base_sensor is None:
+        T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
     return scans_of_files(files, times_s, known, T_base_sensor, request, truth)
 
 
@@ -157,9 +145,7 @@ def _in_order_of_time(
         if listed is None:
             return files, None, poses
         numbers = read_numbers(listed)[:, -1]
-        if len(numbers) != len(files):
-            msg = f"{listed} has {len(numbers)} times for {len(files)} scans"
-            raise ValueError(msg)
+        check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
         times = in_seconds(numbers, listed.name, notes).tolist()
     order = np.argsort(times, kind="stable")
     if listed is not None and (np.diff(order) < 0).any():
@@ -206,20 +192,3 @@ def _split(
         poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
     order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
     return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
-
-
-def _viewpoint(path: Path) -> NDArray[np.float64] | None:
-    if path.suffix.lower() == ".pcd":
-        with contextlib.suppress(ValueError):
-            return read_viewpoint(path)
-    return None
-
-
-def _viewpoint_poses(files: list[Path], notes: Notes) -> NDArray[np.float64] | None:
-    """T_world_sensor (F, 4, 4) of the ``VIEWPOINT`` of PCD files, if it is where each scan was taken."""
-    found = [_viewpoint(path) for path in files]
-    known = [pose for pose in found if pose is not None]
-    if not known or (np.array(known) == (np.eye(4) if len(files) == 1 else known[0])).all():
-        return None
-    notes.add("poses: VIEWPOINT of the PCD files")
-    return np.stack([np.full((4, 4), np.nan) if pose is None else pose for pose in found])

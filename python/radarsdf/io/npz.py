@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance, path_of
-from radarsdf.io.files import check_regular_file, reading, whole_file
+from radarsdf.io.files import check, check_regular_file, reading, whole_file
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 
@@ -69,13 +69,10 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     OSError
         If the file cannot be read.
     """
-    if path_of(path, "path").suffix != ".npz":
-        msg = f"{path} is not an .npz file: only .npz files of scans can be read"
-        raise ValueError(msg)
+    check(path_of(path, "path").suffix == ".npz", f"{path} is not an .npz file of scans")
     arrays = arrays_of(path, (*_SHAPES, "simulated", *_IMU))
-    if missing := sorted({"points", "frame", "poses"} - set(arrays)):
-        msg = f"{path} lacks the arrays {', '.join(missing)}"
-        raise ValueError(msg)
+    missing = sorted({"points", "frame", "poses"} - set(arrays))
+    check(not missing, f"{path} lacks the arrays {', '.join(missing)}")
     with reading(path, "a file of scans"):
         _check_scans(arrays)
         times_s, rates, *others = (arrays.get(name) for name in _IMU)
@@ -106,18 +103,14 @@ def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raises a ValueError unless the arrays fit together."""
     known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
     for name, array in arrays.items():
-        if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
-            msg = f"{name} must be real numbers, not {array.dtype}"
-            raise ValueError(msg)
-        first, *rest = _SHAPES.get(name, (None,))
+        kinds = "biuf" if name == "static" else "iuf"
+        check(array.dtype.kind in kinds, f"{name} must be real numbers, not {array.dtype}")
+        first, *rest = _SHAPES.get(name, (None, *array.shape[1:]))
         expected = (*known.get(str(first), array.shape[:1]), *rest)
-        if name in _SHAPES and array.shape != expected:
-            msg = f"{name} must have shape {expected}, not {array.shape}"
-            raise ValueError(msg)
+        check(array.shape == expected, f"{name} must have shape {expected}, not {array.shape}")
     frame, num_poses = arrays["frame"], len(arrays["poses"])
-    if not ((frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)).all():
-        msg = f"frame must hold row numbers of the {num_poses} poses"
-        raise ValueError(msg)
+    rows = (frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)
+    check(rows.all(), f"frame must hold row numbers of the {num_poses} poses")
 
 
 def write_scans(path: str | PathLike[str], scans: Scans) -> None:
@@ -181,9 +174,8 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
         held = set(file.namelist())
         members = {name: file.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in held}
         unpacked = sum(member.file_size for member in members.values())
-        if unpacked > max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * Path(path).stat().st_size):
-            msg = f"its arrays would unpack to {unpacked} bytes: measurements do not compress that much"
-            raise ValueError(msg)
+        largest = max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * Path(path).stat().st_size)
+        check(unpacked <= largest, f"its arrays would unpack to {unpacked} bytes: measurements compress less")
         for name, member in members.items():
             with file.open(member) as stream:
                 arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
@@ -194,14 +186,9 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[
     """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
     for name, (dtype, *shape) in wanted.items():
         array = arrays.get(name)
-        if (
-            array is None
-            or array.dtype != dtype
-            or array.ndim != len(shape)
-            or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True))
-        ):
-            msg = f"{name} is missing, or of another type or shape"
-            raise ValueError(msg)
+        fits = array is not None and array.dtype == dtype and array.ndim == len(shape)
+        fits = fits and all(n in (None, m) for n, m in zip(shape, np.shape(array), strict=True))
+        check(fits, f"{name} is missing, or of another type or shape")
 
 
 def write_arrays(

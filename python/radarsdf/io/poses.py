@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from radarsdf.checks import are_rigid, check_pose, check_poses, path_of, pose_matrices, real_array
-from radarsdf.io.files import check_regular_file, reading, write_whole
+from radarsdf.io.files import check, check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
 from radarsdf.io.scans import Columns, Notes
 from radarsdf.io.text import (
@@ -63,17 +63,10 @@ class Trajectory:
     times_s: NDArray[np.float64]  # (P,) ascending
     positions: NDArray[np.float64]  # (P, 3) world frame, m
     rotations: Rotation  # P rotations R_world_base
-    name: str = "the trajectory"  # its file, for messages
 
     def span(self) -> str:
         """First and last time, for messages."""
         return f"{self.times_s[0]} to {self.times_s[-1]} s"
-
-    def covers(self, times_s: NDArray[np.float64], max_gap_s: float = np.inf) -> NDArray[np.bool_]:
-        """Mask (N,) of the times (N,), s, that lie between two poses at most `max_gap_s` apart."""
-        after = np.clip(np.searchsorted(self.times_s, times_s), 1, len(self.times_s) - 1)
-        inside: NDArray[np.bool_] = (times_s >= self.times_s[0]) & (times_s <= self.times_s[-1])
-        return inside & (self.times_s[after] - self.times_s[after - 1] <= max_gap_s)
 
     def poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Poses T_world_base (N, 4, 4) at times (N,), s, between the first and the last pose: linear, and by slerp."""
@@ -127,32 +120,15 @@ class TransformChain:
 StampedPoses: TypeAlias = Trajectory | TransformChain
 """Poses by time."""
 
+Poses: TypeAlias = StampedPoses | NDArray[np.float64]
+"""By time, or (F, 4, 4) in the order of the scans."""
+
 UNPOSED: StampedPoses = TransformChain(())
 """In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
 
 
 class NoPoses(ValueError):
     """Scans have no poses, and none are given."""
-
-
-@dataclass(frozen=True, eq=False)
-class ScanPoses:
-    """The pose of the radar for each scan: of its time, or of its number."""
-
-    poses: StampedPoses | NDArray[np.float64]  # T_world_base by time, or (F, 4, 4) in the order of the scans
-    T_base_sensor: NDArray[np.float64]
-    max_gap_s: float
-
-    def of(self, number: int, time_s: float | None) -> NDArray[np.float64] | None:
-        """T_world_sensor (4, 4) of scan `number`, which was taken at `time_s`; None if it has none."""
-        if isinstance(self.poses, np.ndarray):
-            T_world_base = self.poses[number] if number < len(self.poses) else None
-        else:
-            T_world_base = None if time_s is None else self.poses.pose_at(time_s, self.max_gap_s)
-        if T_world_base is None or np.isnan(T_world_base[0, 0]):
-            return None
-        T_world_sensor: NDArray[np.float64] = T_world_base @ self.T_base_sensor
-        return T_world_sensor
 
 
 def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -181,14 +157,12 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     """
     good = are_poses(table[:, 1:]) & np.isfinite(table[:, 0])
     missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
-    rows = np.flatnonzero(good)
-    times_s, first = np.unique(table[rows, 0], return_index=True)
+    times_s, first = np.unique(table[good, 0], return_index=True)
+    rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
-    kept[rows[first]] = True
-    remark = (
-        f"{name}: {(~kept).sum()} of {len(table)} poses left out, which are not finite, not unit quaternions, or of a time "
-        f"that repeats; the first: pose {np.argmin(kept)}"
-    )
+    kept[rows] = True
+    why = f"not finite, not unit quaternions, or of a time that repeats; the first: pose {np.argmin(kept)}"
+    remark = f"{name}: {(~kept).sum()} of {len(table)} poses left out, which are {why}"
     if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
         msg = f"{name} holds {len(times_s)} poses at different times; at least two poses are needed"
         raise ValueError(msg if kept.all() else f"{msg}; {remark}")
@@ -196,28 +170,21 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
         notes.add(remark)
     if notes is not None and (np.diff(first) < 0).any():
         notes.add(f"{name}: its poses are not in the order of their times, and sorted")
-    table = table[rows[first]]
-    return Trajectory(times_s, table[:, 1:4], Rotation.from_quat(table[:, 4:]), name)
+    return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
 
 
-def poses_of(
-    poses: Any, notes: Notes, calibration: Sequence[Path] = ()
-) -> StampedPoses | NDArray[np.float64]:
+def poses_of(poses: Any, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
     """Poses as a user gives them: an array (F, 4, 4), poses by time, or a file for :func:`read_poses`."""
     if isinstance(poses, (str, PathLike)):
         return read_poses(Path(poses), notes, calibration)
     if isinstance(poses, (Trajectory, TransformChain)):
         return poses
     matrices = real_array(poses, "poses")
-    if matrices.ndim != 3:
-        msg = f"poses must be (F, 4, 4) T_world_sensor, or a file of poses, not an array {matrices.shape}"
-        raise ValueError(msg)
-    return _rigid_or_nan(matrices, "the given array", notes)
+    check(matrices.ndim == 3, f"poses must be (F, 4, 4) T_world_sensor, or a file, not {matrices.shape}")
+    return rigid_or_nan(matrices, "the given array", notes)
 
 
-def read_poses(
-    path: Path, notes: Notes, calibration: Sequence[Path] = ()
-) -> StampedPoses | NDArray[np.float64]:
+def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
     """Poses by time, or (F, 4, 4) in the order of the scans, of a file of one of these kinds.
 
     - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, and qx, qy, qz
@@ -231,13 +198,11 @@ def read_poses(
     """
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
-        return _rigid_or_nan(np.array(array_in(path)), str(path), notes)
+        return rigid_or_nan(np.array(array_in(path)), str(path), notes)
     with reading(path, "a table of poses"):
         table = read_table(path)
         values, width = table.values, table.values.shape[1]
-        if len(values) == 0:
-            msg = "it has no rows of numbers"
-            raise ValueError(msg)
+        check(len(values), "it has no rows of numbers")
     heads = [head for head in reversed(table.heads) if len(head) == width]
     for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
         columns, unit_of_angles = _pose_columns(names, values)
@@ -250,7 +215,7 @@ def read_poses(
     if width == 12:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
-        P = _rigid_or_nan(poses, str(path), notes)
+        P = rigid_or_nan(poses, str(path), notes)
         for file in calibration:
             if file.is_file() and (Tr := read_calibration(file)) is not None:
                 notes.add(
@@ -262,7 +227,7 @@ def read_poses(
         )
         return P
     if width == 16 or (width == 4 and len(values) % 4 == 0):
-        return _rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
+        return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
     msg = (
         f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
         "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
@@ -292,9 +257,7 @@ def _pose_columns(names: list[str], table: NDArray[np.float64]) -> tuple[Columns
     return (found if is_pose else {}), unit_of_angles
 
 
-def _of_columns(
-    columns: Columns, unit_of_angles: str, path: Path, notes: Notes
-) -> StampedPoses | NDArray[np.float64]:
+def _of_columns(columns: Columns, unit_of_angles: str, path: Path, notes: Notes) -> Poses:
     """Poses of named columns: by time, or in their order."""
     zeros = np.zeros_like(columns["x"])
     if missing := [role for role in ("z", "roll", "pitch") if "qw" not in columns and role not in columns]:
@@ -310,14 +273,14 @@ def _of_columns(
         quaternions[~np.isfinite(angles).all(axis=1)] = np.nan
     poses = np.column_stack([*(columns.get(axis, zeros) for axis in "xyz"), quaternions])
     if "time" not in columns:
-        return _rigid_or_nan(pose_matrices_of(poses), str(path), notes)
+        return rigid_or_nan(pose_matrices_of(poses), str(path), notes)
     times = columns["time"].copy()
     finite = np.isfinite(times)
     times[finite] = in_seconds(times[finite], path.name, notes)
     return trajectory_of(np.column_stack([times, poses]), str(path), notes)
 
 
-def _rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.float64]:
+def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.float64]:
     """Poses (F, 4, 4) in the order of scans. Damaged ones are NaN, and named: their scans have none."""
     with reading(name, "poses (F, 4, 4)", TypeError):
         matrices = pose_matrices(poses)
@@ -359,9 +322,8 @@ def read_calibration(path: Path) -> NDArray[np.float64] | None:
 
 def check_pose_suffix(path: str | PathLike[str]) -> None:
     """Raises a ValueError for a name that :func:`write_poses` would refuse."""
-    if path_of(path, "path").suffix.lower() not in POSE_SUFFIXES:
-        msg = f"{path} is no file of poses that can be written: those end in {', '.join(POSE_SUFFIXES)}"
-        raise ValueError(msg)
+    known = path_of(path, "path").suffix.lower() in POSE_SUFFIXES
+    check(known, f"{path} is no file of poses that can be written: those end in {', '.join(POSE_SUFFIXES)}")
 
 
 def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
@@ -413,9 +375,10 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike 
         np.savetxt(text, matrices[:, :3].reshape(-1, 12), "%.12g")
     else:
         times_s = real_array(times_s, "times_s")
-        if times_s.shape != (len(matrices),) or not np.isfinite(times_s).all():
-            msg = f"times_s must be one finite number for each of {len(matrices)} poses, not {times_s.shape}"
-            raise ValueError(msg)
+        fits = times_s.shape == (len(matrices),) and np.isfinite(times_s).all()
+        check(
+            fits, f"times_s must be one finite number for each of {len(matrices)} poses, not {times_s.shape}"
+        )
         quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
         np.savetxt(text, np.column_stack([times_s, matrices[:, :3, 3], quaternions]), "%.9f")
     write_whole(path, text.getvalue())

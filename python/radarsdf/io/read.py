@@ -5,28 +5,27 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import check_pose, path_of, positions, positive
 from radarsdf.io import datasets
-from radarsdf.io.bag_messages import bags_in, is_bag
+from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
+from radarsdf.io.fields import SIGMA
+from radarsdf.io.files import check
 from radarsdf.io.folders import read_files, read_folder
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, StampedPoses, poses_of
-from radarsdf.io.recordings import WITHOUT_POSES, Request, Truth, scan_poses
-from radarsdf.io.scans import Notes, Scan, Scans, finite_returns
-
-_OF_BAGS = ("topic", "pose_topic", "imu_topic", "world_frame", "stamps")  # choices without effect elsewhere
+from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, StampedPoses, poses_of, rigid_or_nan
+from radarsdf.io.recordings import RawScan, Request, Truth, posed, scan_poses
+from radarsdf.io.scans import Columns, Notes, Scan, Scans
 
 
 def read(
@@ -47,9 +46,9 @@ def read(
 ) -> Scans:
     """Reads scans with poses from a file, a folder or bags.
 
-    What was assumed and what was left out is logged as a warning of the logger ``radarsdf.io``, a line each, and kept in
-    ``notes`` of the scans. Returns with a coordinate or an intensity that is not finite, files that cannot be read, and
-    scans whose poses are not finite are left out, and counted.
+    What was assumed and what was left out is logged by the logger ``radarsdf.io``, and kept in ``notes`` of the scans.
+    Returns with a coordinate or an intensity that is not finite, files that cannot be read, and scans whose poses are not
+    finite are left out, and counted.
 
     Parameters
     ----------
@@ -124,9 +123,7 @@ def read(
     >>> scans.notes
     ['1 returns left out: a coordinate or the intensity is not a finite number']
     """
-    if stamps not in (None, "header", "record"):
-        msg = f'stamps must be "header" or "record", not {stamps!r:.50}'
-        raise ValueError(msg)
+    check(stamps in (None, "header", "record"), f'stamps must be "header" or "record", not {stamps!r:.50}')
     one = isinstance(path, (str, PathLike))
     paths = [path_of(part, "path") for part in ([path] if one or not isinstance(path, Iterable) else path)]
     files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
@@ -168,10 +165,8 @@ def _read(path: Path, request: Request) -> Scans:
                 request.notes.add(f"poses: of {file.name}")
                 request = dataclasses.replace(request, poses=file)
             return read_bags(bags, request)
-    for name in _OF_BAGS:
-        if getattr(request, name) not in (None, ()):
-            msg = f"{path} is no bag: {name} is of bags alone"
-            raise ValueError(msg)
+    for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
+        check(getattr(request, name) in (None, ()), f"{path} is no bag: {name} is of bags alone")
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path, request)
@@ -179,7 +174,8 @@ def _read(path: Path, request: Request) -> Scans:
         return _npz(path, request)
     if suffix in CLOUD_SUFFIXES:
         return read_files([path], path.parent, request)
-    msg = f"{path} is of no kind that can be read: .npz, .bag, .mcap, .db3, {', '.join(CLOUD_SUFFIXES)}, or a folder of them"
+    kinds = ", ".join((".npz", *BAG_SUFFIXES, *CLOUD_SUFFIXES))
+    msg = f"{path} is of no kind that can be read: {kinds}, or a folder of them"
     raise ValueError(msg)
 
 
@@ -187,39 +183,38 @@ def _npz(path: Path, request: Request) -> Scans:
     """The scans of our own file, with its poses or those that are given."""
     notes = request.notes
     others = None if request.poses is UNPOSED else request.poses
-    if others is None and request.extrinsic is not None:
-        msg = f"{path} has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
-        raise ValueError(msg)
-    if request.fields is not None or request.columns is not None:
-        msg = f"{path} has arrays of known names: fields and columns are not used for .npz files"
-        raise ValueError(msg)
+    what = "has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
+    check(others is not None or request.extrinsic is None, f"{path} {what}")
+    named = request.fields is None and request.columns is None
+    check(named, f"{path} has arrays of known names: fields and columns are not used for .npz files")
     scans = read_scans(path)
-    truth, matched = scans.ground_truth, None
-    if others is not None:
-        times_s = None if scans.times_s is None else scans.times_s.tolist()
-        matched, _ = scan_poses(poses_of(others, notes), len(scans), times_s, request.extrinsic, request)
+    truth = scans.ground_truth
+    if others is None:
+        poses: Any = rigid_or_nan(scans.poses, str(path), notes)
+    else:
+        poses = poses_of(others, notes)
         of = others if isinstance(others, (str, PathLike)) else "those given"
         notes.add(f"poses: {of}, in place of those in {path.name}")
         if truth is not None and request.truth is None:
             notes.add(f"the ground truth of {path.name} is left out: it lies in the world of the poses there")
         truth = None
-
-    def source() -> Iterator[Scan]:
-        for number, scan in enumerate(scans):
-            pose = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
-            if pose is None:
-                notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s))
-            elif not np.isfinite(pose).all():
-                notes.count("scans left out: their poses are not finite", example=f"scan {number}")
-            elif finite := finite_returns(dataclasses.replace(scan, T_world_sensor=pose), notes):
-                yield finite
-
+    times_s = None if scans.times_s is None else scans.times_s.tolist()
+    matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
+    raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
+    source = posed(lambda: raw, lambda _: matched, request)
     found = Scans.of_source(source, notes, request.truth or (lambda: truth), lambda: imu)
     found.truth_kind = scans.truth_kind
     return found
+
+
+def _columns(scan: Scan) -> Columns:
+    columns: dict[str, Any] = dict(zip("xyz", scan.points.T, strict=True))
+    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
+    columns |= dict(zip(SIGMA, () if scan.sigma is None else scan.sigma.T, strict=False))
+    return {name: values for name, values in columns.items() if values is not None}
 
 
 def _truth(ground_truth: Any) -> Truth | None:

@@ -16,17 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.fields import Fields
-from radarsdf.io.poses import MAX_GAP_S, ScanPoses, StampedPoses, Trajectory
+from radarsdf.io.files import check
+from radarsdf.io.poses import MAX_GAP_S, Poses, Trajectory, TransformChain
 from radarsdf.io.scans import Columns, Notes, Scan
-
-WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
-_UNREADABLE = "scans left out: they cannot be read"
-_NO_RETURNS = "scans left out: they hold no returns"
 
 Truth = Callable[[], NDArray[np.float64] | None]
 """Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
 
-FindPoses = Callable[[str], ScanPoses | None]
+FindPoses = Callable[[str], Poses | None]
 """The poses of the scans of a frame; None: none are known."""
 
 
@@ -75,19 +72,28 @@ def posed(
             if known is None:
                 notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}")
                 continue
-            T_world_sensor = known.of(number if raw.number is None else raw.number, raw.time_s)
-            if T_world_sensor is not None:
-                num_posed += 1
-                if scan := _scan(raw, T_world_sensor, layouts, request):
-                    yield scan
-            elif not isinstance(known.poses, np.ndarray):  # else it was named when the poses were read
-                notes.count(WITHOUT_POSES.format(gap_s=known.max_gap_s))
-                span = known.poses.span()
-                unposed = unposed or f"the first scan is at {raw.time_s:.3f} s, the poses are from {span}"
-        if unposed and not num_posed:
-            gap_s = request.max_gap_s
-            msg = f"{notes.about}: no scan has a pose: {unposed}, and a gap between poses may be {gap_s} s: are both of one clock?"
-            raise ValueError(msg)
+            if isinstance(known, np.ndarray):
+                T_world_sensor = known[number if raw.number is None else raw.number]
+                if np.isnan(T_world_sensor[0, 0]):  # it was named when the poses were read
+                    continue
+            else:
+                found = known.pose_at(np.nan if raw.time_s is None else raw.time_s, request.max_gap_s)
+                if found is None:
+                    notes.count(
+                        f"scans left out: no poses within {request.max_gap_s} s of each other around them"
+                    )
+                    unposed = (
+                        unposed or f"the first scan is at {raw.time_s} s, the poses are from {known.span()}"
+                    )
+                    continue
+                T_world_sensor = found
+            num_posed += 1
+            if scan := _scan(raw, T_world_sensor, layouts, request):
+                yield scan
+        what = (
+            f"no scan has a pose: {unposed}, with gaps of up to {request.max_gap_s} s: are both of one clock?"
+        )
+        check(num_posed or not unposed, f"{notes.about}: {what}")
 
     return source
 
@@ -104,12 +110,13 @@ def _scan(
         columns = raw.read()
         empty = not columns or not len(next(iter(columns.values())))
         fields = None if empty else _fields(raw.topic, columns, layouts, request)
-        scan = fields.scan(columns, raw.name, T_world_sensor, raw.time_s, notes) if fields else None
+        scan = fields.scan(columns, T_world_sensor, raw.time_s, notes) if fields else None
     except ValueError as error:
-        notes.count(_UNREADABLE, example=f"{raw.name}: {error}" if raw.name not in str(error) else str(error))
+        known = "" if raw.name in str(error) else f"{raw.name}: "
+        notes.count("scans left out: they cannot be read", example=f"{known}{error}")
         return None
     if not scan:
-        notes.count(_NO_RETURNS)
+        notes.count("scans left out: they hold no returns")
         return None
     return scan
 
@@ -139,32 +146,28 @@ def _note_differences(names: Mapping[str, str], others: Mapping[str, str], notes
 
 
 def scan_poses(
-    poses: StampedPoses | NDArray[np.float64],
+    poses: Poses,
     count: int,
     times_s: Sequence[float] | None,
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
-) -> tuple[ScanPoses, Sequence[float] | None]:
-    """Which pose each of `count` scans has, and the times of the scans as far as they are then known."""
+) -> tuple[Poses, Sequence[float] | None]:
+    """T_world_sensor of each of `count` scans has, and the times of the scans as far as they are then known."""
     about = request.notes.about
     if isinstance(poses, np.ndarray):
-        if len(poses) != count:
-            msg = (
-                f"{about}: there are {count} scans but {len(poses)} poses: give as many poses as scans, or poses with time "
-                "stamps (TUM: time x y z qx qy qz qw) for scans with time stamps"
-            )
-            raise ValueError(msg)
+        what = "give as many, or poses with time stamps for scans with time stamps"
+        check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
     elif times_s is None:
         if not isinstance(poses, Trajectory) or len(poses.times_s) != count:
-            msg = (
-                f"{about}: the {count} scans have no time stamps in their names or in a file of times, and the poses "
-                f"({poses.span()}) are not as many"
-            )
+            msg = f"{about}: the {count} scans have no time stamps, and the poses ({poses.span()}) are not as many"
             raise ValueError(msg)
         request.notes.add(
             f"the scans have no time stamps: they are matched to the {count} poses in their order"
         )
         times_s = poses.times_s.tolist()
         poses = poses.poses(poses.times_s)
-    T = np.eye(4) if T_base_sensor is None else T_base_sensor
-    return ScanPoses(poses, T, request.max_gap_s), times_s
+    if T_base_sensor is not None:
+        poses = (
+            poses @ T_base_sensor if isinstance(poses, np.ndarray) else TransformChain((poses, T_base_sensor))
+        )
+    return poses, times_s

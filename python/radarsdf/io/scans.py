@@ -21,7 +21,6 @@ _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
 
 _ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a scan
-_NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """(N,) each, by name."""
@@ -69,20 +68,18 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
     finite = np.isfinite(points).all(axis=1)
     if intensities is not None:
         finite &= np.isfinite(intensities)
-    notes.count(_NOT_FINITE, int((~finite).sum()))
+    what = "returns left out: a coordinate or the intensity is not a finite number"
+    notes.count(what, int((~finite).sum()))
     optional = (intensities, scan.doppler_mps, scan.sigma)
     intensities, doppler_mps, sigma = (None if array is None else array[finite] for array in optional)
     return Scan(points[finite], scan.T_world_sensor, intensities, doppler_mps, scan.time_s, sigma)
 
 
 class Notes:
-    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``.
-
-    `about` names what is read, for errors. Without `log`, the sentences are kept, but not logged.
-    """
+    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``."""
 
     def __init__(self, about: str = "the scans", *, log: bool = True) -> None:
-        self.about = about
+        self.about = about  # what is read, for messages
         self.lines: list[str] = []
         self._log = log
         self._counts: dict[str, int] = {}
@@ -105,23 +102,19 @@ class Notes:
             self._first.setdefault(what, f"; the first: {example}" if example else "")
             self._counts[what] = self._counts.get(what, 0) + number
 
-    def start_pass(self) -> None:
-        """Forgets the counts: the files are read again."""
-        self._counts = {}
-
     def end_pass(self) -> None:
-        """Turns the counts into sentences."""
+        """Turns the counts into sentences, and begins to count anew."""
         for what, number in self._counts.items():
             self.add(f"{number} {what}{self._first[what]}")
+        self._counts = {}
 
 
 class Scans:
     """F scans with poses, and lidar points as ground truth where there are any.
 
-    Iterating gives one :class:`Scan` after another, as often as wanted. Scans of :func:`radarsdf.io.read` are read from
-    their files while they are iterated, so that memory is bounded by a scan; `points`, `intensities`, `doppler_mps` and
-    `sigmas` read all of them and keep them. `poses`, `times_s` and ``len()`` read the files once, if nobody did so
-    before, and keep no points.
+    Iterating gives one :class:`Scan` after another. Scans of :func:`radarsdf.io.read` are read from their files while they
+    are iterated, so that memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read all of them
+    and keep them. `poses`, `times_s` and ``len()`` read the files once, and keep no points.
 
     Parameters
     ----------
@@ -192,7 +185,7 @@ class Scans:
         """One scan after another."""
         if self._arrays is None:
             return self._read()
-        return (self._scan(self._arrays, i) for i in range(len(self.points)))
+        return (self._scan(i) for i in range(len(self.points)))
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -297,17 +290,17 @@ class Scans:
             scans._ground_truth = lambda: None
         return scans
 
-    def _scan(self, arrays: dict[str, Any], i: int) -> Scan:
-        points, intensities, doppler_mps, sigma = (arrays[n] and arrays[n][i] for n in _ARRAYS)
+    def _scan(self, i: int) -> Scan:
+        values = self._loaded().values()
+        points, intensities, doppler_mps, sigma = (None if array is None else array[i] for array in values)
         time_s = None if self._times_s is None else float(self._times_s[i])
-        return Scan(points, self.poses[i], intensities, doppler_mps, time_s, sigma)
+        return Scan(np.asarray(points), self.poses[i], intensities, doppler_mps, time_s, sigma)
 
     def _read(self) -> Iterator[Scan]:
         """Reads the files, and keeps what is small once they are read to the end."""
         assert self._source is not None
         poses: list[NDArray[np.float64]] = []
         times_s: list[float | None] = []
-        self._notes.start_pass()
         for scan in self._source():
             poses.append(scan.T_world_sensor)
             times_s.append(scan.time_s)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import codecs
 import contextlib
 import re
 from bisect import bisect
@@ -15,12 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.files import reading
+from radarsdf.io.files import check, reading
 from radarsdf.io.scans import Notes
 
-_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
-_COMMENTS = ("#", "//", "%")
-_COMMENT = re.compile("(" + "|".join(_COMMENTS) + ").*")
+_COMMENT = re.compile("(#|//|%).*")
 
 SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "mrad": 1e-3,
           **dict.fromkeys(("km/h", "kmh", "kph"), 1 / 3.6),
@@ -43,7 +40,6 @@ class Table(NamedTuple):
         list[str]
     ]  # the words of all lines above the rows, comments too: one of them may name the columns
     values: NDArray[np.float64]  # (R, W), NaN for a word that is no number, and in a row of another width
-    lines: list[int]  # number of the line of each row, from 1
 
 
 def read_table(path: Path) -> Table:
@@ -55,8 +51,7 @@ def read_table(path: Path) -> Table:
     header: list[str] | None = None
     heads: list[list[str]] = []
     rows: list[str] = []
-    numbers: list[int] = []
-    for number, line in enumerate(read_text(path).split("\n"), 1):
+    for line in read_text(path).splitlines():
         bare = _COMMENT.sub("", line).strip()
         if not rows and line.strip():
             words = _words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
@@ -66,20 +61,16 @@ def read_table(path: Path) -> Table:
                 continue
         if bare:
             rows.append(bare)
-            numbers.append(number)
-    if not rows:
-        return Table(header, heads, np.zeros((0, len(header or ()))), [])
-    return Table(header, heads, _values(rows, numbers, header), numbers)
+    return Table(header, heads, _values(rows, header) if rows else np.zeros((0, len(header or ()))))
 
 
-def _values(rows: list[str], lines: list[int], header: list[str] | None) -> NDArray[np.float64]:
+def _values(rows: list[str], header: list[str] | None) -> NDArray[np.float64]:
     """(R, W) the numbers of the rows, by NumPy at once or else, where some are damaged, row by row."""
     separator = next((sign for sign in (";", ",", "\t") if sign in rows[0]), None)
     if separator == ";":
         rows = [row.replace(",", ".") for row in rows]
     with contextlib.suppress(ValueError):
-        table: NDArray[np.float64] = np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
-        return table
+        return np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
     words = [row.rstrip(",; \t").split(separator) for row in rows]
     width = len(header) if header else Counter(map(len, words)).most_common(1)[0][0]
     table = np.full((len(words), width), np.nan)
@@ -90,35 +81,24 @@ def _values(rows: list[str], lines: list[int], header: list[str] | None) -> NDAr
             table[row, known[row]] = [float(part) for part in parts if _is_number(part)]
     of_words = ~known.any(axis=0)  # a column of labels is no damage
     damaged = ~known[:, ~of_words].all(axis=1)
-    if of_words.all() or 2 * damaged.sum() > len(words):
-        first = int(np.argmax(damaged))
-        msg = f"line {lines[first]} is no row of {width} numbers: {rows[first]!r:.50}"
-        raise ValueError(msg)
+    most = of_words.all() or 2 * damaged.sum() > len(words)
+    check(not most, f"a line is no row of {width} numbers: {rows[int(np.argmax(damaged))]!r:.50}")
     return table
 
 
 def read_numbers(path: Path, columns: int | None = None) -> NDArray[np.float64]:
-    """(R, columns) finite numbers of a text file; None: as many as it has. Raises a ValueError that names the line."""
-    with reading(path, f"a table of {columns or 'any number of'} columns of numbers"):
-        table = read_table(path)
-        bad = ~np.isfinite(table.values).all(axis=1)
-        if bad.any():
-            msg = f"line {table.lines[int(np.argmax(bad))]} is not finite numbers, as many as in other lines"
-            raise ValueError(msg)
-        if columns not in (None, table.values.shape[1]):
-            msg = f"it has {table.values.shape[1]}"
-            raise ValueError(msg)
-    return table.values
+    """(R, columns) finite numbers of a text file; None: as many as it has."""
+    with reading(path, f"a table of {columns or 'any number of'} columns of finite numbers"):
+        values = read_table(path).values
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        check(len(bad) == 0, f"row {bad[:1]} has others, or not as many as other rows")
+        check(columns in (None, values.shape[1]), f"it has {values.shape[1]}")
+    return values
 
 
 def read_text(path: Path) -> str:
-    """The text of a file with line feeds, in UTF-8 or the encoding that a byte order mark names.
-
-    What does not decode, such as a comment in Latin-1, becomes replacement characters.
-    """
-    data = path.read_bytes()
-    encoding = next((encoding for mark, encoding in _MARKS if data.startswith(mark)), "utf-8")
-    return data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    """The text of a file in UTF-8. What does not decode, such as a comment in Latin-1, becomes replacement characters."""
+    return path.read_bytes().decode("utf-8-sig", errors="replace")
 
 
 def _is_number(word: str) -> bool:
@@ -132,8 +112,10 @@ def _is_number(word: str) -> bool:
 def _words_of(line: str) -> list[str]:
     """The words of a line, separated by commas, semicolons, tabs or else white space."""
     separator = next((sign for sign in (";", ",", "\t") if sign in line), None)
-    line = line.replace(",", ".") if separator == ";" else line
-    line = line if separator else re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
+    if separator == ";":
+        line = line.replace(",", ".")
+    if separator is None:
+        line = re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
     return [word.strip().strip('"') for word in line.split(separator)]
 
 
@@ -153,14 +135,10 @@ def unit_since_1970(time: float) -> tuple[str, float]:
 
 def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
     """Times (N,) of the file `name`, s. They may be in ms, µs or ns since 1970, which is noted."""
-    if not np.isfinite(times).all():
-        msg = f"{name} holds a time that is not finite"
-        raise ValueError(msg)
-    units = {unit_since_1970(time) for time in times[times != 0].tolist()}
-    if len(units) > 1:
-        msg = f"{name} holds times of different units, such as s and ns"
-        raise ValueError(msg)
-    ((unit, scale),) = units or {_SINCE_1970[0]}
+    check(np.isfinite(times).all(), f"{name} holds a time that is not finite")
+    units = {unit_since_1970(time) for time in times[times != 0].tolist()} or {_SINCE_1970[0]}
+    check(len(units) == 1, f"{name} holds times of different units, such as s and ns")
+    ((unit, scale),) = units
     if unit != "s":
         notes.add(f"times of {name} are taken as {unit} since 1970")
     return times * scale
