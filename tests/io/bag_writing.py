@@ -142,16 +142,6 @@ class BagWriter:
         returns = [self.make("radar_msgs/msg/RadarReturn", *map(float, row)) for row in np.asarray(rows)]
         return self.make("radar_msgs/msg/RadarScan", self.header(stamp_s, frame), returns)
 
-    def ti_point(
-        self, stamp_s: float, point_id: int, xyz: ArrayLike, velocity: float, intensity: float
-    ) -> Any:
-        """A ti_mmwave_rospkg/RadarScan: one point."""
-        x, y, z = map(float, np.asarray(xyz))
-        return self.make(
-            "ti_mmwave_rospkg/msg/RadarScan", self.header(stamp_s, "ti_mmwave"), point_id, x, y, z,
-            float(np.hypot(x, y)), velocity, 3, 0.0, intensity,
-        )  # fmt: skip
-
     def odometry(
         self, stamp_s: float, T_world_base: ArrayLike, frame: str = "odom", child: str = "base_link"
     ) -> Any:

@@ -100,7 +100,6 @@ READERS = {
     "folder: mounting": Reader(_folder, "base_T_radar.txt", samples.transforms),
     "folder: lidar": Reader(_folder, "lidar.ply", samples.meshes),
     "read: PCD": Reader(readers.read_one, "scan.pcd", samples.clouds),
-    "read: compressed": Reader(readers.read_one, "scan.pcd", readers.compressed),
     "read: array": Reader(readers.read_one, "scan.npy", readers.arrays),
     "read: KITTI": Reader(readers.read_one, "scan.bin", readers.kitti),
     "read: text": Reader(readers.read_one, "scan.csv", readers.text),

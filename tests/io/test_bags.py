@@ -132,26 +132,6 @@ def test_radar_msgs(tmp_path, kind):
     assert_array_equal(scans[1].intensities, [50, 60])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_one_point_a_message(tmp_path, kind):
-    """The number of the point restarts with each scan; of the third, the first point was lost."""
-    with BagWriter(name(tmp_path, kind), kind) as bag:
-        odometry(bag)
-        for i, ids in enumerate(([0, 1, 2], [0], [1, 2], [0, 1])):
-            for n in ids:
-                message = bag.ti_point(TIMES_S[i], n, [i, n, 1], -2.0, 7.0 + n)
-                bag.write("/ti_mmwave/radar_scan", message, TIMES_S[i] + 0.001 * n)
-    scans = read(name(tmp_path, kind))
-    assert [scan.points.tolist() for scan in scans] == [
-        [[0, 0, 1], [0, 1, 1], [0, 2, 1]], [[1, 0, 1]], [[2, 1, 1], [2, 2, 1]], [[3, 0, 1], [3, 1, 1]],
-    ]  # fmt: skip
-    assert_allclose(scans.times_s, TIMES_S[:4], rtol=0, atol=1e-6)
-    assert_array_equal(scans.intensities[0], [7, 8, 9])
-    assert_array_equal(scans.doppler_mps[0], -2)
-    by_order = read(name(tmp_path, kind), MOVED[:4])
-    assert_allclose(by_order.poses, MOVED[:4])
-
-
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_of_paths_the_last_counts(tmp_path, kind):
     def write(bag):

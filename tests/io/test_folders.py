@@ -150,35 +150,6 @@ def test_snail_radar(snail):
     assert np.deg2rad(1) < angle < np.deg2rad(3)
 
 
-def test_snail_radar_lidar_points_move_with_their_own_time(snail):
-    seconds = START_S + np.array([0.0, 0.1, 0.1, 0.0, 0.0, 0.2, -0.1])
-    # Left, back, up; the last four are too near, too far, in the cell of the third, and before the first pose.
-    xyz = [
-        [0, -3, 1],
-        [0, -3, 1],
-        [2.02, 0.02, 0.02],
-        [0.5, 0, 0],
-        [70, 0, 0],
-        [2.273, 0.023, 0.023],
-        [5, 5, 5],
-    ]
-    columns = radar_cloud(xyz, intensity=np.ones(7)) | {"timestamp": seconds, "ring": np.zeros(7, np.uint16)}
-    write_pcd(snail / "xt32" / stamp(0.0), columns)
-    write_pcd(snail / "xt32" / stamp(0.3), radar_cloud([[9, 9, 9]]))  # after the last radar scan
-    expected = UTM + [[0, 3, 1], [0.25, 3, 1], [-1.77, -0.02, 0.02]]
-    assert_allclose(read(snail).ground_truth, expected, rtol=0, atol=1e-5)
-    write_pcd(snail / "lidar.pcd", dict(zip("xyz", UTM[:, None], strict=True)))
-    assert_array_equal(read(snail).ground_truth, UTM[None])
-
-
-COLUMNS = {
-    "x": np.array([1.5, -2], np.float32),
-    "n": np.array([3, 65535], np.uint16),
-    "t": np.array([1706001766.577286344, 0.25]),
-    "i": np.array([-1, 4], np.int8),
-}
-
-
 def test_pcd_with_padding_and_fields_of_several_values(tmp_path):
     cloud = {"x": np.ones(2, np.float32), "_": np.zeros(2, np.int64), "z": np.full(2, 3, np.float32)}
     write_pcd(tmp_path / "cloud.pcd", cloud, SIZE="4 1 4", COUNT="1 8 1", TYPE="F U F")

@@ -31,7 +31,6 @@ from radarsdf.io.bag_messages import (
     topics_with,
 )
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
-from radarsdf.io.fields import Fields
 from radarsdf.io.files import check
 from radarsdf.io.imu import Imu
 from radarsdf.io.poses import UNPOSED, Poses, poses_of
@@ -54,7 +53,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
     check(paths and all(map(is_bag, paths)), f"{others} is no bag: only bags can be read together")
     topics = topics_of(paths)
-    scan_topics = _scan_topics(topics, paths, request)
+    scan_topics = _scan_topics(topics, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
@@ -74,16 +73,10 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
         find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
-    of_imu = _imu_topic(topics, request)
-
-    def imu() -> Imu | None:
-        if of_imu is None:
-            return None
-        return _read_imu(paths, of_imu, frames[0], by_recording[scan_topics[0].name], request)
-
-    return Scans.of_source(
-        posed(raw_scans, find, request), request.notes, request.truth or (lambda: None), imu
-    )
+    recorded = by_recording[scan_topics[0].name]
+    imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
+    truth = request.truth or (lambda: None)
+    return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
 
 
 def _given(
@@ -107,7 +100,7 @@ def _given(
     return transforms_in(paths, request).attach(poses, frames[0], request)
 
 
-def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) -> list[Topic]:
+def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
     """The topics of the scans: the wanted ones, or the only one that can be meant. The others are noted."""
     about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
@@ -122,7 +115,7 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
         return [fitting[name] for name in dict.fromkeys(request.topic)]
     check(fitting, f"{about} has no topic with points: it has {_listed(topics.values()) or 'no topics'}")
     decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
-    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar, partial(_has_doppler, paths)):
+    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar):
         chosen = [topic for topic in decoded if fits(topic)]
         if len(chosen) == 1:
             break
@@ -130,8 +123,11 @@ def _scan_topics(topics: dict[str, Topic], paths: list[Path], request: Request) 
         listed = _listed(fitting.values())
         msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {listed}"
         raise ValueError(msg)
-    unknown = [t for t in topics.values() if t.num_messages and _is_radar(t) and not _is_standard(t)]
-    if others := {*fitting.values(), *unknown} - set(chosen):
+    unread = [t for t in topics.values() if t.num_messages and _RADAR.search(t.message_type)]
+    unread = [t for t in unread if t.name not in fitting]
+    what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that"
+    check(not unread or _is_radar(chosen[0]), f"{about}: {what}")
+    if others := {*fitting.values(), *unread} - set(chosen):
         request.notes.add(f"scans: those of {_listed(chosen)}; not read: {_listed(others)}")
     return chosen
 
@@ -142,21 +138,6 @@ def _listed(topics: Iterable[Topic]) -> str:
 
 def _is_radar(topic: Topic) -> bool:
     return bool(_RADAR.search(f"{topic.name} {topic.message_type}"))
-
-
-def _is_standard(topic: Topic) -> bool:
-    """Whether its type, such as diagnostics, is of a package that has no other points."""
-    return topic.message_type.partition("/")[0].endswith(
-        ("std_msgs", "nav_msgs", "geometry_msgs", "sensor_msgs")
-    )
-
-
-def _has_doppler(paths: list[Path], topic: Topic) -> bool:
-    try:
-        clouds = _peek(paths, topic, Request())
-        return "doppler" in Fields.of(list(clouds[0].content)).names
-    except ValueError:
-        return False
 
 
 def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
@@ -193,13 +174,15 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
 
 
 def _read_imu(
-    paths: list[Path], topic: str, sensor_frame: str, recorded_scans: bool, request: Request
+    paths: list[Path], topic: str | None, sensor_frame: str, recorded_scans: bool, request: Request
 ) -> Imu | None:
     """What the topic holds; None if it has no gyroscope.
 
     `recorded_scans`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
     from stamp to record, because messages of an IMU are recorded several at a time.
     """
+    if topic is None:
+        return None
     numbers, frame = array("d"), ""
     for message in read_messages(paths, {topic}, request.notes):
         rates, force = message.content

@@ -66,7 +66,7 @@ class Fields:
     def of(cls, names: list[str], overrides: Mapping[str, Any] | None = None) -> Fields:
         """The roles of fields by their names.
 
-        `overrides` are fields by role, or numbers of columns; None leaves a role out.
+        `overrides` are fields by role; None leaves a role out.
         """
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
@@ -82,18 +82,13 @@ class Fields:
             found.pop(role, None)
             if field is None:
                 continue
-            by_number = dict(enumerate(names)) if isinstance(field, (int, np.integer)) else {}
-            name = by_number.get(field, field if field in names else lower.get(str(field).lower()))
-            if name is None:
-                kind = "column" if by_number else "field"
-                msg = f"there is no {kind} {field} for {role}: there are {', '.join(names)}"
-                raise ValueError(msg)
-            found[role] = name
+            name = field if field in names else lower.get(str(field).lower())
+            check(name, f"there is no field {field} for {role}: there are {', '.join(names)}")
+            found[role] = str(name)
         wanted = _POLAR if "range" in found and "x" not in found else _XYZ
         missing = ", ".join(role for role in wanted if role not in found)
-        if missing and not set(_POLAR) <= set(found):
-            msg = f"the fields {missing} are missing: there are {', '.join(names) or 'none'}"
-            raise ValueError(msg)
+        known = not missing or set(_POLAR) <= set(found)
+        check(known, f"the fields {missing} are missing: there are {', '.join(names) or 'none'}")
         return cls(found)
 
     @property

@@ -140,33 +140,33 @@ def take_lock(path: Path, use: str) -> int:
     """
     descriptor = os.open(path, sum(getattr(os, flag, 0) for flag in _LOCK_FLAGS), 0o666)
     try:
-        try:
-            if sys.platform == "win32":
-                import msvcrt  # noqa: PLC0415
-
-                # Far beyond the text: nobody could read what is locked.
-                os.lseek(descriptor, 1 << 30, os.SEEK_SET)
-                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-                os.lseek(descriptor, 0, os.SEEK_SET)
-            else:
-                import fcntl  # noqa: PLC0415
-
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in _LOCKED:
-                text = path.read_text(errors="replace")[:100]
-                holder = text if text and text.isprintable() else "another process"  # empty for a moment
-                msg = f"{path.parent} is being {use} by {holder}: wait until that is done, or give another folder"
-                raise BlockingIOError(msg) from error
-            # Not all file systems of clusters have locks.
-            words = f"{path.parent} cannot be locked ({error.strerror}): let nobody else use it meanwhile"
-            warnings.warn(words, RuntimeWarning, stacklevel=3)
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
-    except BaseException:
-        os.close(descriptor)
-        raise
+        _lock(descriptor)
+    except OSError as error:
+        if error.errno in _LOCKED:
+            os.close(descriptor)
+            text = path.read_text(errors="replace")[:100]
+            holder = text if text and text.isprintable() else "another process"  # empty for a moment
+            msg = f"{path.parent} is being {use} by {holder}: wait until that is done, or give another folder"
+            raise BlockingIOError(msg) from error
+        # Not all file systems of clusters have locks.
+        words = f"{path.parent} cannot be locked ({error.strerror}): let nobody else use it meanwhile"
+        warnings.warn(words, RuntimeWarning, stacklevel=3)
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
     return descriptor
+
+
+def _lock(descriptor: int) -> None:
+    if sys.platform == "win32":
+        import msvcrt  # noqa: PLC0415
+
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # beyond the text: nobody could read what is locked
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        os.lseek(descriptor, 0, os.SEEK_SET)
+    else:
+        import fcntl  # noqa: PLC0415
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 # Formats of float32 resolve half a metre at UTM coordinates. What is far from the world's origin is written to them in a

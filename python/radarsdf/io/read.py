@@ -85,8 +85,8 @@ def read(
         In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
         are zero or stand still.
     fields : mapping, optional
-        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. Numbers mean columns,
-        None leaves a role out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth
+        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. None leaves a role
+        out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth
         and sigma_elevation.
     columns : int or sequence of str, optional
         Of files without column names: how many a point has, or their names. By default ``.bin`` files are those of KITTI:
