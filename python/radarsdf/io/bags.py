@@ -108,9 +108,7 @@ def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
         what = (
             f"{name} has messages {topics[name].message_type}" if name in topics else f"has no topic {name}"
         )
-        check(
-            name in fitting, f"{about}: {what}: topics with points are {_listed(fitting.values()) or 'none'}"
-        )
+        check(name in fitting, f"{about}: {what}: topics with points: {_listed(fitting.values()) or 'none'}")
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
     check(fitting, f"{about} has no topic with points: it has {_listed(topics.values()) or 'no topics'}")
@@ -161,10 +159,7 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     listed = ", ".join(fitting)
     wanted, about = request.imu_topic, request.notes.about
     known = wanted is None or wanted in fitting
-    check(
-        known,
-        f"{about} has no inertial measurements in {wanted}: topics that have some are {listed or 'none'}",
-    )
+    check(known, f"{about} has no inertial measurements in {wanted}: there are {listed or 'none'}")
     if wanted is None and len(fitting) > 1:
         request.notes.add(
             f"there are several IMUs, of which none is used: say by imu_topic which, of {listed}"

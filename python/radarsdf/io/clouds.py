@@ -31,6 +31,8 @@ _VLRS_AT, _VLR_BYTES = (
     100,
     54,
 )  # place of the number of variable records in a LAS header, and the least size of one
+_LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
+_VARIABLE = 2**32 - 1  # in place of the number of points in each chunk
 _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a header of PCD has eleven lines
 _PLY_HEADER_BYTES = 1 << 16
 _KITTI_WIDTH, _JUDGED_FILES, _MAX_POSITION_M = 4, 20, 1e7  # of .bin files
@@ -124,7 +126,7 @@ def check_kitti(paths: Sequence[Path]) -> None:
         other, few = _variance(numbers, width), len(numbers) < _ENOUGH_ROWS * width
         check(
             other >= _LESS * within or (few and other),
-            f"the .bin files have {width} columns, it seems: {remedy}",
+            f".bin files have {width} columns: {remedy}",
         )
 
 
@@ -178,10 +180,8 @@ def read_viewpoint(path: Path) -> NDArray[np.float64]:
     """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a PCD file, tx ty tz qw qx qy qz; the identity without one."""
     with path.open("rb") as file:
         numbers = np.array(_pcd_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
-    check(
-        numbers.shape == (7,) and np.isfinite(numbers).all(),
-        f"{path}: its VIEWPOINT is not seven finite numbers",
-    )
+    finite = numbers.shape == (7,) and np.isfinite(numbers).all()
+    check(finite, f"{path}: its VIEWPOINT is not seven finite numbers")
     T_world_sensor = np.eye(4)
     T_world_sensor[:3, 3] = numbers[:3]
     if numbers[3:].any():  # some programs write zeros where nothing is known
@@ -260,6 +260,8 @@ def _las(path: Path, _: GivenColumns) -> Columns:
         largest = size * (_MAX_COMPRESSION if header.are_points_compressed else 1)
         fits = header.point_count * header.point_format.size <= largest
         check(fits, f"its header says {header.point_count} points, for which the file is too small")
+        if header.are_points_compressed:
+            check(_has_chunks(path, header), "its chunks of points are damaged, or it is too small for them")
         cloud = file.read_points(header.point_count)
     # Scaled and shifted, in double precision: the integers in the file are no metres.
     columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
@@ -268,6 +270,39 @@ def _las(path: Path, _: GivenColumns) -> Columns:
     names |= {LAS_INTENSITY: "intensity"}
     known = set(header.point_format.dimension_names)
     return columns | {as_name: np.asarray(cloud[name]) for name, as_name in names.items() if name in known}
+
+
+def _has_chunks(path: Path, header: Any) -> bool:
+    """Whether a LAZ file can hold the chunks that it claims: lazrs allocates for them, and may end the process."""
+    import lazrs  # noqa: PLC0415 - an extra
+
+    point, size, at = header.point_format, path.stat().st_size, header.offset_to_point_data
+    record = bytes(header.vlrs.get("LasZipVlr")[0].record_data)
+    usual = bytes(lazrs.LazVlr.new_for_compression(point.id, point.num_extra_bytes).record_data())
+    # Compressor, then type, size and version of each part of a point.
+    parts, usual_parts = (np.frombuffer(data[34:], "<u2").reshape(-1, 3)[:, :2] for data in (record, usual))
+    possible = record[:2] == usual[:2] and np.array_equal(parts, usual_parts)
+    layers = _LAZ_LAYERS.get(point.id, 0) + point.num_extra_bytes
+    with path.open("rb") as file:
+        for place in (at, size - 8):  # of the place of the chunk table: before the points or at the end
+            file.seek(place)
+            table_at = int.from_bytes(file.read(8), "little", signed=True)
+            if table_at > at:
+                file.seek(min(table_at, size))
+                chunks = int.from_bytes(file.read(8)[4:], "little")  # each begins with a point as it is
+                possible &= table_at + 8 <= size and chunks * point.size <= size
+                possible &= chunks <= max(header.point_count, 1)
+                break
+        chunk_size, left, at = int.from_bytes(record[12:16], "little"), header.point_count, at + 8
+        # In a chunk, the first point, the number of points, and the sizes of its layers are before these.
+        while possible and left > 0 and point.id in _LAZ_LAYERS:
+            file.seek(at + point.size)
+            count, *sizes = np.frombuffer(file.read(4 * (1 + layers)), "<u4").tolist() or [0]
+            at += point.size + 4 * (1 + layers) + sum(sizes)
+            expected = count if chunk_size == _VARIABLE else min(chunk_size, left)
+            possible = len(sizes) == layers and at <= size and 0 < count == expected
+            left -= count
+    return possible
 
 
 READERS: dict[str, Callable[[Path, GivenColumns], Columns]] = {

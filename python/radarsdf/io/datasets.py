@@ -14,10 +14,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -25,16 +24,14 @@ from radarsdf.checks import check_pose
 from radarsdf.io.bag_messages import bags_in
 from radarsdf.io.bags import read_bags
 from radarsdf.io.files import check, reading
-from radarsdf.io.folders import BASE_T_RADAR, lidar_map, natural, scans_of_files
+from radarsdf.io.folders import BASE_T_RADAR, lidar_map, natural, read_files
 from radarsdf.io.poses import (
-    Trajectory,
     pose_matrices_of,
-    poses_of,
     read_calibration,
     read_transform,
     trajectory_of,
 )
-from radarsdf.io.recordings import Request, Truth
+from radarsdf.io.recordings import Request
 from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text
 
@@ -56,32 +53,13 @@ def _bags(folder: Path) -> list[Path]:
     return [path for path in bags_in(folder) if path.stem != "gt_odom"]  # ground truth of NTU4DRadLM
 
 
-def _scans(
-    files: list[Path],
-    times_s: Any,
-    poses: Callable[[], Any],
-    T_base_sensor: Callable[[], NDArray[np.float64] | None],
-    request: Request,
-    truth: Truth = lambda: None,
-) -> Scans:
-    """Scans of one file each. The data set's own poses and extrinsic are read only if the user gives none."""
-    known = files and (times_s is None or len(times_s) == len(files))
-    check(
-        known,
-        f"{request.notes.about} has {len(files)} scans, of which the times or poses are not known for each",
-    )
-    found = poses() if request.poses is None else poses_of(request.poses, request.notes)
-    extrinsic = T_base_sensor() if request.extrinsic is None else request.extrinsic
-    return scans_of_files(files, times_s, found, extrinsic, request, truth)
-
-
 def _ntu4dradlm(folder: Path, request: Request) -> Scans:
     """Bags and ``gt_odom.txt`` (TUM) of the platform; the calibration is given by `extrinsic`."""
     if request.extrinsic is None:
-        request.notes.add(
-            "NTU4DRadLM: no extrinsic is given, so the poses of gt_odom.txt are taken as those of the radar; "
-            "the calibration of the data set has it"
+        what = (
+            "the poses of gt_odom.txt are taken as those of the radar; the calibration of the data set has it"
         )
+        request.notes.add(f"NTU4DRadLM: no extrinsic is given, so {what}")
     poses = folder / "gt_odom.txt" if request.poses is None else request.poses
     return read_bags(_bags(folder), replace(request, poses=poses))
 
@@ -95,38 +73,35 @@ def _viking_hill(folder: Path, request: Request) -> Scans:
 
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
     """PCD files, and ``timestamp_radar.txt`` with lines of a number, seconds and nanoseconds. It has no poses."""
-    if request.poses is None:
-        msg = f"{folder}: MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
-        raise ValueError(msg)
-    stamps = read_numbers(folder / "3_RADAR/timestamp_radar.txt", 3)
-    times_s = (stamps[:, 1] + 1e-9 * stamps[:, 2]).tolist()
-    files = sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural)
-    return _scans(files, times_s, lambda: None, lambda: None, request)
+    what = "MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
+    check(request.poses is not None, f"{folder}: {what}")
+    return read_files(sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural), folder, request)
 
 
 def _coloradar(folder: Path, request: Request) -> Scans:
     """The single-chip radar: rows of x, y, z, intensity and Doppler; poses of the platform in ``groundtruth``."""
-    clouds, truth = folder / "single_chip/pointclouds", folder / "groundtruth"
-
-    def poses() -> Trajectory:
-        table = read_numbers(truth / "groundtruth_poses.txt", 7)
-        stamps = read_numbers(truth / "timestamps.txt", 1)
-        with reading(truth, "a time for each pose"):
-            return trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
-
-    def T_base_sensor() -> NDArray[np.float64] | None:
-        for place in (folder, *folder.resolve().parents[:2]):
-            file = place / "calib/transforms/base_to_single_chip.txt"
-            if file.is_file():
-                with reading(file, "two lines x y z and qx qy qz qw"):
-                    numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
-                    return check_pose(pose_matrices_of(numbers)[0], "it")
-        request.notes.add("there is no base_to_single_chip.txt: the poses are taken as those of the radar")
-        return None
-
-    times_s = read_numbers(clouds / "timestamps.txt", 1)[:, 0].tolist()
-    files = sorted((clouds / "data").glob("radar_pointcloud_*.bin"), key=natural)
-    return _scans(files, times_s, poses, T_base_sensor, replace(request, columns=request.columns or 5))
+    if request.poses is None:
+        truth = folder / "groundtruth"
+        with reading(truth, "a folder with a time for each pose"):
+            stamps, table = (
+                read_numbers(truth / "timestamps.txt", 1),
+                read_numbers(truth / "groundtruth_poses.txt", 7),
+            )
+            poses = trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
+        request = replace(request, poses=poses)
+    if request.extrinsic is None:
+        places = [place / "calib/transforms" for place in (folder, *folder.resolve().parents[:2])]
+        file = next((f for place in places if (f := place / "base_to_single_chip.txt").is_file()), None)
+        if file is None:
+            request.notes.add(
+                "there is no base_to_single_chip.txt: the poses are taken as those of the radar"
+            )
+        else:
+            with reading(file, "two lines x y z and qx qy qz qw"):
+                numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
+                request = replace(request, extrinsic=check_pose(pose_matrices_of(numbers)[0], "it"))
+    files = (folder / "single_chip/pointclouds/data").glob("radar_pointcloud_*.bin")
+    return read_files(sorted(files, key=natural), folder, replace(request, columns=request.columns or 5))
 
 
 def _delft_parts(folder: Path) -> tuple[Path, Path] | None:
@@ -146,16 +121,13 @@ def _view_of_delft(folder: Path, request: Request) -> Scans:
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
-        return _scans(files, None, lambda: None, lambda: None, request)
+        return read_files(files, folder, request)
     posed = [path for path in files if (lidar / "pose" / f"{path.stem}.json").is_file()]
     if len(posed) < len(files):
         request.notes.add(f"{len(files) - len(posed)} scans left out: they have no file of a pose")
     request.notes.add("the scans have no times; the world is the map frame of View-of-Delft")
-
-    def poses() -> NDArray[np.float64]:
-        return np.stack([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed])
-
-    return _scans(posed, None, poses, lambda: None, replace(request, extrinsic=None))
+    poses = np.array([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed])
+    return read_files(posed, folder, replace(request, poses=poses, extrinsic=np.eye(4)))
 
 
 def _delft_pose(
@@ -182,10 +154,9 @@ def _delft_pose(
 #     lidar.pcd or lidar.ply                      optional: ground truth
 
 _SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
-_SNAIL_TRAJECTORY = "utm50r_T_xt32.txt"
 
-# The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source: matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m, multiplied out,
-# of github.com/snail-radar/dataset_tools, commit 2f82c2c.
+# The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source:
+# matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m of github.com/snail-radar/dataset_tools, 2f82c2c.
 _BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
                            [-0.019750133, 0.999429818, 0.027385610, 0.0],
@@ -223,28 +194,15 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
     others = [other for other in _SNAIL_RADARS if other != radar and (sequence / other).is_dir()]
     if others and folder.resolve() == sequence:
         request.notes.add(f"{radar} is read; {' and '.join(others)} are read as folders of their own")
-    with reading(sequence / radar, "a folder of PCD files that are named by their times in seconds"):
-        stamped = sorted((float(path.stem), path) for path in (sequence / radar).glob("*.pcd"))
-    times_s, files = [time_s for time_s, _ in stamped], [path for _, path in stamped]
-    T_xt32_radar = partial(_T_xt32_radar, sequence, radar)
-    trajectory = partial(_snail_trajectory, sequence)
-    return _scans(files, times_s, trajectory, T_xt32_radar, request, partial(lidar_map, sequence))
-
-
-def _snail_trajectory(sequence: Path) -> Trajectory:
-    path = sequence / _SNAIL_TRAJECTORY
-    check(
-        path.is_file(),
-        f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence> of the data set",
-    )
-    return trajectory_of(read_numbers(path, 8), str(path))
-
-
-def _T_xt32_radar(sequence: Path, radar: str) -> NDArray[np.float64]:
-    """The radar in the frame of the lidar, (4, 4). Raises a ValueError if it is not known."""
-    T_body_radar = _body_T_ars548(sequence) if radar.startswith("ars548") else _BODY_T_OCULII
-    T_xt32_radar: NDArray[np.float64] = np.linalg.inv(_BODY_T_XT32) @ T_body_radar
-    return T_xt32_radar
+    if request.poses is None:
+        path = sequence / "utm50r_T_xt32.txt"
+        check(path.is_file(), f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
+        request = replace(request, poses=path)
+    if request.extrinsic is None:
+        T_body_radar = _body_T_ars548(sequence) if radar.startswith("ars548") else _BODY_T_OCULII
+        request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ T_body_radar)
+    files = sorted((sequence / radar).glob("*.pcd"), key=natural)
+    return read_files(files, sequence, request, partial(lidar_map, sequence))
 
 
 def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
@@ -261,15 +219,12 @@ def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
     return T_body_ars548
 
 
+# The first that fits a folder reads it.
 DATASETS = (
-    Dataset("SNAIL-Radar", lambda folder: _snail_parts(folder) is not None, _snail_radar),
-    Dataset("View-of-Delft", lambda folder: _delft_parts(folder) is not None, _view_of_delft),
-    Dataset("ColoRadar", lambda folder: (folder / "single_chip/pointclouds/data").exists(), _coloradar),
-    Dataset("MSC-RAD4R", lambda folder: (folder / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
-    Dataset(
-        "NTU4DRadLM", lambda folder: (folder / "gt_odom.txt").exists() and _bags(folder) != [], _ntu4dradlm
-    ),
-    Dataset(
-        "Viking Hill", lambda folder: (folder / BASE_T_RADAR).exists() and _bags(folder) != [], _viking_hill
-    ),
-)  # the first that fits a folder reads it
+    Dataset("SNAIL-Radar", lambda f: _snail_parts(f) is not None, _snail_radar),
+    Dataset("View-of-Delft", lambda f: _delft_parts(f) is not None, _view_of_delft),
+    Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
+    Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
+    Dataset("NTU4DRadLM", lambda f: (f / "gt_odom.txt").exists() and bool(_bags(f)), _ntu4dradlm),
+    Dataset("Viking Hill", lambda f: (f / BASE_T_RADAR).exists() and bool(_bags(f)), _viking_hill),
+)

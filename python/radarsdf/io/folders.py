@@ -25,7 +25,8 @@ from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970
 BASE_T_RADAR = "base_T_radar.txt"
 """A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
 
-TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt")  # with a time, s, for each scan, one a line
+# With a time, s, for each scan, one a line; of three columns, the last two are seconds and nanoseconds.
+TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.txt")
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
 _CALIBRATIONS = ("calib.txt", "calibration.txt")
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
@@ -48,13 +49,15 @@ _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
 def read_folder(folder: Path, request: Request) -> Scans:
     """The scans of the files in a folder; see :func:`radarsdf.io.read`."""
-    files = cloud_files(folder)
-    check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
-    return read_files(files, folder, request, partial(lidar_map, folder))
+    return read_files(cloud_files(folder), folder, request, partial(lidar_map, folder))
 
 
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
-    """The scans of files with the poses of the request, or those that are found in or near the folder."""
+    """The scans of files with the poses of the request, or those that are found in or near the folder.
+
+    The files hold one scan each, or the only one the table of a recording. `truth` counts if the request has none.
+    """
+    check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
     places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
     if poses is None:
@@ -71,35 +74,23 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     files, times_s, known = _in_order_of_time(files, known, notes)
     if T_base_sensor is None:
         T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
-    return scans_of_files(files, times_s, known, T_base_sensor, request, truth)
-
-
-def scans_of_files(
-    files: list[Path],
-    times_s: Sequence[float] | None,
-    poses: Poses,
-    T_base_sensor: NDArray[np.float64] | None,
-    request: Request,
-    truth: Truth = lambda: None,
-) -> Scans:
-    """Scans of one file each, or of the one table of a recording; `truth` counts if the request has none."""
     columns = request.columns
     if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
-        with reading(request.notes.about, "points of KITTI"):
+        with reading(notes.about, "points of KITTI"):
             check_kitti(raw)
         columns = 4
     reads = [partial(read_columns, path, columns) for path in files]
     names = [str(path) for path in files]
     if len(files) == 1:
-        parts, times_s, poses = _split(files[0], columns, times_s, poses, request.notes)
+        parts, times_s, known = _split(files[0], columns, times_s, known, notes)
         if parts:
             reads = [partial(dict, part) for part in parts]
             names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
-    matched, known_s = scan_poses(poses, len(reads), times_s, T_base_sensor, request)
+    matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
     stamps = [None] * len(reads) if known_s is None else known_s
     raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
     source = posed(lambda: raw_scans, lambda _: matched, request)
-    return Scans.of_source(source, request.notes, request.truth or truth)
+    return Scans.of_source(source, notes, request.truth or truth)
 
 
 def cloud_files(folder: Path) -> list[Path]:
@@ -144,7 +135,8 @@ def _in_order_of_time(
         listed = next((path for path in places if path.is_file()), None)
         if listed is None:
             return files, None, poses
-        numbers = read_numbers(listed)[:, -1]
+        table = read_numbers(listed)
+        numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1]
         check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
         times = in_seconds(numbers, listed.name, notes).tolist()
     order = np.argsort(times, kind="stable")

@@ -159,9 +159,7 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
         name, points = next(iter(arrays.items()))
         return positions(points, f"{path}: {name}")
     kinds = dict.fromkeys((*CLOUD_SUFFIXES, ".npz", *MESH_SUFFIXES))
-    check(
-        suffix in CLOUD_SUFFIXES, f"{path} is no ground truth: that is a file that ends in {', '.join(kinds)}"
-    )
+    check(suffix in CLOUD_SUFFIXES, f"{path} is no ground truth: that ends in {', '.join(kinds)}")
     return read_points(file)
 
 

@@ -376,9 +376,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike 
     else:
         times_s = real_array(times_s, "times_s")
         fits = times_s.shape == (len(matrices),) and np.isfinite(times_s).all()
-        check(
-            fits, f"times_s must be one finite number for each of {len(matrices)} poses, not {times_s.shape}"
-        )
+        check(fits, f"times_s must be {len(matrices)} finite numbers, one a pose, not {times_s.shape}")
         quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
         np.savetxt(text, np.column_stack([times_s, matrices[:, :3, 3], quaternions]), "%.9f")
     write_whole(path, text.getvalue())
