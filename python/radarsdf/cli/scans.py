@@ -107,7 +107,7 @@ def poses(
 
 def _fit_of_poses(recording: Recording, out: Path, *, find: bool) -> str:
     """The command to run next: a fit with the poses that were written."""
-    from radarsdf.io.folders import BASE_T_RADAR
+    from radarsdf.io.recordings import BASE_T_RADAR
 
     target = ["-o", out.stem + MAP_SUFFIX]
     if out.suffix.lower() == ".npz":

@@ -227,8 +227,8 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
         with _opened(path) as reader:
             for connection in reader.connections:
                 name = connection.topic
-                if not (isinstance(name, str) and isinstance(connection.msgtype, str)):
-                    raise _damaged(path, ValueError("a topic has no name or no type"))
+                named = isinstance(name, str) and isinstance(connection.msgtype, str)
+                check(named, f"{path} is not a whole bag: a topic has no name or no type")
                 count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
                 topics[name] = Topic(name, _type_of(connection), count)
     return topics
@@ -236,9 +236,7 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
 
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
     """Those that have messages of these types."""
-    return {
-        name: topic for name, topic in topics.items() if topic.message_type in types and topic.num_messages
-    }
+    return {n: topic for n, topic in topics.items() if topic.message_type in types and topic.num_messages}
 
 
 def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
@@ -252,9 +250,8 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
             number, numbers[topic] = numbers[topic], numbers[topic] + 1
             cdr = hasattr(connection.ext, "serialization_format")
             try:
-                message = (_types(cdr).deserialize_cdr if cdr else _types(cdr).deserialize_ros1)(
-                    raw, message_type
-                )
+                types = _types(cdr)
+                message = (types.deserialize_cdr if cdr else types.deserialize_ros1)(raw, message_type)
                 content = _READERS[message_type](message)
             except Exception as error:  # noqa: BLE001 - damaged messages raise exceptions of many kinds
                 at = f"message {number} of {topic}, at {recorded_s:.3f} s"

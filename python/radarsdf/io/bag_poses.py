@@ -239,24 +239,18 @@ def _choose(
         if len(topics) == 1:
             return topics[0]
         if not topics:
-            others = f"; {', '.join(sorted(fitting))} is passed over" if fitting else ""
-            msg = f"{error}{others}"
+            msg = f"{error}; {', '.join(sorted(fitting)) or 'no topic'} is passed over"
             raise type(error)(msg) from error
         of_tree = False
     else:
         of_tree = True
-    leading = [name for name in topics if tracks[name].child and _leads_to(sensor, tracks[name].child, tree)]
-    if len(leading) == 1:
-        return leading[0]
-    if of_tree:
-        return None
-    msg = f"{about} has several topics with poses: say by pose_topic which one counts, of {', '.join(topics)}"
-    raise ValueError(msg)
-
-
-def _leads_to(sensor: str, child: str, tree: TransformTree) -> bool:
-    """Whether a frame does not move against the sensor, as far as that is known."""
-    return sensor not in tree.tracks or tree.fixed(child, sensor) is not None
+    children = {name: tracks[name].child for name in topics if tracks[name].child}
+    known = sensor in tree.tracks
+    leading = [n for n, child in children.items() if not known or tree.fixed(child, sensor) is not None]
+    listed = ", ".join(topics)
+    one = of_tree or len(leading) == 1
+    check(one, f"{about} has several topics with poses: say by pose_topic which one counts, of {listed}")
+    return leading[0] if len(leading) == 1 else None
 
 
 def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes) -> str:
@@ -286,20 +280,16 @@ def _of_tree(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     if request.extrinsic is not None or sensor not in tree.tracks:
         lowest = moving - {above for frame in moving for above in tree.chain(frame)[1:]}
         if request.extrinsic is None or len(lowest) != 1:
-            msg = (
-                f"{about}: the transforms do not lead to the frame of the scans, {sensor or '(unnamed)'}: they have "
-                f"{', '.join(sorted(tree.tracks))}; give extrinsic, the pose of the radar in the frame that moves"
-            )
+            what = f"{sensor or '(unnamed)'}: they have {', '.join(sorted(tree.tracks))}; give extrinsic"
+            msg = f"{about}: the transforms do not lead to the frame of the scans, {what}"
             raise (ValueError if moving else NoPoses)(msg)
         (base,) = lowest
     chain = tree.chain(base)
     world = chain[-1] if request.world_frame is None else request.world_frame.lstrip("/")
-    for frame in chain[1:-1] if request.world_frame is None else ():
-        times_s = tree.tracks[frame].table[:, 1]
-        if frame in moving and np.median(np.diff(times_s)) > request.max_gap_s:
-            notes.add(
-                f"TF above {frame} is passed over: it changes rarely; world_frame chooses another world"
-            )
+    above = [frame for frame in chain if frame in moving][1:] if request.world_frame is None else []
+    for frame in above:
+        if np.median(np.diff(tree.tracks[frame].table[:, 1])) > request.max_gap_s:
+            notes.add(f"TF above {frame} is passed over: it is rare; world_frame chooses another world")
             world = frame
             break
     check(world in chain, f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}")

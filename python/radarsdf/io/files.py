@@ -46,9 +46,10 @@ def check(holds: object, message: str) -> None:
 @contextmanager
 def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> Iterator[None]:
     """Turns a ValueError, or one of these errors, in its block into a ValueError that names the file: it is not `what`."""
+    kinds: tuple[type[Exception], ...] = (ValueError, *errors)
     try:
         yield
-    except (ValueError, *errors) as error:
+    except kinds as error:
         msg = f"{path} is not {what}: {error}"
         raise ValueError(msg) from error
 

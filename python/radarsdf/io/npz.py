@@ -185,9 +185,9 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
 def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[Any, ...]]) -> None:
     """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
     for name, (dtype, *shape) in wanted.items():
-        array = arrays.get(name)
-        fits = array is not None and array.dtype == dtype and array.ndim == len(shape)
-        fits = fits and all(n in (None, m) for n, m in zip(shape, np.shape(array), strict=True))
+        array = arrays.get(name, np.zeros(0, "O"))
+        fits = array.dtype == dtype and array.ndim == len(shape)
+        fits = fits and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         check(fits, f"{name} is missing, or of another type or shape")
 
 

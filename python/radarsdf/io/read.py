@@ -20,11 +20,10 @@ from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
 from radarsdf.io.fields import SIGMA
 from radarsdf.io.files import check
-from radarsdf.io.folders import read_files, read_folder
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
 from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, StampedPoses, poses_of, rigid_or_nan
-from radarsdf.io.recordings import RawScan, Request, Truth, posed, scan_poses
+from radarsdf.io.recordings import RawScan, Request, Truth, posed, read_files, read_folder, scan_poses
 from radarsdf.io.scans import Columns, Notes, Scan, Scans
 
 
@@ -63,17 +62,15 @@ def read(
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
         (F, 4, 4) T_world_sensor, m, or a file: TUM, KITTI, 4 x 4 matrices, or a table that names its columns. By default
-        those of the data set or the ``.npz``; in a folder, a file such as ``poses.txt`` or ``poses.tum``, or the
-        ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
+        those of the data set, of the ``.npz``, of a file such as ``poses.txt`` in the folder, or of `pose_topic`.
+        `radarsdf.io.UNPOSED` reads scans without poses.
     extrinsic : (4, 4) array_like, optional
-        T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
+        T_base_sensor, m, if the poses are T_world_base.
     topic : str or sequence of str, optional
-        In a bag, the topics of the scans, merged in the order of their times. By default the radar's, if there is one.
-        Each message has the pose of the frame in its header.
+        In a bag, the topics of the scans, merged by time. By default the radar's, if there is one.
     pose_topic : str, optional
         In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one; of several, the only
-        one whose child frame leads to that of the scans, or else TF. What was passed over is noted. Goals, plans and
-        initial poses are never used.
+        one whose child frame leads to that of the scans, or else TF. Goals, plans and initial poses are never used.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
@@ -82,12 +79,11 @@ def read(
     world_frame : str, optional
         With poses of TF, the world frame. By default the root of its tree.
     stamps : {"header", "record"}, optional
-        In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
-        are zero or stand still.
+        In a bag, the time of a scan. By default that of its header, unless its stamps are zero or stand still.
     fields : mapping, optional
         Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. None leaves a role
-        out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth
-        and sigma_elevation.
+        out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth and
+        sigma_elevation.
     columns : int or sequence of str, optional
         Of files without column names: how many a point has, or their names. By default ``.bin`` files are those of KITTI:
         float32 x, y, z, intensity.

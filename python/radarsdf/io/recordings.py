@@ -1,24 +1,54 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From the raw scans of a recording, whatever its format, to scans with poses.
+"""From the files of a recording to scans with poses.
 
 Each format gives an iterator of :class:`RawScan`; :func:`posed` finds the pose of each, reads its columns, and decides what
-they mean. What cannot be used is counted in the notes, and never ends the reading.
+they mean. What cannot be used is counted in the notes, and never ends the reading. Folders have a file a scan.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.fields import Fields
-from radarsdf.io.files import check
-from radarsdf.io.poses import MAX_GAP_S, Poses, Trajectory, TransformChain
-from radarsdf.io.scans import Columns, Notes, Scan
+from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
+from radarsdf.io.fields import Fields, plain_name
+from radarsdf.io.files import check, reading
+from radarsdf.io.poses import (
+    FIND_POSES,
+    MAX_GAP_S,
+    POSE_FILES,
+    NoPoses,
+    Poses,
+    Trajectory,
+    TransformChain,
+    poses_of,
+    read_transform,
+)
+from radarsdf.io.scans import Columns, Notes, Scan, Scans
+from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970
+
+BASE_T_RADAR = "base_T_radar.txt"
+"""A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
+
+# With a time, s, for each scan, one a line; of three columns, the last two are seconds and nanoseconds.
+TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.txt")
+SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
+_CALIBRATIONS = ("calib.txt", "calibration.txt")
+_NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
+_TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
+_SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "sweep", "sweep_id")
+_TIME_FIELDS = ("time", "timestamp", "stamp", "t")
+_SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
+_TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
 Truth = Callable[[], NDArray[np.float64] | None]
 """Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
@@ -171,3 +201,142 @@ def scan_poses(
             poses @ T_base_sensor if isinstance(poses, np.ndarray) else TransformChain((poses, T_base_sensor))
         )
     return poses, times_s
+
+
+def read_folder(folder: Path, request: Request) -> Scans:
+    """The scans of the files in a folder; see :func:`radarsdf.io.read`."""
+    return read_files(cloud_files(folder), folder, request, partial(lidar_map, folder))
+
+
+def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
+    """The scans of files with the poses of the request, or those that are found in or near the folder.
+
+    The files hold one scan each, or the only one the table of a recording. `truth` counts if the request has none.
+    """
+    check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
+    notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
+    places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
+    if poses is None:
+        poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
+        if poses is not None and poses.parent != folder:  # which is easily overlooked
+            notes.add(f"poses: of {poses}")
+    if poses is None:
+        what = files[0] if len(files) == 1 else folder
+        msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
+        raise NoPoses(msg)
+    if isinstance(poses, (str, PathLike)):
+        places = list(dict.fromkeys((Path(poses).parent, *places)))
+    known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
+    files, times_s, known = _in_order_of_time(files, known, notes)
+    if T_base_sensor is None:
+        T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
+    columns = request.columns
+    if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
+        with reading(notes.about, "points of KITTI"):
+            check_kitti(raw)
+        columns = 4
+    reads = [partial(read_columns, path, columns) for path in files]
+    names = [str(path) for path in files]
+    if len(files) == 1:
+        parts, times_s, known = _split(files[0], columns, times_s, known, notes)
+        if parts:
+            reads = [partial(dict, part) for part in parts]
+            names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
+    matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
+    stamps = [None] * len(reads) if known_s is None else known_s
+    raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
+    source = posed(lambda: raw_scans, lambda _: matched, request)
+    return Scans.of_source(source, notes, request.truth or truth)
+
+
+def cloud_files(folder: Path) -> list[Path]:
+    """The scans of a folder, or of a folder of `SCAN_FOLDERS` in it, in natural order: of the suffix with most files."""
+    for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
+        kinds: dict[str, list[Path]] = {}
+        for path in inner.iterdir() if inner.is_dir() else ():
+            other = path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM or path.name.startswith(".")
+            if path.suffix.lower() in CLOUD_SUFFIXES and not other and path.is_file():
+                kinds.setdefault(path.suffix.lower(), []).append(path)
+        if kinds:
+            return sorted(max(kinds.values(), key=len), key=natural)
+    return []
+
+
+def natural(path: Path) -> tuple[Any, ...]:
+    """To sort names as people do: scan_9 before scan_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
+
+
+def lidar_map(folder: Path) -> NDArray[np.float64] | None:
+    """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``. None if there is neither."""
+    found = (folder / f"{_TRUTH_STEM}{suffix}" for suffix in (".pcd", ".ply"))
+    return next((read_points(path) for path in found if path.is_file()), None)
+
+
+def _in_order_of_time(
+    files: list[Path], poses: Poses, notes: Notes
+) -> tuple[list[Path], list[float] | None, Poses]:
+    """Scans in the order of their times, these times, s, None if there are none, and the poses.
+
+    Poses without times belong to the files by number: in the order of the times in their names, or, where a file has the
+    times line by line, in the order of these lines.
+    """
+    times = [time for path in files if (time := _time_in(path.stem)) is not None]
+    listed = None
+    if len(set(times)) < len(files):
+        places = [
+            folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES
+        ]
+        listed = next((path for path in places if path.is_file()), None)
+        if listed is None:
+            return files, None, poses
+        table = read_numbers(listed)
+        numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1]
+        check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
+        times = in_seconds(numbers, listed.name, notes).tolist()
+    order = np.argsort(times, kind="stable")
+    if listed is not None and (np.diff(order) < 0).any():
+        notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
+        if isinstance(poses, np.ndarray) and len(poses) == len(files):
+            poses = poses[order]
+    return [files[i] for i in order], [times[i] for i in order], poses
+
+
+def _time_in(stem: str) -> float | None:
+    """The time, s, that a name ends in: with a point s; in 12, 15 or 18 digits or more ms, µs or ns. Others are numbers."""
+    if parts := _SECONDS_AND_NANOSECONDS.search(stem):
+        return int(parts[1]) + 1e-9 * int(parts[2])
+    found = _TIME.search(stem)
+    if found is None:
+        return None
+    return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
+
+
+def _split(
+    path: Path, columns: Any, times_s: Sequence[float] | None, poses: Poses, notes: Notes
+) -> tuple[list[Columns], Sequence[float] | None, Poses]:
+    """The scans in the one table of a recording, by a column with their numbers; none if it is one scan."""
+    try:
+        table = read_columns(path, columns)
+    except ValueError:  # which is noted when the scan is read
+        return [], times_s, poses
+    plain = {plain_name(name)[0]: name for name in reversed(table)}
+    key = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
+    if key is None or table[key].dtype.kind not in "biuf":
+        return [], times_s, poses
+    rows = np.flatnonzero(np.isfinite(table[key]))
+    values, first, part = np.unique(table[key][rows], return_index=True, return_inverse=True)
+    if len(values) < 2:
+        return [], times_s, poses
+    left_out = len(table[key]) - len(rows)
+    without = f"; {left_out} rows left out, whose {key} is not a number" if left_out else ""
+    notes.add(f"{path.name} is read as {len(values)} scans, by its field {key}{without}")
+    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
+    if time is not None and table[time].dtype.kind in "iuf":
+        scale = SCALES.get(plain_name(time)[1], 1.0)
+        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
+    if isinstance(poses, np.ndarray) and 0 <= values[0] <= values[-1] < len(poses) > len(values):
+        poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
+    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
+    return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
