@@ -40,11 +40,9 @@ class BagWriter:
         The bag: a file for ROS 1, a folder for ROS 2.
     kind : {"ros1", "sqlite3", "mcap"}
         Its format.
-    packed : {"bz2", "lz4", "message", "file", "storage"}, optional
-        How it is compressed: chunks of ROS 1; messages, whole files, or chunks of MCAP by Zstandard.
     """
 
-    def __init__(self, path: Path, kind: str, packed: str | None = None) -> None:
+    def __init__(self, path: Path, kind: str) -> None:
         self.ros1 = kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
         types = {}
@@ -59,11 +57,6 @@ class BagWriter:
             if self.ros1
             else rosbag2.Writer(path, version=9, storage_plugin=plugins[kind])
         )
-        set_compression: Any = self.writer.set_compression
-        if packed is not None and self.ros1:
-            set_compression(rosbag1.Writer.CompressionFormat[packed.upper()])
-        elif packed is not None:
-            set_compression(rosbag2.CompressionMode[packed.upper()], rosbag2.CompressionFormat.ZSTD)
         self.connections: dict[str, Any] = {}
 
     def __enter__(self) -> Self:

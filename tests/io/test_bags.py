@@ -110,12 +110,12 @@ def test_cloud2_in_rows_with_other_types(tmp_path):
     assert_array_equal(scan.intensities, [-3, 4, 5, 6, 7, 8])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_cloud_with_channels(tmp_path, kind):
     check(read(scans_and(tmp_path, kind, odometry, BagWriter.cloud)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_radar_msgs(tmp_path, kind):
     with BagWriter(name(tmp_path, kind), kind) as bag:
         odometry(bag)
@@ -174,7 +174,7 @@ def test_stamps_that_are_zero_or_stand_still(tmp_path, stamp_s):
     scans = read(tmp_path / "a.bag")
     assert scans.notes[0] == f"the header stamps of /radar {why}: the record time is used instead"
     check(scans)
-    with pytest.raises(ValueError, match="no scan has a pose: the first scan is at"):
+    with pytest.raises(ValueError, match="no scan has a pose"):
         list(read(tmp_path / "a.bag", stamps="header"))
 
 

@@ -6,10 +6,11 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,24 +78,31 @@ class Track:
         count = len(self.numbers) // 9
         if damaged := count - len(self.table):
             request.notes.add(
-                f"poses of {name} left out: {damaged} of {count} are not finite, or have no unit quaternion"
+                f"poses of {name} left out: {damaged} of {count} are not finite, with a unit quaternion"
             )
         clock = int(by_record(self.table[:, 0], name, request.stamps, request.notes))
         return trajectory_of(self.table[:, [clock, *range(2, 9)]], name)
 
 
+class _Attached(NamedTuple):
+    """Poses of a frame in _WORLD, in place of its track."""
+
+    chain: TransformChain
+    parent: str = _WORLD
+    constant: bool = False
+
+
 class TransformTree:
     """Frames, each with the transform from its parent."""
 
-    def __init__(self, tracks: dict[str, Track]) -> None:
-        self.tracks = tracks  # by child
-        self.attached: dict[str, TransformChain] = {}  # poses of frames in _WORLD, in place of their tracks
+    def __init__(self, tracks: Mapping[str, Track]) -> None:
+        self.tracks: dict[str, Track | _Attached] = dict(tracks)  # by child
 
     def chain(self, frame: str) -> list[str]:
         """The frame, its parent, and so on up to the root. Raises a ValueError if they run in a circle."""
         chain = [frame]
-        while chain[-1] in self.attached or chain[-1] in self.tracks:
-            parent = _WORLD if chain[-1] in self.attached else self.tracks[chain[-1]].parent
+        while chain[-1] in self.tracks:
+            parent = self.tracks[chain[-1]].parent
             check(parent not in chain, f"the transforms run in a circle: {' -> '.join([*chain, parent])}")
             chain.append(parent)
         return chain
@@ -103,9 +111,10 @@ class TransformTree:
         """The highest frame that does not move against this one, and T_top_frame (4, 4)."""
         T_top_frame = np.eye(4)
         for top in self.chain(frame):
-            if top in self.attached or top not in self.tracks or not self.tracks[top].constant:
+            track = self.tracks.get(top)
+            if not isinstance(track, Track) or not track.constant:
                 break
-            T_top_frame = self.tracks[top].matrix @ T_top_frame
+            T_top_frame = track.matrix @ T_top_frame
         return top, T_top_frame
 
     def fixed(self, base: str, sensor: str) -> NDArray[np.float64] | None:
@@ -117,7 +126,7 @@ class TransformTree:
         """Lets `base`, and all that does not move against it, have these poses, before the extrinsic of a user."""
         top, T_top_base = self.rigid_top(base)
         T_pose_base = np.eye(4) if request.extrinsic is None else request.extrinsic
-        self.attached[top] = TransformChain((poses, T_pose_base @ np.linalg.inv(T_top_base)))
+        self.tracks[top] = _Attached(TransformChain((poses, T_pose_base @ np.linalg.inv(T_top_base))))
         return self.finder(_WORLD, request)
 
     def finder(self, world: str, request: Request) -> Callable[[str], TransformChain | None]:
@@ -139,14 +148,11 @@ class TransformTree:
         return find
 
     def _link(self, child: str, request: Request) -> StampedPoses | NDArray[np.float64]:
-        if child in self.attached:
-            return self.attached[child]
         track = self.tracks[child]
-        return (
-            track.matrix
-            if track.constant
-            else track.trajectory(f"TF from {track.parent} to {child}", request)
-        )
+        if isinstance(track, _Attached):
+            return track.chain
+        name = f"TF from {track.parent} to {child}"
+        return track.matrix if track.constant else track.trajectory(name, request)
 
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
@@ -288,7 +294,8 @@ def _of_tree(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     world = chain[-1] if request.world_frame is None else request.world_frame.lstrip("/")
     above = [frame for frame in chain if frame in moving][1:] if request.world_frame is None else []
     for frame in above:
-        if np.median(np.diff(tree.tracks[frame].table[:, 1])) > request.max_gap_s:
+        track = tree.tracks[frame]
+        if isinstance(track, Track) and np.median(np.diff(track.table[:, 1])) > request.max_gap_s:
             notes.add(f"TF above {frame} is passed over: it is rare; world_frame chooses another world")
             world = frame
             break

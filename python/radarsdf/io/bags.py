@@ -105,9 +105,7 @@ def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
     about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
     for name in request.topic:
-        what = (
-            f"{name} has messages {topics[name].message_type}" if name in topics else f"has no topic {name}"
-        )
+        what = f"{name} has messages {topics[name].message_type}" if name in topics else f"no topic {name}"
         check(name in fitting, f"{about}: {what}: topics with points: {_listed(fitting.values()) or 'none'}")
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
@@ -161,9 +159,7 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     known = wanted is None or wanted in fitting
     check(known, f"{about} has no inertial measurements in {wanted}: there are {listed or 'none'}")
     if wanted is None and len(fitting) > 1:
-        request.notes.add(
-            f"there are several IMUs, of which none is used: say by imu_topic which, of {listed}"
-        )
+        request.notes.add(f"there are several IMUs, none is used: say by imu_topic which, of {listed}")
         return None
     return wanted or next(iter(fitting), None)
 

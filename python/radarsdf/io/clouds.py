@@ -27,10 +27,7 @@ TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
 LAS_INTENSITY = "radar_intensity"  # an extra dimension: LAS's own are whole numbers from 0 to 65535
 _PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
 _MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth
-_VLRS_AT, _VLR_BYTES = (
-    100,
-    54,
-)  # place of the number of variable records in a LAS header, and the least size of one
+_VLRS_AT, _VLR_BYTES = 100, 54  # place of the number of records in a LAS header, and the least size of one
 _LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
 _VARIABLE = 2**32 - 1  # in place of the number of points in each chunk
 _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a header of PCD has eleven lines

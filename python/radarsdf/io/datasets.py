@@ -55,9 +55,7 @@ def _bags(folder: Path) -> list[Path]:
 def _ntu4dradlm(folder: Path, request: Request) -> Scans:
     """Bags and ``gt_odom.txt`` (TUM) of the platform; the calibration is given by `extrinsic`."""
     if request.extrinsic is None:
-        what = (
-            "the poses of gt_odom.txt are taken as those of the radar; the calibration of the data set has it"
-        )
+        what = "the poses of gt_odom.txt are taken as those of the radar; the data set has a calibration"
         request.notes.add(f"NTU4DRadLM: no extrinsic is given, so {what}")
     poses = folder / "gt_odom.txt" if request.poses is None else request.poses
     return read_bags(_bags(folder), replace(request, poses=poses))
@@ -92,9 +90,7 @@ def _coloradar(folder: Path, request: Request) -> Scans:
         places = [place / "calib/transforms" for place in (folder, *folder.resolve().parents[:2])]
         file = next((f for place in places if (f := place / "base_to_single_chip.txt").is_file()), None)
         if file is None:
-            request.notes.add(
-                "there is no base_to_single_chip.txt: the poses are taken as those of the radar"
-            )
+            request.notes.add("no base_to_single_chip.txt: the poses are taken as those of the radar")
         else:
             with reading(file, "two lines x y z and qx qy qz qw"):
                 numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
@@ -140,7 +136,9 @@ def _delft_pose(
         T_map_camera = check_pose(np.array(T_map_camera, np.float64).reshape(4, 4), "mapToCamera")
     calibration = radar / "calib" / f"{frame}.txt"
     T_camera_radar = read_calibration(calibration) if extrinsic is None else extrinsic
-    check(T_camera_radar is not None, f"{calibration} lacks Tr_velo_to_cam")
+    if T_camera_radar is None:
+        msg = f"{calibration} lacks Tr_velo_to_cam"
+        raise ValueError(msg)
     T_map_radar: NDArray[np.float64] = T_map_camera @ T_camera_radar
     return T_map_radar
 

@@ -208,9 +208,7 @@ def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Po
         columns, unit_of_angles = _pose_columns(names, values)
         if columns:
             if heads and names is _TUM:
-                notes.add(
-                    f"{path.name}: its columns are taken as {' '.join(_TUM)}: names above them are not known"
-                )
+                notes.add(f"{path.name}: its columns are taken as {' '.join(_TUM)}: unknown names")
             return _of_columns(columns, unit_of_angles, path, notes)
     if width == 12:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
@@ -218,13 +216,9 @@ def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Po
         P = rigid_or_nan(poses, str(path), notes)
         for file in calibration:
             if file.is_file() and (Tr := read_calibration(file)) is not None:
-                notes.add(
-                    f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr, the world is the first scan"
-                )
+                notes.add(f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr")
                 return np.linalg.inv(Tr) @ P @ Tr
-        notes.add(
-            f"{path.name} has KITTI poses and there is no calibration Tr: they are taken as T_world_sensor"
-        )
+        notes.add(f"{path.name} has KITTI poses, no calibration Tr: they are taken as T_world_sensor")
         return P
     if width == 16 or (width == 4 and len(values) % 4 == 0):
         return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
@@ -329,9 +323,7 @@ def check_pose_suffix(path: str | PathLike[str]) -> None:
 def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
     """Raises a ValueError if :func:`write_poses` would refuse to write without times."""
     if times_s is None and path_of(path, "path").suffix.lower() == ".tum":
-        msg = (
-            f"{path} needs times, when each pose was taken, s, and there are none: .kitti and .npy do without"
-        )
+        msg = f"{path} needs times, s, and there are none: .kitti and .npy do without"
         raise ValueError(msg)
 
 

@@ -109,20 +109,14 @@ def posed(
             else:
                 found = known.pose_at(np.nan if raw.time_s is None else raw.time_s, request.max_gap_s)
                 if found is None:
-                    notes.count(
-                        f"scans left out: no poses within {request.max_gap_s} s of each other around them"
-                    )
-                    unposed = (
-                        unposed or f"the first scan is at {raw.time_s} s, the poses are from {known.span()}"
-                    )
+                    notes.count(f"scans left out: no poses within {request.max_gap_s} s of each other")
+                    unposed = unposed or f"first scan at {raw.time_s} s, poses from {known.span()}"
                     continue
                 T_world_sensor = found
             num_posed += 1
             if scan := _scan(raw, T_world_sensor, layouts, request):
                 yield scan
-        what = (
-            f"no scan has a pose: {unposed}, with gaps of up to {request.max_gap_s} s: are both of one clock?"
-        )
+        what = f"no scan has a pose: {unposed}, gaps up to {request.max_gap_s} s: of one clock?"
         check(num_posed or not unposed, f"{notes.about}: {what}")
 
     return source
@@ -167,9 +161,7 @@ def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields]
 def _note_differences(names: Mapping[str, str], others: Mapping[str, str], notes: Notes) -> None:
     for role in ("intensity", "doppler", "sigma_range"):
         if (role in names) != (role in others):
-            notes.add(
-                f"some scans have {role}, others have none: it is not used where all scans must have it"
-            )
+            notes.add(f"some scans have {role}, others have none: not used where all must have it")
     own, other = names.get("intensity"), others.get("intensity")
     if own and other and own != other:
         notes.add(f"intensities of some scans are {other}, of others {own}: they are taken as of one unit")
@@ -191,9 +183,7 @@ def scan_poses(
         if not isinstance(poses, Trajectory) or len(poses.times_s) != count:
             msg = f"{about}: the {count} scans have no time stamps, and the poses ({poses.span()}) are not as many"
             raise ValueError(msg)
-        request.notes.add(
-            f"the scans have no time stamps: they are matched to the {count} poses in their order"
-        )
+        request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()
         poses = poses.poses(poses.times_s)
     if T_base_sensor is not None:
@@ -258,7 +248,8 @@ def cloud_files(folder: Path) -> list[Path]:
             if path.suffix.lower() in CLOUD_SUFFIXES and not other and path.is_file():
                 kinds.setdefault(path.suffix.lower(), []).append(path)
         if kinds:
-            return sorted(max(kinds.values(), key=len), key=natural)
+            most = max(kinds.values(), key=len)
+            return sorted(most, key=natural)
     return []
 
 
@@ -276,7 +267,7 @@ def lidar_map(folder: Path) -> NDArray[np.float64] | None:
 
 def _in_order_of_time(
     files: list[Path], poses: Poses, notes: Notes
-) -> tuple[list[Path], list[float] | None, Poses]:
+) -> tuple[list[Path], Sequence[float] | None, Poses]:
     """Scans in the order of their times, these times, s, None if there are none, and the poses.
 
     Poses without times belong to the files by number: in the order of the times in their names, or, where a file has the

@@ -102,11 +102,14 @@ class Notes:
             self._first.setdefault(what, f"; the first: {example}" if example else "")
             self._counts[what] = self._counts.get(what, 0) + number
 
+    def start_pass(self) -> None:
+        """Forgets the counts: the files are read again."""
+        self._counts = {}
+
     def end_pass(self) -> None:
-        """Turns the counts into sentences, and begins to count anew."""
+        """Turns the counts into sentences."""
         for what, number in self._counts.items():
             self.add(f"{number} {what}{self._first[what]}")
-        self._counts = {}
 
 
 class Scans:
@@ -301,6 +304,7 @@ class Scans:
         assert self._source is not None
         poses: list[NDArray[np.float64]] = []
         times_s: list[float | None] = []
+        self._notes.start_pass()
         for scan in self._source():
             poses.append(scan.T_world_sensor)
             times_s.append(scan.time_s)
