@@ -235,7 +235,7 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
 
 
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
-    """Those that have messages of these types."""
+    """The topics that have messages of these types."""
     return {n: topic for n, topic in topics.items() if topic.message_type in types and topic.num_messages}
 
 

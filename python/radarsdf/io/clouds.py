@@ -128,7 +128,6 @@ def check_kitti(paths: Sequence[Path]) -> None:
 
 
 def _variance(numbers: NDArray[np.float32], width: int) -> float:
-    """Within columns."""
     return float(numbers[: len(numbers) // width * width].reshape(-1, width).var(axis=0).mean())
 
 

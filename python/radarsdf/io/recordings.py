@@ -174,7 +174,7 @@ def scan_poses(
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
 ) -> tuple[Poses, Sequence[float] | None]:
-    """T_world_sensor of each of `count` scans has, and the times of the scans as far as they are then known."""
+    """The poses T_world_sensor of `count` scans, and their times, s, as far as they are then known."""
     about = request.notes.about
     if isinstance(poses, np.ndarray):
         what = "give as many, or poses with time stamps for scans with time stamps"
@@ -254,7 +254,7 @@ def cloud_files(folder: Path) -> list[Path]:
 
 
 def natural(path: Path) -> tuple[Any, ...]:
-    """To sort names as people do: scan_9 before scan_10."""
+    """Sorts names as people do: scan_9 before scan_10."""
     parts = re.split(r"(\d+)", path.name)
     return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
 

@@ -330,7 +330,7 @@ class Scans:
 
 
 def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
-    """Scans one after another as one, with what all of them have."""
+    """Collects scans, with the arrays that all of them have."""
     times_s = _all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
@@ -351,7 +351,7 @@ def filled(points: Any, **given: Any) -> tuple[Any, ...]:
 def chosen(
     arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64] | Sequence[int]
 ) -> list[NDArray[Any]] | None:
-    """Those of these `numbers`, (K,), in this order, if there are arrays."""
+    """The arrays with these `numbers`, (K,), in this order; None if there are none."""
     return None if arrays is None else [arrays[i] for i in numbers]
 
 
