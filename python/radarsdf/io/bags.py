@@ -119,8 +119,7 @@ def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
         listed = _listed(fitting.values())
         msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {listed}"
         raise ValueError(msg)
-    unread = [t for t in topics.values() if t.num_messages and _RADAR.search(t.message_type)]
-    unread = [t for t in unread if t.name not in fitting]
+    unread = [t for t in topics.values() if t.name not in fitting and _RADAR.search(t.message_type)]
     what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that"
     check(not unread or _is_radar(chosen[0]), f"{about}: {what}")
     if others := {*fitting.values(), *unread} - set(chosen):

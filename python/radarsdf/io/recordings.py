@@ -103,9 +103,10 @@ def posed(
                 notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}")
                 continue
             if isinstance(known, np.ndarray):
-                T_world_sensor = known[number if raw.number is None else raw.number]
-                if np.isnan(T_world_sensor[0, 0]):  # it was named when the poses were read
+                own = known[number if raw.number is None else raw.number :][:1]
+                if not np.isfinite(own).all() or not len(own):  # it was named when the poses were read
                     continue
+                T_world_sensor = own[0]
             else:
                 found = known.pose_at(np.nan if raw.time_s is None else raw.time_s, request.max_gap_s)
                 if found is None:
