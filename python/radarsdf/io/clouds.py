@@ -32,7 +32,8 @@ _LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format
 _VARIABLE = 2**32 - 1  # in place of the number of points in each chunk
 _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a header of PCD has eleven lines
 _PLY_HEADER_BYTES = 1 << 16
-_KITTI_WIDTH, _JUDGED_FILES, _MAX_POSITION_M = 4, 20, 1e7  # of .bin files
+_KITTI_WIDTH, _JUDGED_FILES = 4, 20  # of .bin files
+_MAX_POSITION_M, _FEW = 1e7, 0.02  # of the numbers may be damaged
 _LESS, _ENOUGH_ROWS = 0.8, 30  # of the variance within four columns is left by another number of them
 
 GivenColumns: TypeAlias = int | Sequence[str] | None
@@ -114,8 +115,8 @@ def check_kitti(paths: Sequence[Path]) -> None:
     check(2 * len(fitting) >= len(paths), f"most .bin files are no points of four float32 each: {remedy}")
     numbers = np.concatenate([np.zeros(0, "<f4"), *(np.fromfile(path, "<f4") for path in fitting)])
     positions = numbers.reshape(-1, _KITTI_WIDTH)[:, :3]
-    near = np.abs(positions[np.isfinite(positions)]) <= _MAX_POSITION_M
-    check(near.all(), f"float32 numbers in the .bin files are no positions in m: {remedy}")
+    far = np.abs(positions[np.isfinite(positions)]) > _MAX_POSITION_M
+    check(far.sum() <= _FEW * far.size, f"float32 numbers in the .bin files are no positions in m: {remedy}")
     # Numbers of one column are alike. Logarithms, so that no column has all of the variance.
     numbers = np.nan_to_num(np.sign(numbers) * np.log1p(np.abs(numbers)))
     within = _variance(numbers, _KITTI_WIDTH)
