@@ -24,12 +24,7 @@ from radarsdf.checks import check_pose
 from radarsdf.io.bag_messages import bags_in
 from radarsdf.io.bags import read_bags
 from radarsdf.io.files import check, reading
-from radarsdf.io.poses import (
-    pose_matrices_of,
-    read_calibration,
-    read_transform,
-    trajectory_of,
-)
+from radarsdf.io.poses import pose_matrices_of, read_calibration, read_transform, trajectory_of
 from radarsdf.io.recordings import BASE_T_RADAR, Request, lidar_map, natural, read_files
 from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text

@@ -24,16 +24,9 @@ _ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are unpacked at any compressi
 
 _IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu
 _SHAPES: dict[str, tuple[str | int, ...]] = {
-    "points": ("N", 3),
-    "frame": ("N",),
-    "poses": ("F", 4, 4),
-    "intensity": ("N",),
-    "static": ("N",),
-    "doppler": ("N",),
-    "times": ("F",),
-    "sigma": ("N", 3),
-    "lidar_points": ("M", 3),
-}
+    "points": ("N", 3), "frame": ("N",), "poses": ("F", 4, 4), "intensity": ("N",), "static": ("N",), "doppler": ("N",),
+    "times": ("F",), "sigma": ("N", 3), "lidar_points": ("M", 3),
+}  # fmt: skip
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:

@@ -20,15 +20,7 @@ from radarsdf.checks import are_rigid, check_pose, check_poses, path_of, pose_ma
 from radarsdf.io.files import check, check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
 from radarsdf.io.scans import Columns, Notes
-from radarsdf.io.text import (
-    SCALES,
-    are_degrees,
-    in_seconds,
-    read_numbers,
-    read_table,
-    read_text,
-    without_unit,
-)
+from radarsdf.io.text import SCALES, are_degrees, in_seconds, read_numbers, read_table, without_unit
 
 MAX_GAP_S = 0.5  # between two poses over which poses are interpolated, by default
 
@@ -302,7 +294,8 @@ def read_calibration(path: Path) -> NDArray[np.float64] | None:
     """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither."""
     check_regular_file(path)
     with reading(path, "a KITTI calibration"):
-        lines = [line.partition(":") for line in read_text(path).splitlines()]
+        text = path.read_text(encoding="utf-8", errors="replace")
+        lines = [line.partition(":") for line in text.splitlines()]
         found = {key.strip(): values.split() for key, _, values in lines}
         numbers = found.get("Tr", found.get("Tr_velo_to_cam"))
         if numbers is None:
