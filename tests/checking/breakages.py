@@ -14,7 +14,7 @@ import radarsdf
 from numpy.typing import NDArray
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checking.doppler import velocity_of_poses
-from radarsdf.io.poses.trajectory import Trajectory
+from radarsdf.io.poses import Trajectory
 from radarsdf.simulate import SCENES
 from scipy.spatial.transform import Rotation
 

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.io.clouds.writing import write_cloud
+from radarsdf.io.cloud_writing import write_cloud
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.scans import Scans
 

@@ -40,11 +40,9 @@ class BagWriter:
         The bag: a file for ROS 1, a folder for ROS 2.
     kind : {"ros1", "sqlite3", "mcap"}
         Its format.
-    packed : {"bz2", "lz4", "message", "file", "storage"}, optional
-        How it is compressed: chunks of ROS 1; messages, whole files, or chunks of MCAP by Zstandard.
     """
 
-    def __init__(self, path: Path, kind: str, packed: str | None = None) -> None:
+    def __init__(self, path: Path, kind: str) -> None:
         self.ros1 = kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
         types = {}
@@ -59,11 +57,6 @@ class BagWriter:
             if self.ros1
             else rosbag2.Writer(path, version=9, storage_plugin=plugins[kind])
         )
-        set_compression: Any = self.writer.set_compression
-        if packed is not None and self.ros1:
-            set_compression(rosbag1.Writer.CompressionFormat[packed.upper()])
-        elif packed is not None:
-            set_compression(rosbag2.CompressionMode[packed.upper()], rosbag2.CompressionFormat.ZSTD)
         self.connections: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
@@ -141,16 +134,6 @@ class BagWriter:
         """A radar_msgs/RadarScan of rows of range, azimuth, elevation, Doppler and amplitude."""
         returns = [self.make("radar_msgs/msg/RadarReturn", *map(float, row)) for row in np.asarray(rows)]
         return self.make("radar_msgs/msg/RadarScan", self.header(stamp_s, frame), returns)
-
-    def ti_point(
-        self, stamp_s: float, point_id: int, xyz: ArrayLike, velocity: float, intensity: float
-    ) -> Any:
-        """A ti_mmwave_rospkg/RadarScan: one point."""
-        x, y, z = map(float, np.asarray(xyz))
-        return self.make(
-            "ti_mmwave_rospkg/msg/RadarScan", self.header(stamp_s, "ti_mmwave"), point_id, x, y, z,
-            float(np.hypot(x, y)), velocity, 3, 0.0, intensity,
-        )  # fmt: skip
 
     def odometry(
         self, stamp_s: float, T_world_base: ArrayLike, frame: str = "odom", child: str = "base_link"

@@ -16,7 +16,7 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.io import read
 from radarsdf.io.meshes import read_ground_truth, read_mesh
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.trajectory import trajectory_of
+from radarsdf.io.poses import trajectory_of
 from radarsdf.io.text import read_numbers
 
 from .. import samples
@@ -100,7 +100,6 @@ READERS = {
     "folder: mounting": Reader(_folder, "base_T_radar.txt", samples.transforms),
     "folder: lidar": Reader(_folder, "lidar.ply", samples.meshes),
     "read: PCD": Reader(readers.read_one, "scan.pcd", samples.clouds),
-    "read: compressed": Reader(readers.read_one, "scan.pcd", readers.compressed),
     "read: array": Reader(readers.read_one, "scan.npy", readers.arrays),
     "read: KITTI": Reader(readers.read_one, "scan.bin", readers.kitti),
     "read: text": Reader(readers.read_one, "scan.csv", readers.text),

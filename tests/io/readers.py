@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import io
 import logging
-import struct
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +16,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from radarsdf.io import read
-from radarsdf.io.poses.files import read_poses
+from radarsdf.io.poses import read_poses
 from radarsdf.io.scans import Notes
 
 from .bag_writing import BagWriter
@@ -46,19 +45,6 @@ def read_pose_file(path: Path) -> None:
     """Reads a file of poses."""
     poses = read_poses(path, Notes())
     assert not isinstance(poses, np.ndarray) or poses.shape[1:] == (4, 4)
-
-
-def compressed() -> list[bytes]:
-    """PCD files that are compressed."""
-    raw = np.ascontiguousarray(_TABLE.T).tobytes()
-    packed = b"".join(bytes([len(raw[i : i + 32]) - 1]) + raw[i : i + 32] for i in range(0, len(raw), 32))
-    packed += b"\x20\x00"  # a reference, over what is there
-    head = (
-        b"VERSION 0.7\nFIELDS x y z power ring\nSIZE 4 4 4 4 1\nTYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH 12\nHEIGHT 1\n"
-        b"DATA binary_compressed\n"
-    )
-    packed = packed[:-2] + b"\x00a" + b"\xe0\x02\x00"  # twelve equal bytes: the rings
-    return [head + struct.pack("<II", len(packed), len(raw) + 12) + packed]
 
 
 def arrays() -> list[bytes]:

@@ -110,12 +110,12 @@ def test_cloud2_in_rows_with_other_types(tmp_path):
     assert_array_equal(scan.intensities, [-3, 4, 5, 6, 7, 8])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_cloud_with_channels(tmp_path, kind):
     check(read(scans_and(tmp_path, kind, odometry, BagWriter.cloud)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_radar_msgs(tmp_path, kind):
     with BagWriter(name(tmp_path, kind), kind) as bag:
         odometry(bag)
@@ -130,26 +130,6 @@ def test_radar_msgs(tmp_path, kind):
     assert_allclose(scans[1].points, [[10, 0, 0], [0, 10, 0]], atol=1e-5)
     assert_array_equal(scans[1].doppler_mps, [-1, 2])
     assert_array_equal(scans[1].intensities, [50, 60])
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_one_point_a_message(tmp_path, kind):
-    """The number of the point restarts with each scan; of the third, the first point was lost."""
-    with BagWriter(name(tmp_path, kind), kind) as bag:
-        odometry(bag)
-        for i, ids in enumerate(([0, 1, 2], [0], [1, 2], [0, 1])):
-            for n in ids:
-                message = bag.ti_point(TIMES_S[i], n, [i, n, 1], -2.0, 7.0 + n)
-                bag.write("/ti_mmwave/radar_scan", message, TIMES_S[i] + 0.001 * n)
-    scans = read(name(tmp_path, kind))
-    assert [scan.points.tolist() for scan in scans] == [
-        [[0, 0, 1], [0, 1, 1], [0, 2, 1]], [[1, 0, 1]], [[2, 1, 1], [2, 2, 1]], [[3, 0, 1], [3, 1, 1]],
-    ]  # fmt: skip
-    assert_allclose(scans.times_s, TIMES_S[:4], rtol=0, atol=1e-6)
-    assert_array_equal(scans.intensities[0], [7, 8, 9])
-    assert_array_equal(scans.doppler_mps[0], -2)
-    by_order = read(name(tmp_path, kind), MOVED[:4])
-    assert_allclose(by_order.poses, MOVED[:4])
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
@@ -194,7 +174,7 @@ def test_stamps_that_are_zero_or_stand_still(tmp_path, stamp_s):
     scans = read(tmp_path / "a.bag")
     assert scans.notes[0] == f"the header stamps of /radar {why}: the record time is used instead"
     check(scans)
-    with pytest.raises(ValueError, match="no scan has a pose: the first scan is at"):
+    with pytest.raises(ValueError, match="no scan has a pose"):
         list(read(tmp_path / "a.bag", stamps="header"))
 
 

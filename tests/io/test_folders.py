@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.clouds.reading import read_columns
+from radarsdf.io.clouds import read_columns
 
 START_S = 1706001766.0
 TURN_LEFT = np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # by 90 degrees about z, qx qy qz qw
@@ -148,35 +148,6 @@ def test_snail_radar(snail):
     forward_left_up = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     angle = np.arccos((np.trace(scans.poses[0, :3, :3].T @ forward_left_up) - 1) / 2)
     assert np.deg2rad(1) < angle < np.deg2rad(3)
-
-
-def test_snail_radar_lidar_points_move_with_their_own_time(snail):
-    seconds = START_S + np.array([0.0, 0.1, 0.1, 0.0, 0.0, 0.2, -0.1])
-    # Left, back, up; the last four are too near, too far, in the cell of the third, and before the first pose.
-    xyz = [
-        [0, -3, 1],
-        [0, -3, 1],
-        [2.02, 0.02, 0.02],
-        [0.5, 0, 0],
-        [70, 0, 0],
-        [2.273, 0.023, 0.023],
-        [5, 5, 5],
-    ]
-    columns = radar_cloud(xyz, intensity=np.ones(7)) | {"timestamp": seconds, "ring": np.zeros(7, np.uint16)}
-    write_pcd(snail / "xt32" / stamp(0.0), columns)
-    write_pcd(snail / "xt32" / stamp(0.3), radar_cloud([[9, 9, 9]]))  # after the last radar scan
-    expected = UTM + [[0, 3, 1], [0.25, 3, 1], [-1.77, -0.02, 0.02]]
-    assert_allclose(read(snail).ground_truth, expected, rtol=0, atol=1e-5)
-    write_pcd(snail / "lidar.pcd", dict(zip("xyz", UTM[:, None], strict=True)))
-    assert_array_equal(read(snail).ground_truth, UTM[None])
-
-
-COLUMNS = {
-    "x": np.array([1.5, -2], np.float32),
-    "n": np.array([3, 65535], np.uint16),
-    "t": np.array([1706001766.577286344, 0.25]),
-    "i": np.array([-1, 4], np.int8),
-}
 
 
 def test_pcd_with_padding_and_fields_of_several_values(tmp_path):

@@ -30,7 +30,6 @@ def test_it_becomes_the_scans_that_it_holds():
         assert_allclose(scans.poses, expected["poses"], rtol=0, atol=2e-6)
         # Of the record time, the expected times are a smooth version.
         assert_allclose(np.diff(scans.times_s), np.diff(expected["times"]), rtol=0, atol=0.02)
-    assert scans.notes == [
-        "the header stamps of /ti_mmwave/radar_scan_pcl are zero: the record time is used instead",
-        "197 scans left out: no poses within 0.5 s of each other around them",
-    ]
+    assert "header stamps of /ti_mmwave/radar_scan_pcl are zero" in scans.notes[0]
+    assert scans.notes[1].startswith("197 scans left out")
+    assert len(scans.notes) == 2

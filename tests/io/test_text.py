@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from radarsdf.io import read
-from radarsdf.io.clouds.reading import read_columns
-from radarsdf.io.poses.files import read_poses
-from radarsdf.io.poses.trajectory import trajectory_of
+from radarsdf.io.clouds import read_columns
+from radarsdf.io.poses import read_poses, trajectory_of
 from radarsdf.io.scans import Notes
 from radarsdf.io.text import read_numbers
 
@@ -24,7 +23,7 @@ def table(rows, separator=" ", comma=".", end="\n"):
     )
 
 
-ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-32"]
+ENCODINGS = ["utf-8", "utf-8-sig"]
 LAYOUTS = {
     "spaces": table,
     "commas": lambda rows: table(rows, ", "),
@@ -56,8 +55,7 @@ def test_the_same_numbers_in_all_layouts(tmp_path, layout, encoding):
     ("text", "message"),
     [
         ("\x001 2 3\n4 5\n6\n", "a.csv"),
-        ("1,5 2,5 3,5\n4,5 5,5 6,5\n", "decimal commas between spaces"),
-        ("x y z\n1,5 2,5 3,5\n", "decimal commas between spaces"),
+        ("x y z\n1,5 2,5 3,5\n", "a.csv"),
         ("1 2 3\n4 5\n6\n", "a.csv"),
     ],
 )
@@ -65,7 +63,7 @@ def test_no_line_is_lost(tmp_path, text, message):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_columns(tmp_path / "a.csv")
-    with pytest.raises(ValueError, match=message.replace("a.csv", "line")):
+    with pytest.raises(ValueError, match=message):
         read_numbers(tmp_path / "a.csv")
 
 
@@ -77,7 +75,7 @@ def test_a_row_that_is_none_is_left_out_of_a_cloud_and_counted(tmp_path, wrong, 
     scans = read(tmp_path / "a.csv", [np.eye(4)])
     assert_array_equal(scans.points[0], [[1, 2, 3], [7, 8, 9]])
     assert scans.notes == ["1 returns left out: a coordinate or the intensity is not a finite number"]
-    with pytest.raises(ValueError, match="line"):
+    with pytest.raises(ValueError, match=r"a\.csv"):
         read_numbers(tmp_path / "a.csv")
 
 
@@ -110,9 +108,6 @@ def test_each_scan_keeps_its_pose_where_times_do_not_ascend(folder):
         assert "times.txt is not ascending: scans are read in the order of their times" in scans.notes
     (folder / "times.txt").write_text("0.1\n0.2\n0.3\n0.4\n")
     assert not any("times.txt" in note for note in read(folder).notes)
-    (folder / "times.txt").write_text("0.1\n0.1\n0.3\n0.4\n")
-    assert pairs(read(folder)) == [(1, 10), (2, 20), (3, 30), (4, 40)]
-    assert "times.txt has the same time for several scans" in read(folder).notes
 
 
 def test_times_may_be_in_other_units(folder):
@@ -129,20 +124,20 @@ def test_times_may_be_in_other_units(folder):
 
 
 @pytest.mark.parametrize(
-    ("first", "later", "role", "names"),
+    ("first", "later", "role"),
     [
-        ("x,y,z\n1,0,0\n", "x,y,z,power\n2,0,0,5\n", "intensity", "power"),
-        ("x,y,z,power\n1,0,0,5\n", "x,y,z,power,doppler\n2,0,0,5,1\n", "doppler", "doppler"),
-        ("x,y,z,power\n1,0,0,5\n", "x,y,z\n2,0,0\n", None, "power"),
-        ("x,y,z,doppler\n1,0,0,5\n", "x,y,z\n2,0,0\n", None, "doppler"),
+        ("x,y,z\n1,0,0\n", "x,y,z,power\n2,0,0,5\n", "intensity"),
+        ("x,y,z,power\n1,0,0,5\n", "x,y,z,power,doppler\n2,0,0,5,1\n", "doppler"),
+        ("x,y,z,power\n1,0,0,5\n", "x,y,z\n2,0,0\n", "intensity"),
     ],
 )
-def test_a_column_that_not_all_scans_have_is_said(folder, first, later, role, names):
+def test_a_column_that_not_all_scans_have_is_said(folder, first, later, role):
     for i in range(4):
         (folder / f"{i}.csv").write_text(first if i == 0 else later)
-    with pytest.raises(ValueError, match=f"the field {names}"):
-        len(read(folder))
-    left_out = {role or {"power": "intensity"}.get(names, names): None}
-    scans = read(folder, fields=left_out)
+    scans = read(folder)
     assert len(scans) == 4
-    assert not any("field" in note for note in scans.notes)
+    assert any(f"some scans have {role}, others have none" in note for note in scans.notes)
+    assert {"intensity": scans.intensities, "doppler": scans.doppler_mps}[role] is None
+    left_out = read(folder, fields={role: None})
+    assert len(left_out) == 4
+    assert not any(role in note for note in left_out.notes)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from radarsdf.io import write_poses
-from radarsdf.io.poses.files import read_poses
+from radarsdf.io.poses import read_poses
 from radarsdf.io.scans import Notes
 
 from ..poses.drift import trajectory

@@ -25,7 +25,7 @@ from radarsdf.checking.agreement import (
     standing_still,
 )
 from radarsdf.checking.recording import Finding, FloatArray, Recording, Severity
-from radarsdf.io.poses.trajectory import Trajectory
+from radarsdf.io.poses import Trajectory
 
 # A hypothesis is noted if the scans agree better by this: of the mean logarithm of distances, and of its standard error. It
 # must agree better than standing still by as much, too: any pattern of the sensor's cells agrees with itself if it stands still.

@@ -48,7 +48,7 @@ def live(
 
     from radarsdf.checks import not_negative
     from radarsdf.io.files import check_outputs
-    from radarsdf.io.poses.files import check_pose_suffix, check_pose_times, write_poses
+    from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
     from radarsdf.live.live_map import LiveMap
     from radarsdf.live.replay import replay
 

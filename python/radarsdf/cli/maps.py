@@ -163,7 +163,7 @@ def evaluate(
 
 def _holds_scans(path: Path) -> bool:
     """Whether the truth is scans, and not a file of points or a surface."""
-    from radarsdf.io.bags.files import is_bag
+    from radarsdf.io.bag_messages import is_bag
     from radarsdf.io.npz import holds_scans
 
     return path.is_dir() or is_bag(path) or (path.suffix.lower() == ".npz" and holds_scans(path))
@@ -190,7 +190,7 @@ def render(
     """
     import numpy as np
 
-    from radarsdf.io.clouds.writing import write_cloud
+    from radarsdf.io.cloud_writing import write_cloud
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
     from radarsdf.map.view import scans_of_views
@@ -256,8 +256,7 @@ def _poses(text: str) -> NDArray[np.float64]:
 def _poses_of_file(path: Path) -> NDArray[np.float64]:
     import numpy as np
 
-    from radarsdf.io.poses.files import read_poses
-    from radarsdf.io.poses.trajectory import Trajectory
+    from radarsdf.io.poses import Trajectory, read_poses
     from radarsdf.io.scans import Notes
 
     found = read_poses(path, Notes(str(path)))

@@ -14,7 +14,7 @@ from radarsdf.cli.app import refuse_if
 
 if TYPE_CHECKING:
     from radarsdf import FitConfig
-    from radarsdf.io.poses.trajectory import StampedPoses
+    from radarsdf.io.poses import StampedPoses
     from radarsdf.io.scans import Scans
 
 MAP_SUFFIX = ".safetensors"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from radarsdf import FitConfig
-    from radarsdf.io.poses.trajectory import NoPoses
+    from radarsdf.io.poses import NoPoses
     from radarsdf.io.scans import Scans
     from radarsdf.poses.posed import Posed
 
@@ -75,7 +75,7 @@ def poses(
     from radarsdf.extras import require
     from radarsdf.io.files import check_outputs
     from radarsdf.io.npz import write_scans
-    from radarsdf.io.poses.files import check_pose_suffix, write_poses
+    from radarsdf.io.poses import check_pose_suffix, write_poses
 
     refuse_if(find and recording.poses, f"--find does not use poses: leave out {recording.poses}")
     config = settings.load()
@@ -107,7 +107,7 @@ def poses(
 
 def _fit_of_poses(recording: Recording, out: Path, *, find: bool) -> str:
     """The command to run next: a fit with the poses that were written."""
-    from radarsdf.io.folders import BASE_T_RADAR
+    from radarsdf.io.recordings import BASE_T_RADAR
 
     target = ["-o", out.stem + MAP_SUFFIX]
     if out.suffix.lower() == ".npz":
@@ -136,7 +136,7 @@ def scans_and_poses(
     command writes.
     """
     from radarsdf import odometry, refine_poses
-    from radarsdf.io.poses.files import check_pose_times
+    from radarsdf.io.poses import check_pose_times
     from radarsdf.poses.posed import Posed
 
     scans, missing = scans_or_unposed(recording, find=find)
@@ -175,7 +175,7 @@ def add_segments(results: Results, posed: Posed) -> None:
 
 def scans_or_unposed(recording: Recording, *, find: bool = False) -> tuple[Scans, NoPoses | None]:
     """Read scans, and why they have no poses. `find`: theirs are not used."""
-    from radarsdf.io.poses.trajectory import UNPOSED, NoPoses
+    from radarsdf.io.poses import UNPOSED, NoPoses
 
     if find:
         return recording.read(UNPOSED), None
@@ -207,8 +207,8 @@ def convert(recording: Recording, *, out: Path, results: Results) -> None:
     out: .npz: the scans with their poses, as every command reads them; .ply, .pcd, .las, .laz, .npy or .csv: all returns in
         the world frame, with intensity, doppler, number and time of the scan; of a mesh, a mesh.
     """
-    from radarsdf.io.clouds.reading import CLOUD_SUFFIXES
-    from radarsdf.io.clouds.writing import check_cloud_path, write_cloud
+    from radarsdf.io.cloud_writing import check_cloud_path, write_cloud
+    from radarsdf.io.clouds import CLOUD_SUFFIXES
     from radarsdf.io.files import check_outputs
     from radarsdf.io.meshes import check_mesh_path, holds_mesh, read_mesh, write_mesh
     from radarsdf.io.npz import write_scans

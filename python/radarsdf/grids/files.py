@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
-from radarsdf.io.clouds.writing import ply_header, records
+from radarsdf.io.cloud_writing import ply_header, records
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.io.npz import write_arrays
 

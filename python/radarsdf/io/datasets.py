@@ -2,37 +2,30 @@
 # SPDX-License-Identifier: MIT
 """Published data sets, found by the shape of their folders; `DATASETS` lists them.
 
-Each entry states where the scans, the poses and the pose of the radar on its platform are. What a user passes to
-:func:`radarsdf.io.read` comes first: poses, extrinsic, topics, fields. `T_a_b` transforms points of frame b to frame a, and
-so does the matrix in a file `a_T_b.txt`.
+Each reader states where the scans, the poses and the pose of the radar on its platform are. What a user passes to
+:func:`radarsdf.io.read` comes first. `T_a_b` transforms points of frame b to frame a.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf._core import cell_keys
 from radarsdf.checks import check_pose
-from radarsdf.io.bags.files import bags_in
-from radarsdf.io.bags.reading import read_bags
-from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.clouds.reading import read_columns
-from radarsdf.io.files import reading
-from radarsdf.io.folders import BASE_T_RADAR, lidar_map, natural, scans_of_files
-from radarsdf.io.poses.files import poses_of, read_calibration, read_transform
-from radarsdf.io.poses.trajectory import MAX_GAP_S, Trajectory, pose_matrices_of, trajectory_of
-from radarsdf.io.recordings import Request, Truth
+from radarsdf.io.bag_messages import bags_in
+from radarsdf.io.bags import read_bags
+from radarsdf.io.files import check, reading
+from radarsdf.io.poses import pose_matrices_of, read_calibration, read_transform, trajectory_of
+from radarsdf.io.recordings import BASE_T_RADAR, Request, lidar_map, natural, read_files
 from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text
 
@@ -41,10 +34,8 @@ class Dataset(NamedTuple):
     """A published data set."""
 
     name: str
-    fits: Callable[[Path], bool]
-    """Whether a folder has its shape."""
+    fits: Callable[[Path], bool]  # whether a folder has its shape
     read: Callable[[Path, Request], Scans]
-    """The scans of a folder; see :func:`radarsdf.io.read`."""
 
 
 def find(folder: Path) -> Dataset | None:
@@ -52,40 +43,15 @@ def find(folder: Path) -> Dataset | None:
     return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
 
 
-def _has(*parts: str, bags: bool = False) -> Callable[[Path], bool]:
-    return lambda folder: (
-        all((folder / part).exists() for part in parts) and (not bags or _bags(folder) != [])
-    )
-
-
 def _bags(folder: Path) -> list[Path]:
     return [path for path in bags_in(folder) if path.stem != "gt_odom"]  # ground truth of NTU4DRadLM
-
-
-def _scans(
-    files: list[Path],
-    times_s: Any,
-    poses: Callable[[], Any],
-    T_base_sensor: Callable[[], NDArray[np.float64] | None],
-    request: Request,
-    truth: Truth = lambda: None,
-) -> Scans:
-    """Scans of one file each. The data set's own poses and extrinsic are read only if the user gives none."""
-    if not files or (times_s is not None and len(times_s) != len(files)):
-        msg = f"{request.notes.about} has {len(files)} scans, of which the times or poses are not known for each"
-        raise ValueError(msg)
-    found = poses() if request.poses is None else poses_of(request.poses, request.notes)
-    extrinsic = T_base_sensor() if request.extrinsic is None else request.extrinsic
-    return scans_of_files(files, times_s, found, extrinsic, request, truth)
 
 
 def _ntu4dradlm(folder: Path, request: Request) -> Scans:
     """Bags and ``gt_odom.txt`` (TUM) of the platform; the calibration is given by `extrinsic`."""
     if request.extrinsic is None:
-        request.notes.add(
-            "NTU4DRadLM: no extrinsic is given, so the poses of gt_odom.txt are taken as those of the radar; "
-            "the calibration of the data set has it"
-        )
+        what = "the poses of gt_odom.txt are taken as those of the radar; the data set has a calibration"
+        request.notes.add(f"NTU4DRadLM: no extrinsic is given, so {what}")
     poses = folder / "gt_odom.txt" if request.poses is None else request.poses
     return read_bags(_bags(folder), replace(request, poses=poses))
 
@@ -99,42 +65,33 @@ def _viking_hill(folder: Path, request: Request) -> Scans:
 
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
     """PCD files, and ``timestamp_radar.txt`` with lines of a number, seconds and nanoseconds. It has no poses."""
-    if request.poses is None:
-        msg = f"{folder}: MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
-        raise ValueError(msg)
-    stamps = read_numbers(folder / "3_RADAR/timestamp_radar.txt", 3)
-    times_s = (stamps[:, 1] + 1e-9 * stamps[:, 2]).tolist()
-    files = sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural)
-    return _scans(files, times_s, lambda: None, lambda: None, request)
+    what = "MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
+    check(request.poses is not None, f"{folder}: {what}")
+    return read_files(sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural), folder, request)
 
 
 def _coloradar(folder: Path, request: Request) -> Scans:
     """The single-chip radar: rows of x, y, z, intensity and Doppler; poses of the platform in ``groundtruth``."""
-    clouds, truth = folder / "single_chip/pointclouds", folder / "groundtruth"
-
-    def poses() -> Trajectory:
-        table = read_numbers(truth / "groundtruth_poses.txt", 7)
-        stamps = read_numbers(truth / "timestamps.txt", 1)
-        if len(stamps) != len(table):
-            msg = f"{truth} has {len(stamps)} times for {len(table)} poses"
-            raise ValueError(msg)
-        return trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
-
-    def T_base_sensor() -> NDArray[np.float64] | None:
-        for place in (folder, *folder.resolve().parents[:2]):
-            file = place / "calib/transforms/base_to_single_chip.txt"
-            if file.is_file():
-                with reading(file, "two lines x y z and qx qy qz qw"):
-                    numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
-                    return check_pose(pose_matrices_of(numbers)[0], "it")
-        request.notes.add(
-            "there is no calib/transforms/base_to_single_chip.txt: the poses are taken as those of the radar"
-        )
-        return None
-
-    times_s = read_numbers(clouds / "timestamps.txt", 1)[:, 0].tolist()
-    files = sorted((clouds / "data").glob("radar_pointcloud_*.bin"), key=natural)
-    return _scans(files, times_s, poses, T_base_sensor, replace(request, columns=request.columns or 5))
+    if request.poses is None:
+        truth = folder / "groundtruth"
+        with reading(truth, "a folder with a time for each pose"):
+            stamps, table = (
+                read_numbers(truth / "timestamps.txt", 1),
+                read_numbers(truth / "groundtruth_poses.txt", 7),
+            )
+            poses = trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
+        request = replace(request, poses=poses)
+    if request.extrinsic is None:
+        places = [place / "calib/transforms" for place in (folder, *folder.resolve().parents[:2])]
+        file = next((f for place in places if (f := place / "base_to_single_chip.txt").is_file()), None)
+        if file is None:
+            request.notes.add("no base_to_single_chip.txt: the poses are taken as those of the radar")
+        else:
+            with reading(file, "two lines x y z and qx qy qz qw"):
+                numbers = np.array(read_text(file).split(), np.float64).reshape(1, 7)
+                request = replace(request, extrinsic=check_pose(pose_matrices_of(numbers)[0], "it"))
+    files = (folder / "single_chip/pointclouds/data").glob("radar_pointcloud_*.bin")
+    return read_files(sorted(files, key=natural), folder, replace(request, columns=request.columns or 5))
 
 
 def _delft_parts(folder: Path) -> tuple[Path, Path] | None:
@@ -154,16 +111,13 @@ def _view_of_delft(folder: Path, request: Request) -> Scans:
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
-        return _scans(files, None, lambda: None, lambda: None, request)
+        return read_files(files, folder, request)
     posed = [path for path in files if (lidar / "pose" / f"{path.stem}.json").is_file()]
     if len(posed) < len(files):
         request.notes.add(f"{len(files) - len(posed)} scans left out: they have no file of a pose")
     request.notes.add("the scans have no times; the world is the map frame of View-of-Delft")
-
-    def poses() -> NDArray[np.float64]:
-        return np.stack([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed])
-
-    return _scans(posed, None, poses, lambda: None, replace(request, extrinsic=None))
+    poses = np.array([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed])
+    return read_files(posed, folder, replace(request, poses=poses, extrinsic=np.eye(4)))
 
 
 def _delft_pose(
@@ -184,32 +138,22 @@ def _delft_pose(
     return T_map_radar
 
 
-# SNAIL-Radar, snail-radar.github.io: two radars, the poses of its lidar in UTM zone 50R, which is the world frame, and the
-# lidar as ground truth.
+# SNAIL-Radar, snail-radar.github.io: two radars, and the poses of its lidar in UTM zone 50R, which is the world frame.
 #
 #     eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
 #     ars548/points/1706001762.429354169.pcd      ARS548 frame (forward, left, up); intensity: RCS + 128
 #     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
-#     xt32/1706001766.715735580.pcd               optional: lidar scan, lidar frame (left, back, up)
-#     body_T_oculii.txt, body_T_ars548.txt,       optional: 4 x 4, instead of the published calibration
-#     body_T_xt32.txt
-#     lidar.pcd or lidar.ply                      optional: ground truth instead of xt32
+#     lidar.pcd or lidar.ply                      optional: ground truth
 
 _SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
-_SNAIL_TRAJECTORY = "utm50r_T_xt32.txt"
 
-# The published calibration, for sequences without calibration files. The axes of the body point forward, left and up; its
-# origin is that of the lidar. Source: matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m, multiplied out,
-# of github.com/snail-radar/dataset_tools, commit 2f82c2c.
+# The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source:
+# matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m of github.com/snail-radar/dataset_tools, 2f82c2c.
 _BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-_BODY_T_OCULII = np.array(
-    [
-        [0.999756831, 0.020010494, -0.009265982, 0.07],
-        [-0.019750133, 0.999429818, 0.027385610, 0.0],
-        [0.009808698, -0.027195946, 0.999581997, -0.115],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
+_BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
+                           [-0.019750133, 0.999429818, 0.027385610, 0.0],
+                           [0.009808698, -0.027195946, 0.999581997, -0.115],
+                           [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
 _ARS548_POSITION_M = (0.0, 0.0, 0.07)
 # Its orientation, qx qy qz qw, was set anew several times: from this day on. Afternoons and evenings are half a day later.
 _ARS548_ORIENTATIONS = (
@@ -222,11 +166,6 @@ _ARS548_ORIENTATIONS = (
     (20240113.0, (-0.001835193, -0.014938248, -0.025422503, 0.999563493)),
 )
 _DAY = re.compile(r"(\d{8})(_aft|_eve)?$")
-
-_LIDAR_RANGE_M = (1.0, 60.0)  # nearer points are on the platform or its operator; the radar sees no farther
-_LIDAR_CELL_M = 0.05  # a lidar point a cell: else most would lie on the ground where the platform stood
-_LIDAR_BATCH = 50  # scans from one thinning to the next; bounds the memory
-_MAX_SWEEP_S = 1.0  # larger differences between the times of a point and of its scan mean different clocks
 
 
 def _snail_parts(folder: Path) -> tuple[Path, str] | None:
@@ -247,36 +186,15 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
     others = [other for other in _SNAIL_RADARS if other != radar and (sequence / other).is_dir()]
     if others and folder.resolve() == sequence:
         request.notes.add(f"{radar} is read; {' and '.join(others)} are read as folders of their own")
-    stamped = _stamped_files(sequence / radar)
-    times_s = [time_s for time_s, _ in stamped]
-    return _scans(
-        [path for _, path in stamped],
-        times_s,
-        partial(_snail_trajectory, sequence),
-        partial(_T_xt32_radar, sequence, radar),
-        request,
-        partial(_snail_ground_truth, sequence, np.array(times_s)),
-    )
-
-
-def _snail_trajectory(sequence: Path) -> Trajectory:
-    path = sequence / _SNAIL_TRAJECTORY
-    if not path.is_file():
-        msg = f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence> of the data set"
-        raise ValueError(msg)
-    return trajectory_of(read_numbers(path, 8), str(path))
-
-
-def _T_xt32_radar(sequence: Path, radar: str) -> NDArray[np.float64]:
-    """The radar in the frame of the lidar, (4, 4). Raises a ValueError if it is not known."""
-    T_body_xt32 = read_transform(sequence / "body_T_xt32.txt", _BODY_T_XT32)
-    if radar.startswith("ars548"):
-        file = sequence / "body_T_ars548.txt"
-        T_body_radar = read_transform(file, np.eye(4)) if file.is_file() else _body_T_ars548(sequence)
-    else:
-        T_body_radar = read_transform(sequence / "body_T_oculii.txt", _BODY_T_OCULII)
-    T_xt32_radar: NDArray[np.float64] = np.linalg.inv(T_body_xt32) @ T_body_radar
-    return T_xt32_radar
+    if request.poses is None:
+        path = sequence / "utm50r_T_xt32.txt"
+        check(path.is_file(), f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
+        request = replace(request, poses=path)
+    if request.extrinsic is None:
+        T_body_radar = _body_T_ars548(sequence) if radar.startswith("ars548") else _BODY_T_OCULII
+        request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ T_body_radar)
+    files = sorted((sequence / radar).glob("*.pcd"), key=natural)
+    return read_files(files, sequence, request, partial(lidar_map, sequence))
 
 
 def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
@@ -285,87 +203,20 @@ def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
     found = _DAY.match(name)
     day = float(found[1]) + 0.5 * (found[2] is not None) if found else 0.0
     known = [orientation for first, orientation in _ARS548_ORIENTATIONS if first <= day]
-    if not known:
-        msg = (
-            f"{sequence}: the calibration of the ARS548 depends on the day, which is the name of the folder above, such "
-            f"as 20231105_aft, but that is {name}: give extrinsic, or body_T_ars548.txt (4 x 4)"
-        )
-        raise ValueError(msg)
+    what = f"the day, which is the name of the folder above, such as 20231105_aft, but that is {name}: give extrinsic"
+    check(known, f"{sequence}: the calibration of the ARS548 depends on {what}")
     T_body_ars548 = np.eye(4)
     T_body_ars548[:3, :3] = Rotation.from_quat(known[-1]).as_matrix()
     T_body_ars548[:3, 3] = _ARS548_POSITION_M
     return T_body_ars548
 
 
-def _snail_ground_truth(sequence: Path, times_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Lidar points (M, 3), m, of all lidar scans while the radar's were taken, at most one in each cell."""
-    points = lidar_map(sequence)
-    if points is not None or not (sequence / "xt32").is_dir() or not (sequence / _SNAIL_TRAJECTORY).is_file():
-        return points
-    trajectory = _snail_trajectory(sequence)
-    times_s = times_s[trajectory.covers(times_s)]
-    if not len(times_s):
-        return None
-    origin = trajectory.positions[0]  # cell keys are relative to it: UTM coordinates are out of their range
-    found = [np.zeros((0, 3))]
-    for count, world in enumerate(_lidar_scans(sequence / "xt32", trajectory, times_s[0], times_s[-1]), 1):
-        found.append(_thin(world - origin))
-        if count % _LIDAR_BATCH == 0:
-            found = [_thin(np.concatenate(found))]
-    points = _thin(np.concatenate(found)) + origin
-    return points if len(points) else None
-
-
-def _lidar_scans(
-    folder: Path, trajectory: Trajectory, first_s: float, last_s: float
-) -> Iterator[NDArray[np.float64]]:
-    """(K, 3) world, m, of 1 to 60 m range, each point moved with the pose at its own time if it has a ``timestamp``."""
-    for time_s, path in _stamped_files(folder):
-        if not first_s <= time_s <= last_s:
-            continue
-        columns = read_columns(path)
-        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler")), str(path))
-        xyz = fields.points(columns).astype(np.float64)
-        times_s = columns.get("timestamp", np.full(len(xyz), time_s)).astype(np.float64)
-        ranges_m = np.linalg.norm(xyz, axis=1)
-        used = (ranges_m >= _LIDAR_RANGE_M[0]) & (ranges_m <= _LIDAR_RANGE_M[1]) & np.isfinite(times_s)
-        if (np.abs(times_s[used] - time_s) > _MAX_SWEEP_S).any():
-            msg = f"{path}: the times of its points differ by more than {_MAX_SWEEP_S} s from the time in its name"
-            raise ValueError(msg)
-        used &= trajectory.covers(times_s, MAX_GAP_S)
-        if used.any():
-            T_world_lidar = trajectory.poses(times_s[used])
-            yield (T_world_lidar[:, :3, :3] @ xyz[used][:, :, None])[:, :, 0] + T_world_lidar[:, :3, 3]
-
-
-def _stamped_files(folder: Path) -> list[tuple[float, Path]]:
-    """Times, s, and paths of the PCD files of a folder, in the order of time."""
-    files = []
-    for path in folder.glob("*.pcd"):
-        try:
-            time_s = float(path.stem)
-        except ValueError:
-            time_s = np.nan
-        if not np.isfinite(time_s):
-            msg = f"{path} is not named by its time in seconds"
-            raise ValueError(msg)
-        files.append((time_s, path))
-    return sorted(files)
-
-
-def _thin(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The first point (K, 3) in each cell of points (N, 3)."""
-    _, first = np.unique(cell_keys(points, _LIDAR_CELL_M), return_index=True)
-    kept: NDArray[np.float64] = points[np.sort(first)]
-    return kept
-
-
+# The first that fits a folder reads it.
 DATASETS = (
-    Dataset("SNAIL-Radar", lambda folder: _snail_parts(folder) is not None, _snail_radar),
-    Dataset("View-of-Delft", lambda folder: _delft_parts(folder) is not None, _view_of_delft),
-    Dataset("ColoRadar", _has("single_chip/pointclouds/data"), _coloradar),
-    Dataset("MSC-RAD4R", _has("3_RADAR/PCD", "3_RADAR/timestamp_radar.txt"), _msc_rad4r),
-    Dataset("NTU4DRadLM", _has("gt_odom.txt", bags=True), _ntu4dradlm),
-    Dataset("Viking Hill", _has(BASE_T_RADAR, bags=True), _viking_hill),
+    Dataset("SNAIL-Radar", lambda f: _snail_parts(f) is not None, _snail_radar),
+    Dataset("View-of-Delft", lambda f: _delft_parts(f) is not None, _view_of_delft),
+    Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
+    Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
+    Dataset("NTU4DRadLM", lambda f: (f / "gt_odom.txt").exists() and bool(_bags(f)), _ntu4dradlm),
+    Dataset("Viking Hill", lambda f: (f / BASE_T_RADAR).exists() and bool(_bags(f)), _viking_hill),
 )
-"""The data sets. The first that fits a folder reads it."""

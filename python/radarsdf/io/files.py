@@ -32,11 +32,15 @@ _LOCKED = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 def check_regular_file(path: str | PathLike[str]) -> None:
     """Raises unless `path` can be opened and is no pipe or device: reading those could block or never end."""
-    if not Path(path).is_dir() and not stat.S_ISREG(Path(path).stat().st_mode):
-        msg = f"{path} is not a regular file"
-        raise ValueError(msg)
+    check(Path(path).is_dir() or stat.S_ISREG(Path(path).stat().st_mode), f"{path} is not a regular file")
     with open(path, "rb"):  # noqa: PTH123 - raises the error that names the path, for a folder too
         pass
+
+
+def check(holds: object, message: str) -> None:
+    """Raises a ValueError with this message unless something `holds`."""
+    if not holds:
+        raise ValueError(message)
 
 
 @contextmanager
@@ -62,9 +66,7 @@ def check_outputs(
         if path is None:
             continue
         target = os.path.realpath(path)
-        if target in taken:
-            msg = f"{path} is the same file as {taken[target]}, which would be lost: give another name"
-            raise ValueError(msg)
+        check(target not in taken, f"{path} is the same file as {taken.get(target)}: give another name")
         taken[target] = path
         _mode_to_keep(Path(target), path)
         descriptor, temporary = _open_temporary(Path(target))
@@ -100,26 +102,19 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(OSError):  # its folder may be gone, or the disk; the first error says so
             temporary.unlink()
         # A full disk names no file. An error without a number is not the system's, one with another file is the block's.
-        if (
-            isinstance(error, OSError)
-            and error.errno is not None
-            and error.filename in (None, str(temporary))
-        ):
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
 def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
     """Permissions of the file that would be replaced; None if there is none."""
-    try:
-        mode = target.stat().st_mode
-    except FileNotFoundError:
+    if not target.exists():
         return None
+    mode = target.stat().st_mode
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(named))
-    if not stat.S_ISREG(mode):
-        msg = f"{named} is not a regular file"
-        raise ValueError(msg)
+    check(stat.S_ISREG(mode), f"{named} is not a regular file")
     return stat.S_IMODE(mode)
 
 
@@ -132,12 +127,10 @@ def _open_temporary(target: Path) -> tuple[int, Path]:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
         return os.open(temporary, flags, 0o666), temporary
-    except FileNotFoundError as error:
-        folder = target.parent
-        why = "nothing can be written here" if folder.is_dir() else f"there is no folder {folder}"
-        raise FileNotFoundError(error.errno, why, str(target)) from error
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(target)) from error
+        missing = isinstance(error, FileNotFoundError) and not target.parent.is_dir()
+        why = f"there is no folder {target.parent}" if missing else error.strerror
+        raise OSError(error.errno, why, str(target)) from error
 
 
 def take_lock(path: Path, use: str) -> int:
@@ -148,34 +141,33 @@ def take_lock(path: Path, use: str) -> int:
     """
     descriptor = os.open(path, sum(getattr(os, flag, 0) for flag in _LOCK_FLAGS), 0o666)
     try:
-        try:
-            if sys.platform == "win32":
-                import msvcrt  # noqa: PLC0415
-
-                os.lseek(
-                    descriptor, 1 << 30, os.SEEK_SET
-                )  # far beyond the text: nobody could read what is locked
-                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-                os.lseek(descriptor, 0, os.SEEK_SET)
-            else:
-                import fcntl  # noqa: PLC0415
-
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in _LOCKED:
-                text = path.read_text(errors="replace")[:100]
-                holder = text if text and text.isprintable() else "another process"  # empty for a moment
-                msg = f"{path.parent} is being {use} by {holder}: wait until that is done, or give another folder"
-                raise BlockingIOError(msg) from error
-            # Not all file systems of clusters have locks.
-            words = f"{path.parent} cannot be locked ({error.strerror}): let nobody else use it meanwhile"
-            warnings.warn(words, RuntimeWarning, stacklevel=3)
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
-    except BaseException:
-        os.close(descriptor)
-        raise
+        _lock(descriptor)
+    except OSError as error:
+        if error.errno in _LOCKED:
+            os.close(descriptor)
+            text = path.read_text(errors="replace")[:100]
+            holder = text if text and text.isprintable() else "another process"  # empty for a moment
+            msg = f"{path.parent} is being {use} by {holder}: wait until that is done, or give another folder"
+            raise BlockingIOError(msg) from error
+        # Not all file systems of clusters have locks.
+        words = f"{path.parent} cannot be locked ({error.strerror}): let nobody else use it meanwhile"
+        warnings.warn(words, RuntimeWarning, stacklevel=3)
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
     return descriptor
+
+
+def _lock(descriptor: int) -> None:
+    if sys.platform == "win32":
+        import msvcrt  # noqa: PLC0415
+
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # beyond the text: nobody could read what is locked
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        os.lseek(descriptor, 0, os.SEEK_SET)
+    else:
+        import fcntl  # noqa: PLC0415
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 # Formats of float32 resolve half a metre at UTM coordinates. What is far from the world's origin is written to them in a

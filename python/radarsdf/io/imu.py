@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Imu:
-    """G measurements of an IMU, in its own axes.
+    """G measurements of an inertial measurement unit, in its own axes.
 
     Raises
     ------
@@ -60,9 +60,8 @@ def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
     """`R_sensor_imu` as a rotation (3, 3); of a rigid transform (4, 4), its rotation."""
     matrix: FloatArray = real_array(R_sensor_imu, "R_sensor_imu")
     whole = np.eye(4)
-    if matrix.shape in ((3, 3), (4, 4)):
-        whole[:3, :3] = matrix[:3, :3]
-    if matrix.shape not in ((3, 3), (4, 4)) or not are_rigid(whole[None]).all():
+    whole[:3, :3] = matrix[:3, :3] if matrix.shape in ((3, 3), (4, 4)) else 0.0
+    if not are_rigid(whole[None]).all():
         msg = f"R_sensor_imu, of shape {matrix.shape}, is no rotation matrix (3, 3): orthogonal, with determinant 1"
         raise ValueError(msg)
     return whole[:3, :3]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of, positions
 from radarsdf.interrupts import whole_import
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, has_faces, ply_bytes, read_points
-from radarsdf.io.clouds.writing import face_records, ply_header, records
-from radarsdf.io.files import check_regular_file, origin_for, origin_of, write_origin, write_whole
+from radarsdf.io.cloud_writing import face_records, ply_header, records
+from radarsdf.io.clouds import CLOUD_SUFFIXES, has_faces, ply_bytes, read_points
+from radarsdf.io.files import check, check_regular_file, origin_for, origin_of, write_origin, write_whole
 from radarsdf.io.npz import arrays_of
 from radarsdf.io.scans import Columns
 
@@ -40,9 +40,8 @@ def holds_mesh(path: str | PathLike[str]) -> bool:
 
 def check_mesh_path(path: str | PathLike[str]) -> None:
     """Raises a ValueError unless `path` ends like a format that :func:`write_mesh` writes."""
-    if path_of(path, "path").suffix.lower() not in MESH_SUFFIXES:
-        msg = f"{path}: a mesh can be written as {', '.join(MESH_SUFFIXES)}"
-        raise ValueError(msg)
+    known = path_of(path, "path").suffix.lower() in MESH_SUFFIXES
+    check(known, f"{path}: files of meshes end in {', '.join(MESH_SUFFIXES)}")
 
 
 def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.float64] | None:
@@ -56,14 +55,14 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
     Parameters
     ----------
     path : path-like
-        One of `MESH_SUFFIXES`.
+        It ends in .ply, .obj, .off, .stl or .glb.
     mesh : trimesh.Trimesh
         World frame, m. PLY keeps its vertex attributes of one number a vertex, such as confidence, and its colours.
 
     Returns
     -------
-    ndarray or None
-        (3,) the origin that was subtracted, world, m; None where coordinates are the world's.
+    (3,) float64 ndarray or None
+        The origin that was subtracted, world, m; None where coordinates are the world's.
 
     Raises
     ------
@@ -74,23 +73,24 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
     """
     check_mesh_path(path)
     suffix = Path(path).suffix.lower()
-    vertices = np.asarray(mesh.vertices, np.float64)
-    origin = origin_for(vertices) if suffix in _FLOAT32_SUFFIXES else None
-    with whole_import():
-        import trimesh  # noqa: PLC0415 - takes long
+    if suffix == ".ply":
+        write_whole(path, _ply(mesh))
+        return None
+    origin = origin_for(np.asarray(mesh.vertices, np.float64)) if suffix in _FLOAT32_SUFFIXES else None
     if origin is not None:
         mesh = mesh.copy()
-        mesh.vertices = vertices - origin
+        mesh.vertices = mesh.vertices - origin
     if suffix == ".glb":
+        with whole_import():
+            import trimesh  # noqa: PLC0415 - takes long
         scene: Any = trimesh.Scene()
         scene.add_geometry(mesh, transform=_T_GLTF_WORLD)
         exported: Any = scene.export(file_type="glb")
     else:
-        exported = _ply(mesh) if suffix == ".ply" else mesh.export(file_type=suffix[1:])
-    data: bytes = exported.encode() if isinstance(exported, str) else exported
+        exported = mesh.export(file_type=suffix[1:])
     if suffix in _FLOAT32_SUFFIXES:
         write_origin(path, origin)
-    write_whole(path, data)
+    write_whole(path, exported.encode() if isinstance(exported, str) else exported)
     return origin
 
 
@@ -100,8 +100,8 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     Parameters
     ----------
     path : path-like
-        One of `MESH_SUFFIXES`. If :func:`write_mesh` wrote an origin beside it, that is added. GLB, whose y axis is up, is
-        turned to z up.
+        It ends in .ply, .obj, .off, .stl or .glb. If :func:`write_mesh` wrote an origin beside it, that is added. GLB, whose
+        y axis is up, is turned to z up.
 
     Returns
     -------
@@ -117,24 +117,21 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     """
     file = path_of(path, "path")
     check_regular_file(file)
-    if file.suffix.lower() not in MESH_SUFFIXES:
-        msg = f"{path} is no mesh that can be read: those end in {', '.join(MESH_SUFFIXES)}"
-        raise ValueError(msg)
+    check_mesh_path(file)
     with whole_import():
         import trimesh  # noqa: PLC0415 - takes long
     ply = file.suffix.lower() == ".ply"
     try:
         source: Any = ply_bytes(file) if ply else file
         mesh: Any = trimesh.load_mesh(source, file_type="ply" if ply else None, process=False)
+        faces = mesh.faces
+        whole = faces.ndim == 2 and (not len(faces) or 0 <= faces.min() <= faces.max() < len(mesh.vertices))
     except OSError:
         raise
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} cannot be read as a mesh: {error}"
         raise ValueError(msg) from error
-    faces: Any = mesh.faces if isinstance(mesh, trimesh.Trimesh) else None
-    if np.ndim(faces) != 2 or (len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices)):
-        msg = f"{path} is not one mesh, or a triangle has a corner that is none of its vertices"
-        raise ValueError(msg)
+    check(whole, f"{path}: a triangle has a corner that is none of its vertices")
     if file.suffix.lower() == ".glb":
         mesh.apply_transform(_T_GLTF_WORLD.T)
     if (origin := origin_of(file)) is not None:
@@ -144,49 +141,25 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
 
 
 def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
-    """Reads points of a lidar, or draws points evenly on the triangles of a surface.
+    """Points (M, 3) float64, world frame, m: of a cloud, of an ``.npz`` file, or drawn evenly on a mesh.
 
-    Parameters
-    ----------
-    path : path-like
-        A file for :func:`read_points`; ``.npz`` with an array (M, 3) of one of the names lidar_points, points, xyz and
-        arr_0; or a mesh, in PLY, OBJ, OFF, STL or GLB.
-
-    Returns
-    -------
-    ndarray
-        (M, 3) float64, world frame, m. The same file gives the same points.
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged, of another kind, or holds no points.
-    OSError
-        If it cannot be read.
-    ImportError
-        If it takes a library that is not installed; the message says which.
+    The same file gives the same points. Raises as :func:`radarsdf.io.read_points`.
     """
     file = Path(path)
     suffix = file.suffix.lower()
     if holds_mesh(file):
         mesh = read_mesh(file)
-        if not mesh.area > 0:  # NaN too
-            msg = f"{path} has no surface"
-            raise ValueError(msg)
+        check(mesh.area > 0, f"{path} has no surface")
         # By area, in the order of the triangles: a triangle has points wherever it is large.
         samples: Any = mesh.sample(_SAMPLES, return_index=True, seed=0)
         return np.asarray(samples[0], np.float64)
     if suffix == ".npz":
         arrays = arrays_of(file, _TRUTH_ARRAYS)
-        if not arrays:
-            msg = f"{path} has no ground truth: it lacks an array {' or '.join(_TRUTH_ARRAYS)}"
-            raise ValueError(msg)
+        check(arrays, f"{path} has no ground truth: it lacks an array {' or '.join(_TRUTH_ARRAYS)}")
         name, points = next(iter(arrays.items()))
         return positions(points, f"{path}: {name}")
-    if suffix not in CLOUD_SUFFIXES:
-        kinds = dict.fromkeys((*CLOUD_SUFFIXES, ".npz", *MESH_SUFFIXES))
-        msg = f"{path} is no ground truth: that is a file that ends in {', '.join(kinds)}"
-        raise ValueError(msg)
+    kinds = dict.fromkeys((*CLOUD_SUFFIXES, ".npz", *MESH_SUFFIXES))
+    check(suffix in CLOUD_SUFFIXES, f"{path} is no ground truth: that ends in {', '.join(kinds)}")
     return read_points(file)
 
 

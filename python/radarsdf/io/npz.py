@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance, path_of
-from radarsdf.io.files import check_regular_file, reading, write_whole
+from radarsdf.io.files import check, check_regular_file, reading, whole_file
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 
@@ -25,20 +24,13 @@ _ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are unpacked at any compressi
 
 _IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu
 _SHAPES: dict[str, tuple[str | int, ...]] = {
-    "points": ("N", 3),
-    "frame": ("N",),
-    "poses": ("F", 4, 4),
-    "intensity": ("N",),
-    "static": ("N",),
-    "doppler": ("N",),
-    "times": ("F",),
-    "sigma": ("N", 3),
-    "lidar_points": ("M", 3),
-}
+    "points": ("N", 3), "frame": ("N",), "poses": ("F", 4, 4), "intensity": ("N",), "static": ("N",), "doppler": ("N",),
+    "times": ("F",), "sigma": ("N", 3), "lidar_points": ("M", 3),
+}  # fmt: skip
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
-    """Reads scans from a file.
+    """Reads scans with poses from an ``.npz`` file.
 
     Parameters
     ----------
@@ -70,13 +62,10 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     OSError
         If the file cannot be read.
     """
-    if path_of(path, "path").suffix != ".npz":
-        msg = f"{path} is not an .npz file: only .npz files of scans can be read"
-        raise ValueError(msg)
+    check(path_of(path, "path").suffix == ".npz", f"{path} is not an .npz file of scans")
     arrays = arrays_of(path, (*_SHAPES, "simulated", *_IMU))
-    if missing := sorted({"points", "frame", "poses"} - set(arrays)):
-        msg = f"{path} lacks the arrays {', '.join(missing)}"
-        raise ValueError(msg)
+    missing = sorted({"points", "frame", "poses"} - set(arrays))
+    check(not missing, f"{path} lacks the arrays {', '.join(missing)}")
     with reading(path, "a file of scans"):
         _check_scans(arrays)
         times_s, rates, *others = (arrays.get(name) for name in _IMU)
@@ -105,21 +94,16 @@ def read_scans(path: str | PathLike[str]) -> Scans:
 
 def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raises a ValueError unless the arrays fit together."""
-    for name, array in arrays.items():
-        if array.dtype.kind not in ("biuf" if name == "static" else "iuf"):
-            msg = f"{name} must be real numbers, not {array.dtype}"
-            raise ValueError(msg)
     known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
-    for name, (first, *rest) in _SHAPES.items():
-        shape = arrays[name].shape if name in arrays else None
-        expected = (*known.get(str(first), (shape or ("M",))[:1]), *rest)
-        if shape not in (None, expected):
-            msg = f"{name} must have shape {expected}, not {shape}"
-            raise ValueError(msg)
+    for name, array in arrays.items():
+        kinds = "biuf" if name == "static" else "iuf"
+        check(array.dtype.kind in kinds, f"{name} must be real numbers, not {array.dtype}")
+        first, *rest = _SHAPES.get(name, (None, *array.shape[1:]))
+        expected = (*known.get(str(first), array.shape[:1]), *rest)
+        check(array.shape == expected, f"{name} must have shape {expected}, not {array.shape}")
     frame, num_poses = arrays["frame"], len(arrays["poses"])
-    if not ((frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)).all():
-        msg = f"frame must hold row numbers of the {num_poses} poses"
-        raise ValueError(msg)
+    rows = (frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)
+    check(rows.all(), f"frame must hold row numbers of the {num_poses} poses")
 
 
 def write_scans(path: str | PathLike[str], scans: Scans) -> None:
@@ -128,12 +112,16 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     Parameters
     ----------
     path : path-like
-        Where the file goes. ``.npz`` is appended where it is missing.
+        The file. ``.npz`` is appended where it is missing.
     scans : Scans
-        At least one scan. What is None of it, the file lacks.
+        At least one scan. Attributes that are None are omitted.
 
     Raises
     ------
+    TypeError
+        If `scans` are no :class:`Scans`.
+    ValueError
+        If `path` is no regular file.
     OSError
         If the file cannot be written.
     """
@@ -174,14 +162,13 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
     """The arrays of an ``.npz`` file that have these names, in this order. Raises as :func:`read_scans`."""
     check_regular_file(path)
     arrays = {}
-    # Damaged files raise exceptions of many kinds, among them OSError.
+    # Damaged files raise exceptions of many kinds, OSError among them.
     with reading(path, "a whole .npz file", Exception), zipfile.ZipFile(path) as file:
         held = set(file.namelist())
         members = {name: file.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in held}
         unpacked = sum(member.file_size for member in members.values())
-        if unpacked > max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * Path(path).stat().st_size):
-            msg = f"its arrays would unpack to {unpacked} bytes: measurements do not compress that much"
-            raise ValueError(msg)
+        largest = max(_ALWAYS_UNPACKED, _MAX_COMPRESSION * Path(path).stat().st_size)
+        check(unpacked <= largest, f"its arrays would unpack to {unpacked} bytes: measurements compress less")
         for name, member in members.items():
             with file.open(member) as stream:
                 arrays[name] = np.lib.format.read_array(stream, allow_pickle=False)
@@ -191,26 +178,16 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
 def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[Any, ...]]) -> None:
     """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
     for name, (dtype, *shape) in wanted.items():
-        array = arrays.get(name)
-        if (
-            array is None
-            or array.dtype != dtype
-            or array.ndim != len(shape)
-            or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True))
-        ):
-            msg = f"{name} is missing, or of another type or shape"
-            raise ValueError(msg)
+        array = arrays.get(name, np.zeros(0, "O"))
+        fits = array.dtype == dtype and array.ndim == len(shape)
+        fits = fits and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        check(fits, f"{name} is missing, or of another type or shape")
 
 
 def write_arrays(
     path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
 ) -> None:
     """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all."""
-    for name, array in arrays.items():
-        if np.asarray(array).dtype.hasobject:
-            msg = f"{name} has objects of Python, which are not written"
-            raise ValueError(msg)
-    file = io.BytesIO()
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
-    save(file, **arrays)
-    write_whole(path, file.getvalue())
+    with whole_file(path) as file:
+        save(file, **arrays)

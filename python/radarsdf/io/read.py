@@ -5,29 +5,26 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import check_pose, path_of, positions, positive
 from radarsdf.io import datasets
-from radarsdf.io.bags.files import bags_in, is_bag
-from radarsdf.io.bags.reading import read_bags
-from radarsdf.io.clouds.reading import CLOUD_SUFFIXES, read_points
-from radarsdf.io.folders import read_files, read_folder
+from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
+from radarsdf.io.bags import read_bags
+from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
+from radarsdf.io.fields import SIGMA
+from radarsdf.io.files import check
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses.files import POSE_FILES, poses_of
-from radarsdf.io.poses.trajectory import MAX_GAP_S, UNPOSED, StampedPoses
-from radarsdf.io.recordings import WITHOUT_POSES, Request, Truth, scan_poses
-from radarsdf.io.scans import Notes, Scan, Scans, finite_returns
-
-_OF_BAGS = ("topic", "pose_topic", "imu_topic", "world_frame", "stamps")  # choices without effect elsewhere
+from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, StampedPoses, poses_of, rigid_or_nan
+from radarsdf.io.recordings import RawScan, Request, Truth, posed, read_files, read_folder, scan_poses
+from radarsdf.io.scans import Columns, Notes, Scan, Scans
 
 
 def read(
@@ -48,9 +45,9 @@ def read(
 ) -> Scans:
     """Reads scans with poses from a file, a folder or bags.
 
-    What was assumed and what was left out is logged as a warning of the logger ``radarsdf.io``, a line each, and kept in
-    ``notes`` of the scans. Returns with a coordinate or an intensity that is not finite, files that cannot be read, and
-    scans whose poses are not finite are left out, and counted.
+    What was assumed and what was left out is logged by the logger ``radarsdf.io``, and kept in ``notes`` of the scans.
+    Returns with a coordinate or an intensity that is not finite, files that cannot be read, and scans whose poses are not
+    finite are left out, and counted.
 
     Parameters
     ----------
@@ -58,40 +55,38 @@ def read(
         One of
 
         - our ``.npz`` (see :func:`read_scans`);
-        - a folder with a file a scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
+        - a folder with one file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
           file, which a column such as frame or scan_id splits into scans. Files are read in natural order, or in the order
           of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
-        - a folder of a data set that :mod:`radarsdf.io.datasets` knows by its shape;
+        - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
         (F, 4, 4) T_world_sensor, m, or a file: TUM, KITTI, 4 x 4 matrices, or a table that names its columns. By default
-        those of the data set or the ``.npz``; in a folder, a file such as ``poses.txt`` or ``poses.tum``, or the
-        ``VIEWPOINT`` of PCD files; in a bag, `pose_topic`. `radarsdf.io.UNPOSED` reads scans that have none.
+        those of the data set, of the ``.npz``, of a file such as ``poses.txt`` in the folder, or of `pose_topic`.
+        `radarsdf.io.UNPOSED` reads scans without poses.
     extrinsic : (4, 4) array_like, optional
-        T_base_sensor, m, if the poses are not those of the sensor, but T_world_base.
+        T_base_sensor, m, if the poses are T_world_base.
     topic : str or sequence of str, optional
-        In a bag, the topics of the scans, merged in the order of their times. By default the radar's, if there is one.
-        Each message has the pose of the frame in its header.
+        In a bag, the topics of the scans, merged by time. By default the radar's, if there is one.
     pose_topic : str, optional
-        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one that covers the times
-        of the scans; what was passed over is noted. Goals, plans and initial poses never count.
+        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one; of several, the only
+        one whose child frame leads to that of the scans, or else TF. Goals, plans and initial poses are never used.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
         Rotation from the axes of the IMU to those of the radar. By default that of the file, or of the static transforms of
         a bag.
     world_frame : str, optional
-        With poses of TF, the frame of the world. By default the root of its tree.
+        With poses of TF, the world frame. By default the root of its tree.
     stamps : {"header", "record"}, optional
-        In a bag, the time of a scan: of its header, or when it was recorded. By default of the header, unless its stamps
-        are zero or stand still.
+        In a bag, the time of a scan. By default that of its header, unless its stamps are zero or stand still.
     fields : mapping, optional
-        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. Numbers mean columns,
-        None leaves a role out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth
-        and sigma_elevation.
+        Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. None leaves a role
+        out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth and
+        sigma_elevation.
     columns : int or sequence of str, optional
-        Of files without names of columns: how many a point has, or their names. By default the content of several files
-        decides for ``.bin``.
+        Of files without column names: how many a point has, or their names. By default ``.bin`` files are those of KITTI:
+        float32 x, y, z, intensity.
     max_gap_s : float
         Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
     ground_truth : path-like or (M, 3) array_like, optional
@@ -100,8 +95,8 @@ def read(
     Returns
     -------
     Scans
-        They are read while they are iterated, in memory bounded by a scan. Points keep the precision of the file;
-        intensities, Doppler and deviations are float32.
+        Scans that are read while they are iterated, in memory bounded by one scan. Points keep the precision of the file;
+        intensities, Doppler and standard deviations are float32.
 
     Raises
     ------
@@ -124,9 +119,7 @@ def read(
     >>> scans.notes
     ['1 returns left out: a coordinate or the intensity is not a finite number']
     """
-    if stamps not in (None, "header", "record"):
-        msg = f'stamps must be "header" or "record", not {stamps!r:.50}'
-        raise ValueError(msg)
+    check(stamps in (None, "header", "record"), f'stamps must be "header" or "record", not {stamps!r:.50}')
     one = isinstance(path, (str, PathLike))
     paths = [path_of(part, "path") for part in ([path] if one or not isinstance(path, Iterable) else path)]
     files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
@@ -168,10 +161,8 @@ def _read(path: Path, request: Request) -> Scans:
                 request.notes.add(f"poses: of {file.name}")
                 request = dataclasses.replace(request, poses=file)
             return read_bags(bags, request)
-    for name in _OF_BAGS:
-        if getattr(request, name) not in (None, ()):
-            msg = f"{path} is no bag: {name} is of bags alone"
-            raise ValueError(msg)
+    for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
+        check(getattr(request, name) in (None, ()), f"{path} is no bag: {name} is of bags alone")
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path, request)
@@ -179,7 +170,8 @@ def _read(path: Path, request: Request) -> Scans:
         return _npz(path, request)
     if suffix in CLOUD_SUFFIXES:
         return read_files([path], path.parent, request)
-    msg = f"{path} is of no kind that can be read: .npz, .bag, .mcap, .db3, {', '.join(CLOUD_SUFFIXES)}, or a folder of them"
+    kinds = ", ".join((".npz", *BAG_SUFFIXES, *CLOUD_SUFFIXES))
+    msg = f"{path} is of no kind that can be read: {kinds}, or a folder of them"
     raise ValueError(msg)
 
 
@@ -187,39 +179,38 @@ def _npz(path: Path, request: Request) -> Scans:
     """The scans of our own file, with its poses or those that are given."""
     notes = request.notes
     others = None if request.poses is UNPOSED else request.poses
-    if others is None and request.extrinsic is not None:
-        msg = f"{path} has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
-        raise ValueError(msg)
-    if request.fields is not None or request.columns is not None:
-        msg = f"{path} has arrays of known names: fields and columns are not used for .npz files"
-        raise ValueError(msg)
+    what = "has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
+    check(others is not None or request.extrinsic is None, f"{path} {what}")
+    named = request.fields is None and request.columns is None
+    check(named, f"{path} has arrays of known names: fields and columns are not used for .npz files")
     scans = read_scans(path)
-    truth, matched = scans.ground_truth, None
-    if others is not None:
-        times_s = None if scans.times_s is None else scans.times_s.tolist()
-        matched, _ = scan_poses(poses_of(others, notes), len(scans), times_s, request.extrinsic, request)
+    truth = scans.ground_truth
+    if others is None:
+        poses: Any = rigid_or_nan(scans.poses, str(path), notes)
+    else:
+        poses = poses_of(others, notes)
         of = others if isinstance(others, (str, PathLike)) else "those given"
         notes.add(f"poses: {of}, in place of those in {path.name}")
         if truth is not None and request.truth is None:
             notes.add(f"the ground truth of {path.name} is left out: it lies in the world of the poses there")
         truth = None
-
-    def source() -> Iterator[Scan]:
-        for number, scan in enumerate(scans):
-            pose = scan.T_world_sensor if matched is None else matched.of(number, scan.time_s)
-            if pose is None:
-                notes.count(WITHOUT_POSES.format(gap_s=request.max_gap_s))
-            elif not np.isfinite(pose).all():
-                notes.count("scans left out: their poses are not finite", example=f"scan {number}")
-            elif finite := finite_returns(dataclasses.replace(scan, T_world_sensor=pose), notes):
-                yield finite
-
+    times_s = None if scans.times_s is None else scans.times_s.tolist()
+    matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
+    raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
+    source = posed(lambda: raw, lambda _: matched, request)
     found = Scans.of_source(source, notes, request.truth or (lambda: truth), lambda: imu)
     found.truth_kind = scans.truth_kind
     return found
+
+
+def _columns(scan: Scan) -> Columns:
+    columns: dict[str, Any] = dict(zip("xyz", scan.points.T, strict=True))
+    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
+    columns |= dict(zip(SIGMA, () if scan.sigma is None else scan.sigma.T, strict=False))
+    return {name: values for name, values in columns.items() if values is not None}
 
 
 def _truth(ground_truth: Any) -> Truth | None:

@@ -1,36 +1,59 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From the raw scans of a recording, whatever its format, to scans with poses.
+"""From the files of a recording to scans with poses.
 
-Each format gives an iterator of :class:`RawScan`: where a scan is, how its columns are read, and when it was taken.
-:func:`posed` finds the pose of each, reads its columns, and decides by the first scan of a topic what they mean. What
-cannot be used is counted in the notes, and never ends the reading.
+Each format gives an iterator of :class:`RawScan`; :func:`posed` finds the pose of each, reads its columns, and decides what
+they mean. What cannot be used is counted in the notes, and never ends the reading. Folders have a file a scan.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.clouds.fields import Fields
-from radarsdf.io.poses.trajectory import MAX_GAP_S, ScanPoses, StampedPoses, Trajectory
-from radarsdf.io.scans import Columns, Notes, Scan
+from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
+from radarsdf.io.fields import Fields, plain_name
+from radarsdf.io.files import check, reading
+from radarsdf.io.poses import (
+    FIND_POSES,
+    MAX_GAP_S,
+    POSE_FILES,
+    NoPoses,
+    Poses,
+    Trajectory,
+    TransformChain,
+    poses_of,
+    read_transform,
+)
+from radarsdf.io.scans import Columns, Notes, Scan, Scans
+from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970
 
-WITHOUT_POSES = "scans left out: no poses within {gap_s} s of each other around them"
-_UNREADABLE = "scans left out: they cannot be read"
-_NO_RETURNS = "scans left out: they hold no returns"
-_JUDGED_SCANS = 30  # by whose numbers the unit of angles is known
+BASE_T_RADAR = "base_T_radar.txt"
+"""A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
+
+# With a time, s, for each scan, one a line; of three columns, the last two are seconds and nanoseconds.
+TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.txt")
+SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
+_CALIBRATIONS = ("calib.txt", "calibration.txt")
+_NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
+_TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
+_SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "sweep", "sweep_id")
+_TIME_FIELDS = ("time", "timestamp", "stamp", "t")
+_SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
+_TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
 Truth = Callable[[], NDArray[np.float64] | None]
 """Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
 
-FindPoses = Callable[[str], ScanPoses | None]
+FindPoses = Callable[[str], Poses | None]
 """The poses of the scans of a frame; None: none are known."""
 
 
@@ -40,8 +63,7 @@ class Request:
 
     poses: Any = None
     extrinsic: NDArray[np.float64] | None = None
-    topic: tuple[str, ...] = ()
-    """Topics; none: the only one that can be meant."""
+    topic: tuple[str, ...] = ()  # none: the only one that can be meant
     pose_topic: str | None = None
     imu_topic: str | None = None
     R_sensor_imu: NDArray[np.float64] | None = None
@@ -50,8 +72,7 @@ class Request:
     max_gap_s: float = MAX_GAP_S
     stamps: str | None = None
     world_frame: str | None = None
-    truth: Truth | None = None
-    """None: what lies next to the scans."""
+    truth: Truth | None = None  # None: what lies next to the scans
     notes: Notes = field(default_factory=Notes)
 
 
@@ -61,56 +82,43 @@ class RawScan:
 
     read: Callable[[], Columns]
     time_s: float | None
-    name: str
-    """For errors."""
-    frame: str = ""
-    """Its frame, of a bag."""
-    topic: str = ""
-    """Its topic, of a bag: scans of one topic have the same fields."""
-    number: int | None = None
-    """Of its pose, where poses are in the order of the scans. None: the number of scans before it."""
+    name: str  # for messages
+    frame: str = ""  # of a bag
+    topic: str = ""  # of a bag
+    number: int | None = None  # of its pose, in the order of the scans. None: the number of scans before it
 
 
-RawScans = Callable[[], Iterable[RawScan]]
-"""Returns a new iterator over the scans of a recording."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """What the columns of a topic mean, by its first scan."""
-
-    fields: Fields
-    columns: list[str]
-    scan: str
-
-
-def posed(raw_scans: RawScans, find_poses: FindPoses, request: Request) -> Callable[[], Iterator[Scan]]:
+def posed(
+    raw_scans: Callable[[], Iterable[RawScan]], find_poses: FindPoses, request: Request
+) -> Callable[[], Iterator[Scan]]:
     """The source of :meth:`Scans.of_source`: scans with poses and at least one return, in the order of the files."""
     notes = request.notes
 
     def source() -> Iterator[Scan]:
-        layouts: dict[str, _Layout] = {}
+        layouts: dict[tuple[str, ...], Fields] = {}
         num_posed, unposed = 0, ""
         for number, raw in enumerate(raw_scans()):
             known = find_poses(raw.frame)
             if known is None:
                 notes.count(f"scans left out: no poses lead to their frame, {raw.frame or '(unnamed)'}")
                 continue
-            T_world_sensor = known.of(number if raw.number is None else raw.number, raw.time_s)
-            if T_world_sensor is not None:
-                num_posed += 1
-                scan = _scan(raw, T_world_sensor, layouts, raw_scans, request)
-                if scan is not None:
-                    yield scan
-            elif not isinstance(known.poses, np.ndarray):  # else it was named when the poses were read
-                notes.count(WITHOUT_POSES.format(gap_s=known.max_gap_s))
-                if not unposed:
-                    span = known.poses.span()
-                    unposed = f"the first scan is at {raw.time_s:.3f} s, the poses are from {span}"
-        if unposed and not num_posed:
-            gap_s = request.max_gap_s
-            msg = f"{notes.about}: no scan has a pose: {unposed}, and a gap between poses may be {gap_s} s: are both of one clock?"
-            raise ValueError(msg)
+            if isinstance(known, np.ndarray):
+                own = known[number if raw.number is None else raw.number :][:1]
+                if not np.isfinite(own).all() or not len(own):  # it was named when the poses were read
+                    continue
+                T_world_sensor = own[0]
+            else:
+                found = known.pose_at(np.nan if raw.time_s is None else raw.time_s, request.max_gap_s)
+                if found is None:
+                    notes.count(f"scans left out: no poses within {request.max_gap_s} s of each other")
+                    unposed = unposed or f"first scan at {raw.time_s} s, poses from {known.span()}"
+                    continue
+                T_world_sensor = found
+            num_posed += 1
+            if scan := _scan(raw, T_world_sensor, layouts, request):
+                yield scan
+        what = f"no scan has a pose: {unposed}, gaps up to {request.max_gap_s} s: of one clock?"
+        check(num_posed or not unposed, f"{notes.about}: {what}")
 
     return source
 
@@ -118,107 +126,209 @@ def posed(raw_scans: RawScans, find_poses: FindPoses, request: Request) -> Calla
 def _scan(
     raw: RawScan,
     T_world_sensor: NDArray[np.float64],
-    layouts: dict[str, _Layout],
-    raw_scans: RawScans,
+    layouts: dict[tuple[str, ...], Fields],
     request: Request,
 ) -> Scan | None:
-    """The scan with its pose; None, and counted, if it is damaged or has no returns."""
+    """The scan with its pose; None, and counted, if it is damaged or has no returns. Adds to what `layouts` mean."""
     notes = request.notes
     try:
         columns = raw.read()
+        empty = not columns or not len(next(iter(columns.values())))
+        fields = None if empty else _fields(raw.topic, columns, layouts, request)
+        scan = fields.scan(columns, T_world_sensor, raw.time_s, notes) if fields else None
     except ValueError as error:
-        notes.count(_UNREADABLE, example=str(error))
+        known = "" if raw.name in str(error) else f"{raw.name}: "
+        notes.count("scans left out: they cannot be read", example=f"{known}{error}")
         return None
-    scan = None
-    if columns and len(next(iter(columns.values()))):
-        if raw.topic not in layouts:
-            try:
-                layouts[raw.topic] = _layout(raw, columns, layouts, raw_scans, request)
-            except ValueError as error:
-                if request.fields:
-                    raise
-                notes.count(_UNREADABLE, example=str(error))
-                return None
-        layout = layouts[raw.topic]
-        if not layout.fields.position_names <= set(columns):
-            notes.count(_UNREADABLE, example=f"{raw.name} has no positions, but {', '.join(columns)}")
-            return None
-        if list(columns) != layout.columns:
-            _check_same_roles(raw, columns, layout, request)
-        scan = layout.fields.scan(columns, raw.name, T_world_sensor, raw.time_s, notes)
     if not scan:
-        notes.count(_NO_RETURNS)
+        notes.count("scans left out: they hold no returns")
         return None
     return scan
 
 
-def _layout(
-    raw: RawScan, columns: Columns, others: Mapping[str, _Layout], raw_scans: RawScans, request: Request
-) -> _Layout:
-    """What the columns of the first scan of a topic mean, and what to know of that. Raises as :meth:`Fields.of`."""
-    notes = request.notes
-
-    def first_clouds() -> Iterator[Columns]:
-        of_topic = (other for other in raw_scans() if other.topic == raw.topic)
-        for scan in itertools.islice(of_topic, _JUDGED_SCANS):
-            with contextlib.suppress(ValueError):
-                yield scan.read()
-
-    fields = Fields.of(list(columns), request.fields, raw.name).judged(first_clouds(), notes)
-    fields.note_use(columns, notes, chosen=bool(request.fields))
-    for other in others.values():
-        for role in ("intensity", "doppler", "sigma_range"):
-            if (role in fields.names) != (role in other.fields.names):
-                notes.add(
-                    f"some topics have {role}, others have none: it is not used where all scans must have it"
-                )
-        own, others_own = fields.names.get("intensity"), other.fields.names.get("intensity")
-        if own and others_own and own != others_own:
-            notes.add(
-                f"intensities of {raw.topic} are {own}, of other topics {others_own}: they are taken as of one unit"
-            )
-    return _Layout(fields, list(columns), raw.name)
+def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields], request: Request) -> Fields:
+    """What the columns mean: as in an earlier scan of the topic with the same ones, or else by their names."""
+    layout, notes = (topic, *columns), request.notes
+    if layout not in layouts:
+        fields = Fields.of(list(columns), request.fields).judged(columns, notes)
+        if not request.fields and topic not in {known for known, *_ in layouts}:
+            fields.note_use(columns, notes)
+        for others in layouts.values():
+            _note_differences(fields.names, others.names, notes)
+        layouts[layout] = fields
+    return layouts[layout]
 
 
-def _check_same_roles(raw: RawScan, columns: Columns, layout: _Layout, request: Request) -> None:
-    """Raises a ValueError if a later scan has what the first one of its topic lacks: it would be lost silently."""
-    own = Fields.of(list(columns), request.fields, raw.name)
-    for role, name in own.names.items():
-        if role.startswith(("intensity", "doppler", "sigma")) and role not in layout.fields.names:
-            msg = (
-                f"{raw.name} has the field {name} for {role}, which {layout.scan} lacks: leave it out of all scans by "
-                f"fields={{{role!r}: None}}"
-            )
-            raise ValueError(msg)
+def _note_differences(names: Mapping[str, str], others: Mapping[str, str], notes: Notes) -> None:
+    for role in ("intensity", "doppler", "sigma_range"):
+        if (role in names) != (role in others):
+            notes.add(f"some scans have {role}, others have none: not used where all must have it")
+    own, other = names.get("intensity"), others.get("intensity")
+    if own and other and own != other:
+        notes.add(f"intensities of some scans are {other}, of others {own}: they are taken as of one unit")
 
 
 def scan_poses(
-    poses: StampedPoses | NDArray[np.float64],
+    poses: Poses,
     count: int,
     times_s: Sequence[float] | None,
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
-) -> tuple[ScanPoses, Sequence[float] | None]:
-    """Which pose each of `count` scans has, and the times of the scans as far as they are then known."""
+) -> tuple[Poses, Sequence[float] | None]:
+    """The poses T_world_sensor of `count` scans, and their times, s, as far as they are then known."""
     about = request.notes.about
     if isinstance(poses, np.ndarray):
-        if len(poses) != count:
-            msg = (
-                f"{about}: there are {count} scans but {len(poses)} poses: give as many poses as scans, or poses with time "
-                "stamps (TUM: time x y z qx qy qz qw) for scans with time stamps"
-            )
-            raise ValueError(msg)
+        what = "give as many, or poses with time stamps for scans with time stamps"
+        check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
     elif times_s is None:
         if not isinstance(poses, Trajectory) or len(poses.times_s) != count:
-            msg = (
-                f"{about}: the {count} scans have no time stamps in their names or in a file of times, and the poses "
-                f"({poses.span()}) are not as many"
-            )
+            msg = f"{about}: the {count} scans have no time stamps, and the poses ({poses.span()}) are not as many"
             raise ValueError(msg)
-        request.notes.add(
-            f"the scans have no time stamps: they are matched to the {count} poses in their order"
-        )
+        request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()
         poses = poses.poses(poses.times_s)
-    T = np.eye(4) if T_base_sensor is None else T_base_sensor
-    return ScanPoses(poses, T, request.max_gap_s), times_s
+    if T_base_sensor is not None:
+        poses = (
+            poses @ T_base_sensor if isinstance(poses, np.ndarray) else TransformChain((poses, T_base_sensor))
+        )
+    return poses, times_s
+
+
+def read_folder(folder: Path, request: Request) -> Scans:
+    """The scans of the files in a folder; see :func:`radarsdf.io.read`."""
+    return read_files(cloud_files(folder), folder, request, partial(lidar_map, folder))
+
+
+def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
+    """The scans of files with the poses of the request, or those that are found in or near the folder.
+
+    The files hold one scan each, or the only one the table of a recording. `truth` counts if the request has none.
+    """
+    check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
+    notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
+    places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
+    if poses is None:
+        poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
+        if poses is not None and poses.parent != folder:  # which is easily overlooked
+            notes.add(f"poses: of {poses}")
+    if poses is None:
+        what = files[0] if len(files) == 1 else folder
+        msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
+        raise NoPoses(msg)
+    if isinstance(poses, (str, PathLike)):
+        places = list(dict.fromkeys((Path(poses).parent, *places)))
+    known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
+    files, times_s, known = _in_order_of_time(files, known, notes)
+    if T_base_sensor is None:
+        T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
+    columns = request.columns
+    if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
+        with reading(notes.about, "points of KITTI"):
+            check_kitti(raw)
+        columns = 4
+    reads = [partial(read_columns, path, columns) for path in files]
+    names = [str(path) for path in files]
+    if len(files) == 1:
+        parts, times_s, known = _split(files[0], columns, times_s, known, notes)
+        if parts:
+            reads = [partial(dict, part) for part in parts]
+            names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
+    matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
+    stamps = [None] * len(reads) if known_s is None else known_s
+    raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
+    source = posed(lambda: raw_scans, lambda _: matched, request)
+    return Scans.of_source(source, notes, request.truth or truth)
+
+
+def cloud_files(folder: Path) -> list[Path]:
+    """The scans of a folder, or of a folder of `SCAN_FOLDERS` in it, in natural order: of the suffix with most files."""
+    for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
+        kinds: dict[str, list[Path]] = {}
+        for path in inner.iterdir() if inner.is_dir() else ():
+            other = path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM or path.name.startswith(".")
+            if path.suffix.lower() in CLOUD_SUFFIXES and not other and path.is_file():
+                kinds.setdefault(path.suffix.lower(), []).append(path)
+        if kinds:
+            most = max(kinds.values(), key=len)
+            return sorted(most, key=natural)
+    return []
+
+
+def natural(path: Path) -> tuple[Any, ...]:
+    """Sorts names as people do: scan_9 before scan_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
+
+
+def lidar_map(folder: Path) -> NDArray[np.float64] | None:
+    """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``. None if there is neither."""
+    found = (folder / f"{_TRUTH_STEM}{suffix}" for suffix in (".pcd", ".ply"))
+    return next((read_points(path) for path in found if path.is_file()), None)
+
+
+def _in_order_of_time(
+    files: list[Path], poses: Poses, notes: Notes
+) -> tuple[list[Path], Sequence[float] | None, Poses]:
+    """Scans in the order of their times, these times, s, None if there are none, and the poses.
+
+    Poses without times belong to the files by number: in the order of the times in their names, or, where a file has the
+    times line by line, in the order of these lines.
+    """
+    times = [time for path in files if (time := _time_in(path.stem)) is not None]
+    listed = None
+    if len(set(times)) < len(files):
+        places = [
+            folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES
+        ]
+        listed = next((path for path in places if path.is_file()), None)
+        if listed is None:
+            return files, None, poses
+        table = read_numbers(listed)
+        numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1]
+        check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
+        times = in_seconds(numbers, listed.name, notes).tolist()
+    order = np.argsort(times, kind="stable")
+    if listed is not None and (np.diff(order) < 0).any():
+        notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
+        if isinstance(poses, np.ndarray) and len(poses) == len(files):
+            poses = poses[order]
+    return [files[i] for i in order], [times[i] for i in order], poses
+
+
+def _time_in(stem: str) -> float | None:
+    """The time, s, that a name ends in: with a point s; in 12, 15 or 18 digits or more ms, µs or ns. Others are numbers."""
+    if parts := _SECONDS_AND_NANOSECONDS.search(stem):
+        return int(parts[1]) + 1e-9 * int(parts[2])
+    found = _TIME.search(stem)
+    if found is None:
+        return None
+    return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
+
+
+def _split(
+    path: Path, columns: Any, times_s: Sequence[float] | None, poses: Poses, notes: Notes
+) -> tuple[list[Columns], Sequence[float] | None, Poses]:
+    """The scans in the one table of a recording, by a column with their numbers; none if it is one scan."""
+    try:
+        table = read_columns(path, columns)
+    except ValueError:  # which is noted when the scan is read
+        return [], times_s, poses
+    plain = {plain_name(name)[0]: name for name in reversed(table)}
+    key = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
+    if key is None or table[key].dtype.kind not in "biuf":
+        return [], times_s, poses
+    rows = np.flatnonzero(np.isfinite(table[key]))
+    values, first, part = np.unique(table[key][rows], return_index=True, return_inverse=True)
+    if len(values) < 2:
+        return [], times_s, poses
+    left_out = len(table[key]) - len(rows)
+    without = f"; {left_out} rows left out, whose {key} is not a number" if left_out else ""
+    notes.add(f"{path.name} is read as {len(values)} scans, by its field {key}{without}")
+    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
+    if time is not None and table[time].dtype.kind in "iuf":
+        scale = SCALES.get(plain_name(time)[1], 1.0)
+        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
+    if isinstance(poses, np.ndarray) and 0 <= values[0] <= values[-1] < len(poses) > len(values):
+        poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
+    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
+    return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses

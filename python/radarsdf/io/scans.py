@@ -21,7 +21,6 @@ _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
 
 _ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a scan
-_NOT_FINITE = "returns left out: a coordinate or the intensity is not a finite number"
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """(N,) each, by name."""
@@ -69,27 +68,25 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
     finite = np.isfinite(points).all(axis=1)
     if intensities is not None:
         finite &= np.isfinite(intensities)
-    notes.count(_NOT_FINITE, int((~finite).sum()))
+    what = "returns left out: a coordinate or the intensity is not a finite number"
+    notes.count(what, int((~finite).sum()))
     optional = (intensities, scan.doppler_mps, scan.sigma)
     intensities, doppler_mps, sigma = (None if array is None else array[finite] for array in optional)
     return Scan(points[finite], scan.T_world_sensor, intensities, doppler_mps, scan.time_s, sigma)
 
 
 class Notes:
-    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``.
-
-    `about` names what is read, for errors. Without `log`, the sentences are kept, but not logged.
-    """
+    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``."""
 
     def __init__(self, about: str = "the scans", *, log: bool = True) -> None:
-        self.about = about
+        self.about = about  # what is read, for messages
         self.lines: list[str] = []
         self._log = log
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
 
     def add(self, line: str) -> None:
-        """Keep a sentence, and log it if it is new."""
+        """Keeps a sentence, and logs it if it is new."""
         if line not in self.lines:
             self.lines.append(line)
             if self._log:
@@ -100,17 +97,17 @@ class Notes:
         return "".join(f"; {line}" for line in self.lines)
 
     def count(self, what: str, number: int = 1, example: str = "") -> None:
-        """Count what was left out in this pass through the files, and keep the first example."""
+        """Counts what was left out in this pass through the files, and keeps the first example."""
         if number:
             self._first.setdefault(what, f"; the first: {example}" if example else "")
             self._counts[what] = self._counts.get(what, 0) + number
 
     def start_pass(self) -> None:
-        """Forget the counts: the files are read again."""
+        """Forgets the counts: the files are read again."""
         self._counts = {}
 
     def end_pass(self) -> None:
-        """Turn the counts into sentences."""
+        """Turns the counts into sentences."""
         for what, number in self._counts.items():
             self.add(f"{number} {what}{self._first[what]}")
 
@@ -118,10 +115,9 @@ class Notes:
 class Scans:
     """F scans with poses, and lidar points as ground truth where there are any.
 
-    Iterating gives one :class:`Scan` after another, as often as wanted. Scans of :func:`radarsdf.io.read` are read from
-    their files while they are iterated, so that memory is bounded by a scan; `points`, `intensities`, `doppler_mps` and
-    `sigmas` read all of them and keep them. `poses`, `times_s` and ``len()`` read the files once, if nobody did so
-    before, and keep no points.
+    Iterating gives one :class:`Scan` after another. Scans of :func:`radarsdf.io.read` are read from their files while they
+    are iterated, so that memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read all of them
+    and keep them. `poses`, `times_s` and ``len()`` read the files once, and keep no points.
 
     Parameters
     ----------
@@ -156,7 +152,7 @@ class Scans:
         truth_kind: TruthKind = "lidar",
         imu: Imu | None = None,
     ) -> None:
-        self._arrays: dict[str, Any] | None = {
+        self._arrays: dict[str, list[NDArray[Any]] | None] | None = {
             name: None if arrays is None else list(one_for_each_scan(arrays, name))
             for name, arrays in zip(_ARRAYS, (points, intensities, doppler_mps, sigmas), strict=True)
         }
@@ -192,7 +188,7 @@ class Scans:
         """One scan after another."""
         if self._arrays is None:
             return self._read()
-        return (self._scan(self._arrays, i) for i in range(len(self._arrays["points"])))
+        return (self._scan(i) for i in range(len(self.points)))
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -206,8 +202,7 @@ class Scans:
     @property
     def points(self) -> list[NDArray[Any]]:
         """F arrays (N_i, 3), sensor frame, m."""
-        found: list[NDArray[Any]] = self._loaded()["points"]
-        return found
+        return self._loaded()["points"] or []
 
     @property
     def poses(self) -> NDArray[np.float64]:
@@ -220,17 +215,17 @@ class Scans:
     @property
     def intensities(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
-        return self._optional("intensities")
+        return self._loaded()["intensities"]
 
     @property
     def doppler_mps(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
-        return self._optional("doppler_mps")
+        return self._loaded()["doppler_mps"]
 
     @property
     def sigmas(self) -> list[NDArray[Any]] | None:
         """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
-        return self._optional("sigmas")
+        return self._loaded()["sigmas"]
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
@@ -254,16 +249,42 @@ class Scans:
         return list(self._notes.lines)
 
     def select(self, frames: NDArray[np.int64] | Sequence[int]) -> Scans:
-        """The scans with the numbers `frames`, (K,), in this order. All scans are read."""
+        """Selects scans by their numbers. All scans are read.
+
+        Parameters
+        ----------
+        frames : (K,) integer ndarray, or sequence of int
+            Numbers of scans, from 0, in the order of the result. Negative ones count from the end.
+
+        Returns
+        -------
+        Scans
+            K scans, with the ground truth and the IMU of these.
+
+        Raises
+        ------
+        IndexError
+            If there is no scan of such a number.
+        """
         scans = self.with_poses(self.poses[frames])
         scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
         scans._times_s = None if self._times_s is None else self._times_s[frames]
         return scans
 
     def with_poses(self, poses: NDArray[np.float64], *, other_world: bool = False) -> Scans:
-        """The same scans with other poses (F, 4, 4) T_world_sensor, m. All scans are read.
+        """Replaces the poses. All scans are read.
 
-        `other_world`: the poses are not in the world of the ground truth, which is then left out.
+        Parameters
+        ----------
+        poses : (F, 4, 4) float64 ndarray
+            T_world_sensor, m.
+        other_world : bool
+            Whether the poses are in another world frame than the ground truth, which is then left out.
+
+        Returns
+        -------
+        Scans
+            The same scans with these poses.
         """
         self._loaded()
         scans = copy(self)
@@ -272,10 +293,11 @@ class Scans:
             scans._ground_truth = lambda: None
         return scans
 
-    def _scan(self, arrays: dict[str, Any], i: int) -> Scan:
-        points, intensities, doppler_mps, sigma = (arrays[n] and arrays[n][i] for n in _ARRAYS)
+    def _scan(self, i: int) -> Scan:
+        values = self._loaded().values()
+        points, intensities, doppler_mps, sigma = (None if array is None else array[i] for array in values)
         time_s = None if self._times_s is None else float(self._times_s[i])
-        return Scan(points, self.poses[i], intensities, doppler_mps, time_s, sigma)
+        return Scan(np.asarray(points), self.poses[i], intensities, doppler_mps, time_s, sigma)
 
     def _read(self) -> Iterator[Scan]:
         """Reads the files, and keeps what is small once they are read to the end."""
@@ -300,11 +322,7 @@ class Scans:
             for _ in self._read():
                 pass
 
-    def _optional(self, name: str) -> list[NDArray[Any]] | None:
-        arrays: list[NDArray[Any]] | None = self._loaded()[name]
-        return arrays
-
-    def _loaded(self) -> dict[str, Any]:
+    def _loaded(self) -> dict[str, list[NDArray[Any]] | None]:
         """The arrays of all scans, which are read from their files at the first call."""
         if self._arrays is None:
             self._arrays = _arrays_of(list(self._read()))
@@ -312,7 +330,7 @@ class Scans:
 
 
 def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
-    """Scans one after another as one, with what all of them have."""
+    """Collects scans, with the arrays that all of them have."""
     times_s = _all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
@@ -333,7 +351,7 @@ def filled(points: Any, **given: Any) -> tuple[Any, ...]:
 def chosen(
     arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64] | Sequence[int]
 ) -> list[NDArray[Any]] | None:
-    """Those of these `numbers`, (K,), in this order, if there are arrays."""
+    """The arrays with these `numbers`, (K,), in this order; None if there are none."""
     return None if arrays is None else [arrays[i] for i in numbers]
 
 

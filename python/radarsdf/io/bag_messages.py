@@ -1,0 +1,322 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Bags of ROS 1 and ROS 2 as streams of messages, without ROS: those that hold scans, poses and inertial measurements.
+
+Types of messages are those of rosbags and the definitions below, never those of a bag: rosbags builds Python code from them,
+and old ROS 2 bags have none.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from functools import cache
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.extras import require
+from radarsdf.io.files import check, check_regular_file
+from radarsdf.io.scans import Columns, Notes
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+_METADATA = "metadata.yaml"
+_DEFINITIONS = {
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "tf/msg/tfMessage": "geometry_msgs/TransformStamped[] transforms",
+    "radar_msgs/msg/RadarReturn": (
+        "float32 range; float32 azimuth; float32 elevation; float32 doppler_velocity; float32 amplitude"
+    ),
+    "radar_msgs/msg/RadarScan": "std_msgs/Header header; radar_msgs/RadarReturn[] returns",
+    "nebula_msgs/msg/NebulaPacket": "builtin_interfaces/Time stamp; uint8[] data",
+    "nebula_msgs/msg/NebulaPackets": "std_msgs/Header header; nebula_msgs/NebulaPacket[] packets",
+}
+_POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+# A list of returns as an ARS548 sends it: big-endian, always with space for 800 returns. Azimuth is positive to the left.
+_ARS548_RETURN = np.dtype(
+    [("azimuth_rad", ">f4"), ("azimuth_std", ">f4"), ("invalid", "u1"), ("elevation_rad", ">f4"), ("elevation_std", ">f4"),
+     ("range", ">f4"), ("range_std", ">f4"), ("range_rate", ">f4"), ("range_rate_std", ">f4"), ("rcs", "i1"),
+     ("others", "V10")]
+)  # fmt: skip
+_PACKET_BYTES, _RETURNS_AT, _COUNT_AT, _MAX_RETURNS = 35336, 101, 35309, 800
+_NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
+
+
+class Topic(NamedTuple):
+    """A topic of bags."""
+
+    name: str
+    message_type: str
+    num_messages: int
+
+
+class Pose(NamedTuple):
+    """A pose T_parent_child."""
+
+    stamp_s: float
+    parent: str
+    child: str  # empty where the message does not name it
+    values: tuple[float, ...]  # x, y, z, m; qx, qy, qz, qw
+
+
+class Message(NamedTuple):
+    """A message of a bag."""
+
+    bag: Path
+    topic: str
+    message_type: str
+    recorded_s: float
+    number: int  # of its topic, from 0
+    stamp_s: float
+    frame: str
+    content: Any  # columns of a cloud, a list of poses, or rates, rad/s, and forces, m/s², of an IMU
+
+
+@cache
+def _types(cdr: bool) -> Any:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - an extra
+
+    store = get_typestore(Stores.ROS2_HUMBLE if cdr else Stores.ROS1_NOETIC)
+    for name, text in _DEFINITIONS.items():
+        if name not in store.types:
+            store.register(get_types_from_msg(text.replace("; ", "\n"), name))
+    return store
+
+
+def _stamp(message: Any) -> tuple[float, str]:
+    """Time, s, and frame; of messages without a header, 0 and none."""
+    if not hasattr(message, "header"):
+        return 0.0, ""
+    stamp = message.header.stamp
+    return stamp.sec + 1e-9 * stamp.nanosec, message.header.frame_id.lstrip("/")
+
+
+def _point_cloud2(message: Any) -> Columns:
+    height, width, step, data = message.height, message.width, message.point_step, message.data
+    row_step = message.row_step if height > 1 else step * width  # of one row, some drivers leave it 0
+    fits = step * width <= row_step and row_step * height <= len(data)
+    check(fits, f"{height} x {width} points of {step} bytes do not fit into its {len(data)} bytes")
+    columns: Columns = {}
+    for field in message.fields:
+        kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")
+        check(field.offset + int(kind[1:]) <= step, f"its field {field.name} is beyond its points")
+        if field.count > 1 or not field.name or field.name in columns:  # 0 is what some drivers write for 1
+            continue
+        dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
+        column = np.zeros(0, dtype)
+        if height * width:
+            column = np.ndarray((height, width), dtype, data, field.offset, (row_step, step)).reshape(-1)
+        columns[field.name] = column
+    return columns
+
+
+def _point_cloud(message: Any) -> Columns:
+    columns = {axis: _column(message.points, axis) for axis in "xyz"}
+    for channel in message.channels:
+        if len(channel.values) == len(message.points):
+            columns.setdefault(channel.name, channel.values)
+    return columns
+
+
+def _radar_scan(message: Any) -> Columns:
+    names = {"range": "range", "azimuth": "azimuth_rad", "elevation": "elevation_rad",
+             "doppler_velocity": "doppler_velocity", "amplitude": "amplitude"}  # fmt: skip
+    return {name: _column(message.returns, attribute) for attribute, name in names.items()}
+
+
+def _column(rows: list[Any], attribute: str) -> NDArray[np.float32]:
+    return np.array([getattr(row, attribute) for row in rows], np.float32)
+
+
+def _ars548_packets(message: Any) -> Columns:
+    """What an ARS548 sent, among which lists of returns are found by their length. NaN: the radar calls it invalid."""
+    lists = [np.zeros(0, _ARS548_RETURN)]
+    for packet in message.packets:
+        data = packet.data.tobytes()
+        if len(data) == _PACKET_BYTES:
+            count = min(int.from_bytes(data[_COUNT_AT : _COUNT_AT + 4], "big"), _MAX_RETURNS)
+            lists.append(np.frombuffer(data, _ARS548_RETURN, count, _RETURNS_AT))
+    returns = np.concatenate(lists)
+    invalid = np.unpackbits(returns["invalid"][None], axis=0, bitorder="little") != 0
+    columns = {name: returns[name] for name in ("rcs", "range_std", "azimuth_std", "elevation_std")}
+    for i, name in enumerate(("range", "azimuth_rad", "elevation_rad", "range_rate")):
+        columns[name] = np.where(invalid[2 * i], np.nan, returns[name])  # odd flags are of deviations
+    return columns
+
+
+def _pose(message: Any, position: Any, rotation: Any) -> Pose:
+    values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
+    return Pose(*_stamp(message), getattr(message, "child_frame_id", "").lstrip("/"), values)
+
+
+def _pose_stamped(message: Any) -> list[Pose]:
+    """Also of messages with a covariance, within which is the pose."""
+    pose = getattr(message.pose, "pose", message.pose)
+    return [_pose(message, pose.position, pose.orientation)]
+
+
+def _transform(message: Any) -> list[Pose]:
+    return [_pose(message, message.transform.translation, message.transform.rotation)]
+
+
+def _path(message: Any) -> list[Pose]:
+    return [pose for stamped in message.poses for pose in _pose_stamped(stamped)]
+
+
+def _transforms(message: Any) -> list[Pose]:
+    return [pose for stamped in message.transforms for pose in _transform(stamped)]
+
+
+def _imu(message: Any) -> list[tuple[float, ...] | None]:
+    measured: list[tuple[float, ...] | None] = []
+    for name in ("angular_velocity", "linear_acceleration"):
+        vector, covariance = getattr(message, name), getattr(message, f"{name}_covariance")
+        measured.append(None if covariance[0] == _NOT_MEASURED else (vector.x, vector.y, vector.z))
+    return measured
+
+
+PACKETS = "nebula_msgs/msg/NebulaPackets"
+PATH = "nav_msgs/msg/Path"
+IMU = "sensor_msgs/msg/Imu"
+
+_CLOUDS: dict[str, Callable[[Any], Columns]] = {
+    "sensor_msgs/msg/PointCloud2": _point_cloud2,
+    "sensor_msgs/msg/PointCloud": _point_cloud,
+    "radar_msgs/msg/RadarScan": _radar_scan,
+    PACKETS: _ars548_packets,
+}
+_POSES: dict[str, Callable[[Any], list[Pose]]] = {
+    "nav_msgs/msg/Odometry": _pose_stamped,
+    "geometry_msgs/msg/PoseStamped": _pose_stamped,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
+    "geometry_msgs/msg/TransformStamped": _transform,
+    PATH: _path,
+}
+_TRANSFORMS = dict.fromkeys(("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), _transforms)
+_READERS: dict[str, Callable[[Any], Any]] = {**_CLOUDS, **_POSES, **_TRANSFORMS, IMU: _imu}
+CLOUD_TYPES, POSE_TYPES, TRANSFORM_TYPES = tuple(_CLOUDS), tuple(_POSES), tuple(_TRANSFORMS)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether the path is a bag by its name, or a folder that is a ROS 2 bag, whose files were not renamed."""
+    if path.suffix.lower() in BAG_SUFFIXES or not (path / _METADATA).is_file():
+        return path.suffix.lower() in BAG_SUFFIXES
+    listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
+    files = [file.name for file in path.iterdir() if file.suffix.lower() in BAG_SUFFIXES]
+    return not files or any(name in listed for name in files)
+
+
+def bags_in(folder: Path) -> list[Path]:
+    """The bags in a folder, by name."""
+    return sorted(path for path in folder.iterdir() if is_bag(path) and not path.name.startswith("."))
+
+
+def topics_of(paths: list[Path]) -> dict[str, Topic]:
+    """The topics of bags, by name."""
+    topics: dict[str, Topic] = {}
+    for path in paths:
+        with _opened(path) as reader:
+            for connection in reader.connections:
+                name = connection.topic
+                named = isinstance(name, str) and isinstance(connection.msgtype, str)
+                check(named, f"{path} is not a whole bag: a topic has no name or no type")
+                count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
+                topics[name] = Topic(name, _type_of(connection), count)
+    return topics
+
+
+def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
+    """The topics that have messages of these types."""
+    return {n: topic for n, topic in topics.items() if topic.message_type in types and topic.num_messages}
+
+
+def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
+    """The messages of some topics, in the order of their recording; damaged ones are left out, and noted in the end."""
+    numbers: Counter[str] = Counter()
+    damaged: dict[str, list[str]] = {}
+    with ExitStack() as stack:
+        streams = [stack.enter_context(closing(_stream(path, names))) for path in paths]
+        for recorded_s, path, connection, raw in heapq.merge(*streams, key=itemgetter(0)):
+            topic, message_type = connection.topic, connection.msgtype
+            number, numbers[topic] = numbers[topic], numbers[topic] + 1
+            cdr = hasattr(connection.ext, "serialization_format")
+            try:
+                types = _types(cdr)
+                message = (types.deserialize_cdr if cdr else types.deserialize_ros1)(raw, message_type)
+                content = _READERS[message_type](message)
+            except Exception as error:  # noqa: BLE001 - damaged messages raise exceptions of many kinds
+                at = f"message {number} of {topic}, at {recorded_s:.3f} s"
+                damaged.setdefault(topic, []).append(f"{path}: {at}, is not a whole {message_type}: {error}")
+                continue
+            yield Message(path, topic, message_type, recorded_s, number, *_stamp(message), content)
+    for topic, texts in damaged.items():
+        notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
+
+
+def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes) -> bool:
+    """Whether record times stand for the header stamps of `what`: as wanted, or where these are zero or stand still."""
+    if wanted is not None:
+        return wanted == "record"
+    if stamps.any() and (len(stamps) == 1 or (stamps != stamps[0]).any()):
+        return False
+    why = "stand still" if stamps.any() else "are zero"
+    notes.add(f"the header stamps of {what} {why}: the record time is used instead")
+    return True
+
+
+def _type_of(connection: Any) -> str:
+    """With the encoding, where it is none of ROS, as MCAP files may have."""
+    encoding = getattr(connection.ext, "serialization_format", "cdr")
+    message_type: str = connection.msgtype
+    return message_type if encoding == "cdr" else f"{message_type} in {encoding}"
+
+
+def _stream(
+    path: Path, names: set[str]
+) -> Generator[tuple[float, Path, Any, bytes | memoryview], None, None]:
+    """Record time, s, bag, connection of rosbags, and bytes of each message."""
+    with _opened(path) as reader:
+        connections = [c for c in reader.connections if c.topic in names and _type_of(c) == c.msgtype]
+        if not connections:  # of none, rosbags would give all messages
+            return
+        try:
+            for connection, recorded_ns, raw in reader.messages(connections=connections):
+                # A database of SQLite may hold values of any type.
+                known = isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))
+                check(known, "a message has no time or no bytes")
+                yield 1e-9 * recorded_ns, path, connection, raw
+        except Exception as error:  # damaged bags raise exceptions of many kinds
+            raise _damaged(path, error) from error
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A reader of rosbags."""
+    check_regular_file(path if path.is_file() or not (path / _METADATA).is_file() else path / _METADATA)
+    require("rosbags", what=f"{path}: bags are read by")
+    from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
+
+    try:
+        reader: Any = (rosbag1 if path.suffix.lower() == ".bag" else rosbag2).Reader(path)
+        reader.open()
+    except PermissionError:
+        raise
+    except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
+        raise _damaged(path, error) from error
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    why = str(error) or type(error).__name__
+    cut_off = "end magic" in why or "index" in why.lower()
+    remedy = "; if its recording was cut off, mcap recover or rosbag reindex may repair it" if cut_off else ""
+    return ValueError(f"{path} is not a whole bag: {why.rstrip('.')}{remedy}")

@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Scans, poses and inertial measurements from bags: which topics, which clock, and all messages in bounded memory."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import re
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from radarsdf.io.bag_messages import (
+    CLOUD_TYPES,
+    IMU,
+    PACKETS,
+    Message,
+    Topic,
+    by_record,
+    is_bag,
+    read_messages,
+    topics_of,
+    topics_with,
+)
+from radarsdf.io.bag_poses import poses_in_bags, transforms_in
+from radarsdf.io.files import check
+from radarsdf.io.imu import Imu
+from radarsdf.io.poses import UNPOSED, Poses, poses_of
+from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
+from radarsdf.io.scans import Notes, Scans
+
+# Topics of radars in data sets, and of the poses there. They are preferred to others.
+KNOWN_TOPICS = {
+    "/hugin_raf_1/radar_data": "/icp_odom",  # Viking Hill
+    "/radar_enhanced_pcl": None,  # NTU4DRadLM and others with an Oculii Eagle
+    "/radar_enhanced_pcl2": None,  # SNAIL-Radar
+    "/ti_mmwave/radar_scan_pcl": None,
+}
+_RADAR = re.compile(r"radar|ars_?\d{3}|srr_?\d{3}|oculii|mmwave", re.IGNORECASE)
+_PEEKED_SCANS = 10  # whose stamps and fields are looked at
+
+
+def read_bags(paths: list[Path], request: Request) -> Scans:
+    """Scans of one drive in one or several bags; see :func:`radarsdf.io.read`."""
+    others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
+    check(paths and all(map(is_bag, paths)), f"{others} is no bag: only bags can be read together")
+    topics = topics_of(paths)
+    scan_topics = _scan_topics(topics, request)
+    peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
+    counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
+    frames = [frame for frame, _ in counted.most_common()]
+    by_recording = {
+        name: by_record(np.array([c.stamp_s for c in clouds]), name, request.stamps, request.notes)
+        for name, clouds in peeked.items()
+    }
+
+    def raw_scans() -> Iterator[RawScan]:
+        streams = [_raw_scans(paths, topic, by_recording[topic.name], request) for topic in scan_topics]
+        merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
+        return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
+
+    poses = request.poses
+    if poses is None or (isinstance(poses, (str, PathLike)) and is_bag(Path(poses))):
+        pose_paths = paths if poses is None else [Path(poses)]
+        find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
+    else:
+        find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
+    recorded = by_recording[scan_topics[0].name]
+    imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
+    truth = request.truth or (lambda: None)
+    return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
+
+
+def _given(
+    poses: Poses,
+    paths: list[Path],
+    topics: list[Topic],
+    frames: list[str],
+    raw_scans: Callable[[], Iterator[RawScan]],
+    request: Request,
+) -> FindPoses:
+    """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
+    if isinstance(poses, np.ndarray):
+        count = topics[0].num_messages if len(topics) == 1 else sum(1 for _ in raw_scans())
+        numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
+        return lambda _: numbered_poses
+    if poses is UNPOSED:
+        if len(frames) > 1:
+            listed = ", ".join(frames)
+            request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
+        return lambda _: poses
+    return transforms_in(paths, request).attach(poses, frames[0], request)
+
+
+def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
+    """The topics of the scans: the wanted ones, or the only one that can be meant. The others are noted."""
+    about = request.notes.about
+    fitting = topics_with(CLOUD_TYPES, topics)
+    for name in request.topic:
+        what = f"{name} has messages {topics[name].message_type}" if name in topics else f"no topic {name}"
+        check(name in fitting, f"{about}: {what}: topics with points: {_listed(fitting.values()) or 'none'}")
+    if request.topic:
+        return [fitting[name] for name in dict.fromkeys(request.topic)]
+    check(fitting, f"{about} has no topic with points: it has {_listed(topics.values()) or 'no topics'}")
+    decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
+    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar):
+        chosen = [topic for topic in decoded if fits(topic)]
+        if len(chosen) == 1:
+            break
+    else:
+        listed = _listed(fitting.values())
+        msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {listed}"
+        raise ValueError(msg)
+    unread = [t for t in topics.values() if t.name not in fitting and _RADAR.search(t.message_type)]
+    what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that"
+    check(not unread or _is_radar(chosen[0]), f"{about}: {what}")
+    if others := {*fitting.values(), *unread} - set(chosen):
+        request.notes.add(f"scans: those of {_listed(chosen)}; not read: {_listed(others)}")
+    return chosen
+
+
+def _listed(topics: Iterable[Topic]) -> str:
+    return ", ".join(f"{t.name} ({t.message_type})" for t in sorted(topics))
+
+
+def _is_radar(topic: Topic) -> bool:
+    return bool(_RADAR.search(f"{topic.name} {topic.message_type}"))
+
+
+def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
+    """The first messages of a topic."""
+    with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
+        peeked = list(itertools.islice(messages, _PEEKED_SCANS))
+    check(peeked, f"{paths[0]}: {topic.name} has no messages that can be read{request.notes.ending()}")
+    return peeked
+
+
+def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
+    for message in read_messages(paths, {topic.name}, request.notes):
+        time_s = message.recorded_s if recorded else message.stamp_s
+        name = f"{message.bag}: message {message.number} of {topic.name}"
+        yield RawScan(partial(dict, message.content), time_s, name, message.frame, topic.name, message.number)
+
+
+def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
+    """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several."""
+    fitting = sorted(topics_with([IMU], topics))
+    listed = ", ".join(fitting)
+    wanted, about = request.imu_topic, request.notes.about
+    known = wanted is None or wanted in fitting
+    check(known, f"{about} has no inertial measurements in {wanted}: there are {listed or 'none'}")
+    if wanted is None and len(fitting) > 1:
+        request.notes.add(f"there are several IMUs, none is used: say by imu_topic which, of {listed}")
+        return None
+    return wanted or next(iter(fitting), None)
+
+
+def _read_imu(
+    paths: list[Path], topic: str | None, sensor_frame: str, recorded_scans: bool, request: Request
+) -> Imu | None:
+    """What the topic holds; None if it has no gyroscope.
+
+    `recorded_scans`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
+    from stamp to record, because messages of an IMU are recorded several at a time.
+    """
+    if topic is None:
+        return None
+    numbers, frame = array("d"), ""
+    for message in read_messages(paths, {topic}, request.notes):
+        rates, force = message.content
+        if rates is None:
+            request.notes.add(f"{topic} has no angular velocity: it is not used")
+            return None
+        frame = frame or message.frame
+        numbers.extend((message.stamp_s, message.recorded_s, *rates, *(force or (np.nan,) * 3)))
+    table = np.array(numbers).reshape(-1, 8)
+    table = table[np.isfinite(table[:, :5]).all(axis=1)]
+    if len(table) == 0:
+        return None
+    stamps, recorded = table[:, 0], table[:, 1]
+    times_s = recorded
+    if not by_record(stamps, topic, None, Notes(log=False) if recorded_scans else request.notes):
+        times_s = stamps + np.median(recorded - stamps) if recorded_scans else stamps
+    order = np.argsort(times_s, kind="stable")
+    forces = table[order, 5:]
+    has_force = np.isfinite(forces).all() and forces.any()
+    R_sensor_imu = request.R_sensor_imu
+    if R_sensor_imu is None and frame:
+        T_imu_sensor = transforms_in(paths, request).fixed(frame, sensor_frame)
+        R_sensor_imu = None if T_imu_sensor is None else T_imu_sensor[:3, :3].T
+    return Imu(times_s[order], table[order, 2:5], forces if has_force else None, R_sensor_imu)

@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""All returns of all scans as one point cloud in the world frame, and the parts of PLY files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from radarsdf.checks import path_of
+from radarsdf.extras import require
+from radarsdf.io.clouds import LAS_INTENSITY
+from radarsdf.io.files import check, origin_for, whole_file, write_origin
+from radarsdf.io.scans import Columns, Scan, Scans
+from radarsdf.progress import hides_bar
+
+_CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back
+_LAS_SCALE_M = 1e-4
+_LAS_FORMAT = 6  # the first of LAS 1.4, with a time
+_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+
+
+class CloudWritten(NamedTuple):
+    """Size and origin of a cloud that was written."""
+
+    returns: int
+    """Number of returns."""
+    scans: int
+    """Number of scans."""
+    origin: NDArray[np.float64] | None
+    """(3,) the origin that was subtracted, world, m; None where coordinates are the world's."""
+
+
+def check_cloud_path(path: str | PathLike[str]) -> None:
+    """Raises a ValueError unless `path` ends like a format that :func:`write_cloud` writes."""
+    known = path_of(path, "path").suffix.lower() in CLOUD_OUT_SUFFIXES
+    check(known, f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}")
+
+
+def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | None = False) -> CloudWritten:
+    """Writes all returns of scans as one point cloud, whole or not at all.
+
+    The cloud has x, y, z in the world frame, m; intensity in sensor units and doppler in m/s where the first scan has
+    them; scan, the number of the scan; and time, s, where the first scan has one. What a later scan lacks is NaN.
+    Coordinates are float64. LAS and LAZ round them to 0.1 mm, and have the other columns as extra dimensions. PCD holds
+    float32, since most programs read no other: further than 1000 m from the world's origin it is in a local frame,
+    whose origin is written beside it, as ``NAME.origin.json``.
+
+    Parameters
+    ----------
+    path : path-like
+        It ends in .ply, .pcd, .las, .laz, .npy or .csv. NumPy's file holds one record a return.
+    scans : Scans
+        They are read once.
+    progress : bool, optional
+        Whether to show a progress bar. None: on a terminal.
+
+    Returns
+    -------
+    CloudWritten
+        What was written.
+
+    Raises
+    ------
+    ValueError
+        For another suffix, if `path` is no regular file, or the scans cannot be read.
+    OSError
+        If a file cannot be read or written.
+    ImportError
+        If the format takes a library that is not installed; the message says which.
+    """
+    check_cloud_path(path)
+    suffix = Path(path).suffix.lower()
+    # Of an iterator: the number of scans is not known before the first pass through their files.
+    bar = tqdm(iter(scans), desc="convert", unit="scan", disable=hides_bar(progress))
+    parts = [_columns(number, scan) for number, scan in enumerate(bar)]
+    missing = [np.full(len(part["scan"]), np.nan, np.float32) for part in parts]
+    columns = {
+        name: np.concatenate([part.get(name, nan) for part, nan in zip(parts, missing, strict=True)])
+        for name in parts[0]
+    }
+    for name in {"intensity", "doppler"} & set(columns):
+        columns[name] = columns[name].astype(np.float32)
+    origin = None
+    with whole_file(path) as file:
+        if suffix == ".pcd":
+            origin = origin_for(np.stack([columns[axis] for axis in "xyz"], axis=1))
+            for axis, shift in zip("xyz", np.zeros(3) if origin is None else origin, strict=True):
+                columns[axis] = (columns[axis] - shift).astype(np.float32)
+        _WRITERS[suffix](file, records(columns))
+        if suffix == ".pcd":
+            write_origin(path, origin)
+    return CloudWritten(len(columns["scan"]), len(parts), origin)
+
+
+def _columns(number: int, scan: Scan) -> Columns:
+    columns: dict[str, Any] = dict(zip("xyz", scan.world_points.T, strict=True))
+    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
+    columns |= {"scan": np.full(len(scan), number, np.int32)}
+    columns |= {"time": None if scan.time_s is None else np.full(len(scan), scan.time_s)}
+    return {name: values for name, values in columns.items() if values is not None}
+
+
+def _ply(file: BinaryIO, rows: NDArray[Any]) -> None:
+    file.write(ply_header(rows.dtype, len(rows)))
+    file.write(rows.tobytes())
+
+
+def _pcd(file: BinaryIO, rows: NDArray[Any]) -> None:
+    names = rows.dtype.names or ()
+    kinds = [rows.dtype[name].str[1:] for name in names]
+    header = f"""\
+# .PCD v0.7, radarsdf: world frame, m
+VERSION 0.7
+FIELDS {" ".join(names)}
+SIZE {" ".join(kind[1] for kind in kinds)}
+TYPE {" ".join(kind[0].upper() for kind in kinds)}
+COUNT {" ".join("1" for _ in kinds)}
+WIDTH {len(rows)}
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {len(rows)}
+DATA binary
+"""
+    file.write(header.encode("ascii") + rows.tobytes())
+
+
+def _csv(file: BinaryIO, rows: NDArray[Any]) -> None:
+    names = rows.dtype.names or ()
+    formats = ",".join(_CSV_FORMATS[rows.dtype[name].str[1:]] for name in names)
+    np.savetxt(file, rows, formats, header=",".join(names), comments="")
+
+
+def _las(file: BinaryIO, rows: NDArray[Any], *, compressed: bool) -> None:
+    laspy = require("laspy", what="LAS and LAZ files are written by")
+    as_names = {"intensity": LAS_INTENSITY, "time": "gps_time"}
+    header = laspy.LasHeader(point_format=_LAS_FORMAT, version="1.4")
+    extra = [name for name in rows.dtype.names or () if name not in ("x", "y", "z", "time")]
+    header.add_extra_dims([laspy.ExtraBytesParams(as_names.get(n, n), rows.dtype[n]) for n in extra])
+    header.offsets = np.round([rows[axis].mean() for axis in "xyz"])
+    header.scales = np.full(3, _LAS_SCALE_M)
+    points = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
+    for name in rows.dtype.names or ():
+        points[as_names.get(name, name)] = rows[name]
+    with laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed) as writer:
+        writer.write_points(points)
+
+
+def records(columns: Columns) -> NDArray[Any]:
+    """(N,) one record for each row of the columns, of which there is at least one."""
+    dtype = np.dtype([(name, array.dtype.newbyteorder("<")) for name, array in columns.items()])
+    rows = np.zeros(len(next(iter(columns.values()))), dtype)
+    for name, array in columns.items():
+        rows[name] = array
+    return rows
+
+
+def face_records(faces: NDArray[np.integer[Any]]) -> NDArray[Any]:
+    """(T,) one record for each triangle (T, 3), as in a binary PLY file."""
+    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
+    rows["count"], rows["rows"] = 3, faces
+    return rows
+
+
+def ply_header(
+    dtype: np.dtype[Any], count: int, num_faces: int | None = None, comment: str | None = None
+) -> bytes:
+    """The header of a binary PLY file of `count` such records, and of triangles if it is a mesh."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [] if comment is None else [f"comment {comment}"]
+    lines += ["comment radarsdf: world frame, m", f"element vertex {count}"]
+    lines += [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
+    if num_faces is not None:
+        lines += [f"element face {num_faces}", "property list uchar int vertex_indices"]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+_WRITERS: dict[str, Callable[[BinaryIO, NDArray[Any]], None]] = {
+    ".ply": _ply,
+    ".pcd": _pcd,
+    ".las": lambda file, rows: _las(file, rows, compressed=False),
+    ".laz": lambda file, rows: _las(file, rows, compressed=True),
+    ".npy": np.save,
+    ".csv": _csv,
+}
+
+CLOUD_OUT_SUFFIXES = tuple(_WRITERS)

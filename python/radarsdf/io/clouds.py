@@ -1,0 +1,314 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Files of one point cloud each: PCD, PLY, KITTI's .bin, NumPy, text, LAS and LAZ. All of them become named columns."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from radarsdf.checks import path_of
+from radarsdf.extras import require
+from radarsdf.interrupts import whole_import
+from radarsdf.io.fields import Fields, names_of
+from radarsdf.io.files import check, check_regular_file, origin_of, reading
+from radarsdf.io.scans import Columns, Notes
+from radarsdf.io.text import read_table
+
+TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
+LAS_INTENSITY = "radar_intensity"  # an extra dimension: LAS's own are whole numbers from 0 to 65535
+_PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
+_MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth
+_VLRS_AT, _VLR_BYTES = 100, 54  # place of the number of records in a LAS header, and the least size of one
+_LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
+_VARIABLE = 2**32 - 1  # in place of the number of points in each chunk
+_MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a header of PCD has eleven lines
+_PLY_HEADER_BYTES = 1 << 16
+_KITTI_WIDTH, _JUDGED_FILES = 4, 20  # of .bin files
+_MAX_POSITION_M, _FEW = 1e7, 0.02  # of the numbers may be damaged
+_LESS, _ENOUGH_ROWS = 0.8, 30  # of the variance within four columns is left by another number of them
+
+GivenColumns: TypeAlias = int | Sequence[str] | None
+"""The columns of files without names, as a user gives them: how many numbers a point has, or their names."""
+
+
+def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
+    """The columns of a file of points, (N,) each, by name."""
+    check_regular_file(path)
+    suffix = path.suffix.lower()
+    check(suffix in READERS, f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}")
+    try:
+        return READERS[suffix](path, columns)
+    except (ImportError, MemoryError):
+        raise
+    except BaseException as error:  # libraries raise many kinds for damaged files, OSError among them
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
+        if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
+            raise
+        msg = f"{path} is not a whole {suffix} file of points: {error}"
+        raise ValueError(msg) from error
+
+
+def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
+    """Reads points, such as the ground truth of a lidar, from a file of any format that :func:`read` reads.
+
+    Parameters
+    ----------
+    path : path-like
+        A PCD, PLY, LAS, LAZ, ``.bin``, ``.npy`` or text file.
+
+    Returns
+    -------
+    (M, 3) float64 ndarray
+        Frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places the points; the world's, if
+        :func:`write_cloud` wrote an origin next to it. Points that are not finite are left out.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, of another kind, or holds no points.
+    OSError
+        If it cannot be read.
+    ImportError
+        If it takes a library that is not installed; the message says which.
+    """
+    file = path_of(path, "path")
+    columns = read_columns(file)
+    with reading(path, "a file of points"):
+        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler"))).judged(columns, Notes())
+        points = fields.scan(columns, np.eye(4), None, Notes()).points.astype(np.float64)
+        check(len(points), "it holds no points")
+    if file.suffix.lower() == ".pcd":
+        T_world_sensor = read_viewpoint(file)
+        points = points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
+    origin = origin_of(path)
+    return points if origin is None else points + origin
+
+
+# Files .bin: float32, x, y, z, intensity, as KITTI has them, or as many columns as a user says.
+
+
+def _bin(path: Path, columns: GivenColumns) -> Columns:
+    if columns is None:
+        check_kitti([path])
+    width = columns if isinstance(columns, int) else len(columns or range(_KITTI_WIDTH))
+    numbers = np.fromfile(path, "<f4")
+    whole = path.stat().st_size % (4 * width) == 0
+    check(whole, f"its size is no whole number of points of {width} float32 each: give columns (--columns)")
+    return dict(zip(names_of(width, columns), numbers.reshape(-1, width).T, strict=True))
+
+
+def check_kitti(paths: Sequence[Path]) -> None:
+    """Raises a ValueError if ``.bin`` files of a recording do not look like points of four float32."""
+    paths = [path for path in paths if path.stat().st_size][:_JUDGED_FILES]
+    fitting = [path for path in paths if path.stat().st_size % (4 * _KITTI_WIDTH) == 0]
+    remedy = "give columns (--columns), how many float32 a point has, or their names"
+    check(2 * len(fitting) >= len(paths), f"most .bin files are no points of four float32 each: {remedy}")
+    numbers = np.concatenate([np.zeros(0, "<f4"), *(np.fromfile(path, "<f4") for path in fitting)])
+    positions = numbers.reshape(-1, _KITTI_WIDTH)[:, :3]
+    far = np.abs(positions[np.isfinite(positions)]) > _MAX_POSITION_M
+    check(far.sum() <= _FEW * far.size, f"float32 numbers in the .bin files are no positions in m: {remedy}")
+    # Numbers of one column are alike. Logarithms, so that no column has all of the variance.
+    numbers = np.nan_to_num(np.sign(numbers) * np.log1p(np.abs(numbers)))
+    within = _variance(numbers, _KITTI_WIDTH)
+    for width in range(3, min(21, len(numbers) // 2 + 1)):
+        other, few = _variance(numbers, width), len(numbers) < _ENOUGH_ROWS * width
+        check(other >= _LESS * within or (few and other), f".bin files have {width} columns: {remedy}")
+
+
+def _variance(numbers: NDArray[np.float32], width: int) -> float:
+    return float(numbers[: len(numbers) // width * width].reshape(-1, width).var(axis=0).mean())
+
+
+def _npy(path: Path, columns: GivenColumns) -> Columns:
+    # A memory map: a header that claims more than the file holds is refused before anything is allocated.
+    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    if array.dtype.names is not None and array.ndim == 1:
+        return {name: array[name] for name in array.dtype.names}
+    rows = array.ndim == 2 and array.dtype.kind in "iuf"
+    check(rows, f"it holds an array {array.shape} of {array.dtype}, not one row of numbers a point")
+    return dict(zip(names_of(array.shape[1], columns), np.array(array).T, strict=True))
+
+
+def _text(path: Path, columns: GivenColumns) -> Columns:
+    table = read_table(path)
+    width = table.values.shape[1]
+    # CloudCompare writes names of columns after a comment sign.
+    named = (head for head in table.heads if {"x", "y", "z"} <= {word.lower() for word in head})
+    names = table.header or next(named, None) or names_of(width or 3, columns)
+    values = table.values if len(table.values) else np.zeros((0, len(names)))
+    fits = values.shape[1] == len(names) == len(set(names))
+    check(fits, f"its header has {len(names)} names for {width} columns, or a name twice")
+    return dict(zip(names, values.T, strict=True))
+
+
+# PCD: pointclouds.org/documentation/tutorials/pcd_file_format.html
+
+
+def _pcd(path: Path, _: GivenColumns) -> Columns:
+    """The fields with one number a point: of ascii or binary files to version 0.7."""
+    with path.open("rb") as file:
+        header = _pcd_header(file)
+        body = file.read()
+    names, points = header["FIELDS"], int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
+    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
+    fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
+    dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for kind, size, count in fields]
+    readers = {"binary": _pcd_binary, "ascii": _pcd_ascii}
+    check(header["DATA"][0] in readers, f"its DATA is {header['DATA'][0]}: save it as binary")
+    columns = readers[header["DATA"][0]](body, dtypes, points)
+    # The name _ means padding, and several fields may have it.
+    return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
+
+
+def read_viewpoint(path: Path) -> NDArray[np.float64]:
+    """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a PCD file, tx ty tz qw qx qy qz; the identity without one."""
+    with path.open("rb") as file:
+        numbers = np.array(_pcd_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
+    finite = numbers.shape == (7,) and np.isfinite(numbers).all()
+    check(finite, f"{path}: its VIEWPOINT is not seven finite numbers")
+    T_world_sensor = np.eye(4)
+    T_world_sensor[:3, 3] = numbers[:3]
+    if numbers[3:].any():  # some programs write zeros where nothing is known
+        T_world_sensor[:3, :3] = Rotation.from_quat(numbers[[4, 5, 6, 3]]).as_matrix()
+    return T_world_sensor
+
+
+def _pcd_header(file: BinaryIO) -> dict[str, list[str]]:
+    """The lines of a header by their first words. Comments are in any encoding."""
+    header: dict[str, list[str]] = {}
+    for _ in range(_MAX_HEADER_LINES):
+        line = file.readline(_MAX_LINE).lstrip()
+        if line and not line.startswith(b"#"):
+            key, *words = line.decode("ascii").split()
+            header[key] = words
+        if "DATA" in header:
+            break
+    return header
+
+
+def _pcd_binary(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
+    record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
+    cloud = np.frombuffer(body, record, points)
+    return [cloud[name][:, 0] for name in record.names or ()]
+
+
+def _pcd_ascii(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
+    widths = [dtype.shape[0] for dtype in dtypes]
+    table = np.array(body.split(), np.float64).reshape(points, sum(widths))
+    return [table[:, i] for i in np.cumsum([0, *widths[:-1]])]
+
+
+def ply_bytes(path: Path) -> io.BytesIO:
+    """A PLY file for trimesh, without the comments of its header, which may be in any encoding."""
+    head, end, body = path.read_bytes().partition(b"end_header")
+    return io.BytesIO(re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]*[\r\n]+", b"", head) + end + body)
+
+
+def has_faces(path: Path) -> bool:
+    """Whether a PLY file is a mesh, by its header."""
+    with path.open("rb") as file:
+        header = file.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
+    return re.search(rb"element\s+face\s+0*[1-9]", header) is not None
+
+
+def _ply(path: Path, _: GivenColumns) -> Columns:
+    """The columns of the vertices."""
+    with whole_import():
+        import trimesh  # noqa: PLC0415 - takes long, and few files need it
+
+    # Without materials: a PLY file may name an image, which is then not looked for.
+    loaded: Any = trimesh.load(ply_bytes(path), file_type="ply", process=False, skip_materials=True)
+    vertex = loaded.metadata.get("_ply_raw", {}).get("vertex")
+    if vertex is None or not vertex["length"]:
+        return {axis: np.zeros(0) for axis in "xyz"}
+    data = vertex["data"]
+    names = data.keys() if isinstance(data, dict) else data.dtype.names
+    columns = {str(name): np.asarray(data[name]).reshape(-1) for name in names}
+    whole = all(len(column) == vertex["length"] for column in columns.values())
+    check(whole, f"its header says {vertex['length']} points, which it does not hold")
+    return columns
+
+
+def _las(path: Path, _: GivenColumns) -> Columns:
+    """Columns by their names; those that :func:`write_cloud` wrote have the names as there."""
+    laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
+    size = path.stat().st_size
+    with path.open("rb") as raw:
+        raw.seek(_VLRS_AT)
+        records = int.from_bytes(raw.read(4), "little")
+    # laspy would count to four billion.
+    check(records * _VLR_BYTES <= size, f"its header says {records} records, for which the file is too small")
+    # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
+        header = file.header
+        largest = size * (_MAX_COMPRESSION if header.are_points_compressed else 1)
+        fits = header.point_count * header.point_format.size <= largest
+        check(fits, f"its header says {header.point_count} points, for which the file is too small")
+        if header.are_points_compressed:
+            check(_has_chunks(path, header), "its chunks of points are damaged, or it is too small for them")
+        cloud = file.read_points(header.point_count)
+    # Scaled and shifted, in double precision: the integers in the file are no metres.
+    columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
+    names = {"intensity": "intensity", "gps_time": "time"}
+    names |= {name: str(name) for name in header.point_format.extra_dimension_names}
+    names |= {LAS_INTENSITY: "intensity"}
+    known = set(header.point_format.dimension_names)
+    return columns | {as_name: np.asarray(cloud[name]) for name, as_name in names.items() if name in known}
+
+
+def _has_chunks(path: Path, header: Any) -> bool:
+    """Whether a LAZ file can hold the chunks that it claims: lazrs allocates for them, and may end the process."""
+    import lazrs  # noqa: PLC0415 - an extra
+
+    point, size, at = header.point_format, path.stat().st_size, header.offset_to_point_data
+    record = bytes(header.vlrs.get("LasZipVlr")[0].record_data)
+    usual = bytes(lazrs.LazVlr.new_for_compression(point.id, point.num_extra_bytes).record_data())
+    # Compressor, then type, size and version of each part of a point.
+    parts, usual_parts = (np.frombuffer(data[34:], "<u2").reshape(-1, 3)[:, :2] for data in (record, usual))
+    possible = record[:2] == usual[:2] and np.array_equal(parts, usual_parts)
+    layers = _LAZ_LAYERS.get(point.id, 0) + point.num_extra_bytes
+    with path.open("rb") as file:
+        for place in (at, size - 8):  # of the place of the chunk table: before the points or at the end
+            file.seek(place)
+            table_at = int.from_bytes(file.read(8), "little", signed=True)
+            if table_at > at:
+                file.seek(min(table_at, size))
+                chunks = int.from_bytes(file.read(8)[4:], "little")  # each begins with a point as it is
+                possible &= table_at + 8 <= size and chunks * point.size <= size
+                possible &= chunks <= max(header.point_count, 1)
+                break
+        chunk_size, left, at = int.from_bytes(record[12:16], "little"), header.point_count, at + 8
+        # In a chunk, the first point, the number of points, and the sizes of its layers are before these.
+        while possible and left > 0 and point.id in _LAZ_LAYERS:
+            file.seek(at + point.size)
+            count, *sizes = np.frombuffer(file.read(4 * (1 + layers)), "<u4").tolist() or [0]
+            at += point.size + 4 * (1 + layers) + sum(sizes)
+            expected = count if chunk_size == _VARIABLE else min(chunk_size, left)
+            possible = len(sizes) == layers and at <= size and 0 < count == expected
+            left -= count
+    return possible
+
+
+READERS: dict[str, Callable[[Path, GivenColumns], Columns]] = {
+    ".pcd": _pcd,
+    ".ply": _ply,
+    ".las": _las,
+    ".laz": _las,
+    ".bin": _bin,
+    ".npy": _npy,
+    **dict.fromkeys(TEXT_SUFFIXES, _text),
+}
+"""Reads a file as named columns (N,), by its suffix. What a user says of the columns helps where a format names none."""
+
+CLOUD_SUFFIXES = tuple(READERS)
+"""What :func:`read_columns` reads."""

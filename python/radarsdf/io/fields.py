@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What the fields of a radar's point cloud mean: a table of names, and the returns of a scan by it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from radarsdf.io.files import check
+from radarsdf.io.scans import Notes, Scan, finite_returns
+from radarsdf.io.text import SCALES, are_degrees, without_unit
+
+_XYZ = ("x", "y", "z")
+_POLAR = ("range", "azimuth", "elevation")
+SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+# Names that sensors, drivers and data sets give to a role, in lower case and without what separates words. The first name
+# that a cloud has counts. Files of ours come first.
+_ALIASES: dict[str, tuple[str, ...]] = {
+    "x": ("x",),
+    "y": ("y",),
+    "z": ("z",),
+    "range": ("range", "distance", "r", "rng", "dist", "radius", "slantrange"),
+    "azimuth": ("azimuth", "azimuthangle", "az", "azi", "azim", "angleazimuth"),
+    "elevation": ("elevation", "elevationangle", "el", "ele", "elev", "angleelevation"),
+    "intensity": ("power", "intensity", "rcs", "snr", "snrdb", "amplitude", "reflectivity", "reflectance", "magnitude",
+                  "rssi", "signalpower", "signalstrength"),
+    "doppler": ("doppler", "velocity", "dopplervelocity", "vdopplermps", "radialspeed", "radialvelocity", "rangerate",
+                "vr", "speed", "rdot", "vradial", "vrad", "velr", "vel", "radialvel", "velocityradial",
+                "dopplerspeed", "vdoppler", "relativevelocity"),
+    "sigma_range": ("sigmarange", "rangestd", "rangeaccu"),
+    "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
+    "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
+}  # fmt: skip
+# Names of columns without names, by their number.
+_COLUMNS: dict[int, tuple[str, ...]] = {
+    3: ("x", "y", "z"),
+    4: ("x", "y", "z", "intensity"),  # KITTI
+    5: ("x", "y", "z", "intensity", "doppler"),  # ColoRadar
+    7: ("x", "y", "z", "rcs", "v_r", "v_r_compensated", "time"),  # View-of-Delft
+    8: ("x", "y", "z", "v_r", "range", "power", "alpha", "beta"),  # TJ4DRadSet
+}
+
+
+def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
+    """Names of `width` columns that have none in their file."""
+    if columns is not None and not isinstance(columns, int):
+        check(len(columns) == width, f"there are {width} columns, but {len(columns)} names")
+        return list(columns)
+    return list(_COLUMNS.get(width, ("x", "y", "z", *(f"column_{i}" for i in range(3, width)))[:width]))
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Which field of a cloud plays which role. Positions are x, y and z, or else range, azimuth and elevation."""
+
+    names: dict[str, str]  # by role
+    in_degrees: bool = False  # angles whose names have no unit
+
+    @classmethod
+    def of(cls, names: list[str], overrides: Mapping[str, Any] | None = None) -> Fields:
+        """The roles of fields by their names.
+
+        `overrides` are fields by role; None leaves a role out.
+        """
+        lower = {plain_name(name)[0]: name for name in reversed(names)}
+        lower |= {name.lower(): name for name in reversed(names)}
+        # AzimuthAngle, azimuth_angle and Azimuth Angle are one name.
+        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
+        found: dict[str, str] = {}
+        for role, aliases in _ALIASES.items():
+            name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
+            if name is not None and name not in found.values():
+                found[role] = name
+        for role, field in (overrides or {}).items():
+            check(role in _ALIASES, f"fields has no role {role!r}: roles are {', '.join(_ALIASES)}")
+            found.pop(role, None)
+            if field is None:
+                continue
+            name = field if field in names else lower.get(str(field).lower())
+            check(name, f"there is no field {field} for {role}: there are {', '.join(names)}")
+            found[role] = str(name)
+        wanted = _POLAR if "range" in found and "x" not in found else _XYZ
+        missing = ", ".join(role for role in wanted if role not in found)
+        known = not missing or set(_POLAR) <= set(found)
+        check(known, f"the fields {missing} are missing: there are {', '.join(names) or 'none'}")
+        return cls(found)
+
+    @property
+    def polar(self) -> bool:
+        """Whether positions are of range and angles."""
+        return not set(_XYZ) <= set(self.names)
+
+    def judged(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
+        """These fields with the unit of their angles: of their names, or else by the numbers in a cloud."""
+        names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
+        unit_of = {name: unit for name in names if (unit := plain_name(name)[1])}
+        if len(unit_of) == len(names):
+            return self
+        azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
+        in_degrees = are_degrees(azimuth, elevation, next(iter(unit_of.values()), ""))
+        by = f"as {next(iter(unit_of))} is" if unit_of else "by their numbers"
+        notes.add(
+            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
+            "names such as azimuth_deg or azimuth_rad decide"
+        )
+        return replace(self, in_degrees=in_degrees)
+
+    def note_use(self, names: Iterable[str], notes: Notes) -> None:
+        """Notes which fields are not used, and intensities that would be better in dB."""
+        intensity = self.names.get("intensity", "")
+        if plain_name(intensity)[1] == "linear":
+            notes.add(f"{intensity} is taken as intensity as it is: 10 log10 of it, dB, gives a better map")
+        if unused := [name for name in names if name and name not in self.names.values()]:
+            listed = ", ".join(unused)
+            notes.add(f"fields that are not used: {listed}; fields={{role: name}} or --field chooses others")
+
+    def scan(
+        self,
+        columns: Mapping[str, NDArray[Any]],
+        T_world_sensor: NDArray[np.float64],
+        time_s: float | None,
+        notes: Notes,
+    ) -> Scan:
+        """The finite returns in the columns, (N,) each."""
+        for name in self.names.values():
+            check(columns[name].dtype.kind in "biuf", f"the field {name} holds no numbers")
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is dropped
+            intensities, doppler_mps = (
+                np.ascontiguousarray(self._values(columns, role), np.float32) if role in self.names else None
+                for role in ("intensity", "doppler")
+            )
+            points, sigma = self.points(columns), self._sigma(columns)
+        return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma), notes)
+
+    def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
+        """A column in m, rad or m/s, where its name has another unit, or angles are in degrees."""
+        unit = plain_name(self.names[role])[1]
+        if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
+            unit = "deg"
+        values = columns[self.names[role]]
+        return values * np.float64(SCALES[unit]) if unit in SCALES else values
+
+    def points(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """(N, 3) sensor frame, m: float64 if the file has it or else float32."""
+        if not self.polar:
+            parts = [self._values(columns, axis) for axis in _XYZ]
+            dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
+            return np.stack(parts, axis=1).astype(dtype)
+        ranges, azimuth, elevation = (self._values(columns, role).astype(np.float64) for role in _POLAR)
+        flat = ranges * np.cos(elevation)
+        xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
+        return np.stack(xyz, axis=1).astype(np.float32)
+
+    def _sigma(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32] | None:
+        if not set(SIGMA) <= set(self.names):
+            return None
+        sigma = np.stack([self._values(columns, role) for role in SIGMA], axis=1).astype(np.float32)
+        if _squeezed(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
+            sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
+        return sigma
+
+
+def plain_name(name: str) -> tuple[str, str]:
+    """A name in lower case as radars give it, and its unit: without the prefix of CloudCompare."""
+    return without_unit(name.lower().removeprefix("scalar_"))
+
+
+def _squeezed(name: str) -> str:
+    return re.sub(r"[\W_]+", "", name.lower())

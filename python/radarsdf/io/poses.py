@@ -1,0 +1,365 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""Poses by time and in files: tables with named columns, TUM, KITTI, and 4 x 4 matrices; the pose of each scan."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from radarsdf.checks import are_rigid, check_pose, check_poses, path_of, pose_matrices, real_array
+from radarsdf.io.files import check, check_regular_file, reading, write_whole
+from radarsdf.io.npz import array_in
+from radarsdf.io.scans import Columns, Notes
+from radarsdf.io.text import SCALES, are_degrees, in_seconds, read_numbers, read_table, without_unit
+
+MAX_GAP_S = 0.5  # between two poses over which poses are interpolated, by default
+
+# Names of files of poses that are found beside scans.
+POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
+POSE_SUFFIXES = (".tum", ".kitti", ".npy")  # that write_poses writes
+FIND_POSES = "radarsdf poses finds them from the radar alone"  # ends what is said of scans without poses
+
+_MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
+_ROUNDED_S = 1e-3
+
+_POSITION = "(?:t|p|pos|position|trans|translation|loc|location|pose)"
+_QUATERNION = "(?:q|quat|quaternion|orientation|rot|rotation)"
+_TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+_EULER = ("yaw", "pitch", "roll")
+_TIMES = ("header stamp", "stamp", "timestamp", "time", "t")
+# What words, whole, mean as the name of a column.
+_ROLES = (
+    (rf"(?:{_QUATERNION} .* |(?:.* )?{_QUATERNION} ?)([xyzw])", "q{}"),
+    (rf"(?:{_POSITION} .* |(?:.* )?{_POSITION} ?|)([xyz])", "{}"),
+    (r"(?:.* )?(yaw|pitch|roll)", "{}"),
+    (r"(?:.* )?(?:sec|secs|seconds)", "sec"),
+    (r"(?:.* )?(?:nsec|nsecs|nanosec|nanosecs|nanoseconds)", "nsec"),
+    (r"(?:.*? )?(header stamp|stamp|timestamp|time|t)", "{}"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """P poses T_world_base of a moving frame `base`."""
+
+    times_s: NDArray[np.float64]  # (P,) ascending
+    positions: NDArray[np.float64]  # (P, 3) world frame, m
+    rotations: Rotation  # P rotations R_world_base
+
+    def span(self) -> str:
+        """First and last time, for messages."""
+        return f"{self.times_s[0]} to {self.times_s[-1]} s"
+
+    def poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses T_world_base (N, 4, 4) at times (N,), s, between the first and the last pose: linear, and by slerp."""
+        poses = np.tile(np.eye(4), (len(times_s), 1, 1))
+        poses[:, :3, :3] = Slerp(self.times_s, self.rotations)(times_s).as_matrix()
+        for axis in range(3):
+            poses[:, axis, 3] = np.interp(times_s, self.times_s, self.positions[:, axis])
+        return poses
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+        """Pose T_world_base (4, 4) at one time, s, as `poses`; None outside of them, and in longer gaps.
+
+        A millisecond before the first pose or after the last one, or next to one in a longer gap, is at that pose: times
+        in files are rounded.
+        """
+        after = int(np.clip(np.searchsorted(self.times_s, time_s), 1, len(self.times_s) - 1))
+        both = slice(after - 1, after + 1)
+        first_s, last_s = self.times_s[both]
+        share = (time_s - first_s) / (last_s - first_s)
+        if not 0 <= share <= 1 or last_s - first_s > max_gap_s:
+            share = float(share > 0.5)
+            if not abs(time_s - (last_s if share else first_s)) <= _ROUNDED_S:
+                return None
+        pose = np.eye(4)
+        pose[:3, :3] = Slerp([0, 1], self.rotations[both])(share).as_matrix()
+        pose[:3, 3] = (1 - share) * self.positions[after - 1] + share * self.positions[after]
+        return pose
+
+
+@dataclass(frozen=True, eq=False)
+class TransformChain:
+    """A product of transforms, each of which is constant or moves: T_world_a · T_a_b · … of a tree of frames."""
+
+    links: tuple[Any, ...]  # matrices (4, 4), or poses by time
+
+    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+        """T_world_base (4, 4) at a time, s; None if a link has none near enough."""
+        pose = np.eye(4)
+        for link in self.links:
+            part = link if isinstance(link, np.ndarray) else link.pose_at(time_s, max_gap_s)
+            if part is None:
+                return None
+            pose = pose @ part
+        return pose
+
+    def span(self) -> str:
+        """First and last time of its moving links, for messages."""
+        return ", ".join(link.span() for link in self.links if not isinstance(link, np.ndarray))
+
+
+StampedPoses: TypeAlias = Trajectory | TransformChain
+"""Poses by time."""
+
+Poses: TypeAlias = StampedPoses | NDArray[np.float64]
+"""By time, or (F, 4, 4) in the order of the scans."""
+
+UNPOSED: StampedPoses = TransformChain(())
+"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
+
+
+class NoPoses(ValueError):
+    """Scans have no poses, and none are given."""
+
+
+def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mask (P,) of the rows (P, 7) x y z qx qy qz qw that are finite and have a unit quaternion."""
+    with np.errstate(over="ignore", invalid="ignore"):  # of damaged numbers
+        unit = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= _MAX_NORM_ERROR
+    mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
+    return mask
+
+
+def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, 4, 4) of rows (P, 7) x y z qx qy qz qw; NaN where a row is no pose."""
+    good = are_poses(table)
+    poses = np.full((len(table), 4, 4), np.nan)
+    poses[good] = np.eye(4)
+    poses[good, :3, 3] = table[good, :3]
+    if good.any():
+        poses[good, :3, :3] = Rotation.from_quat(table[good, 3:]).as_matrix()
+    return poses
+
+
+def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = None) -> Trajectory:
+    """The trajectory in rows (P, 8) of time, position and quaternion, in any order.
+
+    Of several poses at one time, the first counts. `notes` take what was left out.
+    """
+    good = are_poses(table[:, 1:]) & np.isfinite(table[:, 0])
+    missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
+    times_s, first = np.unique(table[good, 0], return_index=True)
+    rows = np.flatnonzero(good)[first]
+    kept = np.zeros_like(good)
+    kept[rows] = True
+    why = f"not finite, not unit quaternions, or of a time that repeats; the first: pose {np.argmin(kept)}"
+    remark = f"{name}: {(~kept).sum()} of {len(table)} poses left out, which are {why}"
+    if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
+        msg = f"{name} holds {len(times_s)} poses at different times; at least two poses are needed"
+        raise ValueError(msg if kept.all() else f"{msg}; {remark}")
+    if notes is not None and not kept.all():
+        notes.add(remark)
+    if notes is not None and (np.diff(first) < 0).any():
+        notes.add(f"{name}: its poses are not in the order of their times, and sorted")
+    return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
+
+
+def poses_of(poses: Any, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
+    """Poses as a user gives them: an array (F, 4, 4), poses by time, or a file for :func:`read_poses`."""
+    if isinstance(poses, (str, PathLike)):
+        return read_poses(Path(poses), notes, calibration)
+    if isinstance(poses, (Trajectory, TransformChain)):
+        return poses
+    matrices = real_array(poses, "poses")
+    check(matrices.ndim == 3, f"poses must be (F, 4, 4) T_world_sensor, or a file, not {matrices.shape}")
+    return rigid_or_nan(matrices, "the given array", notes)
+
+
+def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
+    """Poses by time, or (F, 4, 4) in the order of the scans, of a file of one of these kinds.
+
+    - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, and qx, qy, qz
+      and qw or roll, pitch and yaw, as in files of EuRoC, evo and ``rostopic echo -p``. Without a time it is in order.
+    - TUM: ``time x y z qx qy qz qw``, s and m.
+    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in one of the files `calibration`,
+      T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
+    - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
+
+    Times may be in ms, µs or ns since 1970, or in the unit of their name.
+    """
+    check_regular_file(path)
+    if path.suffix.lower() == ".npy":
+        return rigid_or_nan(np.array(array_in(path)), str(path), notes)
+    with reading(path, "a table of poses"):
+        table = read_table(path)
+        values, width = table.values, table.values.shape[1]
+        check(len(values), "it has no rows of numbers")
+    heads = [head for head in reversed(table.heads) if len(head) == width]
+    for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
+        columns, unit_of_angles = _pose_columns(names, values)
+        if columns:
+            if heads and names is _TUM:
+                notes.add(f"{path.name}: its columns are taken as {' '.join(_TUM)}: unknown names")
+            return _of_columns(columns, unit_of_angles, path, notes)
+    if width == 12:
+        poses = np.tile(np.eye(4), (len(values), 1, 1))
+        poses[:, :3] = values.reshape(-1, 3, 4)
+        P = rigid_or_nan(poses, str(path), notes)
+        for file in calibration:
+            if file.is_file() and (Tr := read_calibration(file)) is not None:
+                notes.add(f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr")
+                return np.linalg.inv(Tr) @ P @ Tr
+        notes.add(f"{path.name} has KITTI poses, no calibration Tr: they are taken as T_world_sensor")
+        return P
+    if width == 16 or (width == 4 and len(values) % 4 == 0):
+        return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
+    msg = (
+        f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
+        "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
+    )
+    raise ValueError(msg)
+
+
+def _pose_columns(names: list[str], table: NDArray[np.float64]) -> tuple[Columns, str]:
+    """Columns by role, times in s, and the unit in the names of angles; none if the names are no pose's."""
+    found: Columns = {}
+    unit_of_angles = ""
+    for name, column in zip(names, table.T, strict=True):
+        bare, unit = without_unit(name)
+        words = re.sub(r"[\W_]+", " ", bare).strip()
+        for pattern, template in _ROLES:
+            if match := re.fullmatch(pattern, words):
+                role = template.format(*match.groups())
+                unit_of_angles = unit_of_angles or (unit if role in _EULER else "")
+                found.setdefault(role, column * SCALES.get(unit, 1.0) if role in _TIMES else column)
+                break
+    if {"sec", "nsec"} <= set(found):
+        found["time"] = found["sec"] + 1e-9 * found["nsec"]
+    elif times := [found[name] for name in (*_TIMES, "sec") if name in found]:
+        found["time"] = times[0]
+    rotation = {"qx", "qy", "qz", "qw"} <= set(found) or "yaw" in found
+    is_pose = rotation and {"x", "y"} <= set(found) and ("z" in found or "yaw" in found)
+    return (found if is_pose else {}), unit_of_angles
+
+
+def _of_columns(columns: Columns, unit_of_angles: str, path: Path, notes: Notes) -> Poses:
+    """Poses of named columns: by time, or in their order."""
+    zeros = np.zeros_like(columns["x"])
+    if missing := [role for role in ("z", "roll", "pitch") if "qw" not in columns and role not in columns]:
+        notes.add(f"{path.name} has no {', '.join(missing)}: taken as 0")
+    if "qw" in columns:
+        quaternions = np.stack([columns[role] for role in ("qx", "qy", "qz", "qw")], axis=1)
+    else:
+        angles = np.stack([columns.get(role, zeros) for role in _EULER], axis=1)
+        degrees = are_degrees(angles[:, 0], angles[:, 1], unit_of_angles)
+        unit, by = "degrees" if degrees else "rad", "name" if unit_of_angles else "their numbers"
+        notes.add(f"{path.name}: roll, pitch and yaw are in {unit} by {by}, R = Rz(yaw) Ry(pitch) Rx(roll)")
+        quaternions = Rotation.from_euler("ZYX", np.nan_to_num(angles), degrees=degrees).as_quat()
+        quaternions[~np.isfinite(angles).all(axis=1)] = np.nan
+    poses = np.column_stack([*(columns.get(axis, zeros) for axis in "xyz"), quaternions])
+    if "time" not in columns:
+        return rigid_or_nan(pose_matrices_of(poses), str(path), notes)
+    times = columns["time"].copy()
+    finite = np.isfinite(times)
+    times[finite] = in_seconds(times[finite], path.name, notes)
+    return trajectory_of(np.column_stack([times, poses]), str(path), notes)
+
+
+def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.float64]:
+    """Poses (F, 4, 4) in the order of scans. Damaged ones are NaN, and named: their scans have none."""
+    with reading(name, "poses (F, 4, 4)", TypeError):
+        matrices = pose_matrices(poses)
+        bad = ~are_rigid(matrices)
+        if 2 * bad.sum() > len(bad):  # of another meaning
+            check_poses(matrices)
+    if bad.any():
+        notes.add(
+            f"scans left out: {bad.sum()} of {len(bad)} poses of {name} are not finite and rigid; "
+            f"the first: pose {np.argmax(bad)}"
+        )
+    return np.where(bad[:, None, None], np.nan, matrices)
+
+
+def read_transform(path: Path, default: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rigid transform (4, 4) of a text file, or the default if there is no file."""
+    if not path.is_file():
+        return default
+    matrix = read_numbers(path, 4)
+    with reading(path, "a rigid transform"):
+        return check_pose(matrix, "the matrix")
+
+
+def read_calibration(path: Path) -> NDArray[np.float64] | None:
+    """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither."""
+    check_regular_file(path)
+    with reading(path, "a KITTI calibration"):
+        text = path.read_text(encoding="utf-8", errors="replace")
+        lines = [line.partition(":") for line in text.splitlines()]
+        found = {key.strip(): values.split() for key, _, values in lines}
+        numbers = found.get("Tr", found.get("Tr_velo_to_cam"))
+        if numbers is None:
+            return None
+        T_camera_sensor = np.eye(4)
+        T_camera_sensor[:3] = np.array(numbers, np.float64).reshape(3, 4)
+        return check_pose(T_camera_sensor, "Tr")
+
+
+def check_pose_suffix(path: str | PathLike[str]) -> None:
+    """Raises a ValueError for a name that :func:`write_poses` would refuse."""
+    known = path_of(path, "path").suffix.lower() in POSE_SUFFIXES
+    check(known, f"{path} is no file of poses that can be written: those end in {', '.join(POSE_SUFFIXES)}")
+
+
+def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
+    """Raises a ValueError if :func:`write_poses` would refuse to write without times."""
+    if times_s is None and path_of(path, "path").suffix.lower() == ".tum":
+        msg = f"{path} needs times, s, and there are none: .kitti and .npy do without"
+        raise ValueError(msg)
+
+
+def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike | None = None) -> None:
+    """Writes a trajectory, whole or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        The suffix says the format: ``.tum``, lines of ``time x y z qx qy qz qw``; ``.kitti``, lines of twelve numbers, the
+        first three rows of each matrix; ``.npy``, the array (F, 4, 4). evo reads the first two.
+    poses : (F, 4, 4) array_like
+        T_world_sensor, m.
+    times_s : (F,) array_like, optional
+        s. ``.tum`` needs them; the others have no place for them.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is none of these, poses are no rigid transforms, or times are missing, not finite or not as many.
+    OSError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from radarsdf.io import write_poses
+    >>> write_poses("poses.tum", [np.eye(4)], [12.5])
+    >>> print(Path("poses.tum").read_text().strip())
+    12.500000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 1.000000000
+    """
+    check_pose_suffix(path)
+    check_pose_times(path, times_s)
+    suffix = path_of(path, "path").suffix.lower()
+    matrices = check_poses(poses)
+    text = io.BytesIO()
+    if suffix == ".npy":
+        np.save(text, matrices)
+    elif suffix == ".kitti":
+        np.savetxt(text, matrices[:, :3].reshape(-1, 12), "%.12g")
+    else:
+        times_s = real_array(times_s, "times_s")
+        fits = times_s.shape == (len(matrices),) and np.isfinite(times_s).all()
+        check(fits, f"times_s must be {len(matrices)} finite numbers, one a pose, not {times_s.shape}")
+        quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
+        np.savetxt(text, np.column_stack([times_s, matrices[:, :3, 3], quaternions]), "%.9f")
+    write_whole(path, text.getvalue())
