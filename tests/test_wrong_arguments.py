@@ -102,7 +102,6 @@ def test_simulation(wall):
     refused("scene", simulate.simulate, ("a", None), **given)
     refused("sensor", simulate.simulate, ("a", None), **given)
     refused("poses", simulate.simulate, (None, *NO_ARRAY), **given)
-    refused("lidar_rays", simulate.simulate, ("a", -1, 2.5), **given)
 
 
 @pytest.mark.parametrize(
