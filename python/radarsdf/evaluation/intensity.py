@@ -92,10 +92,11 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
         numbers = np.arange(frames)
     else:
         real_array(frames, "frames")
-        numbers = np.unique(np.asarray(frames))
+        numbers = np.asarray(frames)
     if numbers.size and numbers.dtype.kind not in "iu":
         msg = "frames must be a number of scans or integer frame numbers"
         raise ValueError(msg)
+    numbers = np.unique(numbers)
     if every < 2 or numbers.size < 2:
         msg = f"cannot hold out every {every}th of {numbers.size} scans: at least one must remain to train on"
         raise ValueError(msg)
