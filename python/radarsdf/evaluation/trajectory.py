@@ -67,7 +67,9 @@ def trajectory_metrics(
         raise ValueError(msg)
     true = check_poses(real_array(true_poses, "true_poses"))
     found = check_poses(poses, len(true))
-    at = {"positions": _with_positions, "poses": aligned, "none": lambda given, _: given}[align](found, true)
+    at = found
+    if align != "none":
+        at = _with_positions(found, true) if align == "positions" else aligned(found, true)
     true_steps = steps(true)
     off = between(true_steps, steps(found))
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])

@@ -222,7 +222,8 @@ class RadarSensor:
         path = first + second.range_m
         # Where a mirror stands on the ground, the path to the next surface has no length: this is no ghost.
         seen = (path <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
-        rows, path, second = rows[seen], path[seen], Hits(*(column[seen] for column in second))
+        rows, path = rows[seen], path[seen]
+        second = Hits(second.range_m[seen], second.normals[seen], second.primitive[seen])
         mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
         # The range in the radar equation is the whole path, and the wave loses power at the mirror twice.
         power = self.gain_db + scene.echo_db(target, mirrored, second)

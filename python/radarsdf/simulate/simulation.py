@@ -138,6 +138,15 @@ def simulate(scene: Scene, sensor: RadarSensor, poses: FloatArray, *, name: str,
     instance(sensor, RadarSensor, "sensor")
     poses = check_poses(poses)
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
-    points, intensities, noiseless, kinds = ([scan[column] for scan in scans] for column in range(4))
-    lidar = Lidar(scene, sensor, poses.copy(), seed)
-    return Simulation(points, poses, intensities, noiseless, kinds, scene, sensor, name, seed, lidar)
+    return Simulation(
+        points=[scan.points for scan in scans],
+        poses=poses,
+        intensities=[scan.intensities for scan in scans],
+        noiseless_intensities=[scan.noiseless_intensities for scan in scans],
+        origin_kind=[scan.origin_kind for scan in scans],
+        scene=scene,
+        sensor=sensor,
+        name=name,
+        seed=seed,
+        lidar=Lidar(scene, sensor, poses.copy(), seed),
+    )
