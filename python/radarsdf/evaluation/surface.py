@@ -119,8 +119,10 @@ def surface_metrics(
     accuracy_ratio, precision = right / kept if kept else 0.0, right / total
     completion_ratio = float(np.mean(completion < _THRESHOLD_M))
     angles = _angles(vertices, faces, corners)
-    mean, variance = (float(angles.mean()), float(angles.var())) if len(angles) else (None, None)
-    shape = mean**2 / variance if mean is not None and variance > _ANGLE_NOISE_RAD**2 else None
+    shape = mean = variance = None
+    if len(angles):
+        mean, variance = float(angles.mean()), float(angles.var())
+        shape = mean**2 / variance if variance > _ANGLE_NOISE_RAD**2 else None
     return {
         "protocol": PROTOCOL,
         "accuracy_error_m": kept_sum / kept if kept else None,
@@ -263,7 +265,7 @@ def _angles(vertices: _Points, faces: _Faces, corners: _Points | None) -> _Point
     faces, normals = faces[has_area], normals[has_area]
     if len(faces) == 0:
         return np.zeros(0)
-    pairs, edges = face_adjacency(faces, return_edges=True)
+    pairs, edges = face_adjacency(faces, return_edges=True)  # type: ignore[no-untyped-call]
     if corners is not None:
         middle = vertices[edges].mean(axis=1)
         inside = ((middle >= corners[0]) & (middle <= corners[1])).all(axis=1)

@@ -201,7 +201,8 @@ class Grid:
         def to_nearest(others: NDArray[np.bool_], beyond: bool) -> NDArray[np.float32]:
             """Distances of voxels to the nearest one that is not in a mask. `beyond`: what is beyond the grid is not."""
             mask = np.pad(others, 1, constant_values=not beyond)
-            return distance_transform_edt(mask, self.voxel_size)[1:-1, 1:-1, 1:-1].astype(np.float32)
+            found: NDArray[np.float64] = distance_transform_edt(mask, self.voxel_size)
+            return found[1:-1, 1:-1, 1:-1].astype(np.float32)
 
         occupied = self.occupied
         occupied_m = np.full(self.shape, np.inf, np.float32)
@@ -336,8 +337,8 @@ def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | Distance
     """Write costs or distances of a grid to an ``.npz``, by name, with the grid's `origin` and `voxel_size`."""
     target = path_of(path, "path")
     check_suffix(target, ".npz")
-    arrays = {"origin": grid.origin, "voxel_size": grid.voxel_size} | vars(found)
-    write_arrays(target, arrays, compressed=True)
+    of_grid: dict[str, ArrayLike] = {"origin": grid.origin, "voxel_size": grid.voxel_size}
+    write_arrays(target, of_grid | vars(found), compressed=True)
 
 
 def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
