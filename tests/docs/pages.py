@@ -87,7 +87,8 @@ def _run(command: str) -> tuple[int, str]:
     if not _OWN.fullmatch(command):
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", command],
-            env=os.environ | {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])},
+            env=os.environ
+            | {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
