@@ -176,7 +176,7 @@ def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Fl
 
 def _settled(before: PlacedMap, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
     """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change."""
-    # Errors of the normals of both maps are independent: products of normals of different maps tell along which axes
+    # Errors of the normals of both maps are independent: products of normals of different maps show along which axes
     # surfaces determine the pose (instrumental variables). Errors are correlated in a patch, so the scatter of its sums
     # is the covariance of the equations (Hansen 1982).
     covariance = np.linalg.inv(prior)

@@ -64,7 +64,7 @@ def compare(
     before : Map
         The earlier map, fitted with ``returns.passages``, which is the default of :class:`FitConfig`.
     after : Map, iterable of F arrays, or Scans
-        The later map, likewise; or new scans as :func:`fit` takes them, of which a quick map is made first, with the ranges,
+        The later map, fitted likewise; or new scans as :func:`fit` takes them, of which a quick map is made first, with the ranges,
         errors of poses and leaf cells of `before`.
     poses : (F, 4, 4) array_like, optional
         Of new scans: T_world_sensor, m.

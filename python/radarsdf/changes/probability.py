@@ -55,7 +55,7 @@ class PlaceEvidence:
     confidence: Floats  # (N,) probability of a surface there
     hits: Floats  # (N,) scans with returns in the 27 leaf cells near the place, added up over the cells
     # (N,) scans with rays through the 27 cells near a place behind the surface, likewise, a ray counted once. Rays that
-    # graze a surface pass in front of it, and do not tell that it is not there.
+    # graze a surface pass in front of it, and are no evidence against it.
     passes: Floats
 
 
@@ -131,7 +131,7 @@ class PlacedMap:
         for rows in np.split(np.argsort(blocks, kind="stable"), edges) if len(own) else []:
             x, margin_m = own[rows], 2 * self.leaf_m
             cells = self.radar_map.cells_round(x.min(axis=0) - margin_m, x.max(axis=0) + margin_m)
-            # The core counts up to seven scans for a cell: counts up to 63 tell no more.
+            # The core counts up to seven scans for a cell: larger counts carry no information.
             near = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
             places = np.floor((x - cells.corner) / self.leaf_m).astype(np.int64)
             found[rows] = np.rint(near[tuple(places.T)]) / _CELLS_ALONG_RAY

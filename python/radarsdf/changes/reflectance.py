@@ -126,7 +126,7 @@ class Differences:
         of_day, of_change = chi2 / np.maximum(freedom, 1), chi2_between / np.maximum(freedom_between, 1)
         ratio = np.sqrt(np.maximum(np.maximum(of_day, of_change), 1))
         known = counting & np.isfinite(mean)
-        # A change is as likely by any difference that the range of intensities has room for.
+        # A change may have any size within the range of intensities.
         odds = odds_of_differences(mean[known], (sigma * ratio)[known], self.width)
         changed = np.zeros(len(x))
         changed[known] = posterior(odds, share_of_changes(odds))

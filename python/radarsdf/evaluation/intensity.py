@@ -213,10 +213,10 @@ class KNNIntensity:
         test = np.isin(numbers, holdout(numbers, _EVERY)[1])
         points, directions = _rays(points_world, sensor_positions)
         sensors = np.broadcast_to(real_array(sensor_positions, "sensor positions"), points.shape)
-        asked = np.flatnonzero(test)
-        asked = asked[np.linspace(0, len(asked) - 1, min(_MAX_QUERIES, len(asked))).astype(np.int64)]
+        queries = np.flatnonzero(test)
+        queries = queries[np.linspace(0, len(queries) - 1, min(_MAX_QUERIES, len(queries))).astype(np.int64)]
         inner = cls(points[~test], sensors[~test], whole._values[~test], candidates=_CANDIDATES[-1])
-        k, candidates = inner._best(points[asked], directions[asked], whole._values[asked])
+        k, candidates = inner._best(points[queries], directions[queries], whole._values[queries])
         return cls(points_world, sensor_positions, intensities, candidates=candidates, k=k)
 
     def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> _Floats:

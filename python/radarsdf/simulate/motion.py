@@ -161,20 +161,20 @@ def measured_imu(
     (2001, (2001, 3), True)
     """
     at_s: FloatArray = real_array(times_s, "times_s")
-    way = check_poses(poses)
-    if len(way) < 2 or at_s.shape != (len(way),) or not (np.diff(at_s) > 0).all():
-        msg = f"a motion has two poses or more, and an ascending time for each: {len(way)} poses, times {at_s.shape}"
+    T_world_sensor = check_poses(poses)
+    if len(T_world_sensor) < 2 or at_s.shape != (len(T_world_sensor),) or not (np.diff(at_s) > 0).all():
+        msg = f"a motion has two poses or more, and an ascending time for each: {len(T_world_sensor)} poses, times {at_s.shape}"
         raise ValueError(msg)
     R_imu = np.eye(3) if R_sensor_imu is None else checked_rotation(R_sensor_imu)
     count = int(np.floor((at_s[-1] - at_s[0]) * positive(rate_hz, "rate_hz") + 1e-6)) + 1
     times = at_s[0] + np.arange(count) / rate_hz
-    turning = RotationSpline(at_s, Rotation.from_matrix(way[:, :3, :3]))
+    turning = RotationSpline(at_s, Rotation.from_matrix(T_world_sensor[:, :3, :3]))
     # SciPy's rates are in the frame of the turned body, here turned on into that of the IMU.
     rates, changes = (np.einsum("ji,gj->gi", R_imu, turning(times, order)) for order in (1, 2))
     R_world_imu = np.einsum("gij,jk->gik", turning(times).as_matrix(), R_imu)
     lever = np.asarray(lever_m, np.float64)
     of_lever = np.cross(changes, lever) + np.cross(rates, np.cross(rates, lever))
-    accelerations = CubicSpline(at_s, way[:, :3, 3])(times, 2) - _GRAVITY_MPS2
+    accelerations = CubicSpline(at_s, T_world_sensor[:, :3, 3])(times, 2) - _GRAVITY_MPS2
     forces = np.einsum("gji,gj->gi", R_world_imu, accelerations) - of_lever
     rng = generator(seed, _IMU_STREAM, 0)
     rates = rates + gyroscope_bias_rad_s + _GYROSCOPE_SIGMA_RAD_S * rng.standard_normal((count, 3))

@@ -24,6 +24,7 @@ _NotNegative = Annotated[float, Field(ge=0, le=1e9)]
 _Positive = Annotated[float, Field(gt=0, le=1e9)]
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Height = Annotated[float, Field(gt=0, le=np.pi)]
+_Count = Annotated[int, Field(ge=1, le=10**7)]
 _Power = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 _OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, not to hit it again
@@ -99,9 +100,7 @@ class RadarSensor:
 
     azimuth_fov_rad: Annotated[float, Field(gt=0, le=2 * np.pi)] = 1.92  # full width, centred on x [rad]
     elevation_fov_rad: _Height = 0.52  # full height, centred on the xy plane [rad]
-    beams: Annotated[int, Field(ge=1, le=10**7)] = (
-        3000  # directions in a scan, a jittered grid over the field of view
-    )
+    beams: _Count = 3000  # directions in a scan, a jittered grid over the field of view
     min_range_m: _Positive = 0.5  # there are no nearer returns [m]
     max_range_m: _Positive = 60.0  # there are no farther returns [m], > min_range_m
     sigma_range_m: _NotNegative = 0.04  # standard deviation along the beam, near the sensor [m]

@@ -34,7 +34,7 @@ class Lidar:
 
     @cached_property
     def points(self) -> FloatArray:
-        """(M, 3) world, m. Their rays take as long as the scans, so they are cast only when somebody asks."""
+        """(M, 3) world, m, computed on first access: casting their rays takes as long as the scans."""
         rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
         found = [np.zeros((0, 3))]
         every = max(1, len(self.poses) // 40)  # neighbours see the same surfaces
