@@ -199,8 +199,11 @@ def _triangles(mesh: trimesh.Trimesh) -> tuple[_Points, _Faces]:
         msg = f"mesh must have vertices and faces, not be {mesh!r:.50}"
         raise TypeError(msg)
     vertices, faces = positions(mesh.vertices, "mesh.vertices"), np.asarray(mesh.faces)
-    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
-        msg = f"mesh.faces must be rows of the {len(vertices)} vertices"
+    shaped = faces.dtype.kind in "iu" and faces.shape[1:] == (3,)
+    if faces.size and not (shaped and 0 <= faces.min() <= faces.max() < len(vertices)):
+        msg = (
+            f"mesh.faces must be (F, 3) rows of the {len(vertices)} vertices, not {faces.shape} {faces.dtype}"
+        )
         raise ValueError(msg)
     return vertices, faces.reshape(-1, 3).astype(np.int64)
 
