@@ -12,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -106,7 +107,12 @@ def _run(command: str) -> tuple[int, str]:
     handler = logging.StreamHandler(printed)
     logging.getLogger("radarsdf").addHandler(handler)
     try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        with (
+            contextlib.redirect_stdout(printed),
+            contextlib.redirect_stderr(printed),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("default")  # as in a process of its own: printed, and no error
             status = main(words)
     finally:
         logging.getLogger("radarsdf").removeHandler(handler)
