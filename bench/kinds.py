@@ -121,6 +121,25 @@ _KINDS = {
 }  # fmt: skip
 
 
+class _Site(Site):
+    """Also has fences."""
+
+    def fence(self, xy: FloatArray, yaw: float) -> bool:
+        """A fence along a path: posts 2 m apart, and two rails."""
+        steps, height = int(self.rng.integers(3, 7)), self.rng.uniform(1.1, 1.8)
+        along = np.array([np.cos(yaw), np.sin(yaw)])
+        spots = [xy + 2.0 * (i - steps / 2) * along for i in range(steps + 1)]
+        if not self.reserve([(*spot, 0.5) for spot in spots]):
+            return False
+        wood = vary(self.rng, materials.TREE)
+        for spot in spots:
+            self.add_pole(spot, 0.05, height, wood)
+        for share in (0.4, 0.9):
+            bottom = float(self.terrain.height(np.array(spots)).mean()) + share * height
+            self.add_box(xy, yaw, bottom, np.array([2.0 * steps, 0.05, 0.12]), wood)
+        return True
+
+
 def _path(kind: Kind, rng: np.random.Generator) -> Path:
     length, width = rng.uniform(*kind.length_m), rng.uniform(0.55, 0.8)
     sway, phase = rng.uniform(0.5, 2.5), rng.uniform(0, 2 * np.pi)
@@ -202,7 +221,7 @@ def _simulation(kind: Kind, name: str, seed: int = 0, frames: int | None = None)
     way = path(
         np.linspace(*_BEYOND, 200) if kind.drive == "ahead" else np.linspace(0, 1, 100, endpoint=False)
     )
-    site = Site(rng, terrain, taken=[(x, y, 1.5) for x, y in way])
+    site = _Site(rng, terrain, taken=[(x, y, 1.5) for x, y in way])
     site.solids += _enclosed(kind, way, rng)
     if kind.drive == "places":
         site.solids += _facade(rng, float(way[:, 0].max()))
@@ -210,8 +229,7 @@ def _simulation(kind: Kind, name: str, seed: int = 0, frames: int | None = None)
     def beside(near: float, far: float) -> tuple[FloatArray, float]:
         return site.beside(path, rng.uniform(*(_BEYOND if kind.drive == "ahead" else (0, 1))), near, far)
 
-    for thing, number, limits in kind.things:
-        site.fill(int(rng.integers(*number)), getattr(site, thing), partial(beside, *limits))
+    site.fill(kind.things, beside)
     scans = kind.frames if frames is None else whole_number(frames, "frames", 1)
     poses = along_path(
         terrain,

@@ -16,7 +16,10 @@ from radarsdf.render import picture
 
 from .poses.drift import first
 
-_SCANS = {"hugin": 12, "oculii": 90}  # so many tell an IMU's axes
+_SCANS = {
+    "hugin": (12, 2),
+    "oculii": (90, 2),
+}  # and every second return; so many determine the axes of an IMU
 
 
 def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
@@ -39,13 +42,18 @@ def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
 
     set_attribute(picture, "save_picture", small)
     set_attribute(frames, "FULL", dataclasses.replace(frames.FULL, pairs=12))
-    for name, scans in _SCANS.items():
-        set_attribute(radarsdf.simulate, name, _begun(getattr(radarsdf.simulate, name), scans))
+    for name, (scans, every) in _SCANS.items():
+        set_attribute(radarsdf.simulate, name, _begun(getattr(radarsdf.simulate, name), scans, every))
 
 
-def _begun(drive, scans):
+def _begun(drive, scans, every):
     @functools.wraps(drive)
     def begun(*given, **named):
-        return first(drive, scans, *given, **named)
+        found = first(drive, scans, *given, **named)
+        thinned = {
+            name: [values[::every] for values in getattr(found, name)]
+            for name in ("points", "intensities", "noiseless_intensities", "origin_kind")
+        }
+        return dataclasses.replace(found, **thinned)
 
     return begun

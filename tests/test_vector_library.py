@@ -4,39 +4,8 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from pathlib import Path
-
-import radarsdf
-from radarsdf import threads
-
-ROOT = Path(radarsdf.__file__).parent
-# What of PyTorch's has vectors, and in the last bits depends on who computes it. Not sqrt and norm, which IEEE 754 defines.
-TRANSCENDENTAL = {
-    "acos", "asin", "atan", "atan2", "binary_cross_entropy_with_logits", "cos", "cosh", "erf", "exp", "exp2", "expm1",
-    "gelu", "hypot", "log", "log10", "log1p", "log2", "log_softmax", "logsigmoid", "normal_", "pow", "randn", "sigmoid",
-    "sin", "sinh", "softmax", "softplus", "tan", "tanh",
-}  # fmt: skip
-
-
-def called(room):
-    """Names of the functions and methods that a room's modules call, without NumPy's and the mathematical library's."""
-    for path in (ROOT / room).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-                owner = node.func.value
-                if not (isinstance(owner, ast.Name) and owner.id in ("np", "math")):
-                    yield node.func.attr
-
-
-def test_all_that_are_used_are_called_first_by_one_thread():
-    started = {*threads._TRANSCENDENTAL, "binary_cross_entropy_with_logits", "randn", "normal_"}
-    used = {name for room in ("field", "fitting", "map") for name in called(room)} & TRANSCENDENTAL
-    assert "log10" in used
-    assert used <= started
-
 
 RECORDED = """
 import threading

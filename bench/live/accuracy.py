@@ -33,7 +33,8 @@ def _scenes(options: argparse.Namespace) -> Iterator[tuple[Scene, FitConfig]]:
 def _f_percent(mesh: Any, scene: Scene, options: argparse.Namespace) -> float:
     samples = 20_000 if options.quick else 300_000
     assert scene.ground_truth is not None
-    return 100 * surface_metrics(mesh, scene.ground_truth, samples=samples)["f_score_all"]
+    f_score: float = surface_metrics(mesh, scene.ground_truth, samples=samples)["f_score_all"]
+    return 100 * f_score
 
 
 def accuracy(options: argparse.Namespace) -> Iterator[Row]:

@@ -35,9 +35,8 @@ _FEWEST = 50  # points for the figures of a band
 _NO_TRUTH = "the scene has no ground truth"
 
 COLUMNS = {
-    **{f"coverage_{level}": Column(f"{level} % interval, %", 100, 1) for level in (50, 68, 90, 95)},
+    **{f"coverage_{level}": Column(f"{level} % interval, %", 100, 1) for level in (68, 95)},
     "ence": Column("ENCE"),
-    "nll": Column("NLL"),
     "z_rms": Column("error / predicted"),
     "worst_decile_factor": Column("worst decile, factor"),
     "mean_error_m": Column("bias, cm", 100),
@@ -172,10 +171,10 @@ def _bands(
         band: Row = {"bin": name, "samples": int(own.sum())}
         band["true_share"] = float(is_true[own].mean()) if own.any() else None
         if np.count_nonzero(own & np.isfinite(error_m) & np.isfinite(predicted_m)) >= _FEWEST:
-            metrics = uncertainty_metrics(error_m[own], predicted_m[own], bins=1)
+            metrics = uncertainty_metrics(error_m[own], predicted_m[own])
             band |= {key: metrics[key] for key in ("rmse_m", "mean_error_m", "z_rms", "coverage_95")}
             band["core_m"] = _core(error_m[own & np.isfinite(predicted_m)])
-            band["predicted_m"] = metrics["bin_predicted_m"][0]
+            band["predicted_m"] = float(np.sqrt(np.nanmean(predicted_m[own & np.isfinite(error_m)] ** 2)))
         found.append(band)
     return found
 

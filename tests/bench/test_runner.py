@@ -111,7 +111,7 @@ def test_surface(tmp_path):
     ball, poisson = values["rows"]
     assert ball["seconds"] == 5.0
     assert 0 <= ball["f_score"] <= 1
-    assert ball["samples"] == 100_000
+    assert ball["num_mesh_samples"] == 100_000
     assert poisson["why_not"] == "Open3D is not here"
     assert "- Poisson: Open3D is not here" in table
     for key in ("command", "commit", "processor", "threads"):

@@ -13,7 +13,7 @@ from ..reference_looks import CUBE_CELLS, looks_at
 LEAF_M = 0.2
 CUBE_M = CUBE_CELLS * LEAF_M
 THREADS = (1, 2, 3, 7)
-MANY = 25_000  # enough for several threads
+MANY = 10_000  # enough for several threads
 
 
 def sorted_cells(cells):
@@ -75,25 +75,6 @@ def test_looks_are_those_of_a_plain_search(kind):
     np.testing.assert_array_equal(looks, expected)
 
 
-def test_a_place_that_one_ray_passes_is_missed_only_where_others_are_near():
-    """Rays of one sensor, counted as in the definition: each cube that a ray is partly in."""
-    rng = np.random.default_rng(3)
-    directions = rng.normal(size=(4000, 3)) * [1, 1, 0.2]
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    ranges_m = rng.uniform(5, 30, 4000)
-    rays = tuple(a.astype(np.float32) for a in (directions * ranges_m[:, None], directions, ranges_m))
-    cells, keys = sorted_cells(np.floor(rays[0] / LEAF_M).astype(int))
-    missed = count_looks(keys, LEAF_M, *rays, np.zeros(4000, np.int32)) == 0
-    alone = looks_at(cells, LEAF_M, *rays, np.arange(4000)) > 0
-    assert alone.all()
-    assert not missed.any()  # each has a return
-    half = tuple(a[:2000] for a in rays)
-    looks = count_looks(keys, LEAF_M, *half, np.zeros(2000, np.int32)) > 0
-    alone = looks_at(cells, LEAF_M, *half, np.arange(2000)) > 0
-    assert not (looks & ~alone).any()
-    assert (looks == alone).mean() > 0.97
-
-
 def test_the_number_of_threads_changes_nothing():
     rays, scans = rays_of("any", MANY), scans_of(MANY)
     cells, keys = (a[::8] for a in cells_near(rays[0]))
@@ -142,10 +123,3 @@ def test_scans_of_cells_are_counted_once(num_cells):
         counts = count_scans(cells, scans, num_cells, num_threads)
         assert counts.dtype == np.uint32
         np.testing.assert_array_equal(counts, expected)
-
-
-def test_cells_without_returns_have_no_scans():
-    none = np.zeros(0, np.int32)
-    assert count_scans(none, none, 0).tolist() == []
-    assert count_scans(none, none, 3).tolist() == [0, 0, 0]
-    assert count_scans(np.array([1, 1, 1], np.int32), np.array([4, 4, 9], np.int32), 3).tolist() == [0, 2, 0]

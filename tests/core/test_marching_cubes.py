@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: MIT
 """Marching cubes by property: topology, geometry, agreement of dense, sparse and reference."""
 
-import itertools
+import os
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
 
 from ..mesh_checks import (
@@ -75,31 +78,6 @@ def test_gyroid_is_manifold_and_lies_on_the_surface():
     assert (towards_larger > 0).mean() > 0.999  # slivers next to samples may lean
 
 
-@pytest.mark.parametrize("make", [noise, plateaus])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_any_volume_gives_a_manifold(make, seed):
-    volume = make(seed)
-    vertices, faces = marching_cubes(volume)
-    open_edges = single_edges(faces)
-    ends = np.array(volume.shape) - 1
-    at_border = (vertices == 0) | (vertices == ends)
-    shared = at_border[open_edges[:, 0]] & at_border[open_edges[:, 1]]
-    assert shared.any(axis=1).all()
-    assert has_single_cycle_links(faces, len(vertices)).all()
-    assert (np.linalg.norm(normals(vertices, faces), axis=1) > 0).all()
-    assert len(np.unique(vertices, axis=0)) == len(vertices)
-    assert np.unique(faces).size == len(vertices), "a vertex without a triangle"
-
-
-def test_noise_shows_every_pattern():
-    positive = noise(0) > 0
-    patterns = sum(
-        positive[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None].astype(int) << (4 * i + 2 * j + k)
-        for i, j, k in itertools.product((0, 1), repeat=3)
-    )
-    assert len(np.unique(patterns)) == 256
-
-
 @pytest.mark.parametrize("pattern", range(256))
 def test_each_pattern_is_closed_by_any_surroundings(pattern):
     rng = np.random.default_rng(pattern)
@@ -115,14 +93,7 @@ def test_each_pattern_is_closed_by_any_surroundings(pattern):
 
 @pytest.mark.parametrize(
     "volume",
-    [
-        noise(2, (5, 6, 7)),
-        noise(3, (3, 2, 70), np.float64),
-        noise(4, (2, 9, 33)),
-        noise(5, (4, 4, 32)),
-        plateaus(6, (5, 6, 35)),
-        sphere(12),
-    ],
+    [noise(2, (5, 6, 7)), noise(3, (3, 2, 70), np.float64), noise(5, (4, 4, 32)), plateaus(6, (5, 6, 35))],
 )
 @pytest.mark.parametrize("masked", [False, True])
 def test_dense_and_sparse_equal_the_reference(volume, masked):
@@ -206,7 +177,7 @@ def test_one_corner_of_one_cell():
     assert (normal < 0).all()  # towards the positive corner
 
 
-@pytest.mark.parametrize("n", [31, 32, 33, 34, 64, 65, 66])
+@pytest.mark.parametrize("n", [31, 32, 33, 65])
 def test_rows_of_any_length_end_right(n):
     volume = np.ones((4, 4, n))
     volume[1:3, 1:3, 1:-1] = -1
@@ -216,27 +187,6 @@ def test_rows_of_any_length_end_right(n):
     assert vertices[:, 2].min() == 0.5
     assert vertices[:, 2].max() == n - 1.5
     assert len(marching_cubes(volume > 0, 0.5)[1]) == len(faces)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("masked", [False, True])
-def test_threads_do_not_change_a_bit(dtype, masked):
-    volume = noise(11, (40, 33, 47), dtype)
-    mask = noise(12, volume.shape) > -2 if masked else None
-    _, corners, cells = sparse_lattice(np.argwhere(cells_in_use(volume, mask)), num_threads=1)
-    values = volume[tuple(corners.T)]
-    expected = (
-        marching_cubes(volume, mask=mask, num_threads=1),
-        extract_cells(corners, values, cells, num_threads=1),
-    )
-    for threads in (2, 3, 0):
-        got = (
-            marching_cubes(volume, mask=mask, num_threads=threads),
-            extract_cells(corners, values, cells, num_threads=threads),
-        )
-        for (vertices, faces), (same_vertices, same_faces) in zip(expected, got, strict=True):
-            assert vertices.tobytes() == same_vertices.tobytes()
-            assert faces.tobytes() == same_faces.tobytes()
 
 
 def test_far_from_the_origin_the_mesh_keeps_its_shape():
@@ -287,3 +237,69 @@ def test_types_of_samples(dtype, kept):
 def test_wrong_arguments_are_named(arguments, error, message):
     with pytest.raises(error, match=message):
         marching_cubes(**{"volume": np.zeros((3, 3, 3)), **arguments})
+
+
+EXAMPLES = int(os.environ.get("RADARSDF_EXAMPLES", "0"))
+LIMITS = settings(max_examples=EXAMPLES or 40, derandomize=not EXAMPLES, deadline=None, database=None)
+SAMPLES = [0.0, -0.0, 1.0, -1.0, 0.5, np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e-45, -1e-45, 1e-38]
+LEVELS = [0.0, -0.0, 0.5, 1.0, 3.4e38, -3.4e38, 1e39, 1e-45, -1e-45, 5e-324, 1e-38, 1e300]
+
+
+def check(volume, level, mask=None):
+    """All that the docstring promises, on the unit lattice."""
+    vertices, faces = mesh = marching_cubes(volume, level, mask=mask)
+    used = cells_in_use(volume, mask)
+    assert np.isfinite(vertices).all()
+    assert np.unique(faces).size == len(vertices) == len(np.unique(vertices, axis=0))
+    assert (np.linalg.norm(normals(vertices, faces), axis=1) > 0).all()
+    # Where no triangle joins, there is no cell; single_edges fails for two that run the same way. Cells that meet along
+    # a lattice edge only, beside cells that are not in use, share a vertex but no fan of triangles.
+    border = single_edges(faces)
+    assert on_border(vertices, border, used).all()
+    manifold = has_single_cycle_links(faces, len(vertices))
+    manifold[border] = True
+    assert manifold.all()
+    assert same_mesh(mesh, reference_marching_cubes(volume, level, mask=mask))
+    for threads in (1, 3):
+        again = marching_cubes(volume, level, mask=mask, num_threads=threads)
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(mesh, again, strict=True))
+    _, corners, cells = sparse_lattice(np.argwhere(used))
+    values = volume[tuple(corners.T)]
+    assert same_mesh(mesh, extract_cells(corners, values, cells, level, num_threads=2))
+    return mesh
+
+
+@LIMITS
+@given(
+    volume=hnp.arrays(
+        st.sampled_from([np.float32, np.float64]),
+        hnp.array_shapes(min_dims=3, max_dims=3, min_side=1, max_side=5),
+        elements=st.sampled_from(SAMPLES),
+        fill=st.nothing(),
+    ),
+    level=st.sampled_from(LEVELS),
+    data=st.data(),
+)
+def test_worst_volumes_give_manifolds(volume, level, data):
+    mask = data.draw(st.none() | hnp.arrays(np.bool_, volume.shape))
+    check(volume, level, mask)
+
+
+@pytest.mark.parametrize(("field", "characteristic"), [(sphere, 2), (torus, 0)])
+@pytest.mark.parametrize(
+    "spacing", [(1, 1, 1), (1e-3, 1.0, 1e3), (1e-150, 1e-140, 1e-145), (1e100, 1e90, 1e95)]
+)
+def test_topology_of_any_spacing(field, characteristic, spacing):
+    n = 24
+    vertices, faces = marching_cubes(field(n).astype(np.float32), spacing=spacing)
+    assert euler_characteristic(vertices, faces) == characteristic
+    assert len(single_edges(faces)) == 0
+    assert has_single_cycle_links(faces, len(vertices)).all()
+    unit, same_faces = marching_cubes(field(n).astype(np.float32))
+    assert np.array_equal(faces, same_faces)
+    np.testing.assert_allclose(vertices / spacing, unit, rtol=1e-15)
+
+
+def test_positions_that_float64_cannot_hold_are_refused():
+    with pytest.raises(ValueError, match="beyond float64"):
+        marching_cubes(noise(0), spacing=(1e308, 1, 1))

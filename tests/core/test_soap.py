@@ -66,14 +66,14 @@ def way_of_the_formula(rows, columns):
     rng = np.random.default_rng(0)
     weights, reference, steps = rng.normal(size=(rows, columns)), Reference(rows, columns), []
     expected = weights
-    for _ in range(1, 70):
+    for _ in range(1, 40):
         gradient = dependent_gradients(rng, rows, columns)
         expected = reference.move(expected, gradient, RATE)
         steps.append((gradient, expected))
     return weights, steps
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(20, 37), (2, 3), (64, 16), (3, 520), (515, 4)])
+@pytest.mark.parametrize(("rows", "columns"), [(20, 37), (2, 3), (3, 520)])
 def test_steps_are_those_of_the_formula(rows, columns):
     start, steps = way_of_the_formula(rows, columns)
     weights, memory = start.copy(), memory_of(start)

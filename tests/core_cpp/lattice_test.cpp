@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: MIT
 #include <doctest/doctest.h>
 
-#include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
@@ -13,28 +12,16 @@
 #include <vector>
 
 #include "helpers.hpp"
-#include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
-#include "lattice/cell_walk.hpp"
 #include "lattice/flat_map.hpp"
 #include "lattice/morton.hpp"
 #include "lattice/vertex_table.hpp"
 
-using radarsdf::kAxisBias;
 using LatticeCell = std::array<std::int32_t, 3>;
 
 namespace {
 
 std::uint64_t key_of(const LatticeCell& cell) { return radarsdf::lattice_key(cell.data()); }
-
-LatticeCell cell_of(std::uint64_t key) {
-  LatticeCell cell;
-  for (int axis = 0; axis < 3; ++axis) {
-    cell[static_cast<std::size_t>(axis)] =
-        static_cast<std::int32_t>(radarsdf::morton_coordinate(key, axis)) - kAxisBias;
-  }
-  return cell;
-}
 
 LatticeCell floor_of(const double* point, double size_m) {
   return {static_cast<std::int32_t>(std::floor(point[0] / size_m)),
@@ -97,24 +84,6 @@ TEST_CASE("the flat map is a map") {
   }
 }
 
-TEST_CASE_TEMPLATE("the cell set is the set of the points' cells", T, float, double) {
-  constexpr std::int64_t kPoints = 30000;
-  constexpr double kSize = 0.25;  // a power of two: float and double agree on the cell of a point
-  const auto points = test::normal_numbers<T>(3 * kPoints, 3, 3);
-  std::set<std::uint64_t> expected;
-  for (std::size_t i = 0; i < points.size(); i += 3) {
-    const double point[] = {points[i], points[i + 1], points[i + 2]};
-    expected.insert(key_of(floor_of(point, kSize)));
-  }
-  for (const int threads : test::kThreads) {
-    radarsdf::CellSet cells(kSize);
-    cells.insert(points.data() + 3 * 10000, kPoints - 10000, threads);
-    cells.insert(points.data(), 20000, threads);  // out of order, and some of them twice
-    CHECK(cells.size() == static_cast<std::int64_t>(expected.size()));
-    CHECK(cells.sorted_keys(threads) == std::vector<std::uint64_t>(expected.begin(), expected.end()));
-  }
-}
-
 TEST_CASE("a point that has no cell is refused before anything is stored") {
   for (const float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity(), -2e6F}) {
     const float points[] = {0, 0, 0, 0, bad, 0};
@@ -124,61 +93,6 @@ TEST_CASE("a point that has no cell is refused before anything is stored") {
   }
   CHECK_THROWS_AS(radarsdf::CellSet(0.0), std::invalid_argument);
   CHECK_THROWS_AS(radarsdf::CellSet(std::nan("")), std::invalid_argument);
-}
-
-TEST_CASE("rays mark the cells that they go through, and no others") {
-  constexpr std::int64_t kRays = 200;
-  constexpr double kSize = 0.5, kReach = 3;
-  const auto points = test::normal_numbers<float>(3 * kRays, 4, 4);
-  const auto directions = test::unit_vectors<float>(kRays, 5);
-  std::vector<std::uint64_t> first;
-  for (const int threads : test::kThreads) {
-    radarsdf::CellSet cells(kSize);
-    cells.insert_rays(points.data(), directions.data(), kRays, kReach, threads);
-    const auto keys = cells.sorted_keys(threads);
-    if (first.empty()) first = keys;
-    CHECK(keys == first);
-  }
-  const std::set<std::uint64_t> found(first.begin(), first.end());
-  std::set<std::uint64_t> seen;
-  for (std::size_t i = 0; i < kRays; ++i) {
-    for (int step = -3000; step <= 3000; ++step) {
-      double at[3];
-      bool near_face = false;  // there, rounding decides between two cells
-      for (std::size_t axis = 0; axis < 3; ++axis) {
-        at[axis] = points[3 * i + axis] + kReach * step / 3000 * directions[3 * i + axis];
-        near_face = near_face || std::abs(at[axis] / kSize - std::round(at[axis] / kSize)) < 1e-4;
-      }
-      if (!near_face) {
-        const std::uint64_t key = key_of(floor_of(at, kSize));
-        REQUIRE(found.count(key) == 1);
-        seen.insert(key);
-      }
-    }
-  }
-  // Samples a millimetre apart miss cells of which a ray cuts a corner only.
-  CHECK(seen.size() > 0.98 * static_cast<double>(found.size()));
-}
-
-TEST_CASE("blocks find the row of a key") {
-  const std::set<std::uint64_t> set = random_keys(5000, 12, 6);
-  const std::vector<std::uint64_t> keys(set.begin(), set.end());
-  const radarsdf::CellBlocks blocks(keys.data(), static_cast<std::int64_t>(keys.size()));
-  const std::set<std::uint64_t> others = random_keys(5000, 14, 7);
-  std::vector<std::uint64_t> asked(others.begin(), others.end());
-  asked.insert(asked.end(), keys.begin(), keys.end());
-  for (const int threads : test::kThreads) {
-    std::vector<std::int32_t> rows(asked.size());
-    blocks.rows(asked.data(), static_cast<std::int64_t>(asked.size()), rows.data(), threads);
-    for (std::size_t i = 0; i < asked.size(); ++i) {
-      const auto place = std::lower_bound(keys.begin(), keys.end(), asked[i]);
-      const bool there = place != keys.end() && *place == asked[i];
-      REQUIRE(rows[i] == (there ? static_cast<std::int32_t>(place - keys.begin()) : -1));
-    }
-  }
-  const std::uint64_t unsorted[] = {5, 4}, twice[] = {5, 5};
-  CHECK_THROWS_AS(radarsdf::CellBlocks(unsorted, 2), std::invalid_argument);
-  CHECK_THROWS_AS(radarsdf::CellBlocks(twice, 2), std::invalid_argument);
 }
 
 TEST_CASE("the table numbers the vertices of each level and group in Morton order") {
@@ -227,64 +141,6 @@ TEST_CASE("the table numbers the vertices of each level and group in Morton orde
       CHECK(table.num_cells() == first_cell);
     }
   }
-}
-
-TEST_CASE_TEMPLATE("the table locates points as a search of all cells does", T, float, double) {
-  constexpr int kLevels = 4;
-  constexpr double kSize = 0.5;
-  const std::set<std::uint64_t> set = random_keys(1500, 6, 9);
-  const radarsdf::VertexTable table({set.begin(), set.end()}, kSize, kLevels, radarsdf::Encoding::kOctree, 1);
-  auto points = test::normal_numbers<T>(3 * 5000, 4, 10);
-  points[1] = std::numeric_limits<T>::quiet_NaN();
-  points[3] = T(1e30);
-  std::vector<std::int32_t> located(kLevels * points.size() / 3);
-  table.locate(points.data(), static_cast<std::int64_t>(points.size()) / 3, located.data());
-  std::vector<std::map<std::uint64_t, std::int32_t>> numbers(kLevels);
-  std::set<std::uint64_t> keys = set;
-  std::int32_t number = 0;
-  for (auto& of_level : numbers) {
-    std::set<std::uint64_t> parents;
-    for (const std::uint64_t key : keys) {
-      of_level[key] = number++;
-      parents.insert(key >> 3);
-    }
-    keys = parents;
-  }
-  int in_leaves = 0;
-  for (std::size_t i = 0; i < points.size() / 3; ++i) {
-    const double point[] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
-    const bool valid = i > 1;
-    for (std::size_t level = 0; level < kLevels; ++level) {
-      const std::uint64_t key = valid ? key_of(floor_of(point, kSize)) >> (3 * level) : 0;
-      const auto found = numbers[level].find(key);
-      const std::int32_t expected = valid && found != numbers[level].end() ? found->second : -1;
-      REQUIRE(located[kLevels * i + level] == expected);
-    }
-    in_leaves += located[kLevels * i] >= 0;
-  }
-  CHECK(in_leaves > 100);
-  CHECK(in_leaves < 4900);
-}
-
-TEST_CASE("the vertices of leaf cells are their corners") {
-  const std::set<std::uint64_t> set = random_keys(500, 5, 11);
-  const std::vector<std::uint64_t> leaves(set.begin(), set.end());
-  const radarsdf::VertexTable table(leaves, 1, 2, radarsdf::Encoding::kOctree, 1);
-  const radarsdf::LeafVertices vertices = radarsdf::leaf_vertices(table);
-  const auto coordinates = radarsdf::leaf_coordinates(leaves);
-  for (std::size_t i = 0; i < leaves.size(); ++i) {
-    const LatticeCell cell = cell_of(leaves[i]);
-    for (std::size_t axis = 0; axis < 3; ++axis) REQUIRE(coordinates[3 * i + axis] == cell[axis]);
-    for (std::size_t c = 0; c < 8; ++c) {
-      const auto row = static_cast<std::size_t>(vertices.of_cells[8 * i + c]);
-      for (std::size_t axis = 0; axis < 3; ++axis) {
-        const int step = static_cast<int>(c >> (2 - axis) & 1);
-        REQUIRE(vertices.coordinates[3 * row + axis] == cell[axis] + step);
-      }
-    }
-  }
-  const radarsdf::VertexTable planes(leaves, 1, 2, radarsdf::Encoding::kTriQuadtree, 1);
-  CHECK_THROWS_AS(radarsdf::leaf_vertices(planes), std::invalid_argument);
 }
 
 TEST_CASE("a table refuses what it cannot hold") {

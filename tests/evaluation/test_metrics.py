@@ -99,7 +99,6 @@ def test_box_crops_mesh_and_ground_truth():
     assert m["num_ground_truth"] == 196 * 201  # the 196 columns at x <= 3.9
     # Triangles across the border are sampled whole: 4 m x 4 m, of which 3.9 m lie inside.
     assert m["num_mesh_samples"] == pytest.approx(100_000 * 3.9 / 4.0, rel=0.01)
-    assert m["box"] == box
     everything = surface_metrics(mesh, truth, samples=100_000)
     assert everything["precision"] == pytest.approx(0.5, abs=0.01)
     assert everything["completion_ratio"] == pytest.approx(0.5, abs=0.01)
@@ -115,14 +114,10 @@ def test_discarding_hides_what_f_score_all_shows():
     assert m["f_score_all"] == pytest.approx(2 * 0.25 / 1.25, abs=0.01)
 
 
-def test_same_seed_same_numbers_on_any_number_of_threads():
+def test_the_same_arguments_give_the_same_numbers():
     truth = bumpy().vertices + 0.1
-    one = surface_metrics(bumpy(), truth, samples=20_000, seed=5, num_threads=1)
-    two = surface_metrics(bumpy(), truth, samples=20_000, seed=5, num_threads=2)
-    other = surface_metrics(bumpy(), truth, samples=20_000, seed=6)
-    assert one == two
-    assert one["accuracy_error_m"] != other["accuracy_error_m"]
-    assert one["ground_truth_sha256"] == other["ground_truth_sha256"]
+    one, again = (surface_metrics(bumpy(), truth, samples=20_000) for _ in range(2))
+    assert one == again
 
 
 @pytest.mark.parametrize("flip", [False, True], ids=["wound", "some triangles flipped"])
@@ -162,7 +157,6 @@ def test_angles_without_a_distribution_are_none_not_nan():
         (plane(9.0), grid(step=1.0), {"box": [[0, 0, -1], [4, 4, 1]]}, "no surface in the box"),
         (plane(), grid(step=1.0)[:, :2], {}, r"ground_truth must be \(N, 3\)"),
         (plane(), np.full((3, 3), np.nan), {}, "finite"),
-        (plane(), grid(step=1.0), {"truncation_m": 0.0}, "positive"),
     ],
 )
 def test_surface_refuses(mesh, truth, kwargs, message):
@@ -176,7 +170,7 @@ def test_intensity_metrics():
     assert m["medae"] == 1.5
     assert "mean 3.00  median 1.50  (4 returns" in format_metrics(m)
     for predicted, measured in [([1.0], [1.0, 2.0]), ([], []), ([np.nan], [1.0])]:
-        with pytest.raises(ValueError, match=r"must both be|no returns|finite"):
+        with pytest.raises(ValueError, match=r"must both be|finite"):
             intensity_metrics(predicted, measured)
 
 
@@ -220,7 +214,7 @@ def test_knn_is_the_weighted_mean_it_says():
 def test_the_choice_is_that_of_an_inner_hold_out():
     points, sensors, intensity = scene(360, np.random.default_rng(1))
     number = np.repeat(np.arange(6) * 7 - 3, 60)  # any numbers
-    test = np.isin(number, holdout(number, 3)[1])
+    test = np.isin(number, holdout(number, 5)[1])
     errors = {}
     for candidates in (1, 2, 4, 8, 16, 32, 64, 128):  # 240 returns remain
         for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= candidates):
@@ -228,7 +222,7 @@ def test_the_choice_is_that_of_an_inner_hold_out():
             knn = KNNIntensity(*inner, k=k, candidates=candidates)
             predicted = knn.predict(points[test], sensors[test])
             errors[k, candidates] = np.abs(predicted - intensity[test]).mean()
-    knn = KNNIntensity.chosen(points, sensors, intensity, number, every=3)
+    knn = KNNIntensity.chosen(points, sensors, intensity, number)
     assert (knn.k, knn.candidates) == min(errors, key=errors.get)
     whole = KNNIntensity(points, sensors, intensity, k=knn.k, candidates=knn.candidates)  # of all six scans
     assert (knn.predict(points, sensors + 1) == whole.predict(points, sensors + 1)).all()

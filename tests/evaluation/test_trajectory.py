@@ -17,7 +17,7 @@ WHOLE = moved(np.eye(4)[None], np.array([[30.0, -20, 10, 0.4, -0.3, 2.1]]))[0]
 
 def test_the_same_way_in_another_world_has_no_error():
     true = trajectory(50)
-    for align in ("positions", "poses", "first"):
+    for align in ("positions", "poses"):
         metrics = trajectory_metrics(WHOLE @ true, true, align=align)
         for name in (
             "absolute_m",
@@ -35,21 +35,23 @@ def test_a_turn_that_is_too_sharp_has_the_error_of_its_length():
     true = np.tile(np.eye(4), (101, 1, 1))
     true[:, 0, 3] = np.arange(101)
     found = drifted(true, 0, 0, 0, yaw_rad=0.001)
-    metrics = trajectory_metrics(found, true, align="first", lengths_m=[20, 40])
+    metrics = trajectory_metrics(found, true, align="none")
     assert metrics["step_rad"] == pytest.approx(0.001)
     assert metrics["step_m"] == pytest.approx(0, abs=1e-9)
     assert metrics["relative_rad_per_m"] == pytest.approx(0.001)
-    # The sides of an arc: half of its angle, so 10 and 20 thousandths of each length.
-    assert metrics["relative_ratio"] == pytest.approx((81 * 0.0095 + 61 * 0.0195) / 142, rel=0.02)
+    # The sides of an arc: half of its angle, so 5 to 25 thousandths of 10 to 50 m; there are 91 to 51 of each.
+    counts, angles = np.arange(91, 50, -10), 0.001 * np.arange(10, 51, 10) / 2 - 0.0005
+    assert metrics["relative_ratio"] == pytest.approx(counts @ angles / counts.sum(), rel=0.02)
     assert metrics["length_m"] == pytest.approx(100)
 
 
-def test_parts_are_those_of_kitti_or_tenths_of_a_shorter_way():
+def test_segments_of_long_trajectories_are_those_of_kitti():
     true = np.tile(np.eye(4), (802, 1, 1))
     true[:, 0, 3] = np.arange(802)
-    assert trajectory_metrics(true, true)["relative_lengths_m"] == list(range(100, 900, 100))
-    shorter = trajectory_metrics(true[:101], true[:101])["relative_lengths_m"]
-    assert shorter == pytest.approx([10, 20, 30, 40, 50])
+    found = drifted(true, 0, 0, 0, yaw_rad=1e-5)
+    counts, angles = 802 - np.arange(100, 801, 100), 1e-5 * np.arange(100, 801, 100) / 2
+    ratio = trajectory_metrics(found, true, align="none")["relative_ratio"]
+    assert ratio == pytest.approx(counts @ angles / counts.sum(), rel=0.01)
 
 
 def test_one_pose_has_no_steps():
@@ -63,8 +65,6 @@ def test_wrong_arguments_are_refused():
         trajectory_metrics(poses, poses, align="scale")
     with pytest.raises(ValueError, match="poses"):
         trajectory_metrics(poses[:3], poses)
-    with pytest.raises(ValueError, match="lengths_m"):
-        trajectory_metrics(poses, poses, lengths_m=[0.0])
 
 
 def test_they_are_those_of_evo():

@@ -179,7 +179,7 @@ def test_tiles_have_the_grid_of_their_cells(tmp_path):
 
 def test_the_command_writes_all_files(sharp_map, tmp_path, capsys):
     sharp_map.save(tmp_path / "map.safetensors")
-    names = ["g.npz", "g.ply", "g.bt", "g.yaml"]
+    names = ["g.npz", "g.bt", "g.yaml"]
     words = ["grid", tmp_path / "map.safetensors", *(w for name in names for w in ("-o", tmp_path / name))]
     words += ["--box", 8, -3, -1, 21, 3, 3]
     words += ["--distances", tmp_path / "d.npz", "--costmap", tmp_path / "c.npz", "--heights", 0.3, 1.0]

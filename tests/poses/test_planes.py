@@ -12,7 +12,7 @@ from radarsdf.poses.motion import Motion
 from radarsdf.poses.planes import Groups, PlaneGrid, SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.rigid import aligned, moved
 from radarsdf.returns.planes import Surfels
-from radarsdf.simulate import Leg, drifted
+from radarsdf.simulate import drifted, simulate
 
 from .drift import position_error_m, trajectory
 
@@ -96,8 +96,8 @@ def cost(diagonal, below, gradient, x):
 
 def test_groups_with_a_share_of_the_returns_close_a_loop():
     court = radarsdf.simulate.oculii(seed=5, frames=60)
-    laps = radarsdf.simulate.drive_legs(court, [Leg(ahead_m=75)], speed_mps=8, rate_hz=5).simulation
-    true = laps.poses
+    true = np.concatenate([court.poses, court.poses[:20]])
+    laps = simulate(court.scene, court.sensor, true, name="laps")
     given = drifted(true, 0.0, 0.0, 1, 0.002)
     returns = SensorReturns.of(laps.points, 0.5, None)
     errors_m = []

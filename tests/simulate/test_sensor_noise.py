@@ -43,7 +43,7 @@ def test_weak_returns_are_noisier_in_all_axes(above_threshold_db, factor):
 def test_side_lobes_keep_range_and_azimuth_and_add_returns():
     scene, pose = wall_ahead(10.0, MATT), np.eye(4)
     clean = QUIET.scan(scene, pose, seed=1)
-    sensor = replace(QUIET, sidelobe_share=0.2, sidelobe_fov_rad=0.6, sidelobe_loss_db=5.0)
+    sensor = replace(QUIET, sidelobe_share=0.2, sidelobe_fov_rad=0.6)
     scan = sensor.scan(scene, pose, seed=1)
     false = scan.origin_kind == sim.Origin.SIDELOBE
     assert false.sum() / len(clean.points) == pytest.approx(0.2, abs=0.03)
@@ -61,8 +61,6 @@ def test_side_lobes_keep_range_and_azimuth_and_add_returns():
     range_and_azimuth = np.stack([np.linalg.norm(true, axis=1), np.arctan2(true[:, 1], true[:, 0])], axis=1)
     own = np.stack([ranges_m, np.arctan2(points[:, 1], points[:, 0])], axis=1)
     assert np.abs(own[:, None] - range_and_azimuth).max(axis=2).min(axis=1).max() < 1e-4
-    drop_db = np.median(clean.intensities) - np.median(scan.intensities[false])
-    assert drop_db == pytest.approx(5.0, abs=0.2)
 
 
 def test_clutter_lies_where_its_share_says():

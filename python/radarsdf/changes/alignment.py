@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, qmc
 
 from radarsdf._core import LocalPlanes
 from radarsdf.changes.probability import (
@@ -20,9 +20,7 @@ from radarsdf.changes.probability import (
     share_of_changes,
 )
 from radarsdf.map.threshold import across_triangles
-from radarsdf.poses.motion import ExpectedStep, Rate
 from radarsdf.poses.rigid import moved, rotation_vector, skew
-from radarsdf.poses.tracking import thinned
 from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
@@ -39,7 +37,7 @@ _FIXED = 1e8  # information of what stays as given, 1/m²
 _ALIKE_CELLS = 0.25  # surfaces that are nearer lie on each other
 _SEARCH_CELLS = 8.0  # edge of the cells of a search, in leaf cells
 _SEARCHED = 500  # points of a search
-_FOLLOWED = 200  # best poses of a search
+_TRIED, _FOLLOWED = 8192, 200  # poses of a search, and the best of them
 _ERRORS = 3.0  # standard errors by which poses that agree about as well differ at most
 
 
@@ -47,13 +45,14 @@ _ERRORS = 3.0  # standard errors by which poses that agree about as well differ 
 class Alignment:
     """Where one map lies in the frame of another."""
 
-    T_before_after: Floats = field(default_factory=lambda: np.eye(4))
-    """(4, 4) from the later map's world to that of the earlier one, m. The identity unless `improved`."""
-    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    """(6, 6) of translation, m, and rotation vector about `centre`, rad."""
+    T_before_after: Floats = field(
+        default_factory=lambda: np.eye(4)
+    )  # (4, 4) m. The identity unless `improved`
+    covariance: Floats = field(
+        default_factory=lambda: np.zeros((6, 6))
+    )  # translation, rotation vector about `centre`
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
-    improved: bool = False
-    """Whether the surfaces show that the frames are apart, at a significance level of 0.001."""
+    improved: bool = False  # whether the surfaces show that the frames are apart
     words: str = "The maps were taken as they are."  # the verdict in one sentence
 
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
@@ -80,12 +79,10 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
         return found
 
-    as_given, (pose, covariance, unsure) = far(np.eye(4)), _determined(before, surface, np.eye(4))
-    left = far(pose)
+    pose, covariance, undetermined = _determined(before, surface, np.eye(4))
     other = _determined(before, surface, _searched(before, surface))
-    if Verdict.by_groups(left - far(other[0]), surface.patches).improved:
-        pose, covariance, unsure = other
-        left = far(pose)
+    if Verdict.by_groups(far(pose) - far(other[0]), surface.patches).improved:
+        pose, covariance, undetermined = other
     offset = surface.offset(pose)
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
     by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
@@ -93,12 +90,12 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     figures = (
         f"{moved_m:.3f} m, root mean square, {sigmas:.1f} standard errors, by chance up to {by_chance:.1f}"
     )
-    if sigmas <= by_chance or left.mean() >= as_given.mean():
+    if sigmas <= by_chance or far(pose).mean() >= far(np.eye(4)).mean():
         words = f"The frames were taken as they are: surfaces do not show that they are apart ({figures})."
         return Alignment(covariance=covariance, centre=surface.centre, words=words)
     words = f"The later map was moved so that its surface lies on the earlier one ({figures})."
-    if unsure.size:
-        words += f" Along {unsure.shape[1]} of 6 axes, surfaces do not determine it: there it stays as given."
+    if undetermined:
+        words += f" Along {undetermined} of 6 axes, surfaces do not determine it: there it stays as given."
     return Alignment(pose, covariance, surface.centre + offset[:3], True, words)
 
 
@@ -144,26 +141,22 @@ class _Surface:
 
 def _searched(before: PlacedMap, surface: _Surface) -> Floats:
     """The nearest of the poses at which points agree about as well with planes of the earlier surface as anywhere."""
-    cell_m, radius_m = _SEARCH_CELLS * before.leaf_m, surface.radius_m
-    planes = LocalPlanes(cell_m)
+    planes = LocalPlanes(_SEARCH_CELLS * before.leaf_m)
     planes.add(np.ascontiguousarray(before.vertices - surface.centre))
-    points = thinned(surface.points - surface.centre, _SEARCHED)
-    variances = np.diag(_APART**2)
-    wide = ExpectedStep(
-        Rate(np.zeros(3), variances[3:, 3:]), np.zeros(3), np.zeros(3), variances[:3, :3], 1.0
-    )
-    turns, poses = wide.candidates(0.5 * cell_m, radius_m)
-    width = 0.25 * cell_m
-    scores = planes.scores(points, poses, [width**2, *[(width / radius_m) ** 2] * 2])
+    points = np.ascontiguousarray((surface.points - surface.centre)[:: -(-len(surface.points) // _SEARCHED)])
+    # A quasi-random sequence leaves fewer holes than random numbers (Sobol 1967).
+    offsets = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(_TRIED) * _APART
+    poses = moved(np.tile(np.eye(4), (_TRIED, 1, 1)), offsets)
+    width_m = 0.25 * _SEARCH_CELLS * before.leaf_m
+    scores = planes.scores(points, poses, [width_m**2, *[(width_m / surface.radius_m) ** 2] * 2])
     best = np.argsort(-scores.mean(axis=1))[:_FOLLOWED]
     losses = scores[best[0]] - scores[best]
-    alike = best[losses.mean(axis=1) <= _ERRORS * losses.std(axis=1) / np.sqrt(len(points))]
-    offsets = np.concatenate([poses[alike, :3, 3], turns[alike]], axis=1)
-    return surface.pose(offsets[((offsets / _APART) ** 2).sum(axis=1).argmin()])
+    alike = offsets[best[losses.mean(axis=1) <= _ERRORS * losses.std(axis=1) / np.sqrt(len(points))]]
+    return surface.pose(alike[((alike / _APART) ** 2).sum(axis=1).argmin()])
 
 
-def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, Floats]:
-    """The pose that fits the surfaces, its covariance, and axes (6, K) that they do not determine: there it stays as given."""
+def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, int]:
+    """The pose that fits the surfaces, its covariance, and how many axes they do not determine: there it stays as given."""
     information = np.diag(_APART**-2.0)
     pose, covariance = _settled(before, surface, start, information)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
@@ -178,16 +171,14 @@ def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Fl
         pose, _ = _settled(before, surface, surface.pose(offset / lever_m), information)
     # Errors of normals would make larger ones errors of all surfaces.
     covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
-    return pose, covariance / np.outer(lever_m, lever_m), unsure
+    return pose, covariance / np.outer(lever_m, lever_m), unsure.shape[1]
 
 
 def _settled(before: PlacedMap, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
-    """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change.
-
-    Errors of the normals of both maps are independent: products of normals of different maps tell along which axes surfaces
-    determine the pose (instrumental variables). Errors are correlated in a patch, so the scatter of its sums is the
-    covariance of the equations (Hansen 1982).
-    """
+    """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change."""
+    # Errors of the normals of both maps are independent: products of normals of different maps show along which axes
+    # surfaces determine the pose (instrumental variables). Errors are correlated in a patch, so the scatter of its sums
+    # is the covariance of the equations (Hansen 1982).
     covariance = np.linalg.inv(prior)
     for _ in range(_ITERATIONS):
         there, own = _placed(surface.points, pose), turned(surface.normals, pose[:3, :3])

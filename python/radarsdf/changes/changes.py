@@ -53,7 +53,7 @@ class ChangedSurface:
     in common. NaN without such views."""
 
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
-        """Kinds and areas of the faces.
+        """Compute kinds and areas of the faces.
 
         Returns
         -------
@@ -106,13 +106,11 @@ class Changes:
     T_before_after: Floats
     """(4, 4) from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
-    """`alignment`: in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map knows; `changed_share`, the
-    estimated share of it that changed; `freedom` and `scale` of Student's t, which distances between the maps follow over
-    their standard errors; `reflectance`: the common offset of intensities in words, or why they were not compared;
-    `intensity_offset`, sensor units, None if they were not compared."""
+    """`alignment`: in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map knows; `reflectance`:
+    the common offset of intensities in words, or why they were not compared; `intensity_offset`, sensor units, or None."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
-        """Connected components of changes.
+        """List the connected components of changes.
 
         Parameters
         ----------
@@ -122,7 +120,7 @@ class Changes:
         Returns
         -------
         list of Region
-            The largest first.
+            The largest first. Each is of the faces of one kind, on one of the two surfaces.
         """
         found = []
         for surface, kinds in ((self.before, (GONE, MOVED)), (self.after, (APPEARED, MOVED, REPAINTED))):
@@ -130,8 +128,8 @@ class Changes:
             for kind in kinds:
                 rows = np.flatnonzero(of_faces == kind)
                 labels, sizes = mesh_components(surface.faces[rows], len(surface.vertices))
-                order = np.argsort(labels, kind="stable")
-                for faces in np.split(rows[order], np.cumsum(sizes)[:-1]) if len(rows) else []:
+                ends = np.cumsum(sizes)[:-1]
+                for faces in np.split(rows[np.argsort(labels, kind="stable")], ends) if len(rows) else []:
                     vertices = np.unique(surface.faces[faces])
                     x = surface.vertices[vertices]
                     region = Region(
@@ -147,13 +145,14 @@ class Changes:
         return sorted(found, key=lambda region: -region.area_m2)
 
     def mesh(self) -> trimesh.Trimesh:
-        """The later surface, and the faces of the earlier one that are gone or moved, in colours.
+        """Combine the later surface with the faces of the earlier one that are gone or moved, in colours.
 
         Returns
         -------
         trimesh.Trimesh
             World of the earlier map, m. Green appeared, vermilion is gone, orange moved, purple was repainted, grey is the
-            same, and light grey is unseen. ``vertex_attributes`` are `kind`, `probability`, `moved_m` and `intensity_change`.
+            same, and light grey is unseen. ``vertex_attributes`` (V,) are `kind`, `probability`, `moved_m` and
+            `intensity_change` of :class:`ChangedSurface`.
         """
         import trimesh  # noqa: PLC0415 - slow to import
 

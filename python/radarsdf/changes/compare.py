@@ -52,22 +52,24 @@ def compare(
     box: ArrayLike | None = None,
     progress: bool | None = None,
 ) -> Changes:
-    """Find what appeared, is gone, moved its surface or was repainted between two maps of one place.
+    """Detect what appeared, disappeared, moved or was repainted between two maps of one place.
 
     Unseen is not gone. A surface is gone only where rays of the later drive passed the place, and it appeared only where
-    those of the earlier drive did; elsewhere it is unseen. The probability of a change follows from the distance of the
-    surfaces and its standard error, from how many scans hit the place and passed it on both days, from the confidence of the
-    surface that changed, and from intensities of equal views. The share of what changed is estimated from all places together.
+    those of the earlier drive did. The probability of a change follows from the distance of the surfaces and its standard
+    error, from how many scans hit the place and passed it on both days, from the confidence of the surface that changed, and
+    from intensities of equal views. The share of what changed is estimated from all places together.
 
     Parameters
     ----------
     before : Map
         The earlier map, fitted with ``returns.passages``, which is the default of :class:`FitConfig`.
     after : Map, iterable of F arrays, or Scans
-        The later map, likewise; or new scans as :func:`fit` takes them, of which a quick map is made first, with the ranges,
+        The later map, fitted likewise; or new scans as :func:`fit` takes them, of which a quick map is made first, with the ranges,
         errors of poses and leaf cells of `before`.
-    poses, intensities
-        Of new scans, as :func:`fit` takes them.
+    poses : (F, 4, 4) array_like, optional
+        Of new scans: T_world_sensor, m.
+    intensities : iterable of F arrays (N_i,), optional
+        Of new scans: sensor units.
     align_frames : bool
         Whether the later map may be moved as a whole. It is if its surface shows that the frames are apart, at a significance
         level of 0.001; they may be some metres and some degrees apart. Along axes that surfaces do not determine, such as
@@ -104,19 +106,20 @@ def compare(
     elif poses is not None or intensities is not None:
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)
-    check_passages(before, "before")
-    check_passages(after, "after")
     corners = None if box is None else check_box(box)
-    earlier, later = PlacedMap.of(before), PlacedMap.of(after)
-    for name, placed in (("before", earlier), ("after", later)):
-        if len(placed.faces) == 0:
+    placed = []
+    for name, radar_map in (("before", before), ("after", after)):
+        check_passages(radar_map, name)
+        placed.append(PlacedMap.of(radar_map))
+        if len(placed[-1].faces) == 0:
             msg = f"{name} has no surface: its mesh has 0 triangles. Fit it with more scans of the place"
             raise ValueError(msg)
+    earlier, later = placed
     alignment = align(earlier, later) if align_frames else Alignment()
-    later = later.at(alignment.T_before_after)
+    later = replace(later, T_common_map=alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
     errors = Errors.of(sides)
-    log_odds = [side.log_odds(errors) for side in sides]
+    log_odds = [errors.log_odds(side) for side in sides]
     share = share_of_changes(np.concatenate([absent for absent, _ in log_odds]))
     gone, appeared = (
         _changed(side, *odds, share, kind)
@@ -124,27 +127,26 @@ def compare(
     )
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
+    report: dict[str, Any] = {"alignment": alignment.words, "intensity_offset": None}
     if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
         appeared = _repainted(appeared, differences.apart_from(np.concatenate(changed)))
-    surfaces = [surface if corners is None else _inside(corners, surface) for surface in (gone, appeared)]
-    report = _report(surfaces, alignment, share, errors, differences)
-    return Changes(surfaces[0], surfaces[1], alignment.T_before_after, report)
+        report["intensity_offset"] = differences.offset
+        differences = (
+            f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units: "
+            "that is no change of a place."
+        )
+    report["reflectance"] = differences
+    if corners is not None:
+        gone, appeared = _inside(corners, gone), _inside(corners, appeared)
+    return Changes(gone, appeared, alignment.T_before_after, report | _areas(gone, appeared))
 
 
 def _quick(config: FitConfig) -> FitConfig:
     """Settings of the quick map of new scans."""
-    old = config.returns
-    return FitConfig.quick(
-        leaf_size_m=config.leaf_size_m,
-        returns={
-            "passages": True,
-            "min_range_m": old.min_range_m,
-            "max_range_m": old.max_range_m,
-            "pose_sigma_m": old.pose_sigma_m,
-            "pose_sigma_rad": old.pose_sigma_rad,
-        },
-    )
+    names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
+    same = {name: getattr(config.returns, name) for name in names}
+    return FitConfig.quick(leaf_size_m=config.leaf_size_m, returns={"passages": True, **same})
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
@@ -152,8 +154,7 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     vertices = own_map.to_common(own_map.vertices)
     own = own_map.evidence(vertices)
     other = other_map.evidence(vertices, own.normals)
-    own_sigma_m = np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals))
-    sigma_m = np.hypot(own_sigma_m, other.sigma_m)
+    sigma_m = np.hypot(np.hypot(own.sigma_m, alignment.sigma_m(vertices, own.normals)), other.sigma_m)
     return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
@@ -162,39 +163,30 @@ def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: in
     own, other = side.own, side.other
     gone = own.confidence * posterior(absent, share)
     elsewhere = own.confidence * posterior(shifted, share)
-    parallel = side.parallel
-    moved = np.where(parallel, other.confidence * elsewhere, 0.0)
+    moved = np.where(side.parallel, other.confidence * elsewhere, 0.0)
     seen = np.isfinite(other.distance_m)
     behind = seen & (other.distance_m < 0)
     kinds = np.where(seen, SAME, UNSEEN).astype(np.int8)
     # What lies deep behind the other surface is hidden by it.
-    kinds[behind & ~parallel & (elsewhere > _PROBABLE)] = UNSEEN
+    kinds[behind & ~side.parallel & (elsewhere > _PROBABLE)] = UNSEEN
     kinds[~behind & (gone > _PROBABLE)] = lost
     # A surface that is elsewhere is more than one that is not here. In front of the other one, rays must have passed, too.
     kinds[(moved > _PROBABLE) & (behind | (seen & (gone > _PROBABLE)))] = MOVED
     probability = np.where(kinds == MOVED, np.maximum(moved, np.where(behind, 0, gone)), gone)
     # Along the normal: the earlier surface moved to where the later one is.
     towards = -other.distance_m if lost == GONE else other.distance_m
-    return ChangedSurface(
-        side.vertices,
-        side.faces,
-        kinds,
-        probability.astype(np.float32),
-        np.where(kinds == MOVED, towards, np.nan).astype(np.float32),
-        np.full(len(kinds), np.nan, np.float32),
-    )
+    moved_m = np.where(kinds == MOVED, towards, np.nan).astype(np.float32)
+    unknown = np.full(len(kinds), np.nan, np.float32)
+    return ChangedSurface(side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m, unknown)
 
 
 def _repainted(surface: ChangedSurface, differences: Differences) -> ChangedSurface:
     """The later surface, with what changed its reflectance alone."""
-    same = surface.kind == SAME
-    change, probability = differences.probability(surface.vertices, same)
+    change, repainted = differences.probability(surface.vertices, surface.kind == SAME)
     return replace(
         surface,
-        kind=np.where(probability > _PROBABLE, REPAINTED, surface.kind).astype(np.int8),
-        probability=np.where(
-            same, np.maximum(surface.probability, probability.astype(np.float32)), surface.probability
-        ),
+        kind=np.where(repainted > _PROBABLE, REPAINTED, surface.kind).astype(np.int8),
+        probability=np.maximum(surface.probability, repainted.astype(np.float32)),
         intensity_change=change.astype(np.float32),
     )
 
@@ -215,18 +207,19 @@ def _check_common(
     Maps in wrong frames agree about the ground and a level floor, so level and steep surfaces are judged separately;
     and on both sides, since a place may be cleared.
     """
-    if all((of_side == UNSEEN).all() for of_side in kinds):
+    seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
+    if seen == 0:
         msg = f"the maps have no surface in common: they are of other places, or in other frames. {alignment.words}"
         raise ValueError(msg)
-    seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
     for name, is_level in (("level", True), ("steep", False)):
-        changed, agree = [], []
-        for side, of_side in zip(sides, kinds, strict=True):
+        changed, agree = np.zeros(2), np.zeros(2)
+        for i, (side, of_side) in enumerate(zip(sides, kinds, strict=True)):
             mask = (np.abs(side.own.normals[:, 2]) >= _LEVEL) == is_level
-            changed.append(int((mask & (of_side > SAME)).sum()))
-            agree.append(int((mask & side.agree(errors, _AGREEING_SIGMAS) & (of_side == SAME)).sum()))
-        if sum(changed) > _MOST_CHANGED * seen and all(a > b for a, b in zip(changed, agree, strict=True)):
-            shares = " and ".join(f"{a / (a + b):.0%}" for a, b in zip(changed, agree, strict=True))
+            limit_m = _AGREEING_SIGMAS * errors.scale * side.sigma_m
+            alike = side.parallel & (np.abs(side.other.distance_m) <= limit_m) & (of_side == SAME)
+            changed[i], agree[i] = (mask & (of_side > SAME)).sum(), (mask & alike).sum()
+        if changed.sum() > _MOST_CHANGED * seen and (changed > agree).all():
+            shares = " and ".join(f"{part:.0%}" for part in changed / (changed + agree))
             msg = (
                 f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. {alignment.words} "
                 "Give maps of one place, whose frames are at most some metres and degrees apart, with poses that do not drift"
@@ -234,32 +227,12 @@ def _check_common(
             raise ValueError(msg)
 
 
-def _report(
-    surfaces: Sequence[ChangedSurface],
-    alignment: Alignment,
-    share: float,
-    errors: Errors,
-    differences: Differences | str,
-) -> dict[str, Any]:
-    """See :attr:`Changes.report`."""
-    areas = dict.fromkeys((NAMES[kind] for kind in CHANGED), 0.0)
-    compared = 0.0
-    for surface in surfaces:
-        of_faces, face_m2 = surface.of_faces()
-        compared += float(face_m2[of_faces != UNSEEN].sum())
-        for kind in CHANGED:
-            areas[NAMES[kind]] += float(face_m2[of_faces == kind].sum())
-    words, offset = differences, None
-    if isinstance(differences, Differences):
-        offset = differences.offset
-        words = f"All returns of the later drive are {offset:+.1f} stronger, sensor units: that is no change of a place."
+def _areas(*surfaces: ChangedSurface) -> dict[str, Any]:
+    """Areas for a report."""
+    kinds, areas_m2 = (
+        np.concatenate(columns) for columns in zip(*(s.of_faces() for s in surfaces), strict=True)
+    )
     return {
-        "alignment": alignment.words,
-        "areas_m2": areas,
-        "compared_m2": compared,
-        "changed_share": share,
-        "scale": errors.scale,
-        "freedom": errors.freedom,
-        "reflectance": words,
-        "intensity_offset": offset,
+        "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},
+        "compared_m2": float(areas_m2[kinds != UNSEEN].sum()),
     }

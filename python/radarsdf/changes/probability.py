@@ -10,7 +10,7 @@ chance alone makes few changes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -25,9 +25,8 @@ from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
 
-_REACH_CELLS = (
-    2.0  # a field knows distances about so far from its surface: returns scatter into the next cells
-)
+# A field knows distances about so far from its surface: returns scatter into the next cells.
+_REACH_CELLS = 2.0
 PARALLEL = np.cos(np.pi / 4)
 """Least cosine between normals of surfaces that are about parallel: one that moved still is."""
 _BLOCK_M = 32.0  # cells are looked up in blocks, so that few are in memory
@@ -48,15 +47,16 @@ _MOST_DISTANCES = 5_000  # evenly spread, for both
 class PlaceEvidence:
     """Surface, hits and free space of a map at N places."""
 
-    distance_m: Floats
-    """(N,) from the surface along its normal, positive in free space. NaN where it was not observed."""
+    distance_m: (
+        Floats  # (N,) from the surface along its normal, positive in free space. NaN where not observed
+    )
     normals: Floats  # (N, 3) of that surface, towards free space, in the common frame
-    sigma_m: Floats  # (N,) standard error of the surface's position. NaN where there are no returns.
+    sigma_m: Floats  # (N,) standard error of the surface's position. NaN where there are no returns
     confidence: Floats  # (N,) probability of a surface there
     hits: Floats  # (N,) scans with returns in the 27 leaf cells near the place, added up over the cells
+    # (N,) scans with rays through the 27 cells near a place behind the surface, likewise, a ray counted once. Rays that
+    # graze a surface pass in front of it, and are no evidence against it.
     passes: Floats
-    """(N,) scans with rays through the 27 cells near a place behind the surface, likewise, a ray counted once. Rays that graze a
-    surface pass in front of it, and do not tell that it is not there."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,6 @@ class PlacedMap:
         sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
         return cls(radar_map, np.eye(4), vertices, faces, normals, sigma_m)
 
-    def at(self, T_common_map: Floats) -> PlacedMap:
-        """The map in another place (4, 4)."""
-        return replace(self, T_common_map=T_common_map)
-
     @property
     def leaf_m(self) -> float:
         """Edge of a leaf cell, m."""
@@ -98,7 +94,7 @@ class PlacedMap:
         return cKDTree(self.vertices)
 
     def nearest(self, x: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
-        """Of places (N, 3), world of the map, m: distances (N,) of the nearest vertices, m, their rows, and distances from their planes."""
+        """Distances of the vertices nearest to places (N, 3), world of the map, their rows, and distances from their planes."""
         near_m, rows = self._tree.query(x)
         away = x - self.vertices[rows]
         return near_m, rows, np.einsum("ni,ni->n", away, self.normals[rows])
@@ -130,64 +126,15 @@ class PlacedMap:
     def _passes(self, own: Floats) -> Floats:
         """(N,) see :attr:`PlaceEvidence.passes`, of places (N, 3), world of the map, m."""
         found = np.zeros(len(own))
-        leaf_m = self.leaf_m
-        blocks = np.floor(own / _BLOCK_M).astype(np.int64)
-        order = np.lexsort(blocks.T)
-        edges = np.flatnonzero((np.diff(blocks[order], axis=0) != 0).any(axis=1)) + 1
-        for rows in np.split(order, edges):
-            if len(rows) == 0:
-                continue
-            x = own[rows]
-            cells = self.radar_map.cells_round(x.min(axis=0) - 2 * leaf_m, x.max(axis=0) + 2 * leaf_m)
-            # The core counts up to seven scans for a cell: counts up to 63 tell no more.
+        blocks = np.unique(np.floor(own / _BLOCK_M), axis=0, return_inverse=True)[1].ravel()
+        edges = np.cumsum(np.bincount(blocks))[:-1]
+        for rows in np.split(np.argsort(blocks, kind="stable"), edges) if len(own) else []:
+            x, margin_m = own[rows], 2 * self.leaf_m
+            cells = self.radar_map.cells_round(x.min(axis=0) - margin_m, x.max(axis=0) + margin_m)
+            # The core counts up to seven scans for a cell: larger counts carry no information.
             near = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
-            places = np.floor((x - cells.corner) / leaf_m).astype(np.int64)
+            places = np.floor((x - cells.corner) / self.leaf_m).astype(np.int64)
             found[rows] = np.rint(near[tuple(places.T)]) / _CELLS_ALONG_RAY
-        return found
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Distances between surfaces that did not change, over their standard error: Student's t, widened.
-
-    At edges, in corners and at ghosts both maps are worse than their uncertainty says, so some distances are far off.
-    """
-
-    freedom: float  # degrees of freedom. Few: some distances are far larger than the others.
-    scale: float  # by how much they are larger than the standard errors say
-
-    @classmethod
-    def of(cls, sides: Sequence[Side]) -> Errors:
-        """The errors that make the distances most likely, if an unknown share of them is of other surfaces within reach."""
-        known = [side.distances() for side in sides]
-        distance_m, sigma_m = (np.concatenate(columns) for columns in zip(*known, strict=True))
-        reach_m = np.repeat([side.reach_m for side in sides], [len(found) for found, _ in known])
-        some = slice(None, None, -(-len(distance_m) // _MOST_DISTANCES) or 1)
-        distance_m, sigma_m, reach_m = distance_m[some], sigma_m[some], reach_m[some]
-        if len(distance_m) == 0:
-            return cls(_FREEDOMS[-1], 1.0)
-
-        def likelihood(errors: Errors) -> float:
-            same, other = errors.log_density(distance_m, sigma_m), -np.log(2 * reach_m)
-            share = share_of_changes(other - same)
-            return float(np.logaddexp(np.log(1 - share) + same, np.log(share) + other).sum())
-
-        return max((cls(freedom, scale) for freedom in _FREEDOMS for scale in _SCALES), key=likelihood)
-
-    def log_density(self, distance_m: Floats, sigma_m: Floats) -> Floats:
-        """(N,) logarithm of the density of distances (N,) with standard errors (N,), 1/m."""
-        width_m, n = self.scale * sigma_m, self.freedom
-        constant = gammaln((n + 1) / 2) - gammaln(n / 2) - 0.5 * np.log(n * np.pi)
-        found: Floats = constant - np.log(width_m) - (n + 1) / 2 * np.log1p((distance_m / width_m) ** 2 / n)
-        return found
-
-    def log_spread(self, distance_m: Floats, sigma_m: Floats, lower_m: float, upper_m: float) -> Floats:
-        """:meth:`log_density` for a surface that lies anywhere in [lower_m, upper_m]."""
-        width_m = self.scale * sigma_m
-        inside = stdtr(self.freedom, (upper_m - distance_m) / width_m)
-        inside -= stdtr(self.freedom, (lower_m - distance_m) / width_m)
-        # Far outside, the difference is nothing but rounding.
-        found: Floats = np.log(np.maximum(inside, 1e-12) / (upper_m - lower_m))
         return found
 
 
@@ -215,24 +162,62 @@ class Side:
         mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
         return mask
 
-    def agree(self, errors: Errors, sigmas: float) -> NDArray[np.bool_]:
-        """(V,) whether the other map has the surface, to within so many of its standard errors."""
-        return self.parallel & (np.abs(self.other.distance_m) <= sigmas * errors.scale * self.sigma_m)
 
-    def distances(self) -> tuple[Floats, Floats]:
-        """(K,) distances that are known, and their standard errors, m."""
-        return self.other.distance_m[self.observed], self.sigma_m[self.observed]
+@dataclass(frozen=True)
+class Errors:
+    """Distances between surfaces that did not change, over their standard error: Student's t, widened.
 
-    def log_odds(self, errors: Errors) -> tuple[Floats, Floats]:
+    At edges, in corners and at ghosts both maps are worse than their uncertainty says, so some distances are far off.
+    """
+
+    freedom: float  # degrees of freedom. Few: some distances are far larger than the others.
+    scale: float  # by how much they are larger than the standard errors say
+
+    @classmethod
+    def of(cls, sides: Sequence[Side]) -> Errors:
+        """The errors that make the distances most likely, if an unknown share of them is of other surfaces within reach."""
+        columns = [
+            np.stack([s.other.distance_m, s.sigma_m, np.full(len(s.sigma_m), s.reach_m)])[:, s.observed]
+            for s in sides
+        ]
+        known = np.concatenate(columns, axis=1)
+        if known.size == 0:
+            return cls(_FREEDOMS[-1], 1.0)
+        distance_m, sigma_m, reach_m = known[:, :: -(-known.shape[1] // _MOST_DISTANCES)]
+
+        def likelihood(errors: Errors) -> float:
+            same, other = errors.log_density(distance_m, sigma_m), -np.log(2 * reach_m)
+            share = share_of_changes(other - same)
+            return float(np.logaddexp(np.log(1 - share) + same, np.log(share) + other).sum())
+
+        return max((cls(freedom, scale) for freedom in _FREEDOMS for scale in _SCALES), key=likelihood)
+
+    def log_density(self, distance_m: Floats, sigma_m: Floats) -> Floats:
+        """(N,) logarithm of the density of distances (N,) with standard errors (N,), 1/m."""
+        width_m, n = self.scale * sigma_m, self.freedom
+        constant = gammaln((n + 1) / 2) - gammaln(n / 2) - 0.5 * np.log(n * np.pi)
+        found: Floats = constant - np.log(width_m) - (n + 1) / 2 * np.log1p((distance_m / width_m) ** 2 / n)
+        return found
+
+    def _log_spread(self, distance_m: Floats, sigma_m: Floats, lower_m: float, upper_m: float) -> Floats:
+        """:meth:`log_density` for a surface that lies anywhere in [lower_m, upper_m]."""
+        width_m = self.scale * sigma_m
+        inside = stdtr(self.freedom, (upper_m - distance_m) / width_m)
+        inside -= stdtr(self.freedom, (lower_m - distance_m) / width_m)
+        # Far outside, the difference is nothing but rounding.
+        found: Floats = np.log(np.maximum(inside, 1e-12) / (upper_m - lower_m))
+        return found
+
+    def log_odds(self, side: Side) -> tuple[Floats, Floats]:
         """Logarithms (V,) of how much more likely the evidence is if the surface is absent from the other map than if it is still
         there; and if it is elsewhere along its normal, to either side, -inf where that was not observed."""
-        observed, reach_m = self.observed, self.reach_m
-        distance_m, sigma_m = self.distances()
-        same = errors.log_density(distance_m, sigma_m)
-        absent = _passed(self.own, self.other)
+        observed, reach_m = side.observed, side.reach_m
+        distance_m, sigma_m = side.other.distance_m[observed], side.sigma_m[observed]
+        same = self.log_density(distance_m, sigma_m)
+        absent = _passed(side.own, side.other)
         shifted = np.full(len(absent), -np.inf)
-        shifted[observed] = errors.log_spread(distance_m, sigma_m, -reach_m, reach_m) - same
-        absent[observed] += errors.log_spread(distance_m, sigma_m, 0.0, reach_m) - same
+        shifted[observed] = self._log_spread(distance_m, sigma_m, -reach_m, reach_m) - same
+        absent[observed] += self._log_spread(distance_m, sigma_m, 0.0, reach_m) - same
         return absent, shifted
 
 
@@ -252,10 +237,7 @@ def _passed(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
 
 
 def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:
-    """(N,) logarithm of how much more likely differences (N,) are by a change than by errors with deviations (N,).
-
-    A change may make any difference within reach.
-    """
+    """(N,) logarithm of how much more likely differences (N,) are by a change, of any size within reach, than by errors."""
     found: Floats = 0.5 * (differences / sigma) ** 2 + np.log(sigma * np.sqrt(2 * np.pi) / (2 * reach))
     return found
 

@@ -63,9 +63,9 @@ class Differences:
 
         What both maps expect is subtracted from both days: so views may differ a little within what counts as one.
         """
-        scales = [scale for p in (before, after) if (scale := p.radar_map.intensity_scale) is not None]
-        days = [_placed(placed) for placed in (before, after)]
-        if len(scales) < len(days) or not all(len(day.counts) for day in days):
+        scales = [p.radar_map.intensity_scale for p in (before, after)]
+        days = [_placed(p) for p in (before, after)]
+        if None in scales or not all(len(day.counts) for day in days):
             return "Reflectance was not compared: a map has no intensities."
         leaf_m = max(before.leaf_m, after.leaf_m)
         points, directions, ranges_m, counts, intensities = (
@@ -75,23 +75,18 @@ class Differences:
         sensors = points - directions * ranges_m[:, None]
         expected = [p.radar_map.intensity(p.to_own(points), p.to_own(sensors)) for p in (before, after)]
         left = intensities - np.mean(expected, axis=0)
-        later = np.repeat([False, True], [len(day.counts) for day in days])
-        rows, count = rows_of_views(points - points.mean(axis=0), directions, ranges_m, leaf_m)
-        sums = []
-        for of_day in (~later, later):
-            known = of_day & np.isfinite(left)
-            columns = np.column_stack([np.ones(len(left)), left, intensities, points])
-            sums.append(
-                np.stack(
-                    [np.bincount(rows[known], counts[known] * column[known], count) for column in columns.T]
-                )
-            )
-        both = (sums[0][0] > 0) & (sums[1][0] > 0)
-        if not both.any():
+        of_day = np.repeat([0, 1], [len(day.counts) for day in days])
+        views, count = rows_of_views(points - points.mean(axis=0), directions, ranges_m, leaf_m)
+        known = np.isfinite(left)
+        row = (of_day * count + views)[known]
+        columns = np.column_stack([np.ones(len(left)), left, intensities, points])[known]
+        sums = np.stack([np.bincount(row, counts[known] * column, 2 * count) for column in columns.T])
+        sums = sums.reshape(len(sums), 2, count)  # by day and view
+        first, second = sums[:, :, (sums[0] > 0).all(axis=0)].transpose(1, 0, 2)
+        if first.size == 0:
             return "Reflectance was not compared: the maps share no view."
-        first, second = (summed[:, both] for summed in sums)
         spreads = [np.subtract(*np.percentile(day[2] / day[0], [95, 5])) for day in (first, second)]
-        if both.sum() > _FEWEST_VIEWS and max(spreads) > _OTHER_UNITS * min(spreads):
+        if first.shape[1] > _FEWEST_VIEWS and max(spreads) > _OTHER_UNITS * min(spreads):
             return (
                 f"Reflectance was not compared: from the same views, intensities of the earlier map spread over {spreads[0]:.3g}, "
                 f"of the later one over {spreads[1]:.3g}, so they are in other units."
@@ -103,8 +98,12 @@ class Differences:
             values - offset,
             days[0].sigma ** 2 / first[0] + days[1].sigma ** 2 / second[0],
         )
-        within = [_left_of(day, expected[number][later == bool(number)]) for number, day in enumerate(days)]
-        width = max(scale.high - scale.low for scale in scales)
+        within = []
+        for number, day in enumerate(days):
+            rest = day.intensities - expected[number][of_day == number]
+            of_own = _Means(day.points, rest, day.sigma**2 / day.counts)
+            within.append(of_own.select(np.isfinite(rest)))
+        width = max(scale.high - scale.low for scale in scales if scale is not None)
         return cls(between, within, offset, PLACE_CELLS * leaf_m, width)
 
     def apart_from(self, changed: Floats) -> Differences:
@@ -127,7 +126,7 @@ class Differences:
         of_day, of_change = chi2 / np.maximum(freedom, 1), chi2_between / np.maximum(freedom_between, 1)
         ratio = np.sqrt(np.maximum(np.maximum(of_day, of_change), 1))
         known = counting & np.isfinite(mean)
-        # A change is as likely by any difference that the range of intensities has room for.
+        # A change may have any size within the range of intensities.
         odds = odds_of_differences(mean[known], (sigma * ratio)[known], self.width)
         changed = np.zeros(len(x))
         changed[known] = posterior(odds, share_of_changes(odds))
@@ -142,10 +141,3 @@ def _placed(placed: PlacedMap) -> EchoesAt:
         points=placed.to_common(echoes.points),
         directions=turned(echoes.directions, placed.T_common_map[:3, :3]),
     )
-
-
-def _left_of(day: EchoesAt, expected: Floats) -> _Means:
-    """What its map leaves of the means of a day, of which it expects `expected` (G,)."""
-    left = day.intensities - expected
-    known = np.isfinite(left)
-    return _Means(day.points, left, day.sigma**2 / day.counts).select(known)

@@ -108,8 +108,7 @@ def grid(
 ) -> None:
     """Make the grid, write its files, draw it.
 
-    out: A file to write, may be repeated: .npz with all arrays, .ply of the voxels' centres, .bt for OctoMap, .yaml and .pgm
-        for ROS's map_server.
+    out: A file to write, may be repeated: .npz with all arrays, .bt for OctoMap, .yaml and .pgm for ROS's map_server.
     voxel: Edge length of a voxel, m.
     heights: Range of heights above the ground that the .yaml map covers, m.
     distances: Also write the Euclidean distance field of the grid, as .npz.
@@ -117,7 +116,7 @@ def grid(
     picture: Also draw heights, costs and free space, as .png.
     """
     from radarsdf.extras import require
-    from radarsdf.grids.files import check_arrays_path, check_flat_path, check_grid_path
+    from radarsdf.grids.files import check_suffix
     from radarsdf.grids.grid import save_arrays
     from radarsdf.grids.occupancy import grid as grid_of
     from radarsdf.io.files import check_outputs
@@ -126,11 +125,10 @@ def grid(
     flat = [path for path in out if path.suffix == ".yaml"]
     whole = [path for path in out if path.suffix != ".yaml"]
     for path in whole:
-        check_grid_path(path)
-    for path in flat:
-        check_flat_path(path)
+        check_suffix(path, ".npz", ".bt", ".yaml")
     for arrays_path in (distances, costmap):
-        check_arrays_path(arrays_path)
+        if arrays_path is not None:
+            check_suffix(arrays_path, ".npz")
     if picture is not None:
         require("matplotlib", what="pictures need")
     outputs = [*out, *(path.with_suffix(".pgm") for path in flat), distances, costmap, picture]

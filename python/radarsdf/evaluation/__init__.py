@@ -8,22 +8,15 @@ The functions take meshes and arrays, not maps, so they measure the results of o
 
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime
 
-from .calibration import ConfidenceMetrics, UncertaintyMetrics, confidence_metrics, uncertainty_metrics
-from .intensity import IntensityMetrics, KNNIntensity, holdout, intensity_metrics
-from .surface import SurfaceMetrics, adjacent_angles, format_metrics, gamma_from_moments, surface_metrics
-from .trajectory import TrajectoryMetrics, trajectory_metrics
+from .calibration import confidence_metrics, uncertainty_metrics
+from .intensity import KNNIntensity, holdout, intensity_metrics
+from .surface import format_metrics, surface_metrics
+from .trajectory import trajectory_metrics
 
 __all__ = [
-    "ConfidenceMetrics",
-    "IntensityMetrics",
     "KNNIntensity",
-    "SurfaceMetrics",
-    "TrajectoryMetrics",
-    "UncertaintyMetrics",
-    "adjacent_angles",
     "confidence_metrics",
     "format_metrics",
-    "gamma_from_moments",
     "holdout",
     "intensity_metrics",
     "surface_metrics",

@@ -5,37 +5,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.checks import MAX_POSITION_M, real_array, refuse_masked, whole_number
+from radarsdf.checks import positions, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"  # changes when the meaning of a number changes
 
 _Floats = NDArray[np.float64]
-_MAX_FRAMES = 10**8  # 58 days at 20 Hz; a larger number is a mistake and would fill the memory
-_MAX_INTENSITY = 1e100  # a sum of as many intensities as fit in memory stays finite
 _CHUNK = 1 << 21  # candidates at a time, of all queries together: about 130 MB
 _DISTANCE_M, _ANGLE_RAD = 0.1, 0.1  # noise of the returns: smaller differences hardly change a weight
 _KS = (1, 2, 4, 8, 16, 32)
 _CANDIDATES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
-_MAX_QUERIES = 20_000  # held-out returns that are predicted to choose between them, evenly spread
+_EVERY = 5  # training scans from one that is held out to the next, to choose between them
+_MAX_QUERIES = 20_000  # held-out returns that are predicted to choose, evenly spread
 
 
-class IntensityMetrics(TypedDict):
-    """Result of `intensity_metrics`."""
-
-    protocol: str
-    mae: float
-    medae: float
-    num_returns: int
-
-
-def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMetrics:
+def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, Any]:
     """Compute the errors of predicted intensities.
 
     Parameters
@@ -45,7 +35,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
 
     Returns
     -------
-    IntensityMetrics
+    dict of str to float
         `mae` and `medae`, mean and median absolute error in the sensor's units, and `num_returns`.
 
     Raises
@@ -56,22 +46,19 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> IntensityMet
         If the values are not real numbers.
     """
     p, m = real_array(predicted, "predicted"), real_array(measured, "measured")
-    if p.ndim != 1 or p.shape != m.shape:
-        msg = f"predicted {p.shape} and measured {m.shape} must both be (N,)"
-        raise ValueError(msg)
-    if p.size == 0:
-        msg = "no returns to compare"
-        raise ValueError(msg)
-    if not ((np.abs(p) <= _MAX_INTENSITY).all() and (np.abs(m) <= _MAX_INTENSITY).all()):
-        msg = f"predicted and measured must be finite, and within {_MAX_INTENSITY:g}"
+    if p.ndim != 1 or p.shape != m.shape or p.size == 0:
+        msg = f"predicted {p.shape} and measured {m.shape} must both be (N,), of at least one return"
         raise ValueError(msg)
     error = np.abs(p - m)
-    return IntensityMetrics(
-        protocol=INTENSITY_PROTOCOL,
-        mae=float(error.mean()),
-        medae=float(np.median(error)),
-        num_returns=p.size,
-    )
+    if not np.isfinite(error).all():
+        msg = "predicted and measured must be finite"
+        raise ValueError(msg)
+    return {
+        "protocol": INTENSITY_PROTOCOL,
+        "mae": float(error.mean()),
+        "medae": float(np.median(error)),
+        "num_returns": p.size,
+    }
 
 
 def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -101,16 +88,15 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
     >>> train.tolist(), test.tolist()
     ([1, 2, 4, 5], [0, 3, 6])
     """
-    whole_number(every, "every", -(2**63))
     if isinstance(frames, (int, np.integer)):
-        numbers = np.arange(whole_number(frames, "frames", 0, _MAX_FRAMES))
+        numbers = np.arange(frames)
     else:
         real_array(frames, "frames")
         numbers = np.asarray(frames)
-        if numbers.size and (numbers.dtype.kind not in "iu" or numbers.max() > np.iinfo(np.int64).max):
-            msg = "frames must be a number of scans or integer frame numbers"
-            raise ValueError(msg)
-        numbers = np.unique(numbers)
+    if numbers.size and numbers.dtype.kind not in "iu":
+        msg = "frames must be a number of scans or integer frame numbers"
+        raise ValueError(msg)
+    numbers = np.unique(numbers)
     if every < 2 or numbers.size < 2:
         msg = f"cannot hold out every {every}th of {numbers.size} scans: at least one must remain to train on"
         raise ValueError(msg)
@@ -169,7 +155,7 @@ class KNNIntensity:
         if len(points) == 0:
             msg = "the baseline needs at least one return"
             raise ValueError(msg)
-        if self._values.shape != (len(points),) or not (np.abs(self._values) <= _MAX_INTENSITY).all():
+        if self._values.shape != (len(points),) or not np.isfinite(self._values).all():
             msg = f"intensities must be ({len(points)},) and finite, but have shape {self._values.shape}"
             raise ValueError(msg)
         if whole_number(k, "k", 1) > whole_number(candidates, "candidates", 1):
@@ -189,14 +175,12 @@ class KNNIntensity:
         sensor_positions: ArrayLike,
         intensities: ArrayLike,
         scans: ArrayLike,
-        *,
-        every: int = 5,
     ) -> KNNIntensity:
         """Make the baseline with the `candidates` and `k` that are best for these training scans.
 
-        Every `every`-th training scan is held out once more, and predicted from the others. The least mean absolute
-        error decides between k = 1, 2, 4, … 32 of k, 2 k, 4 k, … 256 candidates; of equal ones the first. The result
-        predicts from all training scans.
+        Every fifth training scan is held out once more, and predicted from the others. The least mean absolute error
+        decides between k = 1, 2, 4, … 32 of k, 2 k, 4 k, … 256 candidates; of equal ones the first. The result predicts
+        from all training scans.
 
         Parameters
         ----------
@@ -204,8 +188,6 @@ class KNNIntensity:
             As for the class. Give the training scans only: a choice that sees the evaluation is not fair.
         scans : (N,) array_like
             Scan number of each return, integers. Whole scans are held out, since returns of one scan share view and noise.
-        every : int
-            Distance between held-out scans, at least 2; see :func:`holdout`.
 
         Returns
         -------
@@ -222,21 +204,19 @@ class KNNIntensity:
         On three simulated scenes and five real drives the error is at most 0.6 % above that of the best choice.
         """
         whole = cls(points_world, sensor_positions, intensities)
-        refuse_masked(scans, "scans")
         numbers = np.asarray(scans)
         if numbers.shape != whole._values.shape or not np.issubdtype(numbers.dtype, np.integer):
             msg = f"scans must be ({len(whole._values)},) integers, not {numbers.shape} {numbers.dtype}"
             raise ValueError(msg)
-        whole_number(every, "every", 2)
         if numbers.min() == numbers.max():
             return whole
-        test = np.isin(numbers, holdout(numbers, every)[1])
+        test = np.isin(numbers, holdout(numbers, _EVERY)[1])
         points, directions = _rays(points_world, sensor_positions)
         sensors = np.broadcast_to(real_array(sensor_positions, "sensor positions"), points.shape)
-        asked = np.flatnonzero(test)
-        asked = asked[np.linspace(0, len(asked) - 1, min(_MAX_QUERIES, len(asked))).astype(np.int64)]
+        queries = np.flatnonzero(test)
+        queries = queries[np.linspace(0, len(queries) - 1, min(_MAX_QUERIES, len(queries))).astype(np.int64)]
         inner = cls(points[~test], sensors[~test], whole._values[~test], candidates=_CANDIDATES[-1])
-        k, candidates = inner._best(points[asked] - inner._origin, directions[asked], whole._values[asked])
+        k, candidates = inner._best(points[queries], directions[queries], whole._values[queries])
         return cls(points_world, sensor_positions, intensities, candidates=candidates, k=k)
 
     def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> _Floats:
@@ -261,53 +241,50 @@ class KNNIntensity:
         """
         points, directions = _rays(x, sensor_positions)
         predicted = np.zeros(len(points))
-        for part in self._parts(len(points)):
-            angle, weight, values = self._nearest(points[part] - self._origin, directions[part])
-            if self.k < self.candidates:
-                closest = np.argpartition(angle, self.k - 1, axis=1)[:, : self.k]
-                weight, values = (np.take_along_axis(a, closest, axis=1) for a in (weight, values))
-            predicted[part] = (weight * values).sum(axis=1) / weight.sum(axis=1)
+        for part, angle, weight, values in self._nearest(points, directions):
+            closest = np.argpartition(angle, self.k - 1, axis=1)[:, : self.k]
+            weights = np.take_along_axis(weight, closest, axis=1)
+            sums = (weights * np.take_along_axis(values, closest, axis=1)).sum(axis=1)
+            predicted[part] = sums / weights.sum(axis=1)
         return predicted
 
     def _best(self, points: _Floats, directions: _Floats, measured: _Floats) -> tuple[int, int]:
         """The `k` and the `candidates`, of those that this search has, with the least error at these returns."""
         sizes = [size for size in _CANDIDATES if size <= self.candidates]
         errors = {(k, size): 0.0 for size in sizes for k in _KS if k <= size}
-        for part in self._parts(len(points)):
-            angle, weight, values = self._nearest(points[part], directions[part])
+        for part, angle, weight, values in self._nearest(points, directions):
             for size in sizes:
                 closest = np.argsort(angle[:, :size], axis=1, kind="stable")
                 weights = np.take_along_axis(weight, closest, axis=1)
                 sums = np.cumsum(weights * np.take_along_axis(values, closest, axis=1), axis=1)
-                weights = np.cumsum(weights, axis=1)
-                for k in _KS:
-                    if k <= size:
-                        error = sums[:, k - 1] / weights[:, k - 1] - measured[part]
-                        errors[k, size] += float(np.abs(error).sum())
+                means = sums / np.cumsum(weights, axis=1)
+                for k in (k for k in _KS if k <= size):
+                    errors[k, size] += float(np.abs(means[:, k - 1] - measured[part]).sum())
         return min(errors, key=lambda setting: errors[setting])
 
-    def _parts(self, queries: int) -> Iterator[slice]:
-        step = max(1, _CHUNK // self.candidates)
-        return (slice(start, start + step) for start in range(0, queries, step))
-
-    def _nearest(self, points: _Floats, directions: _Floats) -> tuple[_Floats, _Floats, _Floats]:
-        """Angle, weight and intensity of the candidates of each point, the nearest first, each (M, candidates)."""
+    def _nearest(
+        self, points: _Floats, directions: _Floats
+    ) -> Iterator[tuple[slice, _Floats, _Floats, _Floats]]:
+        """Some points at a time; angle, weight and intensity of their candidates, the nearest first, (m, candidates)."""
         ranks = np.arange(1, self.candidates + 1)  # with k=1 as a number, the result would lose a dimension
-        distance, index = self._tree.query(points, k=ranks, workers=resolve_num_threads(0))
-        chord = np.linalg.norm(self._directions[index] - directions[:, None], axis=2)
-        angle = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))  # accurate at small angles, unlike arccos
-        weight = 1.0 / ((distance + _DISTANCE_M) * (angle + _ANGLE_RAD))
-        return angle, weight, self._values[index]
+        step = max(1, _CHUNK // self.candidates)
+        for start in range(0, len(points), step):
+            part = slice(start, start + step)
+            distance, index = self._tree.query(
+                points[part] - self._origin, k=ranks, workers=resolve_num_threads(0)
+            )
+            chord = np.linalg.norm(self._directions[index] - directions[part, None], axis=2)
+            angle = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))  # accurate at small angles, unlike arccos
+            weight = 1.0 / ((distance + _DISTANCE_M) * (angle + _ANGLE_RAD))
+            yield part, angle, weight, self._values[index]
 
 
 def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[_Floats, _Floats]:
     """Points (N, 3) and the unit vectors (N, 3) from the sensor to each, after checks of both arguments."""
-    x, s = real_array(points, "points"), real_array(sensors, "sensor positions")
-    if x.ndim != 2 or x.shape[1] != 3 or s.shape not in {x.shape, (3,)}:
-        msg = f"points must be (N, 3) and sensor positions (N, 3) or (3,), not {x.shape} and {s.shape}"
-        raise ValueError(msg)
-    if not ((np.abs(x) <= MAX_POSITION_M).all() and (np.abs(s) <= MAX_POSITION_M).all()):
-        msg = f"points and sensor positions must be finite, and within {MAX_POSITION_M:g} m"
+    x = positions(points, "points")
+    s = positions(np.atleast_2d(real_array(sensors, "sensor positions")), "sensor positions")
+    if len(s) not in {1, len(x)}:
+        msg = f"sensor positions must be ({len(x)}, 3) or (3,), not {s.shape}"
         raise ValueError(msg)
     ray = x - s
     length = np.linalg.norm(ray, axis=1, keepdims=True)

@@ -4,69 +4,47 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checks import check_poses, positive, real_array
+from radarsdf.checks import check_poses, real_array
 from radarsdf.poses.rigid import Floats, aligned, between, nearest_rotation, placed, steps, turned_by
 
-Alignment = Literal["positions", "poses", "first", "none"]
+Alignment = Literal["positions", "poses", "none"]
 
 _SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # of the length, where it is shorter than KITTI's
 _KITTI_M = np.arange(100.0, 900.0, 100.0)
 
 
-class TrajectoryMetrics(TypedDict):
-    """Result of `trajectory_metrics`: lengths in metres, angles in radians."""
-
-    protocol: str
-    align: str
-    num_poses: int
-    length_m: float
-    absolute_m: float
-    absolute_rad: float
-    step_m: float
-    step_rad: float
-    relative_ratio: float | None
-    relative_rad_per_m: float | None
-    relative_lengths_m: list[float]
-
-
 def trajectory_metrics(
-    poses: ArrayLike,
-    true_poses: ArrayLike,
-    *,
-    align: Alignment = "positions",
-    lengths_m: ArrayLike | None = None,
-) -> TrajectoryMetrics:
+    poses: ArrayLike, true_poses: ArrayLike, *, align: Alignment = "positions"
+) -> dict[str, Any]:
     """Compute the errors of a trajectory against the true one.
 
     Parameters
     ----------
     poses, true_poses : (F, 4, 4) array_like
         T_world_sensor, m, of the same scans. Their worlds may differ.
-    align : {"positions", "poses", "first", "none"}
+    align : {"positions", "poses", "none"}
         What one rigid motion of the whole brings together first: all positions (Umeyama 1991, as ``evo_ape --align``),
-        mean position and mean rotation, the first pose, or nothing. Positions on a straight line leave the rotation about it
-        open; "poses" does not.
-    lengths_m : (K,) array_like, optional
-        Of the segments for relative errors, m. By default those of KITTI, 100 to 800 m, or for a trajectory of less than 800 m
-        10, 20, 30, 40 and 50 % of its length.
+        mean position and mean rotation, or nothing. Positions on a straight line leave the rotation about it open;
+        "poses" does not.
 
     Returns
     -------
-    TrajectoryMetrics
+    dict of str to float
         ``absolute_m`` and ``absolute_rad``, root mean square over the scans; ``step_m`` and ``step_rad``, root mean square
-        of the motion from each scan to the next; ``relative_ratio`` and ``relative_rad_per_m``, mean error of the segments that
-        begin at each scan, over their length; ``length_m`` of the true trajectory.
+        of the motion from each scan to the next; ``relative_ratio`` and ``relative_rad_per_m``, mean error over length of the
+        segments that begin at each scan: those of KITTI, 100 to 800 m, or of a trajectory of less than 800 m 10, 20, 30, 40
+        and 50 % of its length; ``length_m`` of the true trajectory.
 
     Raises
     ------
     ValueError
-        If poses are no rigid transforms, or are not as many; if `align` or a length is none of these.
+        If poses are no rigid transforms, or are not as many; if `align` is none of these.
 
     Notes
     -----
@@ -89,52 +67,40 @@ def trajectory_metrics(
         raise ValueError(msg)
     true = check_poses(real_array(true_poses, "true_poses"))
     found = check_poses(poses, len(true))
-    at = _aligned(found, true, align)
+    at = found
+    if align != "none":
+        at = _with_positions(found, true) if align == "positions" else aligned(found, true)
     true_steps = steps(true)
     off = between(true_steps, steps(found))
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])
-    if lengths_m is not None:
-        lengths = np.atleast_1d(real_array(lengths_m, "lengths_m"))
-        for length in lengths:
-            positive(length, "lengths_m")
-    else:
-        lengths = _KITTI_M if distance_m[-1] >= _KITTI_M[-1] else distance_m[-1] * _SHARES
-    ratio, rad_per_m = _relative(found, true, distance_m, lengths)
-    return TrajectoryMetrics(
-        protocol="radarsdf-trajectory-1",  # changes when the meaning of a number changes
-        align=align,
-        num_poses=len(true),
-        length_m=float(distance_m[-1]),
-        absolute_m=_rms(np.linalg.norm((at - true)[:, :3, 3], axis=1)),
-        absolute_rad=_rms(turned_by(at, true)),
-        step_m=_rms(np.linalg.norm(off[:, :3, 3], axis=1)),
-        step_rad=_rms(_angles(off)),
-        relative_ratio=ratio,
-        relative_rad_per_m=rad_per_m,
-        relative_lengths_m=lengths.tolist(),
-    )
+    ratio, rad_per_m = _relative(found, true, distance_m)
+    return {
+        "protocol": "radarsdf-trajectory-1",  # changes when the meaning of a number changes
+        "align": align,
+        "num_poses": len(true),
+        "length_m": float(distance_m[-1]),
+        "absolute_m": _rms(np.linalg.norm((at - true)[:, :3, 3], axis=1)),
+        "absolute_rad": _rms(turned_by(at, true)),
+        "step_m": _rms(np.linalg.norm(off[:, :3, 3], axis=1)),
+        "step_rad": _rms(_angles(off)),
+        "relative_ratio": ratio,
+        "relative_rad_per_m": rad_per_m,
+    }
 
 
-def _aligned(poses: Floats, true: Floats, align: Alignment) -> Floats:
-    """The poses (F, 4, 4) after one rigid motion of the whole; see `trajectory_metrics`."""
-    if align == "poses":
-        return aligned(poses, true)
+def _with_positions(poses: Floats, true: Floats) -> Floats:
+    """The poses (F, 4, 4) after the rigid motion that brings positions together."""
+    from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
     whole = np.eye(4)
-    if align == "first":
-        whole = true[0] @ np.linalg.inv(poses[0])
-    elif align == "positions":
-        from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
-        whole[:3, :3] = nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle))
-        whole = placed(whole, poses, true)
-    found: Floats = np.einsum("ij,fjk->fik", whole, poses)
+    whole[:3, :3] = nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle))
+    found: Floats = np.einsum("ij,fjk->fik", placed(whole, poses, true), poses)
     return found
 
 
-def _relative(
-    poses: Floats, true: Floats, distance_m: Floats, lengths: Floats
-) -> tuple[float | None, float | None]:
-    """Mean errors of translation, m/m, and rotation, rad/m, of all segments of these lengths."""
-    ratios, angles = [], []
+def _relative(poses: Floats, true: Floats, distance_m: Floats) -> tuple[float | None, float | None]:
+    """Mean errors of translation, m/m, and rotation, rad/m, of all segments."""
+    lengths = _KITTI_M if distance_m[-1] >= _KITTI_M[-1] else distance_m[-1] * _SHARES
+    ratios, angles = [np.zeros(0)], [np.zeros(0)]
     for length in lengths[lengths > 0]:
         last = np.searchsorted(distance_m, distance_m + length)
         first = np.flatnonzero(last < len(distance_m))
@@ -142,9 +108,8 @@ def _relative(
         off = between(between(true[first], true[last]), between(poses[first], poses[last]))
         ratios.append(np.linalg.norm(off[:, :3, 3], axis=1) / length)
         angles.append(_angles(off) / length)
-    if not ratios or not sum(map(len, ratios)):
-        return None, None
-    return float(np.concatenate(ratios).mean()), float(np.concatenate(angles).mean())
+    ratio, angle = np.concatenate(ratios), np.concatenate(angles)
+    return (float(ratio.mean()), float(angle.mean())) if len(ratio) else (None, None)
 
 
 def _angles(motions: Floats) -> Floats:

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A box of the world in voxels: occupied, free and unknown."""
+"""A box of the world in voxels: occupied, free and unknown; and what planners derive from it."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from os import PathLike
@@ -15,11 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from radarsdf.checks import number, path_of, real_array
-from radarsdf.grids.files import check_arrays_path, write_grid, write_map_server
+from radarsdf.grids.files import check_suffix, write_map_server, write_octomap
 from radarsdf.io.npz import write_arrays
 from radarsdf.settings import settings
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 1
+LETHAL = 100
+"""Cost of a column that no wheel can enter, as in ROS."""
+
+_Metres = Annotated[float, Field(gt=0, le=100)]
 
 
 @dataclass(frozen=True)
@@ -32,188 +35,10 @@ class DistanceField:
     not_free_m: NDArray[np.float32]
     """(X, Y, Z) to the centre of the nearest voxel that is not free, m: what is unknown, and what is beyond the grid,
     counts as occupied. 0 in voxels that are not free. So far a robot may go whatever is in the unknown."""
-    unknown: NDArray[np.bool_]
-    """(X, Y, Z) voxels that are unknown."""
     error_m: float
     """Half a diagonal of a voxel, and the error of the surface's position, m: what voxels and noise add where the map has the
     surface right. It is no bound on the distance to the truth: false returns that are called occupied make `occupied_m` too
     small, and surface that the map does not have makes it too large."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Voxels of a box of the world, made by :func:`radarsdf.grid`.
-
-    Voxel (i, j, k) spans ``origin + [i, j, k] * voxel_size`` to ``origin + [i + 1, j + 1, k + 1] * voxel_size``.
-    """
-
-    origin: NDArray[np.float64]
-    """(3,) lower corner of voxel (0, 0, 0), world, m: a multiple of the voxel along each axis."""
-    voxel_size: float
-    """Edge of a voxel, m."""
-    state: NDArray[np.int8]
-    """(X, Y, Z) -1: unknown, 0: free, 1: occupied."""
-    probability: NDArray[np.float32]
-    """(X, Y, Z) probability that there is a surface in the voxel. NaN without rays and returns there."""
-    distance_m: NDArray[np.float32]
-    """(X, Y, Z) the map's signed distance at the centre of the voxel, m, positive in free space. NaN where it was not
-    observed."""
-    position_error_m: float
-    """The position of the surface in 95 % of the occupied voxels is known to so much, with 95 % confidence, m."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Number of voxels along x, y and z."""
-        x, y, z = self.state.shape
-        return x, y, z
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """(X, Y, Z) whether rays passed the voxel and nothing is in it."""
-        mask: NDArray[np.bool_] = self.state == FREE
-        return mask
-
-    @property
-    def occupied(self) -> NDArray[np.bool_]:
-        """(X, Y, Z) whether there probably is a surface in the voxel."""
-        mask: NDArray[np.bool_] = self.state == OCCUPIED
-        return mask
-
-    @property
-    def unknown(self) -> NDArray[np.bool_]:
-        """(X, Y, Z) whether the voxel is neither free nor occupied."""
-        mask: NDArray[np.bool_] = self.state == UNKNOWN
-        return mask
-
-    def centres(self, which: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-        """Centres of voxels.
-
-        Parameters
-        ----------
-        which : (X, Y, Z) ndarray of bool, optional
-            Default: all voxels.
-
-        Returns
-        -------
-        (N, 3) ndarray of float64
-            World, m, in C order of the voxels.
-        """
-        voxels = np.argwhere(np.ones(self.shape, bool) if which is None else which)
-        return self.origin + (voxels + 0.5) * self.voxel_size
-
-    def at(self, x: ArrayLike) -> NDArray[np.int8]:
-        """State of the voxels that positions are in.
-
-        Parameters
-        ----------
-        x : (N, 3) array_like
-            World, m.
-
-        Returns
-        -------
-        (N,) ndarray of int8
-            As :attr:`state`; unknown outside of the grid, and at positions that are not finite.
-
-        Raises
-        ------
-        ValueError
-            If `x` is not (N, 3).
-        """
-        positions = real_array(x, "positions")
-        if positions.ndim != 2 or positions.shape[1] != 3:
-            msg = f"positions must have shape (N, 3), not {positions.shape}"
-            raise ValueError(msg)
-        voxels = np.nan_to_num(np.floor((positions - self.origin) / self.voxel_size), nan=-1)
-        inside = ((voxels >= 0) & (voxels < self.shape)).all(axis=1)
-        found = np.full(len(positions), UNKNOWN, np.int8)
-        found[inside] = self.state[tuple(voxels[inside].astype(np.int64).T)]
-        return found
-
-    def distances(self) -> DistanceField:
-        """Euclidean distances to what is occupied, and to what is not free; exact between centres of voxels."""
-        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
-
-        occupied, size = self.occupied, self.voxel_size
-        outside = np.full(self.shape, np.inf, np.float32)
-        if occupied.any():
-            outside = distance_transform_edt(~occupied, size).astype(np.float32)
-            inside = distance_transform_edt(np.pad(occupied, 1), size)[1:-1, 1:-1, 1:-1]
-            outside[occupied] = -inside[occupied]
-        not_free = distance_transform_edt(np.pad(self.free, 1), size)[1:-1, 1:-1, 1:-1]
-        error_m = math.sqrt(3) / 2 * size + self.position_error_m
-        return DistanceField(outside, not_free.astype(np.float32), self.unknown, error_m)
-
-    def costmap(self, wheels: Wheels | None = None) -> Costmap:
-        """Heights of the ground, and their costs for a vehicle.
-
-        Parameters
-        ----------
-        wheels : Wheels, optional
-            Limits of the vehicle. Default: those of a car.
-
-        Returns
-        -------
-        Costmap
-            Arrays (X, Y).
-        """
-        return costmap(self, Wheels() if wheels is None else wheels)
-
-    def flat(self, lower_m: float = 0.3, upper_m: float = 2.0) -> FlatGrid:
-        """The grid in two dimensions that ROS's map_server reads, of what is between two heights above the ground.
-
-        Parameters
-        ----------
-        lower_m, upper_m : float
-            Above the ground of each column, or of the nearest one whose ground is known, m. Below `lower_m` wheels pass,
-            above `upper_m` the robot does.
-
-        Returns
-        -------
-        FlatGrid
-            A column is occupied if a voxel between the heights is, free if all are.
-
-        Raises
-        ------
-        ValueError
-            If the heights are not ascending, or no column of the grid shows ground.
-        """
-        return flat_grid(self, lower_m, upper_m)
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the grid to a file. An old one is replaced only once the new one is complete.
-
-        Parameters
-        ----------
-        path : path-like
-            ``.npz``: all arrays of the grid, by name. ``.ply``: centres of the voxels that are not unknown, with state and
-            probability. ``.bt``: an octree as OctoMap reads it, of what is occupied and free.
-
-        Raises
-        ------
-        ValueError
-            For another suffix, or if the grid is too far from the world's origin for a ``.bt``, 32,768 voxels, or its origin
-            is not a multiple of its voxels.
-        OSError
-            If the file cannot be written.
-        """
-        write_grid(path, vars(self), self.centres(~self.unknown))
-
-
-def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | DistanceField) -> None:
-    """Write costs or distances of a grid to an ``.npz``, by name, with the grid's `origin` and `voxel_size`."""
-    target = path_of(path, "path")
-    check_arrays_path(target)
-    arrays: dict[str, ArrayLike] = {"origin": grid.origin, "voxel_size": grid.voxel_size}
-    arrays |= {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
-    write_arrays(target, arrays, compressed=True)
-
-
-# Grids in two dimensions: heights of the ground, where wheels can go, and what ROS's map_server reads
-
-LETHAL = 100
-"""Cost of a column that no wheel can enter, as in ROS."""
-
-_Metres = Annotated[float, Field(gt=0, le=100)]
 
 
 @settings
@@ -271,85 +96,249 @@ class FlatGrid:
         OSError
             If a file cannot be written.
         """
-        write_map_server(path, self.state, self.origin, self.cell_size)
+        write_map_server(path_of(path, "path"), self.state, self.origin, self.cell_size)
 
 
-def costmap(grid: Grid, wheels: Wheels) -> Costmap:
-    """See :meth:`Grid.costmap`."""
-    height, clearance = _ground(grid)
-    # A column of walls alone has no ground, but nothing can stand there.
-    blocked = np.isnan(height) & grid.occupied.any(axis=2)
-    with np.errstate(invalid="ignore"):
-        blocked |= clearance < wheels.clearance_m
-    slope, step = _planes(height, grid.voxel_size)
-    effort = np.fmax(slope / wheels.max_slope_rad, step / wheels.max_step_m)
-    cost = np.full(height.shape, -1, np.int8)
-    known = np.isfinite(effort)
-    cost[known] = np.minimum(99, np.floor(99 * effort[known])).astype(np.int8)
-    cost[(known & (effort > 1)) | blocked] = LETHAL
-    return Costmap(height, slope, step, clearance, cost)
+@dataclass(frozen=True)
+class Grid:
+    """Voxels of a box of the world, made by :func:`radarsdf.grid`.
 
-
-def flat_grid(grid: Grid, lower_m: float, upper_m: float) -> FlatGrid:
-    """See :meth:`Grid.flat`."""
-    lower_m, upper_m = number(lower_m, "lower_m"), number(upper_m, "upper_m")
-    if lower_m >= upper_m:
-        msg = f"upper_m must be above lower_m, {lower_m}, not {upper_m}"
-        raise ValueError(msg)
-    height, _ = _ground(grid)
-    top_m = float(grid.origin[2] + grid.shape[2] * grid.voxel_size)
-    if not np.isfinite(height).any():
-        msg = (
-            f"no column shows ground between z = {grid.origin[2]:.2f} and {top_m:.2f} m: choose a box from below the "
-            "ground to two voxels or more above it"
-        )
-        raise ValueError(msg)
-    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
-
-    nearest = distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
-    base = height[tuple(nearest)]
-    above = _z(grid) - base[..., None]
-    half = grid.voxel_size / 2
-    # Whole voxels: one that only reaches into the heights from below may be of the ground.
-    between = (above - half >= lower_m) & (above - half < upper_m)
-    occupied = (grid.occupied & between).any(axis=2)
-    free = np.where(between, grid.free, True).all(axis=2) & between.any(axis=2)
-    # A column whose heights reach out of the box is free only as far as the box is known.
-    free &= base + upper_m <= top_m + half
-    state = np.full(height.shape, -1, np.int8)
-    state[free], state[occupied] = 0, 1
-    return FlatGrid(grid.origin[:2].copy(), grid.voxel_size, state)
-
-
-def _z(grid: Grid) -> NDArray[np.float64]:
-    """(Z,) heights of the voxels' centres, world, m."""
-    return np.asarray(grid.origin[2] + (np.arange(grid.shape[2]) + 0.5) * grid.voxel_size)
-
-
-def _ground(grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Heights of the ground (X, Y), world, m, and the room above it, m. NaN in columns without.
-
-    The ground of a column is the lowest surface on which the signed distance rises upwards. Its height is where the
-    distance is zero, interpolated between the voxels above and below.
+    Voxel (i, j, k) spans ``origin + [i, j, k] * voxel_size`` to ``origin + [i + 1, j + 1, k + 1] * voxel_size``.
     """
-    size, z = grid.voxel_size, _z(grid)
-    # Above the uppermost voxels nothing is known.
-    lower, occupied = grid.distance_m, np.pad(grid.occupied, ((0, 0), (0, 0), (0, 1)))
-    upper = np.concatenate([lower[..., 1:], np.full_like(lower[..., :1], np.nan)], axis=2)
-    with np.errstate(invalid="ignore"):
-        up = (lower <= 0) & (upper > 0) & (occupied[..., :-1] | occupied[..., 1:])
-        share = np.where(up, lower / (lower - upper), 0)
-    found: NDArray[np.bool_] = np.asarray(up.any(axis=2))
-    first = up.argmax(axis=2)
-    share = np.take_along_axis(share, first[..., None], 2)[..., 0]
-    height = np.where(found, z[first] + share * size, np.nan).astype(np.float32)
-    # Not the voxels of the ground itself, which are one or two.
-    above = np.arange(len(z)) > np.asarray(first + 2)[..., None]
-    hanging: NDArray[np.bool_] = grid.occupied & above & found[..., None]
-    lowest = hanging.argmax(axis=2)
-    room = np.where(hanging.any(axis=2), z[lowest] - size / 2 - height, np.inf)
-    clearance = np.where(found, room, np.nan).astype(np.float32)
-    return height, clearance
+
+    origin: NDArray[np.float64]
+    """(3,) lower corner of voxel (0, 0, 0), world, m: a multiple of the voxel along each axis."""
+    voxel_size: float
+    """Edge of a voxel, m."""
+    state: NDArray[np.int8]
+    """(X, Y, Z) -1: unknown, 0: free, 1: occupied."""
+    probability: NDArray[np.float32]
+    """(X, Y, Z) probability that there is a surface in the voxel. NaN without rays and returns there."""
+    distance_m: NDArray[np.float32]
+    """(X, Y, Z) the map's signed distance at the centre of the voxel, m, positive in free space. NaN where it was not
+    observed."""
+    position_error_m: float
+    """The position of the surface in 95 % of the occupied voxels is known to so much, with 95 % confidence, m."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of voxels along x, y and z."""
+        x, y, z = self.state.shape
+        return x, y, z
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(X, Y, Z) whether rays passed the voxel and nothing is in it."""
+        mask: NDArray[np.bool_] = self.state == FREE
+        return mask
+
+    @property
+    def occupied(self) -> NDArray[np.bool_]:
+        """(X, Y, Z) whether there probably is a surface in the voxel."""
+        mask: NDArray[np.bool_] = self.state == OCCUPIED
+        return mask
+
+    @property
+    def unknown(self) -> NDArray[np.bool_]:
+        """(X, Y, Z) whether the voxel is neither free nor occupied."""
+        mask: NDArray[np.bool_] = self.state == UNKNOWN
+        return mask
+
+    def centres(self, which: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+        """Compute the centres of voxels.
+
+        Parameters
+        ----------
+        which : (X, Y, Z) ndarray of bool, optional
+            Mask of the voxels, such as :attr:`free`. Default: all.
+
+        Returns
+        -------
+        (N, 3) ndarray of float64
+            World, m, in C order of the voxels.
+        """
+        voxels = np.argwhere(np.ones(self.shape, bool) if which is None else which)
+        return self.origin + (voxels + 0.5) * self.voxel_size
+
+    def at(self, x: ArrayLike) -> NDArray[np.int8]:
+        """Look up the state of the voxels that positions are in.
+
+        Parameters
+        ----------
+        x : (N, 3) array_like
+            World, m.
+
+        Returns
+        -------
+        (N,) ndarray of int8
+            As :attr:`state`; unknown outside of the grid, and at positions that are not finite.
+
+        Raises
+        ------
+        ValueError
+            If `x` is not (N, 3).
+        """
+        positions = real_array(x, "positions")
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            msg = f"positions must have shape (N, 3), not {positions.shape}"
+            raise ValueError(msg)
+        voxels = np.nan_to_num(np.floor((positions - self.origin) / self.voxel_size), nan=-1)
+        inside = ((voxels >= 0) & (voxels < self.shape)).all(axis=1)
+        found = np.full(len(positions), UNKNOWN, np.int8)
+        found[inside] = self.state[tuple(voxels[inside].astype(np.int64).T)]
+        return found
+
+    def distances(self) -> DistanceField:
+        """Compute Euclidean distances to what is occupied, and to what is not free; exact between centres of voxels.
+
+        Returns
+        -------
+        DistanceField
+            Arrays (X, Y, Z) of float32, m.
+        """
+        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
+
+        def to_nearest(others: NDArray[np.bool_], beyond: bool) -> NDArray[np.float32]:
+            """Distances of voxels to the nearest one that is not in a mask. `beyond`: what is beyond the grid is not."""
+            mask = np.pad(others, 1, constant_values=not beyond)
+            found: NDArray[np.float64] = distance_transform_edt(mask, self.voxel_size)
+            return found[1:-1, 1:-1, 1:-1].astype(np.float32)
+
+        occupied = self.occupied
+        occupied_m = np.full(self.shape, np.inf, np.float32)
+        if occupied.any():
+            occupied_m = np.where(occupied, -to_nearest(occupied, True), to_nearest(~occupied, False))
+        error_m = math.sqrt(3) / 2 * self.voxel_size + self.position_error_m
+        return DistanceField(occupied_m, to_nearest(self.free, True), error_m)
+
+    def costmap(self, wheels: Wheels | None = None) -> Costmap:
+        """Compute heights of the ground, and their costs for a vehicle.
+
+        Parameters
+        ----------
+        wheels : Wheels, optional
+            Limits of the vehicle. Default: those of a car.
+
+        Returns
+        -------
+        Costmap
+            Arrays (X, Y): heights and clearance, m, slopes, rad, and costs from 0 to 100.
+        """
+        wheels = Wheels() if wheels is None else wheels
+        height, clearance = self._ground()
+        # A column of walls alone has no ground, but nothing can stand there.
+        blocked = np.isnan(height) & self.occupied.any(axis=2)
+        with np.errstate(invalid="ignore"):
+            blocked |= clearance < wheels.clearance_m
+        slope, step = _planes(height, self.voxel_size)
+        effort = np.fmax(slope / wheels.max_slope_rad, step / wheels.max_step_m)
+        cost = np.full(height.shape, -1, np.int8)
+        known = np.isfinite(effort)
+        cost[known] = np.minimum(99, np.floor(99 * effort[known])).astype(np.int8)
+        cost[(known & (effort > 1)) | blocked] = LETHAL
+        return Costmap(height, slope, step, clearance, cost)
+
+    def flat(self, lower_m: float = 0.3, upper_m: float = 2.0) -> FlatGrid:
+        """Flatten what is between two heights above the ground to the grid in two dimensions that ROS's map_server reads.
+
+        Parameters
+        ----------
+        lower_m, upper_m : float
+            Above the ground of each column, or of the nearest one whose ground is known, m. Below `lower_m` wheels pass,
+            above `upper_m` the robot does.
+
+        Returns
+        -------
+        FlatGrid
+            A column is occupied if a voxel between the heights is, free if all are.
+
+        Raises
+        ------
+        ValueError
+            If the heights are not ascending, or no column of the grid shows ground.
+        """
+        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
+
+        if number(lower_m, "lower_m") >= number(upper_m, "upper_m"):
+            msg = f"upper_m must be above lower_m, {lower_m}, not {upper_m}"
+            raise ValueError(msg)
+        height, _ = self._ground()
+        top_m = float(self.origin[2] + self.shape[2] * self.voxel_size)
+        if not np.isfinite(height).any():
+            msg = (
+                f"no column shows ground between z = {self.origin[2]:.2f} and {top_m:.2f} m: choose a box from below the "
+                "ground to two voxels or more above it"
+            )
+            raise ValueError(msg)
+        nearest = distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
+        base = height[tuple(nearest)]
+        above, half = self._z() - base[..., None], self.voxel_size / 2
+        # Whole voxels: one that only reaches into the heights from below may be of the ground.
+        between = (above - half >= lower_m) & (above - half < upper_m)
+        free = np.where(between, self.free, True).all(axis=2) & between.any(axis=2)
+        # A column whose heights reach out of the box is free only as far as the box is known.
+        free &= base + upper_m <= top_m + half
+        state = np.full(height.shape, UNKNOWN, np.int8)
+        state[free], state[(self.occupied & between).any(axis=2)] = FREE, OCCUPIED
+        return FlatGrid(self.origin[:2].copy(), self.voxel_size, state)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the grid to a file. An old one is replaced only once the new one is complete.
+
+        Parameters
+        ----------
+        path : path-like
+            ``.npz``: all arrays of the grid, by name. ``.bt``: an octree as OctoMap reads it, of what is occupied and free.
+
+        Raises
+        ------
+        ValueError
+            For another suffix, or if the grid is too far from the world's origin for a ``.bt``, 32,768 voxels, or its origin
+            is not a multiple of its voxels.
+        OSError
+            If the file cannot be written.
+        """
+        target = path_of(path, "path")
+        check_suffix(target, ".npz", ".bt")
+        if target.suffix == ".npz":
+            write_arrays(target, vars(self), compressed=True)
+        else:
+            write_octomap(target, self.state, self.origin, self.voxel_size)
+
+    def _z(self) -> NDArray[np.float64]:
+        """(Z,) heights of the voxels' centres, world, m."""
+        return np.asarray(self.origin[2] + (np.arange(self.shape[2]) + 0.5) * self.voxel_size)
+
+    def _ground(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Heights of the ground (X, Y), world, m, and the room above it, m. NaN in columns without.
+
+        The ground of a column is the lowest surface on which the signed distance rises upwards. Its height is where the
+        distance is zero, interpolated between the voxels above and below.
+        """
+        z = self._z()
+        # Above the uppermost voxels nothing is known.
+        lower, occupied = self.distance_m, np.pad(self.occupied, ((0, 0), (0, 0), (0, 1)))
+        upper = np.concatenate([lower[..., 1:], np.full_like(lower[..., :1], np.nan)], axis=2)
+        with np.errstate(invalid="ignore"):
+            up = (lower <= 0) & (upper > 0) & (occupied[..., :-1] | occupied[..., 1:])
+            share = np.where(up, lower / (lower - upper), 0)
+        found: NDArray[np.bool_] = np.asarray(up.any(axis=2))
+        first = up.argmax(axis=2)
+        share = np.take_along_axis(share, first[..., None], 2)[..., 0]
+        height = np.where(found, z[first] + share * self.voxel_size, np.nan).astype(np.float32)
+        # Not the voxels of the ground itself, which are one or two.
+        above = np.arange(len(z)) > np.asarray(first + 2)[..., None]
+        hanging: NDArray[np.bool_] = self.occupied & above & found[..., None]
+        room = np.where(hanging.any(axis=2), z[hanging.argmax(axis=2)] - self.voxel_size / 2 - height, np.inf)
+        return height, np.where(found, room, np.nan).astype(np.float32)
+
+
+def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | DistanceField) -> None:
+    """Write costs or distances of a grid to an ``.npz``, by name, with the grid's `origin` and `voxel_size`."""
+    target = path_of(path, "path")
+    check_suffix(target, ".npz")
+    of_grid: dict[str, ArrayLike] = {"origin": grid.origin, "voxel_size": grid.voxel_size}
+    write_arrays(target, of_grid | vars(found), compressed=True)
 
 
 def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -360,15 +349,12 @@ def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float3
     stack = np.stack([padded[1 + i : 1 + i + x, 1 + j : 1 + j + y] for i, j in shifts])  # (9, X, Y)
     known = np.isfinite(stack)
     design = np.array([[1.0, i * size, j * size] for i, j in shifts])
-    weights = known.astype(np.float64)
-    normal = np.einsum("kxy,ka,kb->xyab", weights, design, design)
+    normal = np.einsum("kxy,ka,kb->xyab", known.astype(np.float64), design, design)
     right = np.einsum("kxy,ka->xya", np.where(known, stack, 0), design)
-    fits = np.linalg.det(normal) > 1e-6 * size**4
-    fits &= known[4]  # the column itself
+    fits = (np.linalg.det(normal) > 1e-6 * size**4) & known[4]  # the column itself
     safe = np.where(fits[..., None, None], normal, np.eye(3))
     plane = np.linalg.solve(safe, right[..., None])[..., 0]
-    residual = np.abs(stack - np.einsum("ka,xya->kxy", design, plane))
-    step = np.fmax.reduce(residual, axis=0)
+    step = np.fmax.reduce(np.abs(stack - np.einsum("ka,xya->kxy", design, plane)), axis=0)
     slope = np.arctan(np.hypot(plane[..., 1], plane[..., 2]))
     slope, step = (np.where(fits, values, np.nan).astype(np.float32) for values in (slope, step))
     return slope, step

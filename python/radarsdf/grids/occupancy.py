@@ -5,11 +5,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
 from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
@@ -19,29 +18,18 @@ _MAX_VOXELS = 2**28  # 15 bytes each
 # Half of what a cube covers across a plane through its centre, in edges: the mean over all directions of the plane.
 _HALF_WIDTH = 0.75
 _SIGMAS_95 = 1.96
+# Probabilities of a surface. Free voxels were passed by scans seven times as often as what is behind surfaces.
+_OCCUPIED_FROM, _FREE_TO = 0.5, 0.125
 
 
-def grid(
-    radar_map: Map,
-    box: ArrayLike,
-    voxel_size: float = 0.2,
-    *,
-    occupied_from: float = 0.5,
-    free_to: float = 0.125,
-) -> Grid:
+def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     """Classify the voxels of a box as occupied, free or unknown, for planners.
 
     A voxel is occupied where a surface probably is: by its signed distance, with :meth:`Map.uncertainty` and
     :meth:`Map.confidence`. It is free only where rays passed on the way to their returns, where no return is in it, where
     all its neighbours are known, since an unseen surface may be next to the unknown, and where no surface of a neighbour may
-    reach into it. All else is unknown. How much rays tell is calibrated on the map itself: how often they pass what is
-    behind its surfaces.
-
-    What a radar does not see is not free. It sees nothing in its blind cone, outside of its field of view, nor nearer
-    than its minimum range (``returns.min_range_m``): the ground under the sensor is unknown until it drove on. Smooth
-    ground sends nothing back at grazing angles and stays unknown. Glass and thin wires may send nothing back and be
-    called free if rays to what is behind them passed often. Rays to ghosts count only where these were not recognised; they may
-    free a place behind a mirror.
+    reach into it. All else is unknown: blind cones, what is nearer than the minimum range, smooth ground at grazing angles.
+    Glass and thin wires may be called free if rays to what is behind them passed often.
 
     Parameters
     ----------
@@ -53,9 +41,6 @@ def grid(
     voxel_size : float
         Edge of a voxel, m. Below that of a leaf cell, voxels are not better known. Above it, a voxel is occupied if a
         part of it is, and free only if it is throughout.
-    occupied_from, free_to : float
-        From which probability of a surface on a voxel is occupied, and up to which it may be free; ascending, in
-        (0, 1). By default, scans must have passed it seven times as often as what is behind surfaces.
 
     Returns
     -------
@@ -81,9 +66,6 @@ def grid(
     check_passages(radar_map, "this map")
     corners = check_box(box)
     size = positive(voxel_size, "voxel_size")
-    if not 0 < free_to < occupied_from < 1:
-        msg = f"free_to and occupied_from must be ascending and in (0, 1), not {free_to} and {occupied_from}"
-        raise ValueError(msg)
     # A voxel is at most as large as a leaf cell, or is made of parts that are.
     parts = max(1, math.ceil(size / radar_map.config.leaf_size_m - 1e-6)) if size <= MAX_POSITION_M else 1
     # Whole multiples of the voxel, as octrees have them; 1e-6 voxels are rounding.
@@ -94,7 +76,7 @@ def grid(
         msg = f"the box has {voxels:.3g} voxels: at most {_MAX_VOXELS} fit; take a smaller one, or larger voxels"
         raise MemoryError(msg)
     shape = tuple((counts.astype(np.int64) * parts).tolist())
-    fine = _fine_grid(radar_map, first * size, size / parts, shape, occupied_from, free_to)
+    fine = _fine_grid(radar_map, first * size, size / parts, shape)
     return fine if parts == 1 else _coarser(fine, parts)
 
 
@@ -105,14 +87,7 @@ def check_passages(radar_map: Map, name: str) -> None:
         raise ValueError(msg)
 
 
-def _fine_grid(
-    radar_map: Map,
-    lower: NDArray[np.float64],
-    size: float,
-    shape: tuple[int, ...],
-    occupied_from: float,
-    free_to: float,
-) -> Grid:
+def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: tuple[int, ...]) -> Grid:
     """The grid from a corner (3,), world, m, in voxels that are at most as large as leaf cells."""
     from scipy.ndimage import binary_erosion  # noqa: PLC0415 - slow to import
 
@@ -129,79 +104,62 @@ def _fine_grid(
     enclosed = binary_erosion(known, np.ones((3, 3, 3)))[places] & ~cells.returns[places]
     odds = radar_map.passage_odds
     probability = np.where(passed > 0, (odds / (1 + odds)).astype(np.float32)[passed], np.float32(np.nan))
-    free = enclosed & (passed > 0) & (probability <= free_to)
+    free = enclosed & (passed > 0) & (probability <= _FREE_TO)
     distance_m = np.full(shape, np.nan, np.float32)
     occupied = np.zeros(shape, bool)
     rows = np.nonzero(observed)
     position_error_m = 0.0
     if len(rows[0]):
         x = np.stack([centres[axis][rows[axis]] for axis in range(3)], 1)
-        surface = _Planes.of(radar_map, x)
-        distance_m[rows] = surface.distance_m
+        planes_m, normals = radar_map.tangent_planes(x)
+        distance_m[rows] = planes_m
+        sigma_m = radar_map.uncertainty(x)
+        spread_m = np.nan_to_num(sigma_m, nan=leaf_m).astype(np.float64)
+        confidence = np.where(np.isnan(planes_m), 0, radar_map.confidence(x)).astype(np.float64)
         # Where the map has it; its error is in `position_error_m`, or rough surfaces would be nowhere.
-        of_surface = np.where(_crossed(distance_m, _HALF_WIDTH * size)[rows], surface.confidence, 0)
-        is_there = of_surface >= occupied_from
+        of_surface = np.where(_crossed(distance_m, _HALF_WIDTH * size)[rows], confidence, 0)
+        is_there = of_surface >= _OCCUPIED_FROM
         occupied[rows] = is_there
         # Behind a surface, rays passed by mistake: nothing is free there.
-        free[rows] &= surface.before(_HALF_WIDTH * size) <= free_to
-        free &= surface.touch(np.stack(rows, 1), shape, size, max(1, round(leaf_m / size))) <= free_to
+        is_before = ndtr((_HALF_WIDTH * size - distance_m[rows]) / spread_m)
+        free[rows] &= np.nan_to_num(confidence * is_before) <= _FREE_TO
+        step = max(1, round(leaf_m / size))
+        planes = distance_m[rows], normals, spread_m, confidence
+        free &= _touched(np.stack(rows, 1), planes, shape, size, step) <= _FREE_TO
         of_rays = np.where(free[rows], probability[rows], 0)
         probability[rows] = 1 - (1 - of_surface) * (1 - of_rays)
         if is_there.any():
-            errors_m = np.nan_to_num(radar_map.uncertainty(x[is_there]), nan=0)
-            position_error_m = _SIGMAS_95 * float(np.quantile(errors_m, 0.95))
+            position_error_m = _SIGMAS_95 * float(np.quantile(np.nan_to_num(sigma_m[is_there], nan=0), 0.95))
     state = np.full(shape, UNKNOWN, np.int8)
     state[free], state[occupied] = FREE, OCCUPIED
     return Grid(lower, size, state, probability, distance_m, position_error_m)
 
 
-@dataclass(frozen=True)
-class _Planes:
-    """The surface near N positions: a plane each, whose distance has an error."""
+def _touched(
+    voxels: NDArray[np.int64],
+    planes: tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    shape: tuple[int, ...],
+    size: float,
+    step: int,
+) -> NDArray[np.float32]:
+    """Largest probability, in each voxel of a grid, that a surface of a voxel `step` away is in it.
 
-    distance_m: NDArray[np.float32]  # (N,) signed distance of the position from the surface, m. NaN: unknown.
-    normals: NDArray[np.float64]  # (N, 3) unit vectors to where distances grow
-    sigma_m: NDArray[np.float64]  # (N,) standard error of the distance, m
-    confidence: NDArray[np.float64]  # (N,) probability that there is a surface
-
-    @classmethod
-    def of(cls, radar_map: Map, x: NDArray[np.float64]) -> _Planes:
-        """The planes at positions (N, 3), world, m."""
-        distance_m, normals = radar_map.tangent_planes(x)
-        sigma_m = np.nan_to_num(radar_map.uncertainty(x), nan=radar_map.config.leaf_size_m).astype(np.float64)
-        confidence = np.where(np.isnan(distance_m), 0, radar_map.confidence(x)).astype(np.float64)
-        return cls(distance_m.astype(np.float32), normals, sigma_m, confidence)
-
-    def before(self, limit_m: float) -> NDArray[np.float64]:
-        """(N,) probability that the surface is there, and nearer than a limit or that the position is behind it."""
-        return np.nan_to_num(self.confidence * _below((limit_m - self.distance_m) / self.sigma_m))
-
-    def touch(
-        self, voxels: NDArray[np.int64], shape: tuple[int, ...], size: float, step: int
-    ) -> NDArray[np.float32]:
-        """Largest probability, in each voxel of a grid, that one of these planes, from `step` voxels away, is in it.
-
-        A cell without a return may still be cut by the surface of its neighbour.
-        """
-        found = np.zeros(shape, np.float32)
-        rows = np.flatnonzero(self.confidence > 0)
-        for offset in np.ndindex(3, 3, 3):
-            moved = (np.array(offset) - 1) * step
-            targets = voxels[rows] + moved
-            inside = ((targets >= 0) & (targets < shape)).all(axis=1)
-            near, at = rows[inside], tuple(targets[inside].T)
-            distance_m = self.distance_m[near] + np.einsum("ni,i->n", self.normals[near], moved * size)
-            half_m = 0.5 * size * np.abs(self.normals[near]).sum(axis=1)
-            sigma_m = self.sigma_m[near]
-            share = _below((half_m - distance_m) / sigma_m) - _below((-half_m - distance_m) / sigma_m)
-            found[at] = np.maximum(found[at], (self.confidence[near] * share).astype(np.float32))
-        return found
-
-
-def _below(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of a standard normal distribution below t."""
-    share: NDArray[np.float64] = torch.special.ndtr(torch.from_numpy(np.asarray(t, np.float64))).numpy()
-    return share
+    Of the N voxels (N, 3) with planes: distance, normal, its standard error and the probability of a surface. A cell without
+    a return may still be cut by the surface of its neighbour.
+    """
+    found = np.zeros(shape, np.float32)
+    rows = np.flatnonzero(planes[3] > 0)
+    for offset in np.ndindex(3, 3, 3):
+        moved = (np.array(offset) - 1) * step
+        targets = voxels[rows] + moved
+        inside = ((targets >= 0) & (targets < shape)).all(axis=1)
+        plane_m, normals, sigma_m, confidence = (column[rows[inside]] for column in planes)
+        distance_m = plane_m + np.einsum("ni,i->n", normals, moved * size)
+        half_m = 0.5 * size * np.abs(normals).sum(axis=1)
+        share = ndtr((half_m - distance_m) / sigma_m) - ndtr((-half_m - distance_m) / sigma_m)
+        at = tuple(targets[inside].T)
+        found[at] = np.maximum(found[at], (confidence * share).astype(np.float32))
+    return found
 
 
 def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool_]:
@@ -232,12 +190,7 @@ def _coarser(fine: Grid, parts: int) -> Grid:
     coarse = np.full(shape, UNKNOWN, np.int8)
     coarse[(state == FREE).all(axis=-1)] = FREE
     coarse[(state == OCCUPIED).any(axis=-1)] = OCCUPIED
-    middle = (slice(parts // 2, None, parts),) * 3
-    return Grid(
-        fine.origin,
-        fine.voxel_size * parts,
-        coarse,
-        np.fmax.reduce(blocks(fine.probability), axis=-1),
-        np.ascontiguousarray(fine.distance_m[middle]),
-        fine.position_error_m,
-    )
+    probability = np.fmax.reduce(blocks(fine.probability), axis=-1)
+    distance_m = np.ascontiguousarray(fine.distance_m[(slice(parts // 2, None, parts),) * 3])
+    size = fine.voxel_size * parts
+    return Grid(fine.origin, size, coarse, probability, distance_m, fine.position_error_m)

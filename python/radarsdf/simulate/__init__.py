@@ -13,36 +13,14 @@ Examples
 """
 
 from .materials import Material
-from .motion import Leg, LegDrive, MeasuredMotion, drifted, drive_legs, measured_imu, measured_motion
+from .motion import MeasuredMotion, drifted, measured_imu, measured_motion
 from .radar import Origin, RadarSensor, Scan
 from .scenes import SCENES, astyx, hugin, oculii, wall
 from .simulation import Simulation, simulate
 from .world import Box, CornerReflector, Hits, Pole, Primitive, Scene, Terrain
 
 __all__ = [
-    "SCENES",
-    "Box",
-    "CornerReflector",
-    "Hits",
-    "Leg",
-    "LegDrive",
-    "Material",
-    "MeasuredMotion",
-    "Origin",
-    "Pole",
-    "Primitive",
-    "RadarSensor",
-    "Scan",
-    "Scene",
-    "Simulation",
-    "Terrain",
-    "astyx",
-    "drifted",
-    "drive_legs",
-    "hugin",
-    "measured_imu",
-    "measured_motion",
-    "oculii",
-    "simulate",
-    "wall",
-]
+    "SCENES", "Box", "CornerReflector", "Hits", "Material", "MeasuredMotion", "Origin", "Pole",
+    "Primitive", "RadarSensor", "Scan", "Scene", "Simulation", "Terrain", "astyx", "drifted", "hugin",
+    "measured_imu", "measured_motion", "oculii", "simulate", "wall",
+]  # fmt: skip

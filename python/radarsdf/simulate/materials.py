@@ -4,26 +4,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-
-from radarsdf.checks import number
-
-__all__ = [
-    "ASPHALT",
-    "BRICK",
-    "CONCRETE",
-    "GLASS",
-    "GRASS",
-    "METAL",
-    "REFLECTOR",
-    "STEEL_POLE",
-    "TREE",
-    "Material",
-]
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 FloatArray = NDArray[np.float64]
 
@@ -31,7 +17,7 @@ FloatArray = NDArray[np.float64]
 _TEXTURE_WAVES = np.array([[1.7, 0.9, 1.3], [-0.8, 2.1, -1.1], [0.5, -1.2, 2.6]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(strict=True, allow_inf_nan=False))
 class Material:
     """Radar properties of a surface.
 
@@ -46,34 +32,22 @@ class Material:
 
     name: str
     reflectivity_db: float  # echo at normal incidence, relative to the other materials [dB]
-    specular: float = 0.5  # share of the specular lobe at normal incidence, 0..1
-    lobe_width_rad: float = 0.25  # w, standard deviation of the specular lobe [rad], > 0
-    looks: float = 3.0  # independent scatterers averaged in one return, > 0: few mean strong fading
-    texture_db: float = 0.0  # amplitude of the slow change of reflectivity over the surface [dB], >= 0
-    mirror_loss_db: float = np.inf  # loss of a wave mirrored by the surface [dB], >= 0; inf: no ghosts
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if field.name != "name":
-                number(getattr(self, field.name), field.name)
-        if not (0 <= self.specular <= 1 and self.lobe_width_rad > 0 and self.looks > 0):
-            msg = f"specular must be in [0, 1], lobe_width_rad and looks must be positive: {self}"
-            raise ValueError(msg)
-        if not (self.texture_db >= 0 and self.mirror_loss_db >= 0):
-            msg = "texture_db and mirror_loss_db must not be negative"
-            raise ValueError(msg)
-
-    def lobe_db(self, cos_incidence: FloatArray) -> FloatArray:
-        """Change of the echo, dB, with the cosine (N,) of the angle of incidence; 0 at normal incidence."""
-        cos = np.clip(cos_incidence, 1e-3, 1.0)
-        specular = np.exp(-0.5 * (np.arccos(cos) / self.lobe_width_rad) ** 2)
-        lobe: FloatArray = 10 * np.log10((1 - self.specular) * cos**2 + self.specular * specular + 1e-6)
-        return lobe
+    specular: Annotated[float, Field(ge=0, le=1)] = (
+        0.5  # share of the specular lobe at normal incidence, 0..1
+    )
+    lobe_width_rad: Annotated[float, Field(gt=0)] = 0.25  # w, standard deviation of the specular lobe [rad]
+    looks: Annotated[float, Field(gt=0)] = 3.0  # independent scatterers in one return: few mean strong fading
+    texture_db: Annotated[float, Field(ge=0)] = 0.0  # amplitude of slow changes over the surface [dB], >= 0
+    # Loss of a wave mirrored by the surface [dB], >= 0; inf: no ghosts.
+    mirror_loss_db: Annotated[float, Field(ge=0, allow_inf_nan=True)] = np.inf
 
     def echo_db(self, points: FloatArray, cos_incidence: FloatArray) -> FloatArray:
         """Echo (N,), dB, of hits (N, 3), world frame, m, without the loss by range: reflectivity, texture and lobe."""
         texture = np.sin(points @ _TEXTURE_WAVES.T).mean(axis=1)
-        echo: FloatArray = self.reflectivity_db + self.texture_db * texture + self.lobe_db(cos_incidence)
+        cos = np.clip(cos_incidence, 1e-3, 1.0)
+        specular = np.exp(-0.5 * (np.arccos(cos) / self.lobe_width_rad) ** 2)
+        lobe_db = 10 * np.log10((1 - self.specular) * cos**2 + self.specular * specular + 1e-6)
+        echo: FloatArray = self.reflectivity_db + self.texture_db * texture + lobe_db
         return echo
 
 

@@ -4,32 +4,30 @@
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.special import gammaincinv
 
-from radarsdf.checks import number, whole_number
+from radarsdf.checks import whole_number
+from radarsdf.settings import settings
 
 from .world import Hits, Scene
 
-__all__ = ["Origin", "RadarSensor", "Scan", "generator"]
-
 FloatArray = NDArray[np.float64]
 
+# Sums and products of numbers below 1e9 do not overflow.
+_NotNegative = Annotated[float, Field(ge=0, le=1e9)]
+_Positive = Annotated[float, Field(gt=0, le=1e9)]
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Height = Annotated[float, Field(gt=0, le=np.pi)]
+_Count = Annotated[int, Field(ge=1, le=10**7)]
+_Power = Annotated[float, Field(ge=-1e9, le=1e9)]
+
 _OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, not to hit it again
-_MAX_BEAMS = 10**7  # in a scan; their rays take some gigabytes
-_LARGEST = 1e9  # limit of all settings: sums and products of such numbers do not overflow
-_NOT_NEGATIVE = (
-    "sigma_range_m", "sigma_range_per_m", "sigma_azimuth_rad", "sigma_elevation_rad", "weak_noise", "sigma_power_db",
-    "step_db", "clutter_per_scan", "clutter_power_db",
-    "phantoms_per_scan", "phantom_depth", "range_loss_db", "sidelobe_loss_db",
-)  # fmt: skip
-_SHARES = ("clutter_near_share", "phantom_lasting_share", "ghost_share", "sidelobe_share")
 _MIN_LEG_M = 0.01  # shorter paths from a mirror to the next surface are no reflection
 # Separate streams of random numbers within a scan: more clutter, for example, must not change the noise of the surface
 # returns.
@@ -69,7 +67,7 @@ class _Echoes(NamedTuple):  # candidates of returns, before detection
     range_m: FloatArray  # (N,)
     angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
     power_db: FloatArray  # (N,) with speckle
-    noiseless_db: FloatArray  # (N,) without speckle; NaN for false returns
+    noiseless_db: FloatArray | float = np.nan  # (N,) without speckle; NaN for false returns
 
 
 def generator(seed: int, *key: int) -> np.random.Generator:
@@ -77,7 +75,7 @@ def generator(seed: int, *key: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(whole_number(seed, "seed", 0), spawn_key=key))
 
 
-@dataclass(frozen=True)
+@settings
 class RadarSensor:
     """A scanning 3D radar. Sensor frame: x forward, y left, z up.
 
@@ -97,68 +95,67 @@ class RadarSensor:
     Raises
     ------
     ValueError
-        If a value is outside the range in its comment.
+        If a value is negative, a share beyond 1, or otherwise outside the range in its comment.
     """
 
-    azimuth_fov_rad: float = 1.92  # full width, centred on x [rad], 0..2π
-    elevation_fov_rad: float = 0.52  # full height, centred on the xy plane [rad], 0..π
-    beams: int = 3000  # directions in a scan, a jittered grid over the field of view; 1..10^7
-    min_range_m: float = 0.5  # there are no nearer returns [m], > 0
-    max_range_m: float = 60.0  # there are no farther returns [m], > min_range_m
-    sigma_range_m: float = 0.04  # standard deviation along the beam, near the sensor [m]
-    sigma_range_per_m: float = 0.0  # its growth, in squares, with the range [m/m]
-    sigma_azimuth_rad: float = 0.004  # standard deviation of the azimuth [rad]
-    sigma_elevation_rad: float = 0.006  # standard deviation of the elevation [rad]
-    weak_noise: float = 0.0  # further noise of a return at the threshold, as a multiple of these, >= 0
-    sigma_power_db: float = 1.0  # standard deviation of the receiver's noise, besides speckle [dB]
-    gain_db: float = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
-    range_loss_db: float = (
-        40.0  # loss of power by a tenfold range, less if the receiver compensates [dB], >= 0
-    )
-    threshold_db: float = 64.0  # weaker returns are not detected [dB]
-    floor_db: float = -np.inf  # lower limit of the intensities, to which weaker ones are clipped [dB]
-    saturation_db: float = 118.0  # upper limit of the intensities, to which stronger ones are clipped [dB]
-    step_db: float = 0.1  # intensities are multiples of this [dB], >= 0; 0: continuous
-    clutter_per_scan: float = 0.0  # expected number of false returns in free space, >= 0
-    clutter_near_share: float = (
-        0.5  # share of them near the sensor; the rest is uniform along the beams, 0..1
-    )
-    clutter_power_db: float = 3.0  # mean power of clutter and phantoms above the threshold [dB], >= 0
-    phantoms_per_scan: float = 0.0  # expected number of false returns behind surfaces, >= 0
-    phantom_lasting_share: float = 0.5  # share of them at places that are the same in all scans, 0..1
-    phantom_depth: float = 0.05  # mean depth behind the surface, exponential, as a share of the range, >= 0
-    ghost_share: float = 0.0  # share of the beams on mirroring surfaces that can give a ghost, 0..1
-    sidelobe_share: float = 0.0  # share of the surface echoes seen once more, in a false elevation, 0..1
-    sidelobe_fov_rad: float = 0.52  # full height of the false elevations, uniform in their sine [rad], 0..π
-    sidelobe_loss_db: float = 0.0  # loss of such an echo [dB], >= 0
+    azimuth_fov_rad: Annotated[float, Field(gt=0, le=2 * np.pi)] = 1.92  # full width, centred on x [rad]
+    elevation_fov_rad: _Height = 0.52  # full height, centred on the xy plane [rad]
+    beams: _Count = 3000  # directions in a scan, a jittered grid over the field of view
+    min_range_m: _Positive = 0.5  # there are no nearer returns [m]
+    max_range_m: _Positive = 60.0  # there are no farther returns [m], > min_range_m
+    sigma_range_m: _NotNegative = 0.04  # standard deviation along the beam, near the sensor [m]
+    sigma_range_per_m: _NotNegative = 0.0  # its growth, in squares, with the range [m/m]
+    sigma_azimuth_rad: _NotNegative = 0.004  # standard deviation of the azimuth [rad]
+    sigma_elevation_rad: _NotNegative = 0.006  # standard deviation of the elevation [rad]
+    weak_noise: _NotNegative = 0.0  # further noise of a return at the threshold, as a multiple of these
+    sigma_power_db: _NotNegative = 1.0  # standard deviation of the receiver's noise, besides speckle [dB]
+    gain_db: _Power = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
+    range_loss_db: _NotNegative = 40.0  # loss by a tenfold range, less if the receiver compensates [dB]
+    threshold_db: _Power = 64.0  # weaker returns are not detected [dB]
+    floor_db: _Power | None = None  # intensities are clipped to at least this [dB]; None: they are not
+    saturation_db: _Power = 118.0  # and to at most this [dB], > threshold_db and floor_db
+    step_db: _NotNegative = 0.1  # intensities are multiples of this [dB]; 0: continuous
+    clutter_per_scan: _NotNegative = 0.0  # expected number of false returns in free space
+    clutter_near_share: _Share = 0.5  # share of them near the sensor; the rest is uniform along the beams
+    clutter_power_db: _NotNegative = 3.0  # mean power of clutter and phantoms above the threshold [dB]
+    phantoms_per_scan: _NotNegative = 0.0  # expected number of false returns behind surfaces
+    phantom_lasting_share: _Share = 0.5  # share of them at places that are the same in all scans
+    phantom_depth: _NotNegative = 0.05  # mean depth behind the surface, exponential, as a share of the range
+    ghost_share: _Share = 0.0  # share of the beams on mirroring surfaces that can give a ghost
+    sidelobe_share: _Share = 0.0  # share of the surface echoes seen once more, in a false elevation
+    sidelobe_fov_rad: _Height = 0.52  # full height of the false elevations, uniform in their sine [rad]
 
     def __post_init__(self) -> None:
-        whole_number(self.beams, "beams", 1, _MAX_BEAMS)
-        for field in dataclasses.fields(self):
-            value = number(getattr(self, field.name), field.name)
-            if abs(value) > _LARGEST and not (field.name == "floor_db" and value == -np.inf):
-                msg = f"{field.name} must be within {_LARGEST:g}, not {value}"
-                raise ValueError(msg)
-        rules = [
-            ("azimuth_fov_rad must be in (0, 2π]", 0 < self.azimuth_fov_rad <= 2 * np.pi),
-            ("elevation_fov_rad must be in (0, π]", 0 < self.elevation_fov_rad <= np.pi),
-            ("sidelobe_fov_rad must be in (0, π]", 0 < self.sidelobe_fov_rad <= np.pi),
-            ("min_range_m must be in (0, max_range_m)", 0 < self.min_range_m < self.max_range_m),
-            ("step_db must be 0 or at least 1e-9", self.step_db == 0 or self.step_db >= 1 / _LARGEST),
-            (
-                "saturation_db must be above threshold_db and floor_db",
-                self.saturation_db > max(self.threshold_db, self.floor_db),
-            ),
-            *((f"{name} must not be negative", getattr(self, name) >= 0) for name in _NOT_NEGATIVE),
-            *((f"{name} must be in [0, 1]", 0 <= getattr(self, name) <= 1) for name in _SHARES),
-        ]
-        for rule, holds in rules:
-            if not holds:
-                msg = f"{rule}, not {getattr(self, rule.split()[0])}"
-                raise ValueError(msg)
+        if self.min_range_m >= self.max_range_m:
+            msg = f"min_range_m must be below max_range_m, {self.max_range_m}, not {self.min_range_m}"
+            raise ValueError(msg)
+        if self.saturation_db <= self._least_db:
+            msg = f"saturation_db must be above threshold_db and floor_db, not {self.saturation_db}"
+            raise ValueError(msg)
+
+    @property
+    def _least_db(self) -> float:
+        """The lowest intensity."""
+        return self.threshold_db if self.floor_db is None else max(self.floor_db, self.threshold_db)
 
     def scan(self, scene: Scene, T_world_sensor: FloatArray, seed: int = 0, frame: int = 0) -> Scan:
-        """Scan a scene once, from the pose `T_world_sensor` (4, 4), m. Seed and frame determine all random numbers."""
+        """Scan a scene once.
+
+        Parameters
+        ----------
+        scene : Scene
+            The world.
+        T_world_sensor : (4, 4) ndarray of float64
+            Pose of the sensor, m.
+        seed, frame : int
+            Seed of the simulation and number of the scan: they determine all random numbers.
+
+        Returns
+        -------
+        Scan
+            The N returns: `points` (N, 3) float32, sensor frame, m; `intensities` and `noiseless_intensities` (N,) float32,
+            dB; `origin_kind` (N,) int8, codes of `Origin`.
+        """
         angles = self._beam_angles(generator(seed, frame, _BEAMS))
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
         directions = unit_vectors(angles) @ R.T
@@ -172,7 +169,7 @@ class RadarSensor:
             Origin.PHANTOM: self._phantoms(rays, R, seed, generator(seed, frame, _PHANTOMS)),
         }
         scans = [
-            self._measure(echoes, kind, generator(seed, frame, _NOISE, int(kind)))
+            self._measure(echoes, kind, generator(seed, frame, _NOISE, kind))
             for kind, echoes in candidates.items()
         ]
         order = generator(seed, frame, _ORDER).permutation(sum(len(scan.points) for scan in scans))
@@ -197,10 +194,8 @@ class RadarSensor:
         columns = max(1, round(min(self.beams, np.sqrt(self.beams * aspect))))
         rows = -(-self.beams // columns)
         cell = rng.permutation(rows * columns)[: self.beams]
-        u = (np.stack([cell % columns, cell // columns], axis=1) + rng.random((self.beams, 2))) / [
-            columns,
-            rows,
-        ]
+        u = np.stack([cell % columns, cell // columns], axis=1) + rng.random((self.beams, 2))
+        u /= [columns, rows]
         azimuth = (u[:, 0] - 0.5) * self.azimuth_fov_rad
         elevation = np.arcsin((2 * u[:, 1] - 1) * np.sin(self.elevation_fov_rad / 2))
         return np.stack([azimuth, elevation], axis=1)
@@ -226,21 +221,21 @@ class RadarSensor:
         path = first + second.range_m
         # Where a mirror stands on the ground, the path to the next surface has no length: this is no ghost.
         seen = (path <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
-        rows, path, second = rows[seen], path[seen], second.select(seen)
+        rows, path = rows[seen], path[seen]
+        second = Hits(second.range_m[seen], second.normals[seen], second.primitive[seen])
         mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
         # The range in the radar equation is the whole path, and the wave loses power at the mirror twice.
         power = self.gain_db + scene.echo_db(target, mirrored, second)
         power = power - self.range_loss_db * np.log10(path) - 2 * loss[rows]
         looks = scene.material_values(second, "looks", 1.0)
-        return _Echoes(path, angles[rows], power + _speckle_db(looks, rng), np.full(len(rows), np.nan))
+        return _Echoes(path, angles[rows], power + _speckle_db(looks, rng))
 
     def _sidelobes(self, surface: _Echoes, rng: np.random.Generator) -> _Echoes:
         """Some of the echoes of surfaces once more, as if from another elevation."""
         rows = np.flatnonzero(rng.random(len(surface.range_m)) < self.sidelobe_share)
         angles = surface.angles[rows]
         angles[:, 1] = np.arcsin(rng.uniform(-1, 1, size=len(rows)) * np.sin(self.sidelobe_fov_rad / 2))
-        power = surface.power_db[rows] - self.sidelobe_loss_db
-        return _Echoes(surface.range_m[rows], angles, power, np.full(len(rows), np.nan))
+        return _Echoes(surface.range_m[rows], angles, surface.power_db[rows])
 
     def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:
         """Weak returns of no surface: near the sensor, and anywhere along a beam before its surface."""
@@ -252,16 +247,15 @@ class RadarSensor:
         distance = np.where(is_far, anywhere, near)
         power = self.threshold_db + rng.exponential(self.clutter_power_db, size=len(beam))
         rows = (distance >= self.min_range_m) & (distance < 0.95 * free)
-        return _Echoes(distance[rows], angles[beam[rows]], power[rows], np.full(int(rows.sum()), np.nan))
+        return _Echoes(distance[rows], angles[beam[rows]], power[rows])
 
     def _phantoms(self, rays: _Rays, R: FloatArray, seed: int, rng: np.random.Generator) -> _Echoes:
         """Weak returns of no surface behind surfaces, more behind far ones, whose beams are wider.
 
         Lasting ones are at places that hold for all scans of a seed: at most one in each cell of space.
         """
-        expected = self.phantoms_per_scan * np.array(
-            [1 - self.phantom_lasting_share, self.phantom_lasting_share]
-        )
+        lasting = self.phantom_lasting_share
+        expected = self.phantoms_per_scan * np.array([1 - lasting, lasting])
         passing, tries = rng.poisson(expected / [1, _PHANTOM_SHARE])
         seen = np.flatnonzero(rays.hits.primitive >= 0)
         weights = rays.hits.range_m[seen]
@@ -272,12 +266,11 @@ class RadarSensor:
         key = int(generator(seed, _PLACES).integers(2**63))
         is_place, *offsets = (_hashed(cells.astype(np.int64), key + k) for k in range(4))
         places = _PHANTOM_CELL_M * (cells + np.stack(offsets, axis=1))
-        x, y, z = (
-            (np.concatenate([points[:passing], places[is_place < _PHANTOM_SHARE]]) - rays.origin) @ R
-        ).T
+        phantoms = np.concatenate([points[:passing], places[is_place < _PHANTOM_SHARE]])
+        x, y, z = ((phantoms - rays.origin) @ R).T
         power = self.threshold_db + rng.exponential(self.clutter_power_db, size=len(x))
         angles = np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
-        return _Echoes(np.sqrt(x**2 + y**2 + z**2), angles, power, np.full(len(x), np.nan))
+        return _Echoes(np.sqrt(x**2 + y**2 + z**2), angles, power)
 
     def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> Scan:
         """Add the sensor's noise, detect, round and clip the intensities."""
@@ -293,13 +286,12 @@ class RadarSensor:
             power = np.round(power / self.step_db) * self.step_db
         rows = (power >= self.threshold_db) & (range_m >= self.min_range_m) & (range_m <= self.max_range_m)
         points = range_m[rows, None] * unit_vectors(angles[rows])
-        intensities = np.clip(power[rows], self.floor_db, self.saturation_db)
-        low = max(self.floor_db, self.threshold_db)
-        noiseless = np.clip(echoes.noiseless_db[rows], low, self.saturation_db)
-        kinds = np.full(len(points), kind, dtype=np.int8)
-        return Scan(
-            points.astype(np.float32), intensities.astype(np.float32), noiseless.astype(np.float32), kinds
+        intensities = np.clip(power[rows], self.floor_db, self.saturation_db).astype(np.float32)
+        noiseless = np.clip(
+            np.broadcast_to(echoes.noiseless_db, rows.shape)[rows], self._least_db, self.saturation_db
         )
+        kinds = np.full(len(points), kind, dtype=np.int8)
+        return Scan(points.astype(np.float32), intensities, noiseless.astype(np.float32), kinds)
 
 
 def unit_vectors(angles: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +18,6 @@ from .materials import Material
 from .radar import RadarSensor, generator
 from .simulation import Simulation, simulate
 from .world import Box, CornerReflector, Pole, Primitive, Scene, Terrain
-
-__all__ = ["SCENES", "astyx", "hugin", "oculii", "wall"]
 
 FloatArray = NDArray[np.float64]
 Path = Callable[[FloatArray], FloatArray]
@@ -40,10 +38,87 @@ class Site:
         self, rng: np.random.Generator, terrain: Terrain, taken: list[tuple[float, float, float]]
     ) -> None:
         self.solids: list[Primitive] = []
-        self._rng, self._terrain = rng, terrain
-        self._taken = list(taken)  # circles: x, y, radius [m]
+        self.terrain = terrain
+        self.rng = rng
+        self._taken = list(taken)
 
-    def _free(self, circles: list[tuple[float, float, float]]) -> bool:
+    def fill(
+        self,
+        things: Iterable[tuple[str, tuple[int, int], tuple[float, float]]],
+        place: Callable[[float, float], tuple[FloatArray, float]],
+    ) -> None:
+        """Put things by the names of their methods, so many of each, where `place` says: a position and a yaw by limits.
+
+        Each has ten tries, and is left out if all fail.
+        """
+        for name, counts, limits in things:
+            for _ in range(int(self.rng.integers(*counts))):
+                any(getattr(self, name)(*place(*limits)) for _ in range(10))
+
+    def beside(self, path: Path, u: float, near: float, far: float) -> tuple[FloatArray, float]:
+        """A random place `near` to `far` m to one side of where a path is at `u`, (2,), and its direction there, rad."""
+        ahead, here = path(np.array([u + 0.01, u]))
+        yaw = float(np.arctan2(*(ahead - here)[::-1]))
+        side = self.rng.choice([-1.0, 1.0]) * self.rng.uniform(near, far)
+        return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
+
+    def building(self, xy: FloatArray, yaw: float) -> bool:
+        """A building of concrete or brick, 9 to 16 m long."""
+        material = vary(self.rng, materials.CONCRETE if self.rng.random() < 0.5 else materials.BRICK)
+        size = self.rng.uniform([9, 6, 5], [16, 9, 9])
+        return self._block(xy, yaw + self.rng.normal(0, 0.15), size, material)
+
+    def wall(self, xy: FloatArray, yaw: float) -> bool:
+        """A free-standing wall, 1.4 to 2.6 m high."""
+        size = self.rng.uniform([5, 0.25, 1.4], [12, 0.4, 2.6])
+        return self._block(xy, yaw + self.rng.normal(0, 0.15), size, vary(self.rng, materials.CONCRETE))
+
+    def hedge(self, xy: FloatArray, yaw: float) -> bool:
+        """A hedge along a road, 1 to 2 m high."""
+        size = self.rng.uniform([4, 0.7, 1.0], [14, 1.2, 2.0])
+        return self._block(xy, yaw + self.rng.normal(0, 0.05), size, vary(self.rng, materials.TREE))
+
+    def car(self, xy: FloatArray, yaw: float) -> bool:
+        """A car of two boxes: the body, and the cabin on top."""
+        metal = vary(self.rng, materials.METAL)
+        yaw, size = yaw + self.rng.normal(0, 0.05), self.rng.uniform([3.9, 1.7, 0.8], [4.8, 1.9, 1.0])
+        if not self._block(xy, yaw, size, metal):
+            return False
+        cabin = np.array([0.5 * size[0], 0.9 * size[1], 0.6])
+        self.add_box(xy, yaw, self._ground(xy) + size[2] - 0.05, cabin, metal)
+        return True
+
+    def pole(self, xy: FloatArray, _yaw: float) -> bool:
+        """A lamp post of steel or the trunk of a tree."""
+        tree = self.rng.random() < 0.4
+        radius = self.rng.uniform(0.15, 0.3) if tree else self.rng.uniform(0.06, 0.12)
+        height = self.rng.uniform(4, 8)
+        material = vary(self.rng, materials.TREE if tree else materials.STEEL_POLE)
+        return self.reserve([(*xy, radius)]) and self.add_pole(xy, radius, height, material)
+
+    def tree(self, xy: FloatArray, _yaw: float) -> bool:
+        """A trunk, and a crown that begins 2 to 3 m above the ground."""
+        radius, crown = self.rng.uniform(0.15, 0.35), self.rng.uniform([1.2, 2.0], [2.6, 5.0])
+        if not self.reserve([(*xy, 0.5 * float(crown[0]))]):
+            return False
+        wood, ground = vary(self.rng, materials.TREE), self._ground(xy)
+        bottom = ground + self.rng.uniform(2.0, 3.0)
+        self.add_pole(xy, radius, bottom - ground + _BURIED_M, wood)
+        self.solids.append(Pole(np.array([*xy, bottom]), float(crown[0]), float(crown[1]), wood))
+        return True
+
+    def basket(self, xy: FloatArray, facing: float) -> None:
+        """A basketball hoop: a post, and a board 0.6 m from it towards x · `facing`, where `facing` is 1 or -1."""
+        if self.reserve([(*xy, 0.3)]):
+            self.add_pole(xy, 0.1, 3.2, materials.STEEL_POLE)
+            at, board = xy + np.array([0.6 * facing, 0.0]), np.array([0.06, 1.8, 1.05])
+            self.add_box(at, 0.0, self._ground(xy) + 2.9, board, materials.METAL)
+
+    def _ground(self, xy: FloatArray) -> float:
+        return float(self.terrain.height(xy[None])[0])
+
+    def reserve(self, circles: list[tuple[float, float, float]]) -> bool:
+        """Whether circles are free; if so, they are taken."""
         old, new = np.array(self._taken).reshape(-1, 3), np.array(circles)
         gap = np.linalg.norm(old[:, None, :2] - new[None, :, :2], axis=2) - old[:, None, 2] - new[None, :, 2]
         if (gap < 0).any():
@@ -55,108 +130,23 @@ class Site:
         """Put a box of length, width and height on the ground, unless it would overlap."""
         along = np.array([np.cos(yaw), np.sin(yaw)])
         spots = np.linspace(-0.5, 0.5, max(1, round(size[0] / size[1]))) * max(0.0, size[0] - size[1])
-        if not self._free([(*(xy + s * along), 0.75 * size[1]) for s in spots]):
+        if not self.reserve([(*(xy + s * along), 0.75 * size[1]) for s in spots]):
             return False
-        ground = float(self._terrain.height(xy[None])[0])
-        self._add_box(xy, yaw, ground - _BURIED_M, np.array([*size[:2], size[2] + _BURIED_M]), material)
+        bottom = self._ground(xy) - _BURIED_M
+        self.add_box(xy, yaw, bottom, np.array([*size[:2], size[2] + _BURIED_M]), material)
         return True
 
-    def _add_box(
+    def add_box(
         self, xy: FloatArray, yaw: float, bottom: float, size: FloatArray, material: Material
     ) -> None:
+        """Add a box of a size (3,) whose lower face is at the height `bottom`, m."""
         self.solids.append(Box(np.array([*xy, bottom + size[2] / 2]), size / 2, yaw, material))
 
-    def beside(self, path: Path, u: float, near: float, far: float) -> tuple[FloatArray, float]:
-        """A random place `near` to `far` m to one side of where a path is at `u`, (2,), and its direction there, rad."""
-        ahead, here = path(np.array([u + 0.01, u]))
-        yaw = float(np.arctan2(*(ahead - here)[::-1]))
-        side = self._rng.choice([-1.0, 1.0]) * self._rng.uniform(near, far)
-        return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
-
-    def fill(
-        self,
-        count: int,
-        put: Callable[[FloatArray, float], bool],
-        where: Callable[[], tuple[FloatArray, float]],
-    ) -> None:
-        """Put `count` objects at random places. Each has ten tries, and is left out if all fail."""
-        for _ in range(count):
-            any(put(*where()) for _ in range(10))
-
-    def building(self, xy: FloatArray, yaw: float) -> bool:
-        """A building of concrete or brick, 9 to 16 m long."""
-        material = vary(self._rng, materials.CONCRETE if self._rng.random() < 0.5 else materials.BRICK)
-        size = self._rng.uniform([9, 6, 5], [16, 9, 9])
-        return self._block(xy, yaw + self._rng.normal(0, 0.15), size, material)
-
-    def wall(self, xy: FloatArray, yaw: float) -> bool:
-        """A free-standing wall, 1.4 to 2.6 m high."""
-        size = self._rng.uniform([5, 0.25, 1.4], [12, 0.4, 2.6])
-        return self._block(xy, yaw + self._rng.normal(0, 0.15), size, vary(self._rng, materials.CONCRETE))
-
-    def car(self, xy: FloatArray, yaw: float) -> bool:
-        """A car of two boxes: the body, and the cabin on top."""
-        metal = vary(self._rng, materials.METAL)
-        yaw, size = yaw + self._rng.normal(0, 0.05), self._rng.uniform([3.9, 1.7, 0.8], [4.8, 1.9, 1.0])
-        if not self._block(xy, yaw, size, metal):
-            return False
-        roof = float(self._terrain.height(xy[None])[0]) + size[2]
-        self._add_box(xy, yaw, roof - 0.05, np.array([0.5 * size[0], 0.9 * size[1], 0.6]), metal)
+    def add_pole(self, xy: FloatArray, radius_m: float, height_m: float, material: Material) -> bool:
+        """Add a pole that rises so far above the ground, and return True."""
+        base = np.array([*xy, self._ground(xy) - _BURIED_M])
+        self.solids.append(Pole(base, radius_m, height_m + _BURIED_M, material))
         return True
-
-    def pole(self, xy: FloatArray, _yaw: float) -> bool:
-        """A lamp post of steel or the trunk of a tree."""
-        tree = self._rng.random() < 0.4
-        radius = self._rng.uniform(0.15, 0.3) if tree else self._rng.uniform(0.06, 0.12)
-        height = self._rng.uniform(4, 8)
-        material = vary(self._rng, materials.TREE if tree else materials.STEEL_POLE)
-        if not self._free([(*xy, radius)]):
-            return False
-        base = float(self._terrain.height(xy[None])[0]) - _BURIED_M
-        self.solids.append(Pole(np.array([*xy, base]), radius, height + _BURIED_M, material))
-        return True
-
-    def hedge(self, xy: FloatArray, yaw: float) -> bool:
-        """A hedge along a road, 1 to 2 m high."""
-        size = self._rng.uniform([4, 0.7, 1.0], [14, 1.2, 2.0])
-        return self._block(xy, yaw + self._rng.normal(0, 0.05), size, vary(self._rng, materials.TREE))
-
-    def fence(self, xy: FloatArray, yaw: float) -> bool:
-        """A fence along a path: posts 2 m apart, and two rails."""
-        steps, height = int(self._rng.integers(3, 7)), self._rng.uniform(1.1, 1.8)
-        along = np.array([np.cos(yaw), np.sin(yaw)])
-        spots = [xy + 2.0 * (i - steps / 2) * along for i in range(steps + 1)]
-        if not self._free([(*spot, 0.5) for spot in spots]):
-            return False
-        wood = vary(self._rng, materials.TREE)
-        ground = self._terrain.height(np.array(spots))
-        for spot, base in zip(spots, ground, strict=True):
-            self.solids.append(Pole(np.array([*spot, base - _BURIED_M]), 0.05, height + _BURIED_M, wood))
-        for share in (0.4, 0.9):
-            bottom = float(ground.mean()) + share * height
-            self._add_box(xy, yaw, bottom, np.array([2.0 * steps, 0.05, 0.12]), wood)
-        return True
-
-    def tree(self, xy: FloatArray, _yaw: float) -> bool:
-        """A trunk, and a crown that begins 2 to 3 m above the ground."""
-        radius, crown = self._rng.uniform(0.15, 0.35), self._rng.uniform([1.2, 2.0], [2.6, 5.0])
-        if not self._free([(*xy, 0.5 * float(crown[0]))]):
-            return False
-        wood, ground = vary(self._rng, materials.TREE), float(self._terrain.height(xy[None])[0])
-        bottom = ground + self._rng.uniform(2.0, 3.0)
-        base = np.array([*xy, ground - _BURIED_M])
-        self.solids.append(Pole(base, radius, bottom - ground + 2 * _BURIED_M, wood))
-        self.solids.append(Pole(np.array([*xy, bottom]), float(crown[0]), float(crown[1]), wood))
-        return True
-
-    def basket(self, xy: FloatArray, facing: float) -> None:
-        """A basketball hoop: a post, and a board 0.6 m from it towards x · `facing`, where `facing` is 1 or -1."""
-        base = float(self._terrain.height(xy[None])[0])
-        if self._free([(*xy, 0.3)]):
-            foot = np.array([*xy, base - _BURIED_M])
-            self.solids.append(Pole(foot, 0.1, 3.2 + _BURIED_M, materials.STEEL_POLE))
-            board = np.array([0.06, 1.8, 1.05])
-            self._add_box(xy + np.array([0.6 * facing, 0.0]), 0.0, base + 2.9, board, materials.METAL)
 
 
 def along_path(
@@ -189,6 +179,16 @@ def along_path(
 
 _LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan has
 
+# Methods of `Site`, how many of each there are, and how far beside the path, m, or in court lengths.
+_LANE = (
+    ("building", (4, 8), (13, 20)), ("wall", (3, 6), (6, 11)), ("car", (6, 11), (4, 9)), ("pole", (12, 20), (3, 14)),
+)  # fmt: skip
+_COURT = (("building", (4, 7), (1.6, 2.0)), ("wall", (3, 6), (1.1, 1.4)), ("car", (4, 8), (1.2, 1.6)))
+_STREET = (
+    ("building", (5, 16), (14, 60)), ("car", (2, 12), (4, 9)), ("hedge", (4, 12), (7, 30)),
+    ("wall", (1, 6), (8, 35)), ("tree", (15, 40), (7, 60)), ("pole", (8, 20), (4, 15)),
+)  # fmt: skip
+
 # The ranges of intensities are those of the paper (Table II). Everything else is assumed, not measured: the fields of
 # view are usual ones, and noise and gain are chosen so that the kNN baseline has errors as on the paper's data sets.
 HUGIN_A3 = RadarSensor(
@@ -218,12 +218,8 @@ ASTYX_HIRES = RadarSensor(
 )  # fmt: skip
 
 
-def _frames(frames: int | None, default: int) -> int:
-    return default if frames is None else whole_number(frames, "frames", 1)
-
-
 def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
-    """A dense and accurate radar on a drive of 60 m past walls, buildings, cars and poles on rolling ground.
+    """Simulate a dense and accurate radar on a drive of 60 m past walls, buildings, cars and poles on rolling ground.
 
     Parameters
     ----------
@@ -245,22 +241,13 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
         x = 60.0 * u
         return np.stack([x, sway * np.sin(2 * np.pi * x / 70 + phase)], axis=1)
 
-    lane = path(np.linspace(-0.1, 1.5, 200))
-    site = Site(rng, terrain, taken=[(x, y, 2.2) for x, y in lane])
-
-    def beside(near: float, far: float) -> tuple[FloatArray, float]:
-        return site.beside(path, rng.uniform(0.1, 1.45), near, far)
-
-    site.fill(int(rng.integers(4, 8)), site.building, lambda: beside(13, 20))
-    site.fill(int(rng.integers(3, 6)), site.wall, lambda: beside(6, 11))
-    site.fill(int(rng.integers(6, 11)), site.car, lambda: beside(4, 9))
-    site.fill(int(rng.integers(12, 20)), site.pole, lambda: beside(3, 14))
-    poses = along_path(terrain, path, _frames(frames, 120), height_m=1.5, rng=generator(seed, _TRAJECTORY))
-    return simulate(Scene(site.solids, terrain), HUGIN_A3, poses, name="hugin", seed=seed)
+    site = Site(rng, terrain, taken=[(x, y, 2.2) for x, y in path(np.linspace(-0.1, 1.5, 200))])
+    site.fill(_LANE, lambda near, far: site.beside(path, rng.uniform(0.1, 1.45), near, far))
+    return _driven(site, path, (frames, 120), HUGIN_A3, "hugin", seed, height_m=1.5)
 
 
 def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
-    """A sparse and noisy radar on a lap in a sports court with hoops and fence posts, cars and buildings behind them.
+    """Simulate a sparse and noisy radar on a lap in a sports court with hoops, posts, cars and buildings round it.
 
     Parameters
     ----------
@@ -292,18 +279,15 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
         at = np.array([length * np.cos(angle), width * np.sin(angle)]) * rng.uniform(near, far)
         return at, float(np.arctan2(width * np.cos(angle), -length * np.sin(angle)))
 
-    site.fill(int(rng.integers(4, 7)), site.building, lambda: round_about(1.6, 2.0))
-    site.fill(int(rng.integers(3, 6)), site.wall, lambda: round_about(1.1, 1.4))
-    site.fill(int(rng.integers(4, 8)), site.car, lambda: round_about(1.2, 1.6))
+    site.fill(_COURT, round_about)
     for angle in np.arange(0, 2 * np.pi, 2 * np.pi / rng.integers(14, 22)):
         corner = np.clip(1.45 * np.array([np.cos(angle), np.sin(angle)]), -1, 1)
         site.pole(corner * np.array([length, width]), 0.0)
-    poses = along_path(terrain, path, _frames(frames, 120), height_m=1.1, rng=generator(seed, _TRAJECTORY))
-    return simulate(Scene(site.solids, terrain), OCULII_EAGLE, poses, name="oculii", seed=seed)
+    return _driven(site, path, (frames, 120), OCULII_EAGLE, "oculii", seed, height_m=1.1)
 
 
 def wall(seed: int = 0, frames: int | None = None) -> Simulation:
-    """A scene for view dependence: an arc of 10 m radius round a corner reflector on a wall. Some walls have windows.
+    """Simulate an arc of 10 m radius round a corner reflector on a wall, for view dependence. Some walls have windows.
 
     Parameters
     ----------
@@ -322,39 +306,31 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
     terrain = Terrain.random(rng, 0.05, materials.GRASS)
     height, half_length = rng.uniform(3.0, 4.5), rng.uniform(12.0, 16.0)
     brick = vary(rng, materials.BRICK)
-    solids: list[Primitive] = [
-        Box(np.array([-0.2, rng.uniform(-1, 1), height / 2 - 0.5]), np.array([0.2, half_length, height / 2 + 0.5]),
-            0.0, brick)
-    ]  # fmt: skip
+    center = np.array([-0.2, rng.uniform(-1, 1), height / 2 - 0.5])
+    site = Site(rng, terrain, taken=[])
+    site.solids.append(Box(center, np.array([0.2, half_length, height / 2 + 0.5]), 0.0, brick))
     for y in rng.permutation([-7.5, -5.0, -2.5, 2.5, 5.0, 7.5])[: rng.integers(0, 4)]:
         size = np.array([0.04, rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.7)])
-        solids.append(Box(np.array([0.0, y, rng.uniform(1.5, 2.0)]), size, 0.0, vary(rng, materials.GLASS)))
+        center = np.array([0.0, y, rng.uniform(1.5, 2.0)])
+        site.solids.append(Box(center, size, 0.0, vary(rng, materials.GLASS)))
     mounted = np.array([0.02, 0.0, rng.uniform(1.0, 1.4)])
-    reflector = CornerReflector(
-        mounted, np.array([1.0, 0.0, 0.0]), rng.uniform(0.3, 0.4), materials.REFLECTOR
-    )
+    edge_m = rng.uniform(0.3, 0.4)
+    site.solids.append(CornerReflector(mounted, np.array([1.0, 0.0, 0.0]), edge_m, materials.REFLECTOR))
     radius = 10.0 + rng.uniform(-0.5, 0.5)
 
     def path(u: FloatArray) -> FloatArray:
-        angle = np.deg2rad(160) * (u - 0.5)
-        xy: FloatArray = (radius + 0.1 * np.sin(9 * u))[:, None] * np.stack(
-            [np.cos(angle), np.sin(angle)], axis=1
-        )
+        angle, distance = np.deg2rad(160) * (u - 0.5), radius + 0.1 * np.sin(9 * u)
+        xy: FloatArray = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return xy
 
-    rng = generator(seed, _TRAJECTORY)
-    poses = along_path(terrain, path, _frames(frames, 90), height_m=1.2, rng=rng, look_at=mounted[:2])
-    return simulate(Scene([*solids, reflector], terrain), HUGIN_A4, poses, name="wall", seed=seed)
+    return _driven(site, path, (frames, 90), HUGIN_A4, "wall", seed, height_m=1.2, look_at=mounted[:2])
 
 
 def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
-    """An automotive radar on a street: few scans, noise that grows with the range, and many false returns.
+    """Simulate an automotive radar on a street: few scans, noise that grows with the range, and many false returns.
 
-    The radar is fitted to four drives of the Astyx HiRes2019 dataset (r0009_0024, r0057_0068, r0133_0142, r0144_0167):
-    returns per scan, distances to lidar points, deviations from planes through them along beam, azimuth and elevation,
-    those of strong and of weak returns, and false returns, each by range. The world is a street of their kind, not a
-    copy. r0309_0320 was left out to confirm: its noise in elevation agrees, it has more false returns. ``docs/simulation.md`` has
-    the figures.
+    The radar is fitted to four drives of the Astyx HiRes2019 dataset; ``docs/simulation.md`` has the figures. The world is a
+    street of their kind, not a copy.
 
     Parameters
     ----------
@@ -378,25 +354,30 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
         return np.stack([x, sway * np.sin(2 * np.pi * x / wave + phase)], axis=1)
 
     first, last = -10.0, length + 100.0
-    road = path(np.arange(first, last, 2.0) / length)
-    site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in road])
+    site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in path(np.arange(first, last, 2.0) / length)])
+    site.fill(_STREET, lambda near, far: site.beside(path, rng.uniform(first, last) / length, near, far))
+    return _driven(site, path, (frames, 20), ASTYX_HIRES, "astyx", seed, height_m=1.25)
 
-    def beside(near: float, far: float) -> tuple[FloatArray, float]:
-        return site.beside(path, rng.uniform(first, last) / length, near, far)
 
-    site.fill(int(rng.integers(5, 16)), site.building, lambda: beside(14, 60))
-    site.fill(int(rng.integers(2, 12)), site.car, lambda: beside(4, 9))
-    site.fill(int(rng.integers(4, 12)), site.hedge, lambda: beside(7, 30))
-    site.fill(int(rng.integers(1, 6)), site.wall, lambda: beside(8, 35))
-    site.fill(int(rng.integers(15, 40)), site.tree, lambda: beside(7, 60))
-    site.fill(int(rng.integers(8, 20)), site.pole, lambda: beside(4, 15))
-    poses = along_path(terrain, path, _frames(frames, 20), height_m=1.25, rng=generator(seed, _TRAJECTORY))
-    return simulate(Scene(site.solids, terrain), ASTYX_HIRES, poses, name="astyx", seed=seed)
+def _driven(
+    site: Site,
+    path: Path,
+    frames: tuple[int | None, int],
+    sensor: RadarSensor,
+    name: str,
+    seed: int,
+    *,
+    height_m: float,
+    look_at: FloatArray | None = None,
+) -> Simulation:
+    """Scans of a site along a path. `frames`: their number, and the default."""
+    count = frames[1] if frames[0] is None else whole_number(frames[0], "frames", 1)
+    rng = generator(seed, _TRAJECTORY)
+    poses = along_path(site.terrain, path, count, height_m=height_m, rng=rng, look_at=look_at)
+    return simulate(Scene(site.solids, site.terrain), sensor, poses, name=name, seed=seed)
 
 
 SCENES: dict[str, Callable[..., Simulation]] = {
-    "hugin": hugin,
-    "oculii": oculii,
-    "wall": wall,
-    "astyx": astyx,
+    scene.__name__: scene for scene in (hugin, oculii, wall, astyx)
 }
+"""The simulations by name; each takes `seed` and `frames`."""

@@ -10,15 +10,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import check_poses, instance, whole_number
+from radarsdf.checks import check_poses, instance
 
 from .radar import Origin, RadarSensor, generator, unit_vectors
 from .world import Scene
 
-__all__ = ["Lidar", "Simulation", "simulate"]
-
 FloatArray = NDArray[np.float64]
 
+_LIDAR_RAYS = 10_000  # from each pose
 _LIDAR_SIGMA_M = 0.01
 _LIDAR_CELL_M = 0.05  # one lidar point per cell: otherwise most would lie on the ground near the sensor
 _LIDAR_STREAM = 2**31  # no scan has this number
@@ -32,20 +31,15 @@ class Lidar:
     sensor: RadarSensor
     poses: FloatArray  # (F, 4, 4) T_world_sensor, m
     seed: int
-    rays: int  # from each pose
 
     @cached_property
     def points(self) -> FloatArray:
-        """(M, 3) world frame, m, with a noise of 1 cm along the ray and at most one point in each cell of 5 cm.
-
-        Their rays take as long as the scans, so they are cast only when somebody asks.
-        """
+        """(M, 3) world, m, computed on first access: casting their rays takes as long as the scans."""
         rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
         found = [np.zeros((0, 3))]
-        for T_world_sensor in self.poses[
-            :: max(1, len(self.poses) // 40)
-        ]:  # neighbours see the same surfaces
-            u = rng.uniform(-1, 1, size=(self.rays, 2))
+        every = max(1, len(self.poses) // 40)  # neighbours see the same surfaces
+        for T_world_sensor in self.poses[::every]:
+            u = rng.uniform(-1, 1, size=(_LIDAR_RAYS, 2))
             elevation = np.arcsin(u[:, 1] * np.sin(sensor.elevation_fov_rad / 2))
             angles = np.stack([u[:, 0] * sensor.azimuth_fov_rad / 2, elevation], axis=1)
             directions, origin = unit_vectors(angles) @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
@@ -70,7 +64,9 @@ class Simulation:
     points: list[NDArray[np.float32]]  # F arrays (N_i, 3), sensor frame, m
     poses: FloatArray  # (F, 4, 4) T_world_sensor, m
     intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB
-    noiseless_intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB, as in `Scan`
+    noiseless_intensities: list[
+        NDArray[np.float32]
+    ]  # F arrays (N_i,), dB, no speckle and noise; NaN: false return
     origin_kind: list[NDArray[np.int8]]  # F arrays (N_i,), codes of `Origin`
     scene: Scene
     sensor: RadarSensor
@@ -80,7 +76,10 @@ class Simulation:
 
     @property
     def ground_truth(self) -> FloatArray:
-        """(M, 3) lidar points of the surfaces that the radar can detect, world frame, m."""
+        """(M, 3) lidar points of the surfaces that the radar can detect, world frame, m.
+
+        They have a noise of 1 cm along the ray, and there is at most one in each cell of 5 cm.
+        """
         return self.lidar.points
 
     def __len__(self) -> int:
@@ -89,11 +88,8 @@ class Simulation:
 
     def world_points(self) -> FloatArray:
         """All returns, false ones included: (N, 3) float64, world frame, m, in the order of the scans."""
-        moved = [
-            p.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-            for p, T in zip(self.points, self.poses, strict=True)
-        ]
-        return np.concatenate(moved)
+        scans = zip(self.points, self.poses, strict=True)
+        return np.concatenate([p.astype(np.float64) @ T[:3, :3].T + T[:3, 3] for p, T in scans])
 
     def is_surface(self) -> NDArray[np.bool_]:
         """Mask of the returns from a surface, (N,) bool, in the order of `world_points`."""
@@ -112,15 +108,7 @@ class Simulation:
         return float(error[surface].mean(dtype=np.float64)) if surface.any() else float("nan")
 
 
-def simulate(
-    scene: Scene,
-    sensor: RadarSensor,
-    poses: FloatArray,
-    *,
-    name: str,
-    seed: int = 0,
-    lidar_rays: int = 10_000,
-) -> Simulation:
+def simulate(scene: Scene, sensor: RadarSensor, poses: FloatArray, *, name: str, seed: int = 0) -> Simulation:
     """Scan a scene from every pose.
 
     Parameters
@@ -135,8 +123,6 @@ def simulate(
         Name of the simulation.
     seed : int
         Seed of all random numbers. The same arguments give the same result, bit by bit.
-    lidar_rays : int
-        Rays cast from each pose for the ground truth. Of 80 poses or more, only every n-th is used, 40 to 60 in all.
 
     Returns
     -------
@@ -150,7 +136,6 @@ def simulate(
     """
     instance(scene, Scene, "scene")
     instance(sensor, RadarSensor, "sensor")
-    whole_number(lidar_rays, "lidar_rays", 0)
     poses = check_poses(poses)
     scans = [sensor.scan(scene, T_world_sensor, seed, frame) for frame, T_world_sensor in enumerate(poses)]
     return Simulation(
@@ -163,5 +148,5 @@ def simulate(
         sensor=sensor,
         name=name,
         seed=seed,
-        lidar=Lidar(scene, sensor, poses.copy(), seed, lidar_rays),
+        lidar=Lidar(scene, sensor, poses.copy(), seed),
     )

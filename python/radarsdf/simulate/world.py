@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A world of ground and solids: exact ray hits, distances, and the echo of every hit.
+"""A world of ground and solids: exact ray hits, signed distances, and the echo of every hit.
 
 World frame: z up, m. Signed distances are positive in free space and negative inside a solid.
 """
@@ -20,27 +20,22 @@ from .materials import Material
 __all__ = ["Box", "CornerReflector", "Hits", "Pole", "Primitive", "Scene", "Terrain"]
 
 FloatArray = NDArray[np.float64]
+_First = tuple[FloatArray, FloatArray]
 _CHUNK = 32768  # rays or points at a time; they take some tens of MB
 
 
 class Primitive(ABC):
-    """A solid in a scene. All arrays are float64, in the world frame, in m."""
+    """A part of a scene. All arrays are float64, in the world frame, in m."""
 
     material: Material
-    """Radar properties of the surface."""
 
     @abstractmethod
     def bounding_sphere(self) -> tuple[FloatArray, float]:
-        """Centre (3,) and radius of a sphere that contains the solid."""
+        """Centre (3,) and radius of a sphere that contains the part."""
 
     @abstractmethod
-    def intersect(
-        self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """First hits of (N, 3) rays: ranges (N,) and unit normals (N, 3).
-
-        The range is inf where there is no hit within `max_range_m` (N,). Its normal then has no meaning.
-        """
+    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+        """First hits of (N, 3) rays: ranges (N,), inf beyond `max_range_m` (N,), and unit normals (N, 3)."""
 
     @abstractmethod
     def signed_distance(self, points: FloatArray) -> FloatArray:
@@ -48,13 +43,7 @@ class Primitive(ABC):
 
     def echo_db(self, points: FloatArray, directions: FloatArray, normals: FloatArray) -> FloatArray:
         """Echo (N,), dB, of hits (N, 3) seen along unit directions (N, 3), without the loss by range."""
-        return self.material.echo_db(points, cos_incidence(directions, normals))
-
-
-def cos_incidence(directions: FloatArray, normals: FloatArray) -> FloatArray:
-    """Cosine (N,) between the normals (N, 3) and the directions back to the sensor."""
-    cos: FloatArray = -np.einsum("ni,ni->n", directions, normals)
-    return cos
+        return self.material.echo_db(points, -np.einsum("ni,ni->n", directions, normals))
 
 
 def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
@@ -80,18 +69,15 @@ class Box(Primitive):
     def bounding_sphere(self) -> tuple[FloatArray, float]:
         return self.center, float(np.linalg.norm(self.half_extents))
 
-    def intersect(
-        self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
         R_world_box = self._rotation()
         origin, direction = (origins - self.center) @ R_world_box, directions @ R_world_box
-        near = _quotient(-np.copysign(self.half_extents, direction) - origin, direction)
-        far = _quotient(np.copysign(self.half_extents, direction) - origin, direction)
-        axis = near.argmax(axis=1)
-        t = np.take_along_axis(near, axis[:, None], axis=1)[:, 0]
+        corner = np.copysign(self.half_extents, direction)
+        near, far = _quotient(-corner - origin, direction), _quotient(corner - origin, direction)
+        rows, axis = np.arange(len(near)), near.argmax(axis=1)
+        t = near[rows, axis]
         t = np.where((t <= far.min(axis=1)) & (t > 0) & (t <= max_range_m), t, np.inf)
         local = np.zeros_like(direction)
-        rows = np.arange(len(t))
         local[rows, axis] = -np.copysign(1.0, direction[rows, axis])
         return t, local @ R_world_box.T
 
@@ -114,9 +100,7 @@ class Pole(Primitive):
         center = self.base + np.array([0, 0, self.height_m / 2])
         return center, float(np.hypot(self.radius_m, self.height_m / 2))
 
-    def intersect(
-        self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
         o, d = origins - self.base, directions
         a = np.maximum(d[:, 0] ** 2 + d[:, 1] ** 2, 1e-24)
         b = o[:, 0] * d[:, 0] + o[:, 1] * d[:, 1]
@@ -160,7 +144,7 @@ class CornerReflector(Primitive):
     retro_db: float = 25.0  # echo on the axis, above `material.reflectivity_db` [dB]
     retro_width_rad: float = 0.28  # standard deviation of the lobe; 0.28 is the usual 3 dB cone of 38 degrees
 
-    def edges(self) -> FloatArray:
+    def _edges(self) -> FloatArray:
         """Unit vectors (3, 3) from the apex along the edges, one per row, at equal angles to the axis."""
         up = np.array([0.0, 0.0, 1.0]) if abs(self.axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
         side = np.cross(up, self.axis)
@@ -173,10 +157,8 @@ class CornerReflector(Primitive):
     def bounding_sphere(self) -> tuple[FloatArray, float]:
         return self.apex, self.edge_m
 
-    def intersect(
-        self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        edges = self.edges()
+    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+        edges = self._edges()
         o, d = (origins - self.apex) @ edges.T, directions @ edges.T  # in the frame of the three edges
         best, plate = np.full(len(o), np.inf), np.zeros(len(o), dtype=np.int64)
         for i in range(3):
@@ -190,7 +172,7 @@ class CornerReflector(Primitive):
         return best, facing[:, None] * edges[plate]
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
-        p = (points - self.apex) @ self.edges().T
+        p = (points - self.apex) @ self._edges().T
         best = np.full(len(p), np.inf)
         for i in range(3):
             u, v = p[:, (i + 1) % 3], p[:, (i + 2) % 3]
@@ -203,23 +185,17 @@ class CornerReflector(Primitive):
         return best
 
     def echo_db(self, points: FloatArray, directions: FloatArray, normals: FloatArray) -> FloatArray:
-        plates = self.material.echo_db(points, cos_incidence(directions, normals))
+        plates = super().echo_db(points, directions, normals)
         angle = np.arccos(np.clip(-directions @ self.axis, -1, 1))
-        retro = (
-            self.material.reflectivity_db
-            + self.retro_db
-            - 10 * np.log10(np.e) * 0.5 * (angle / self.retro_width_rad) ** 2
-        )
+        lobe_db = 10 * np.log10(np.e) * 0.5 * (angle / self.retro_width_rad) ** 2
+        retro = self.material.reflectivity_db + self.retro_db - lobe_db
         echo: FloatArray = 10 * np.log10(10 ** (plates / 10) + 10 ** (retro / 10))
         return echo
 
 
 @dataclass(frozen=True, eq=False)
-class Terrain:
-    """Height field z(x, y) = level + Σ amplitude · sin(wave · (x, y) + phase), solid below and without an edge.
-
-    World frame, m, z up.
-    """
+class Terrain(Primitive):
+    """Height field z(x, y) = level + Σ amplitude · sin(wave · (x, y) + phase), solid below and without an edge."""
 
     waves: FloatArray  # (K, 2) wave vectors [rad/m]
     amplitudes: FloatArray  # (K,) [m]
@@ -229,9 +205,21 @@ class Terrain:
 
     @classmethod
     def random(cls, rng: np.random.Generator, roughness_m: float, material: Material) -> Terrain:
-        """Rolling ground of five octaves with two waves each, of about 40 m down to 2.5 m, with the mean height 0.
+        """Draw rolling ground of five octaves with two waves each, from about 40 m down to 2.5 m long.
 
-        `roughness_m` is the amplitude of the longest waves. Each halving of the wavelength divides the amplitude by 2.5.
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Source of lengths, headings and phases.
+        roughness_m : float
+            Amplitude of the longest waves, m. Each halving of the wavelength divides the amplitude by 2.5.
+        material : Material
+            What the ground is made of.
+
+        Returns
+        -------
+        Terrain
+            Ground with mean height 0.
         """
         octave = np.repeat(np.arange(5), 2)
         length = 40.0 / 2.0**octave * rng.uniform(0.8, 1.25, size=10)
@@ -245,26 +233,22 @@ class Terrain:
         height: FloatArray = self.level_m + np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes
         return height
 
-    def slope(self, xy: FloatArray) -> FloatArray:
-        """Gradient (N, 2) of the height at the positions (N, 2), world, m."""
+    def _slope(self, xy: FloatArray) -> FloatArray:
+        """Gradient (N, 2) of the height."""
         slope: FloatArray = (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves
         return slope
 
-    def normals(self, xy: FloatArray) -> FloatArray:
-        """Upward unit normals (N, 3) at the positions (N, 2), world, m."""
-        normals = np.concatenate([-self.slope(xy), np.ones((len(xy), 1))], axis=1)
+    def _normals(self, xy: FloatArray) -> FloatArray:
+        normals = np.concatenate([-self._slope(xy), np.ones((len(xy), 1))], axis=1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return normals
 
-    def intersect(
-        self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """First hits of (N, 3) rays from above the ground; see `Primitive.intersect`.
+    def bounding_sphere(self) -> tuple[FloatArray, float]:
+        return np.zeros(3), np.inf
 
-        Each ray advances until it is below the ground. The steepest possible slope bounds the length of a safe step,
-        but a step is at least 10 cm + 1 % of the range, so a crest of millimetres can be missed. Newton's method then
-        finds the crossing within the last step.
-        """
+    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+        # Each ray from above advances until it is below the ground. The steepest possible slope bounds the length of a
+        # safe step, but a step is at least 10 cm + 1 % of the range, so a crest of millimetres can be missed.
         steepest = float(np.abs(self.amplitudes) @ np.linalg.norm(self.waves, axis=1))
         top = self.level_m + float(np.abs(self.amplitudes).sum())
         dz = directions[:, 2]
@@ -280,12 +264,13 @@ class Terrain:
             gap = p[:, 2] - self.height(p[:, :2])
             below = gap <= 0
             hit[active[below]] = True
-            gone = ~below & ((t[active] > max_range_m[active]) | ((p[:, 2] > top) & (dz[active] >= 0)))
+            gone = (t[active] > max_range_m[active]) | ((p[:, 2] > top) & (dz[active] >= 0))
             keep = ~below & ~gone
             active, gap = active[keep], gap[keep]
             step = np.maximum(gap / np.maximum(closing[active], 1e-9), 0.1 + 0.01 * t[active])
             before[active] = t[active]
             t[active] += step
+        # Newton's method finds the crossing within the last step.
         rows = np.flatnonzero(hit)
         o, d, low, high = origins[rows], directions[rows], before[rows], t[rows]
         x = high.copy()
@@ -293,33 +278,27 @@ class Terrain:
             p = o + x[:, None] * d
             gap = p[:, 2] - self.height(p[:, :2])
             low, high = np.where(gap > 0, x, low), np.where(gap > 0, high, x)
-            rate = d[:, 2] - np.einsum("ni,ni->n", self.slope(p[:, :2]), d[:, :2])
+            rate = d[:, 2] - np.einsum("ni,ni->n", self._slope(p[:, :2]), d[:, :2])
             newton = x - gap / np.where(np.abs(rate) < 1e-9, -1e-9, rate)
             x = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
         result, normals = np.full(len(t), np.inf), np.zeros_like(directions)
         result[rows] = np.where(x <= max_range_m[rows], x, np.inf)
-        normals[rows] = self.normals((o + x[:, None] * d)[:, :2])
+        normals[rows] = self._normals((o + x[:, None] * d)[:, :2])
         return result, normals
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
-        """Distances (N,) of points (N, 3) to the ground, negative below.
-
-        Exact for points that are nearer to the ground than its radius of curvature, some metres. Farther away the
-        result is the distance to some point of the ground: it may be too large, never too small.
-        """
+        # Exact for points that are nearer to the ground than its radius of curvature, some metres. Farther away the
+        # result is the distance to some point of the ground: it may be too large, never too small.
         foot = points[:, :2].copy()
         vertical = points[:, 2] - self.height(foot)
         best = np.abs(vertical)
         for _ in range(8):
             on = np.concatenate([foot, self.height(foot)[:, None]], axis=1)
             best = np.minimum(best, np.linalg.norm(points - on, axis=1))
-            normals = self.normals(foot)
+            normals = self._normals(foot)
             along = np.einsum("ni,ni->n", points - on, normals)
             foot = points[:, :2] - along[:, None] * normals[:, :2]
         return np.copysign(best, vertical)
-
-    def echo_db(self, points: FloatArray, directions: FloatArray, normals: FloatArray) -> FloatArray:
-        return self.material.echo_db(points, cos_incidence(directions, normals))
 
 
 class Hits(NamedTuple):
@@ -330,10 +309,6 @@ class Hits(NamedTuple):
         FloatArray  # (N, 3) unit vectors, world, towards the origin of the ray; zero where it hits nothing
     )
     primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 where it hits nothing
-
-    def select(self, rows: NDArray[np.bool_]) -> Hits:
-        """Hits of the rays in an (N,) mask."""
-        return Hits(self.range_m[rows], self.normals[rows], self.primitive[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,35 +327,46 @@ class Scene:
     terrain: Terrain | None = None
 
     @property
-    def parts(self) -> list[Primitive | Terrain]:
+    def parts(self) -> list[Primitive]:
         """All parts in the order of `Hits.primitive`: the solids, then the ground."""
         return [*self.solids, *([self.terrain] if self.terrain is not None else [])]
 
     def raycast(self, origins: ArrayLike, directions: ArrayLike, max_range_m: float) -> Hits:
-        """First hit of each ray within `max_range_m`, exact to about 1e-9 m.
+        """Find the first hit of each ray, exact to about 1e-9 m.
 
-        Origins are (N, 3) or (3,), world frame, m; directions (N, 3) unit vectors.
+        Parameters
+        ----------
+        origins : (N, 3) or (3,) array_like
+            Where the rays begin, world, m.
+        directions : (N, 3) array_like
+            Unit vectors, world.
+        max_range_m : float
+            Farther hits do not count, m.
+
+        Returns
+        -------
+        Hits
+            `range_m` (N,), m, `normals` (N, 3), world, and `primitive` (N,), the row in `parts`. Inf, zeros and -1 where
+            a ray hits nothing.
         """
         d = np.asarray(directions, dtype=np.float64)
         o = np.broadcast_to(np.asarray(origins, dtype=np.float64), d.shape)
-        pieces = [
+        chunks = [
             self._raycast(o[i : i + _CHUNK], d[i : i + _CHUNK], max_range_m)
             for i in range(0, max(len(d), 1), _CHUNK)
         ]
-        return Hits(*map(np.concatenate, zip(*pieces, strict=True)))
+        return Hits(*map(np.concatenate, zip(*chunks, strict=True)))
 
     def _raycast(self, origins: FloatArray, directions: FloatArray, max_range_m: float) -> Hits:
         nearest = np.full(len(directions), max_range_m)
         normals = np.zeros_like(directions)
         primitive = np.full(len(directions), -1, dtype=np.int64)
         for index, part in enumerate(self.parts):
-            rows = np.arange(len(directions))
-            if not isinstance(part, Terrain):
-                center, radius = part.bounding_sphere()
-                to_center = center - origins
-                along = np.einsum("ni,ni->n", to_center, directions)
-                off = np.einsum("ni,ni->n", to_center, to_center) - along**2
-                rows = np.flatnonzero((off <= radius**2) & (along > -radius) & (along < nearest + radius))
+            center, radius = part.bounding_sphere()
+            to_center = center - origins
+            along = np.einsum("ni,ni->n", to_center, directions)
+            off = np.einsum("ni,ni->n", to_center, to_center) - along**2
+            rows = np.flatnonzero((off <= radius**2) & (along > -radius) & (along < nearest + radius))
             t, n = part.intersect(origins[rows], directions[rows], nearest[rows])
             hit = np.isfinite(t)
             rows = rows[hit]
@@ -388,17 +374,25 @@ class Scene:
         return Hits(np.where(primitive >= 0, nearest, np.inf), normals, primitive)
 
     def signed_distance(self, points: ArrayLike) -> FloatArray:
-        """Signed distances (N,), m, of points (N, 3), world frame, to the union of all parts; positive in free space.
+        """Compute signed distances to the union of all parts.
 
-        There they are exact, but see `Terrain.signed_distance` for points metres above the ground. Inside, where parts
-        overlap, the absolute value may be too small.
+        Parameters
+        ----------
+        points : (N, 3) array_like
+            World, m.
+
+        Returns
+        -------
+        (N,) ndarray of float64
+            m, positive in free space. Metres above rough ground they may be too large; inside of solids that overlap,
+            the absolute value may be too small.
         """
         p = np.asarray(points, dtype=np.float64)
         best = np.full(len(p), np.inf)
         for i in range(0, len(p), _CHUNK):
-            piece = p[i : i + _CHUNK]
             for part in self.parts:
-                best[i : i + _CHUNK] = np.minimum(best[i : i + _CHUNK], part.signed_distance(piece))
+                of_part = part.signed_distance(p[i : i + _CHUNK])
+                best[i : i + _CHUNK] = np.minimum(best[i : i + _CHUNK], of_part)
         return best
 
     def echo_db(self, points: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
