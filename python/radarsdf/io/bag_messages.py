@@ -35,6 +35,25 @@ _DEFINITIONS = {
     "radar_msgs/msg/RadarScan": "std_msgs/Header header; radar_msgs/RadarReturn[] returns",
     "nebula_msgs/msg/NebulaPacket": "builtin_interfaces/Time stamp; uint8[] data",
     "nebula_msgs/msg/NebulaPackets": "std_msgs/Header header; nebula_msgs/NebulaPacket[] packets",
+    "continental_msgs/msg/ContinentalArs548Detection": (
+        "float32 azimuth; float32 azimuth_std; bool[8] invalid; float32 elevation; float32 elevation_std; float32 range; "
+        "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
+        "uint8 multi_target; uint16 object; uint8 ambiguity"
+    ),
+    "continental_msgs/msg/ContinentalArs548DetectionList": (
+        "std_msgs/Header header; uint8 sync_status; geometry_msgs/Point origin; float32[8] origin_and_alignment; "
+        "uint8 alignment_status; continental_msgs/ContinentalArs548Detection[] detections"
+    ),
+    "ars548_messages/msg/Detection": (
+        "float32 azimuth; float32 azimuth_std; uint8 invalid; float32 elevation; float32 elevation_std; float32 range; "
+        "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
+        "uint8 multi_target; uint16 object; uint8 ambiguity; uint16 sort_index"
+    ),
+    "ars548_messages/msg/DetectionList": (
+        "std_msgs/Header header; uint64 crc; uint32[5] counters; uint8 sync_status; uint32 event; uint8 qualifier; "
+        "uint16 origin_invalid; float32[12] origin; uint8 invalid; ars548_messages/Detection[800] detections; "
+        "float32[2] velocities; uint32 num_detections; float32[2] alignment; uint8 alignment_status"
+    ),
 }
 _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -44,6 +63,7 @@ _ARS548_RETURN = np.dtype(
      ("range", ">f4"), ("range_std", ">f4"), ("range_rate", ">f4"), ("range_rate_std", ">f4"), ("rcs", "i1"),
      ("others", "V10")]
 )  # fmt: skip
+_ARS548_VALUES = [name for name in _ARS548_RETURN.names or () if name not in ("invalid", "others")]
 _PACKET_BYTES, _RETURNS_AT, _COUNT_AT, _MAX_RETURNS = 35336, 101, 35309, 800
 _NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
 
@@ -143,10 +163,26 @@ def _ars548_packets(message: Any) -> Columns:
             count = min(int.from_bytes(data[_COUNT_AT : _COUNT_AT + 4], "big"), _MAX_RETURNS)
             lists.append(np.frombuffer(data, _ARS548_RETURN, count, _RETURNS_AT))
     returns = np.concatenate(lists)
-    invalid = np.unpackbits(returns["invalid"][None], axis=0, bitorder="little") != 0
+    flags = np.unpackbits(returns["invalid"][None], axis=0, bitorder="little")
+    return _ars548({name: returns[name] for name in _ARS548_VALUES}, flags != 0)
+
+
+def _ars548_list(message: Any) -> Columns:
+    """The returns of an ARS548 as its drivers publish them: Autoware's with a flag a value, ars548_messages with bits."""
+    returns = message.detections[: getattr(message, "num_detections", None)]
+    flags = np.array([row.invalid for row in returns], np.uint8)
+    if flags.ndim == 1:
+        flags = np.unpackbits(flags[:, None], axis=1, bitorder="little")
+    return _ars548(
+        {name: _column(returns, name.removesuffix("_rad")) for name in _ARS548_VALUES}, flags.T != 0
+    )
+
+
+def _ars548(returns: Columns, invalid: NDArray[np.bool_]) -> Columns:
+    """Columns without what the radar calls `invalid` (8, N): of distance, azimuth, elevation and rate, before each deviation."""
     columns = {name: returns[name] for name in ("rcs", "range_std", "azimuth_std", "elevation_std")}
     for i, name in enumerate(("range", "azimuth_rad", "elevation_rad", "range_rate")):
-        columns[name] = np.where(invalid[2 * i], np.nan, returns[name])  # odd flags are of deviations
+        columns[name] = np.where(invalid[2 * i], np.nan, returns[name])
     return columns
 
 
@@ -189,6 +225,8 @@ _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
     "sensor_msgs/msg/PointCloud": _point_cloud,
     "radar_msgs/msg/RadarScan": _radar_scan,
+    "continental_msgs/msg/ContinentalArs548DetectionList": _ars548_list,
+    "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _ars548_packets,
 }
 _POSES: dict[str, Callable[[Any], list[Pose]]] = {
