@@ -20,12 +20,16 @@ REQUIREMENTS = {
 def require(*modules: str, what: str) -> Any:
     """Import libraries that may not be installed, and return the last one.
 
-    `what` needs them, such as "the viewer needs". An ImportError names one that is missing and the command to install all.
+    `what` needs them, such as "the viewer needs". An ImportError names all that are missing, and the command to install.
     """
-    try:
-        return [importlib.import_module(name) for name in modules][-1]
-    except ImportError as error:
-        names = [name for name in (one.partition(".")[0] for one in modules) if name in REQUIREMENTS]
-        wanted = " ".join(f'"{REQUIREMENTS[name]}"' for name in names)
-        msg = f"{what} {' and '.join(names)}: pip install {wanted}"
-        raise ImportError(msg) from error
+    missing: list[str] = []
+    for name in modules:
+        try:
+            found = importlib.import_module(name)
+        except ImportError:
+            missing.append(name.partition(".")[0])
+    if missing:
+        wanted = " ".join(f'"{REQUIREMENTS[name]}"' for name in missing)
+        msg = f"{what} {' and '.join(missing)}: pip install {wanted}"
+        raise ImportError(msg)
+    return found

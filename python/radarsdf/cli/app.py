@@ -53,30 +53,28 @@ def run(words: list[str]) -> int:
 def _run(words: list[str]) -> int:
     commands = {name: found for of_heading in COMMANDS.values() for name, found in of_heading.items()}
     name, *words = words
-    prog, options = f"radarsdf {name}", name
     if name == "--version":
         import radarsdf
 
         print("radarsdf", radarsdf.__version__)
         return 0
     refuse_if(name not in commands, f"there is no command {name!r:.50}; radarsdf --help lists all")
+    command = name
     if name == "tiles":
         if not words or words[0] in ("-h", "--help"):
             print(steps())
             return 0
         name = words.pop(0) if words[0] in TILE_STEPS else "run"
-        prog, options, commands = f"radarsdf tiles {name}", f"tiles_{name}", TILE_STEPS
+        command, commands = f"tiles {name}", TILE_STEPS
     module, arguments, text = commands[name]
-    usage = " ".join(filter(None, (prog, arguments, "[OPTIONS]...")))
-    parser = Parser(prog, usage, text, allow_abbrev=False)
-    getattr(parser, options)()
-    given = parser.parse_args(words)
+    usage = " ".join(filter(None, ("radarsdf", command, arguments, "[OPTIONS]...")))
+    given = Parser(command, usage, text).parse_args(words)
 
     from radarsdf.cli.results import Results
 
     results = Results(**{key: vars(given).get(key, False) for key in ("quiet", "json")})
-    command = getattr(import_module(f"radarsdf.cli.{module}"), {"eval": "evaluate"}.get(name, name))
-    status = command(given, results)
+    function = {"eval": "evaluate"}.get(name, name)
+    status = getattr(import_module(f"radarsdf.cli.{module}"), function)(given, results)
     results.end()
     return int(status or 0)
 

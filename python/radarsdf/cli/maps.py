@@ -183,7 +183,8 @@ def _poses(words: list[str]) -> NDArray[np.float64]:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        found: Any = read_poses(" ".join(words), Notes(" ".join(words)))
+        path = Path(" ".join(words))
+        found: Any = read_poses(path, Notes(str(path)))
         poses = found.poses(found.times_s) if isinstance(found, Trajectory) else found
         return np.asarray(poses[np.isfinite(poses).all(axis=(1, 2))])
     refuse_if(len(numbers) not in (3, 7), "--pose takes x y z, x y z qx qy qz qw, or a file")

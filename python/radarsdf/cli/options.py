@@ -1,16 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The arguments and options of each command, here and not next to the commands so that help imports none of these."""
+"""The arguments and options of the commands: tables, here and not next to the commands, so that help imports none of these."""
 
 from __future__ import annotations
 
 import argparse
-from argparse import BooleanOptionalAction
 from pathlib import Path
 from typing import Any, NoReturn
-
-_SCANS = "the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"
-_NO_CHECK = "do not refuse scans in which radarsdf check would find an error"
 
 
 class UsageError(Exception):
@@ -18,252 +14,26 @@ class UsageError(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """The options of one command, a group of options by each method."""
+    """Parses the words after a command, or a step of ``radarsdf tiles`` such as ``tiles fit``."""
+
+    def __init__(self, command: str, usage: str = "", text: str = "") -> None:
+        super().__init__(f"radarsdf {command}", usage or None, text, allow_abbrev=False)
+        for name in OF_COMMANDS[command].split():
+            if name in GROUPS:
+                group = self.add_argument_group(name)
+                for member in GROUPS[name].split():
+                    _add(self if not member.startswith("-") else group, command, member)
+            else:
+                _add(self, command, name)
 
     def error(self, message: str) -> NoReturn:
         msg = f"{message}; {self.prog} --help lists the options"
         raise UsageError(msg)
 
-    # fmt: off
-    def add_map(self) -> None:
-        self.add_argument("map", type=Path, help="the map: .safetensors of radarsdf fit, or the folder of radarsdf tiles")
 
-    def add_out(self, text: str, **options: Any) -> None:
-        self.add_argument("-o", "--out", type=Path, help=text, **{"required": True} | options)
-
-    def add_flag(self, name: str, text: str) -> None:
-        self.add_argument(name, action="store_true", help=text)
-
-    def add_recording(self, scans: str = _SCANS, **options: Any) -> None:
-        self.add_argument("scans", type=Path, help=scans, **options)
-        self.add_argument("poses", type=Path, nargs="?", help="their poses, if they have none: TUM, KITTI, 4 x 4 matrices")
-        add = self.add_argument_group("reading").add_argument
-        add("--extrinsic", type=Path, metavar="FILE", help="T_base_sensor, 4 x 4, if the poses are those of another frame")
-        add("--topic", action="append", help="in a bag: the topic of the scans; may be repeated")
-        add("--pose-topic", metavar="TOPIC", help="in a bag: the topic of the poses")
-        add("--imu-topic", metavar="TOPIC", help="in a bag: the topic of the IMU, for poses that are found")
-        add("--imu-rotation", type=Path, metavar="FILE", help="R_sensor_imu, 3 x 3; default: of the bag, or found")
-        add("--field", action="append", metavar="ROLE=NAME",
-            help="which field holds x, y, z, intensity or doppler, such as intensity=Power; may be repeated")
-        add("--columns", help="in files without a header: how many, or their names, such as x,y,z,intensity,doppler")
-        add("--max-gap", type=float, default=0.5, metavar="S", help="longest gap between poses to interpolate; default: 0.5 s")
-        add("--world-frame", metavar="FRAME", help="in a bag with TF: the frame of the world")
-        add("--stamps", choices=("header", "record"), help="in a bag: whether a scan has the time of its header or record")
-
-    def add_settings(self) -> None:
-        group = self.add_argument_group("settings")
-        add = group.add_mutually_exclusive_group().add_argument
-        add("--paper", action="store_true", help="use the published configuration: slower, for comparison")
-        add("--quick", action="store_true",
-            help="average distances instead of training: less accurate, but under a second; mesh with --voxel 0.2")
-        group.add_argument("--config", type=Path, metavar="FILE", help="a TOML file, as radarsdf config prints it")
-        group.add_argument("--set", action="append", metavar="NAME=VALUE",
-            help="change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated")
-
-    def add_surface(self) -> None:
-        add = self.add_argument_group("surface").add_argument
-        add("--voxel", type=float, default=0.1, metavar="M", help="edge length of a voxel; default: 0.1 m")
-        add("--min-confidence", type=float, metavar="P",
-            help="leave out surface with a confidence below this, 0 to 1; default: that of the highest expected F-score")
-        add("--max-uncertainty", type=float, metavar="M", help="leave out surface with a standard error above this")
-        add("--min-component", type=int, metavar="N",
-            help="leave out components of fewer triangles; default: 30, and fewer in voxels above 0.1 m")
-
-    def add_box(self) -> None:
-        self.add_argument("--box", type=float, nargs=6, action=_Corners, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-            help="use only the part between these two corners: lower, upper, world frame, m")
-
-    def add_holdout(self) -> None:
-        self.add_argument("--holdout", type=int, metavar="N",
-            help="compare intensities with the scans that radarsdf fit --holdout N left out")
-
-    def add_address(self) -> None:
-        add = self.add_argument_group("page").add_argument
-        add("--host", default="127.0.0.1",
-            help="address to listen on; default: 127.0.0.1; with 0.0.0.0, everyone who reaches this machine sees the map")
-        add("--port", type=int, help="port to listen on; default: 8080, or the next that is free")
-
-    def add_results(self) -> None:
-        self.add_flag("--quiet", "show no progress bar")
-        self.add_flag("--json", "print the results as one JSON object, lengths in m; all else goes to standard error")
-
-    def demo(self) -> None:
-        add = self.add_argument
-        add("--scene", choices=("hugin", "oculii", "wall", "astyx"), default="hugin", help="the radar and the place")
-        add("--frames", type=int, metavar="N", help="number of scans; default: depends on the scene")
-        self.add_out("the folder to write", required=False, default=Path("radarsdf_demo"))
-        add("--view", action=BooleanOptionalAction,
-            help="show the map in the browser at the end; default: in a terminal of a machine with a screen")
-        self.add_results()
-        self.add_surface()
-        self.add_settings()
-
-    def check(self) -> None:
-        self.add_results()
-        self.add_recording()
-        self.add_settings()
-
-    def fit(self) -> None:
-        add = self.add_argument
-        self.add_out("the map to write, .safetensors", required=False)
-        self.add_flag("--dry-run", "only estimate memory and time")
-        add("--holdout", type=int, metavar="N",
-            help="leave out the first scan and then every N-th scan, for radarsdf eval --holdout N")
-        self.add_flag("--refine", "refine the poses by the returns first; radarsdf poses writes refined poses")
-        self.add_flag("--geometry-only", "do not use the intensities")
-        self.add_flag("--no-check", _NO_CHECK)
-        add("--checkpoint", type=Path, metavar="FILE",
-            help="save the state of the fit from time to time, and continue from it; it is removed with the map written")
-        add("--report", type=Path, metavar="PAGE", help="also write a page about the map, .html")
-        self.check()
-
-    def mesh(self) -> None:
-        add = self.add_argument
-        self.add_map()
-        self.add_out("the mesh to write: .ply, .obj, .stl, .glb")
-        self.add_box()
-        add("--viewpoint", type=float, nargs=3, metavar=("X", "Y", "Z"),
-            help="colour the mesh by the intensity seen from here, world frame, m")
-        add("--picture", type=Path, help="also draw the mesh, as .png")
-        self.add_results()
-        self.add_surface()
-
-    def poses(self) -> None:
-        self.add_out("the poses to write: .tum (with times), .kitti, .npy; or .npz: the scans with these poses")
-        self.add_flag("--find", "do not use the poses of the scans: find them from returns and Doppler")
-        self.add_argument("--picture", type=Path, help="also draw the trajectory from above, before and after, as .png")
-        self.check()
-
-    def live(self) -> None:
-        add = self.add_argument
-        self.add_out("the map to write in the end, .safetensors", required=False)
-        add("--trajectory", type=Path, help="also write where the scans were placed: .tum, .kitti or .npy")
-        add("--rate", type=float, default=1.0,
-            help="multiplies the recorded speed, which is 0.1 s a scan without times; 0: as fast as possible")
-        self.add_flag("--find", "do not use the poses of the scans: track each scan on the last ones")
-        self.add_flag("--view", "show the map in the browser while it grows")
-        self.add_address()
-        self.check()
-
-    def view(self) -> None:
-        self.add_map()
-        self.add_argument("--open", action=BooleanOptionalAction, help="open a browser here; default: if there is a screen")
-        self.add_argument("--max-vertices", type=int, default=500_000, metavar="N", help="simplify a mesh that has more")
-        self.add_box()
-        self.add_flag("--quiet", "show no progress bar")
-        self.add_recording(nargs="?")
-        self.add_address()
-        self.add_surface()
-
-    def report(self) -> None:
-        self.add_map()
-        self.add_out("the page to write, .html")
-        self.add_holdout()
-        self.add_box()
-        self.add_results()
-        self.add_recording(nargs="?")
-        self.add_surface()
-
-    def eval(self) -> None:
-        self.add_argument("what", type=Path, help="a mesh, or a map")
-        self.add_argument("--samples", type=int, default=10_000_000, metavar="N", help="points sampled on the mesh")
-        self.add_box()
-        self.add_holdout()
-        self.add_results()
-        self.add_recording("the truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
-            "(.ply, .obj, .off, .stl, .glb), or scans as for radarsdf fit, with lidar points or with --holdout")
-        self.add_surface()
-
-    def render(self) -> None:
-        add = self.add_argument
-        self.add_map()
-        add("--pose", nargs="+", action="append", required=True, metavar="P",
-            help="where the sensor is, world frame: x y z, m, or x y z qx qy qz qw, or a file of poses; may be repeated")
-        self.add_out("what to write: .npz, scans for radarsdf fit; .ply, points in the world frame; .png, a picture")
-        add("--returns", type=float, metavar="N", help="number of returns in a scan; default: that of the map's sensor")
-        self.add_flag("--noise", "add the noise of the sensor")
-        add("--seed", type=int, default=0, help="seed of the noise")
-        self.add_results()
-
-    def compare(self) -> None:
-        add = self.add_argument
-        self.add_map()
-        self.add_out("a mesh in colours to write, such as changes.ply, or .npz with all arrays", required=False)
-        add("--report", type=Path, metavar="PAGE", help="also write a page about what changed, such as changes.html")
-        self.add_flag("--view", "show what changed in the browser at the end, until Ctrl-C")
-        add("--align", action=BooleanOptionalAction, default=True,
-            help="move the later map as a whole if its surface is then nearer to the earlier one")
-        add("--min-area", type=float, default=0.1, metavar="M2", help="smallest region that is listed; default: 0.1 m2")
-        self.add_box()
-        self.add_results()
-        self.add_recording("the later map, or later scans, as for radarsdf fit")
-        self.add_address()
-
-    def grid(self) -> None:
-        add = self.add_argument
-        self.add_map()
-        self.add_out("a file to write, may be repeated: .npz with all arrays, .ply of the voxels' centres, .bt for OctoMap, "
-            ".yaml and .pgm for ROS's map_server", action="append")
-        add("--voxel", type=float, default=0.2, metavar="M", help="edge length of a voxel; default: 0.2 m")
-        self.add_box()
-        add("--heights", type=float, nargs=2, default=(0.3, 2.0), metavar=("LOW", "HIGH"),
-            help="range of heights above the ground that the .yaml map covers, m; default: 0.3 2.0")
-        add("--distances", type=Path, help="also write the Euclidean distance field of the grid, as .npz")
-        add("--costmap", type=Path, help="also write heights, slopes, steps and costs for wheels, as .npz")
-        add("--picture", type=Path, help="also draw heights, costs and free space, as .png")
-        self.add_results()
-
-    def convert(self) -> None:
-        self.add_out(".npz: the scans with their poses; .ply, .pcd, .las, .laz, .npy, .csv: all returns in the world frame, "
-            "with intensity, doppler, number and time of the scan; of a mesh, a mesh")
-        self.add_results()
-        self.add_recording("the scans, as for radarsdf fit; or a mesh: .ply, .obj, .off, .stl, .glb")
-
-    def config(self) -> None:
-        self.add_settings()
-
-    def info(self) -> None:
-        self.add_argument("map", type=Path, nargs="?", help="also report what is in this map")
-        self.add_results()
-
-    def tiles_plan(self) -> None:
-        add = self.add_argument
-        self.add_out("the folder to write")
-        add("--tile-size", type=float, metavar="M", help="edge of a tile; default: 512 leaf cells")
-        add("--halo", type=float, metavar="M", help="margin around a tile that its fit sees")
-        self.add_flag("--refine", "refine the poses by the returns first, and write them into the folder, poses.tum")
-        self.add_flag("--geometry-only", "do not use the intensities")
-        self.add_flag("--no-check", _NO_CHECK)
-        self._add_where()
-        self.check()
-
-    def tiles_run(self) -> None:
-        self.tiles_plan()
-        self.add_surface()
-
-    def tiles_fit(self) -> None:
-        self._add_where()
-        self.tiles_status()
-
-    def tiles_mesh(self) -> None:
-        self.add_out("a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder", required=False)
-        self._add_where()
-        self.tiles_clean()
-        self.add_surface()
-
-    def tiles_status(self) -> None:
-        self.add_argument("--tile", action="append", metavar="NAME", help="only the tile of this name; may be repeated")
-        self.tiles_clean()
-
-    def tiles_clean(self) -> None:
-        self.add_argument("folder", type=Path, help="the folder that radarsdf tiles plan wrote")
-        self.add_results()
-
-    def _add_where(self) -> None:
-        add = self.add_mutually_exclusive_group().add_argument
-        add("--processes", type=int, metavar="N", help="worker processes; each fits one tile at a time")
-        add("--cluster", metavar="ADDRESS", help="of dask.distributed's scheduler, such as tcp://host:8786")
-    # fmt: on
+def _add(group: Any, command: str, name: str) -> None:
+    kind, text = OPTIONS.get(f"{command} {name}") or OPTIONS[name]
+    group.add_argument(*(("-o", "--out") if name == "-o" else (name,)), help=text, **kind)
 
 
 class _Corners(argparse.Action):
@@ -271,3 +41,150 @@ class _Corners(argparse.Action):
 
     def __call__(self, _parser: Any, namespace: Any, values: Any, _option: Any = None) -> None:
         setattr(namespace, self.dest, [values[:3], values[3:]])
+
+
+OF_COMMANDS = {
+    "demo": "--scene --frames -o --view results surface settings",
+    "check": "results reading settings",
+    "fit": "-o --dry-run --holdout --refine --geometry-only --no-check --checkpoint --report results reading settings",
+    "mesh": "map -o --box --viewpoint --picture results surface",
+    "poses": "-o --find --picture results reading settings",
+    "live": "-o --trajectory --rate --find --view results reading page settings",
+    "view": "map --open --max-vertices --box --quiet reading page surface",
+    "report": "map -o --holdout --box results reading surface",
+    "eval": "what --samples --holdout --box results reading surface",
+    "render": "map --pose -o --returns --noise --seed results",
+    "compare": "map -o --report --view --align --min-area --box results reading page",
+    "grid": "map -o --voxel --box --heights --distances --costmap --picture results",
+    "convert": "-o results reading",
+    "config": "settings",
+    "info": "map results",
+    "tiles run": "-o tiles workers results reading surface settings",
+    "tiles plan": "-o tiles workers results reading settings",
+    "tiles fit": "folder --tile workers results",
+    "tiles mesh": "folder -o workers results surface",
+    "tiles status": "folder --tile results",
+    "tiles clean": "folder results",
+}
+GROUPS = {
+    "results": "--quiet --json",
+    "reading": "scans poses --extrinsic --topic --pose-topic --imu-topic --imu-rotation --field --columns --max-gap "
+    "--world-frame --stamps",
+    "settings": "--paper --quick --config --set",
+    "surface": "--voxel --min-confidence --max-uncertainty --min-component",
+    "page": "--host --port",
+    "tiles": "--tile-size --halo --refine --geometry-only --no-check",
+    "workers": "--processes --cluster",
+}
+
+_Kind = dict[str, Any]
+_FLAG: _Kind = {"action": "store_true"}
+_SWITCH: _Kind = {"action": argparse.BooleanOptionalAction}
+_FILE: _Kind = {"type": Path, "metavar": "FILE"}
+_OUT: _Kind = _FILE | {"required": True}
+_PATH: _Kind = {"type": Path}
+_MAYBE: _Kind = _PATH | {"nargs": "?"}
+_COUNT: _Kind = {"type": int, "metavar": "N"}
+_METRES: _Kind = {"type": float, "metavar": "M"}
+_NAME: _Kind = {"metavar": "NAME"}
+_NAMES: _Kind = _NAME | {"action": "append"}
+_POINT: _Kind = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z")}
+_BOX: _Kind = {"type": float, "nargs": 6, "action": _Corners, "metavar": ("X0", "Y0", "Z0", "X1", "Y1", "Z1")}
+
+# fmt: off
+OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o"
+    "map": (_PATH, "the map: .safetensors of radarsdf fit, or the folder of radarsdf tiles"),
+    "info map": (_MAYBE, "also report what is in this map"),
+    "what": (_PATH, "a mesh, or a map"),
+    "folder": (_PATH, "the folder that radarsdf tiles plan wrote"),
+
+    "scans": (_PATH, "the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"),
+    "view scans": (_MAYBE, "scans to browse, as for radarsdf fit"),
+    "report scans": (_MAYBE, "the scans of the map, as for radarsdf fit"),
+    "eval scans": (_PATH, ("the truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
+                   "(.ply, .obj, .off, .stl, .glb), or scans as for radarsdf fit, with lidar points or with --holdout")),
+    "compare scans": (_PATH, "the later map, or later scans, as for radarsdf fit"),
+    "convert scans": (_PATH, "the scans, as for radarsdf fit; or a mesh: .ply, .obj, .off, .stl, .glb"),
+    "poses": (_MAYBE, "their poses, if they have none: TUM, KITTI, 4 x 4 matrices"),
+    "--extrinsic": (_FILE, "T_base_sensor, 4 x 4, if the poses are those of another frame"),
+    "--topic": (_NAMES, "in a bag: the topic of the scans; may be repeated"),
+    "--pose-topic": (_NAME, "in a bag: the topic of the poses"),
+    "--imu-topic": (_NAME, "in a bag: the topic of the IMU, for poses that are found"),
+    "--imu-rotation": (_FILE, "R_sensor_imu, 3 x 3; default: of the bag, or found"),
+    "--field": (_NAMES | {"metavar": "ROLE=NAME"}, "which field holds x, y, z, intensity or doppler; may be repeated"),
+    "--columns": (_NAME, "in files without a header: how many, or their names, such as x,y,z,intensity,doppler"),
+    "--max-gap": (_METRES | {"metavar": "S", "default": 0.5}, "longest gap between poses to interpolate; default: 0.5 s"),
+    "--world-frame": (_NAME, "in a bag with TF: the frame of the world"),
+    "--stamps": ({"choices": ("header", "record")}, "in a bag: whether a scan has the time of its header or record"),
+
+    "fit -o": (_FILE, "the map to write, .safetensors"),
+    "live -o": (_FILE, "the map to write in the end, .safetensors"),
+    "mesh -o": (_OUT, "the mesh to write: .ply, .obj, .stl, .glb"),
+    "poses -o": (_OUT, "the poses to write: .tum (with times), .kitti, .npy; or .npz: the scans with these poses"),
+    "report -o": (_OUT, "the page to write, .html"),
+    "render -o": (_OUT, ".npz, scans as radarsdf fit takes them; .ply, points in the world frame; .png, a picture"),
+    "compare -o": (_FILE, "a mesh in colours to write, such as changes.ply, or .npz with all arrays"),
+    "grid -o": (_OUT | {"action": "append"}, ("a file to write, may be repeated: .npz with all arrays, .ply of the voxels' "
+                "centres, .bt for OctoMap, .yaml and .pgm for ROS's map_server")),
+    "convert -o": (_OUT, (".npz: the scans with their poses; .ply, .pcd, .las, .laz, .npy, .csv: all returns in the world "
+                   "frame, with intensity, doppler, number and time of the scan; of a mesh, a mesh")),
+    "demo -o": (_FILE | {"default": Path("radarsdf_demo")}, "the folder to write; default: radarsdf_demo"),
+    "tiles mesh -o": (_FILE, "a .ply file, or a .json file for 3D Tiles; default: mesh.ply in the folder"),
+    "-o": (_OUT, "the folder to write"),
+
+    "--quiet": (_FLAG, "show no progress bar"),
+    "--json": (_FLAG, "print the results as one JSON object, lengths in m; all else goes to standard error"),
+    "--paper": (_FLAG, "use the published configuration: slower, for comparison"),
+    "--quick": (_FLAG, "average distances instead of training: less accurate, under a second; mesh with --voxel 0.2"),
+    "--config": (_FILE, "change the settings in this TOML file; radarsdf config prints all"),
+    "--set": (_NAMES | {"metavar": "NAME=VALUE"}, "change a setting, such as training.sdf_iterations=200; may be repeated"),
+    "--voxel": (_METRES | {"default": 0.1}, "edge length of a voxel; default: 0.1 m"),
+    "grid --voxel": (_METRES | {"default": 0.2}, "edge length of a voxel; default: 0.2 m"),
+    "--min-confidence": (_METRES | {"metavar": "P"},
+                         "leave out surface below this, 0 to 1; default: that of the highest expected F-score"),
+    "--max-uncertainty": (_METRES, "leave out surface with a standard error above this"),
+    "--min-component": (_COUNT, "leave out components of fewer triangles; default: 30, and fewer in large voxels"),
+    "--host": ({"default": "127.0.0.1"}, ("address to listen on; default: 127.0.0.1, this machine alone; with 0.0.0.0, "
+               "everyone who can reach this machine sees the map")),
+    "--port": ({"type": int}, "port to listen on; default: 8080, or the next that is free"),
+    "--box": (_BOX, "use only the part between these two corners: lower, upper, world frame, m"),
+    "--holdout": (_COUNT, "compare intensities with the scans that radarsdf fit --holdout N left out"),
+    "fit --holdout": (_COUNT, "leave out the first scan and then every N-th scan, for radarsdf eval --holdout N"),
+    "--refine": (_FLAG, "refine the poses by the returns first; radarsdf poses writes refined poses"),
+    "--geometry-only": (_FLAG, "do not use the intensities"),
+    "--no-check": (_FLAG, "do not refuse scans in which radarsdf check would find an error"),
+
+    "--scene": ({"choices": ("hugin", "oculii", "wall", "astyx"), "default": "hugin"}, "the radar and the place"),
+    "--frames": (_COUNT, "number of scans; default: depends on the scene"),
+    "demo --view": (_SWITCH, "show the map in the browser at the end; default: in a terminal of a machine with a screen"),
+    "--view": (_FLAG, "show the result in the browser, until Ctrl-C"),
+    "--dry-run": (_FLAG, "only estimate memory and time"),
+    "--checkpoint": (_FILE, "save the state of the fit here from time to time, and continue from it"),
+    "--report": (_FILE, "also write a page, .html: pictures, errors, plots"),
+    "--viewpoint": (_POINT, "colour the mesh by the intensity seen from here, world frame, m"),
+    "--picture": (_FILE, "also draw a picture, .png"),
+    "--find": (_FLAG, "do not use the poses of the scans: find them from returns and Doppler"),
+    "--trajectory": (_FILE, "also write where the scans were placed: .tum, .kitti or .npy"),
+    "--rate": ({"type": float, "default": 1.0},
+               "multiplies the recorded speed, which is 0.1 s a scan without times; 0: as fast as possible"),
+    "--open": (_SWITCH, "open the page in a browser here; default: if there is a screen"),
+    "--max-vertices": (_COUNT | {"default": 500_000}, "simplify a mesh that has more; default: 500000"),
+    "--samples": (_COUNT | {"default": 10_000_000}, "points sampled on the mesh; default: 10000000"),
+    "--pose": ({"nargs": "+", "action": "append", "required": True, "metavar": "P"}, ("where the sensor is, world frame: "
+               "x y z, m, or x y z qx qy qz qw, or a file of poses as for radarsdf fit; may be repeated")),
+    "--returns": (_METRES | {"metavar": "N"}, "number of returns in a scan; default: that of the map's sensor"),
+    "--noise": (_FLAG, "add the noise of the sensor"),
+    "--seed": (_COUNT | {"default": 0}, "seed of the noise"),
+    "--align": (_SWITCH | {"default": True}, "move the later map if its surface is then nearer to the earlier one"),
+    "--min-area": (_METRES | {"metavar": "M2", "default": 0.1}, "smallest region that is listed; default: 0.1 m2"),
+    "--heights": ({"type": float, "nargs": 2, "default": (0.3, 2.0), "metavar": ("LOW", "HIGH")},
+                  "range of heights above the ground that the .yaml map covers, m; default: 0.3 2.0"),
+    "--distances": (_FILE, "also write the Euclidean distance field of the grid, as .npz"),
+    "--costmap": (_FILE, "also write heights, slopes, steps and costs for wheels, as .npz"),
+    "--tile-size": (_METRES, "edge of a tile; default: 512 leaf cells"),
+    "--halo": (_METRES, "margin around a tile that its fit sees"),
+    "--tile": (_NAMES, "only the tile of this name; may be repeated"),
+    "--processes": (_COUNT, "worker processes; each fits one tile at a time"),
+    "--cluster": ({"metavar": "ADDRESS"}, "of dask.distributed's scheduler, such as tcp://host:8786"),
+}
+# fmt: on

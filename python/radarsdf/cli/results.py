@@ -46,7 +46,7 @@ class Results:
 
     def add_file(self, what: str, path: Path, origin: Any = None, **values: Any) -> None:
         """Add what was written to a file, and the origin of its frame, if that is not the world."""
-        local = "" if origin is None else ", in a local frame, whose origin is in the file .origin next to it"
+        local = "" if origin is None else f", in a local frame, whose origin is in {path.name}.origin.json"
         self.add(f"{what} written to {path}{local}", out=path, origin=origin, **values)
 
     def end(self) -> None:

@@ -21,6 +21,7 @@ def config(given: Namespace, results: Results) -> None:
 
 def load_config(given: Namespace) -> FitConfig:
     """The configuration: a preset, then the changes of a file, then single ones."""
+    refuse_if(given.paper and given.quick, "--paper and --quick are two presets: leave out one of them")
     config = FitConfig.paper() if given.paper else FitConfig.quick() if given.quick else FitConfig()
     if given.config is not None:
         config = config.override(**read_toml(given.config))

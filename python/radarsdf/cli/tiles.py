@@ -93,6 +93,8 @@ def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
 
 
 def _check_where(given: Namespace) -> None:
+    both = given.processes is not None and given.cluster
+    refuse_if(both, "--processes and --cluster exclude each other: leave out one")
     too_few = given.processes is not None and given.processes < 1
     refuse_if(too_few, f"--processes must be at least 1, not {given.processes}")
 

@@ -53,13 +53,15 @@ def uncertainty_values(subject: Subject) -> dict[str, Any] | None:
     low, high = np.nanpercentile(sigma_m, [2, 98])
     shown_m = shown.vertex_attributes["uncertainty_m"]
     colors, legend = colored(shown_m, len(shown_m), "standard error, m", (float(low), float(high)))
-    percentiles = [10, 50, 90]
+    percentiles, confidence = [10, 50, 90], mesh.vertex_attributes["confidence"]
     return {
         "picture": picture(shown, colors),
         "legend": legend,
         "percentiles": percentiles,
-        "sigma_m": np.nanpercentile(sigma_m, percentiles),
-        "confidence": np.nanpercentile(mesh.vertex_attributes["confidence"], percentiles),
+        "rows": [
+            ("Uncertainty, m", *(f"{x:.3f}" for x in np.nanpercentile(sigma_m, percentiles))),
+            ("Confidence", *(f"{x:.2f}" for x in np.nanpercentile(confidence, percentiles))),
+        ],
         "against_truth": _calibration(subject, sigma_m),
     }
 
