@@ -128,7 +128,9 @@ def test_a_scan_is_shown_and_the_sensor_moves_there(client, viewer, scans, sharp
     np.testing.assert_allclose(shown, view.world_points - sharp_map.origin, atol=1e-4)
     before = len(client.received())
     slide(client, "predicted", value=False)
-    client.wait_for(lambda m: m.changes("/scans/predicted", "visible") or m.name == "/scans/predicted", before)
+    client.wait_for(
+        lambda m: m.changes("/scans/predicted", "visible") or m.name == "/scans/predicted", before
+    )
     slide(client, "predicted", value=True)
 
 
