@@ -165,7 +165,9 @@ def test_calibration_has_all_parts(tmp_path):
 
 
 def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
-    few = {"training": {"sdf_iterations": 5, "intensity_iterations": 5}}  # enough to differ
+    few = {
+        "training": {"sdf_iterations": 3, "intensity_iterations": 3, "batch_size": 512}
+    }  # enough to differ
     monkeypatch.setattr("bench.scenes.QUICK", few)
     neighbours, *ours = run(tmp_path, "intensity", "wall", "--base", "default", "--repetitions", "2")[1][
         "rows"
@@ -175,7 +177,7 @@ def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
     assert ours[0]["mae"] != ours[1]["mae"]
     rows = run(tmp_path, "ablation", "wall", "--repetitions", "1")[1]["rows"]
     assert len({row["mae"] for row in rows}) == len(rows) == 5  # each variant really changes the fit
-    table, values = run(tmp_path, "views", "wall", "--base", "default", "--frames", "12")
+    table, values = run(tmp_path, "views", "wall", "--base", "default", "--frames", "8")
     assert (
         len(values["rows"]) == 8
     )  # with and without direction, measured and noiseless, at the reflector and elsewhere

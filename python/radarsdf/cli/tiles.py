@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import multiprocessing
 from argparse import Namespace
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from radarsdf.io.scans import Notes, Scans, scans_in_memory
 from radarsdf.tiles.drive_poses import TRAJECTORY, DrivePoses
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, failure_of, is_done
+from radarsdf.tiles.tasks import cluster_executor
 from radarsdf.tiles.tiled_map import TiledMap
 
 _FIRST_SCANS = 100  # that are checked before the work
@@ -68,7 +70,6 @@ def plan(given: Namespace, results: Results) -> None:
 
 
 def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
-
     if (poses := DrivePoses.load(folder)) is not None:
         way: dict[str, Any] = poses.posed.way or {}
         results.add(way["verdict"], poses=folder / TRAJECTORY, improved=way["improved"])
@@ -93,25 +94,18 @@ def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
 
 
 def _check_where(given: Namespace) -> None:
-    both = given.processes is not None and given.cluster
-    refuse_if(both, "--processes and --cluster exclude each other: leave out one")
-    too_few = given.processes is not None and given.processes < 1
-    refuse_if(too_few, f"--processes must be at least 1, not {given.processes}")
+    here = given.processes is None
+    refuse_if(not here and given.cluster, "--processes and --cluster exclude each other: leave out one")
+    refuse_if(not here and given.processes < 1, f"--processes must be at least 1, not {given.processes}")
 
 
 def _executor(given: Namespace) -> AbstractContextManager[Executor | None]:
     """What runs the tasks. None: this process."""
     _check_where(given)
     if given.cluster is not None:
-        from radarsdf.tiles.plan import Plan
-        from radarsdf.tiles.tasks import cluster_executor
-
         memory_bytes = max(tile.memory_bytes for tile in Plan.load(given.folder).tiles)
         return cluster_executor(given.cluster, memory_bytes)
     if given.processes is not None:
-        import multiprocessing
-        from concurrent.futures import ProcessPoolExecutor
-
         # Not forked: a forked child has only one of the threads of PyTorch and OpenMP.
         return ProcessPoolExecutor(given.processes, multiprocessing.get_context("spawn"))
     return nullcontext()

@@ -18,6 +18,8 @@ from radarsdf.io.meshes import check_mesh_path
 from radarsdf.render.figures import save_grid_picture
 from radarsdf.report.changes import write_changes_report
 from radarsdf.report.page import require_extras
+from radarsdf.view.pages import ChangesView
+from radarsdf.view.serving import url_of
 
 _LISTED = 10  # regions, the largest first
 
@@ -62,9 +64,6 @@ def compare(given: Namespace, results: Results) -> None:
         results.add(f"{report} written", report=report)
     if given.view:
         results.end()
-        from radarsdf.view.pages import ChangesView
-        from radarsdf.view.serving import url_of
-
         with ChangesView(changes, regions, edge_m, host=given.host, port=given.port) as page:
             print(f"what changed is on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
             until_stopped(page)
