@@ -16,7 +16,7 @@ from radarsdf.render import picture
 
 from .poses.drift import first
 
-_SCANS = {"hugin": 8, "oculii": 90}  # so many tell an IMU's axes
+_SCANS = {"hugin": 11, "oculii": 90}  # so many tell an IMU's axes
 
 
 def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
@@ -27,7 +27,7 @@ def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
         found = usual(*given, **named)
         return dataclasses.replace(
             found,
-            sdf_iterations=min(found.sdf_iterations, 20),
+            sdf_iterations=min(found.sdf_iterations, 30),
             intensity_iterations=min(found.intensity_iterations, 30),
         )
 

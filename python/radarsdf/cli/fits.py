@@ -23,6 +23,7 @@ from radarsdf.io.files import check_outputs
 from radarsdf.map.threshold import Threshold
 from radarsdf.render import picture
 from radarsdf.report.page import require_extras
+from radarsdf.report.subject import Subject
 from radarsdf.view import serving
 
 
@@ -73,7 +74,8 @@ def fit(given: Namespace, results: Results) -> None:
     results.add(f"next: {shlex.join(words)}{' --voxel 0.2' * given.quick}")
     if report is not None:
         findings = radarsdf.check(every_scan, config=radar_map.config)
-        add_report(results, report, radar_map, out.name, scans, held_out, findings)
+        subject = Subject(radar_map, out.name, scans, held_out, findings, progress=results.progress)
+        add_report(results, report, subject)
 
 
 def _add_fit(results: Results, radar_map: RadarMap) -> None:

@@ -66,12 +66,21 @@ def report(given: Namespace, results: Results) -> None:
         every_scan = read_scans(given)
         findings = check(every_scan, config=radar_map.config)
         scans, held_out = split(every_scan, given.holdout)
-    options = {"voxel_size_m": given.voxel, "box": given.box, "limits": mesh_limits(given)}
-    name = given.map.absolute().name
-    add_report(results, given.out, radar_map, name, scans, held_out, findings, **options)
+    subject = Subject(
+        radar_map,
+        given.map.absolute().name,
+        scans,
+        held_out,
+        findings,
+        voxel_size_m=given.voxel,
+        box=given.box,
+        progress=results.progress,
+        limits=mesh_limits(given),
+    )
+    add_report(results, given.out, subject)
 
 
-def add_report(results: Results, path: Path, *subject: Any, **options: Any) -> None:
-    """Write a page about a map. The rest are arguments of :class:`radarsdf.report.subject.Subject`."""
-    size = write_report(path, Subject(*subject, **options, progress=results.progress))
+def add_report(results: Results, path: Path, subject: Subject) -> None:
+    """Write a page about a map."""
+    size = write_report(path, subject)
     results.add(f"report of {size / 1e6:.1f} MB written to {path}", report=path, report_bytes=size)

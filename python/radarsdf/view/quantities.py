@@ -52,9 +52,7 @@ class Quantity:
     """A value of each vertex."""
 
     label: str  # with its unit
-    values: Callable[
-        [_Rows, Position], NDArray[Any]
-    ]  # of vertices (N,), for a sensor position, world, m: (N,)
+    values: Callable[[_Rows, Position], NDArray[Any]]  # (N,) of vertices (N,), for a sensor at a position
     scale: Scale
     of_sensor: bool = False  # whether it depends on the sensor position
 
@@ -75,15 +73,19 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
         some = np.arange(0, len(vertices), max(1, len(vertices) // _SAMPLES))
         scale = Scale.of(intensity(some, sensor))
         found["intensity"] = Quantity("predicted intensity, sensor units", intensity, scale, of_sensor=True)
-    of_vertices = {
+    of_vertices: dict[str, tuple[str, NDArray[Any]]] = {
         "uncertainty": ("uncertainty (standard error), m", surface.uncertainty_m),
         "confidence": ("confidence (probability)", surface.confidence),
         "height": ("height, m", vertices[:, 2]),
     }
     for name, (label, values) in of_vertices.items():
         scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
-        found[name] = Quantity(label, lambda rows, _, values=values: values[rows], scale)
+        found[name] = Quantity(label, _looked_up(values), scale)
     return found
+
+
+def _looked_up(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
+    return lambda rows, _: values[rows]
 
 
 def legend(quantity: Quantity) -> str:
