@@ -16,7 +16,7 @@ from radarsdf.render import picture
 
 from .poses.drift import first
 
-_SCANS = {"hugin": 11, "oculii": 90}  # so many tell an IMU's axes
+_SCANS = {"hugin": 12, "oculii": 90}  # so many tell an IMU's axes
 
 
 def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
