@@ -35,11 +35,11 @@ def map_file(scans_file, tmp_path_factory):
 def little_work(monkeypatch):
     """Most of the time of a command with a picture is that of its pixels, and of the demo that of its samples."""
 
-    def few_samples(mesh, truth, samples):
-        return surface_metrics(mesh, truth, samples=min(samples, 20_000))
+    def few_samples(mesh, truth, samples, **options):
+        return surface_metrics(mesh, truth, samples=min(samples, 20_000), **options)
 
     monkeypatch.setattr(picture, "save_picture", partial(picture.save_picture, width=160, height=100))
-    monkeypatch.setattr("radarsdf.cli.fits.surface_metrics", few_samples)
+    monkeypatch.setattr("radarsdf.evaluation.surface_metrics", few_samples)
 
 
 @pytest.fixture

@@ -23,8 +23,9 @@ def refuse_if(wrong: object, message: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Print a line on standard error."""
-    print(text, file=sys.stderr)
+    """Print a line on standard error, if there is one."""
+    if sys.stderr is not None:
+        print(text, file=sys.stderr)
 
 
 def run(words: list[str]) -> int:

@@ -7,24 +7,28 @@ from __future__ import annotations
 import shlex
 import sys
 from argparse import Namespace
+from collections.abc import Callable
+from importlib.util import find_spec
 
 import radarsdf
 from radarsdf import Interrupted, RadarMap
-from radarsdf.cli.app import refuse_if, warn
-from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, mesh_limits, split
-from radarsdf.cli.maps import add_intensity_errors
-from radarsdf.cli.pages import add_report, show
+from radarsdf.cli.app import refuse_if
+from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split
+from radarsdf.cli.maps import evaluate, mesh
+from radarsdf.cli.options import Parser
+from radarsdf.cli.pages import add_report
+from radarsdf.cli.pages import view as show_map
 from radarsdf.cli.results import Results, save_map
 from radarsdf.cli.scans import posed_scans, warn_or_refuse
 from radarsdf.cli.settings import load_config
-from radarsdf.evaluation import format_metrics, holdout, surface_metrics
-from radarsdf.io import Scans, write_mesh, write_scans
+from radarsdf.io import Scans, write_scans
 from radarsdf.io.files import check_outputs
-from radarsdf.map.threshold import Threshold
-from radarsdf.render import picture
 from radarsdf.report.page import require_extras
 from radarsdf.report.subject import Subject
 from radarsdf.view import serving
+
+# Options of the demo that it passes on.
+_SHARED = ("paper", "quick", "config", "set", "voxel", "min_confidence", "max_uncertainty", "min_component")
 
 
 def fit(given: Namespace, results: Results) -> None:
@@ -106,7 +110,7 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
 
 
 def demo(given: Namespace, results: Results) -> None:
-    """Simulate, fit, mesh, evaluate, write."""
+    """Simulate, then run the commands that fit, mesh and evaluate, which are printed."""
     frames, out, view = given.frames, given.out, given.view
     refuse_if(frames is not None and frames < 2, f"--frames must be at least 2, not {frames}")
     if view is None:  # only where somebody can see it, and end it by Ctrl-C
@@ -114,35 +118,26 @@ def demo(given: Namespace, results: Results) -> None:
         view = in_terminal and serving.has_display() and serving.has_viser()
     elif view:
         serving.require_viser()
-    config, progress, limits = load_config(given), results.progress, mesh_limits(given)
-    out.mkdir(parents=True, exist_ok=True)
-    files = [out / name for name in ("scans.npz", "map.safetensors", "mesh.ply", "picture.png")]
-    check_outputs(files)
-    scans_file, map_file, mesh_file, picture_file = files
-
     drive = radarsdf.simulate.SCENES[given.scene](frames=frames)
-    scans = Scans(drive.points, drive.poses, drive.intensities, drive.ground_truth, truth_kind="simulated")
-    train, test = (scans.select(rows) for rows in holdout(len(scans.points)))
-    results.add(f"simulated a drive, {given.scene}: {len(train)} scans to fit, {len(test)} held out")
-    radar_map = radarsdf.fit(train.points, train.poses, train.intensities, config=config, progress=progress)
-    save_map(radar_map, map_file)  # first: the rest can be had from the map
-    _add_fit(results, radar_map)
-    viewpoint = scans.poses[len(scans.poses) // 2, :3, 3]
-    mesh = radar_map.mesh(given.voxel, viewpoint=viewpoint, **limits, progress=progress)
-    results.add_threshold(Threshold.of_mesh(mesh.metadata))
-    metrics = surface_metrics(mesh, drive.ground_truth, samples=1_000_000)
-    results.add(format_metrics(metrics), surface=metrics)
-    add_intensity_errors(results, radar_map, test, train)
+    out.mkdir(parents=True, exist_ok=True)
+    scans_file, map_file = str(out / "scans.npz"), str(out / "map.safetensors")
+    write_scans(scans_file, Scans(drive.points, drive.poses, drive.intensities, drive.ground_truth))
+    results.add(f"simulated a drive of {len(drive.points)} scans, {given.scene}: {scans_file}")
 
-    write_scans(scans_file, scans)
-    write_mesh(mesh_file, mesh)
-    try:
-        picture.save_picture(picture_file, mesh, scalar=mesh.vertex_attributes["intensity"])
-    except ImportError as error:  # Matplotlib is optional
-        files.remove(picture_file)
-        warn(f"warning: no picture: {error}")
-    results.add("wrote " + ", ".join(map(str, files)), files=files)
-    results.add(f"next: {shlex.join(['radarsdf', 'view', str(map_file), str(scans_file)])}")
+    def run(function: Callable[[Namespace, Results], None], command: str, *words: str) -> None:
+        results.add(f"$ radarsdf {command} {shlex.join(words)}")
+        parsed = vars(Parser(command).parse_args(words))
+        function(
+            Namespace(**parsed | {name: vars(given)[name] for name in _SHARED if name in parsed}), results
+        )
+
+    picture = ["--picture", str(out / "picture.png")] if find_spec("matplotlib") else []
+    viewpoint = [f"{x:.1f}" for x in drive.poses[len(drive.poses) // 2, :3, 3]]
+    run(fit, "fit", scans_file, "-o", map_file, "--holdout", "10")
+    run(mesh, "mesh", map_file, "-o", str(out / "mesh.ply"), "--viewpoint", *viewpoint, *picture)
+    run(evaluate, "eval", map_file, scans_file, "--holdout", "10", "--samples", "1000000")
     if view:
         results.end()
-        show(radar_map, scans, open_page=True, voxel_size=given.voxel, progress=progress, **limits)
+        run(show_map, "view", map_file, scans_file, "--open")
+    else:
+        results.add(f"next: {shlex.join(['radarsdf', 'view', map_file, scans_file])}")

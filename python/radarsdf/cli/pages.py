@@ -7,15 +7,12 @@ from __future__ import annotations
 import webbrowser
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 from radarsdf import check
 from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import check_address, inputs_of, load_map, mesh_limits, read_scans, split
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.io.files import check_outputs
-from radarsdf.io.scans import Scans
-from radarsdf.map.map import Map
 from radarsdf.report.page import require_extras
 from radarsdf.report.subject import Subject
 from radarsdf.report.writing import write_report
@@ -24,13 +21,12 @@ from radarsdf.view.viewer import Viewer
 
 
 def view(given: Namespace, results: Results) -> None:
-    """Serve the page until Ctrl-C."""
+    """Serve the page until Ctrl-C, and print its address."""
     check_address(given)
     radar_map = load_map(given.map)
-    show(
+    with Viewer(
         radar_map,
         read_scans(given) if given.scans else None,
-        open_page=serving.has_display() if given.open is None else given.open,
         voxel_size=given.voxel,
         box=given.box,
         max_vertices=given.max_vertices,
@@ -38,17 +34,12 @@ def view(given: Namespace, results: Results) -> None:
         port=given.port,
         progress=results.progress,
         **mesh_limits(given),
-    )
-
-
-def show(radar_map: Map, scans: Scans | None, *, open_page: bool, **arguments: Any) -> None:
-    """Serve the viewer until Ctrl-C, and print its address. `arguments`: those of :class:`radarsdf.view.viewer.Viewer`."""
-    with Viewer(radar_map, scans, **arguments) as viewer:
+    ) as viewer:
         url = serving.url_of(viewer.host, viewer.port)
         print(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it", flush=True)
         for note in viewer.notes:
-            print(note)
-        if open_page:
+            print(note, flush=True)
+        if serving.has_display() if given.open is None else given.open:
             webbrowser.open(url)
         until_stopped(viewer)
 
