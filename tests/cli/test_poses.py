@@ -84,15 +84,6 @@ def test_scans_without_poses_get_some(drive, unposed, tmp_path, capsys):
     assert "--find" in refusal(capsys, tmp_path, "poses", unposed, out, *again, status=2)
 
 
-def test_a_fit_finds_the_poses_that_are_missing(unposed, tmp_path, capsys):
-    out = tmp_path / "map.safetensors"
-    assert call("fit", unposed, "-o", out, "--quick") == 0
-    said = capsys.readouterr()
-    assert "has no poses: they are found from the radar alone" in said.err
-    assert "placed by returns and Doppler" in said.out
-    assert len(radarsdf.load(out).mesh(0.2).faces) > 1000
-
-
 def test_a_fit_mends_the_poses(drive, drifted_file, tmp_path, capsys):
     plain, mended = (
         values(capsys, "fit", drifted_file, "-o", tmp_path / f"{i}.safetensors", "--quick", *words)

@@ -116,17 +116,3 @@ def test_what_cannot_be_written(clouds, scans_file, tmp_path_factory, capsys):
         ([out / "absent.npz", "-o", out / "scans.npz"], "absent.npz"),
     ):
         assert said in refusal(capsys, out, "convert", *words)
-
-
-def test_several_topics_of_a_bag(tmp_path):
-    pytest.importorskip("rosbags", reason="the extra ros is not installed")
-    from tests.io.bag_writing import BagWriter  # noqa: PLC0415 - it takes rosbags
-
-    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
-        for time_s in (100.0, 100.1, 100.2):
-            bag.write("/odom", bag.odometry(time_s, np.eye(4), child="radar"), time_s)
-            for topic in ("/front", "/rear", "/lidar"):
-                bag.write(topic, bag.cloud2(time_s, {"x": [1.0], "y": [2.0], "z": [3.0]}), time_s)
-    words = [tmp_path / "a.bag", "--topic", "/front", "--topic", "/rear"]
-    assert call("convert", *words, "-o", tmp_path / "b.npz") == 0
-    assert len(read_scans(tmp_path / "b.npz")) == 6

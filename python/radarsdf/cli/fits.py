@@ -86,16 +86,16 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
     """Add the counts of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
     names = ("scans", "returns", "returns_used", "movers", "ghosts", "wild_intensities", "leaf_cells")
-    scans, returns, used, moving, ghosts, outliers, _ = counts = [report[name] for name in names]
+    used, moving, ghosts = report["returns_used"], report["movers"], report["ghosts"]
     left_out = {
         "move by their Doppler": moving,
         "are ghosts": ghosts,
-        "are out of range": returns - used - moving - ghosts,
+        "are out of range": report["returns"] - used - moving - ghosts,
     }
-    line = f"{used} of {returns} returns in {scans} scans make the surface"
+    line = f"{used} of {report['returns']} returns in {report['scans']} scans make the surface"
     line += "".join(f", {count} {why}" for why, count in left_out.items() if count)
-    results.add(line, **dict(zip(names, counts, strict=True)))
-    if outliers:
+    results.add(line, **{name: report[name] for name in names})
+    if outliers := report["wild_intensities"]:
         results.add(f"{outliers} intensities are outliers, and are left out of the reflectance")
     noise, losses = report["noise"], report["losses"]
     seconds = sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s")
@@ -127,9 +127,8 @@ def demo(given: Namespace, results: Results) -> None:
     def run(function: Callable[[Namespace, Results], None], command: str, *words: str) -> None:
         results.add(f"$ radarsdf {command} {shlex.join(words)}")
         parsed = vars(Parser(command).parse_args(words))
-        function(
-            Namespace(**parsed | {name: vars(given)[name] for name in _SHARED if name in parsed}), results
-        )
+        shared = {name: vars(given)[name] for name in _SHARED if name in parsed}
+        function(Namespace(**parsed | shared), results)
 
     picture = ["--picture", str(out / "picture.png")] if find_spec("matplotlib") else []
     viewpoint = [f"{x:.1f}" for x in drive.poses[len(drive.poses) // 2, :3, 3]]
