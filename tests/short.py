@@ -31,7 +31,7 @@ def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
         return dataclasses.replace(
             found,
             sdf_iterations=min(found.sdf_iterations, 30),
-            intensity_iterations=min(found.intensity_iterations, 60),
+            intensity_iterations=min(found.intensity_iterations, 30),
         )
 
     set_attribute(Schedule, "of", short)

@@ -31,12 +31,6 @@ def test_of_a_control_group(tmp_path):
     assert available_bytes(tmp_path) == 2_200_000
 
 
-def test_of_a_control_group_of_the_first_version(tmp_path):
-    files = {"memory__memory_limit_in_bytes": "3000000", "memory__memory_usage_in_bytes": "1000000"}
-    tree(tmp_path, "4:cpu:/x\n3:memory:/x\n", **files, memory__memory_stat="inactive_file 0\n")
-    assert available_bytes(tmp_path) == 2_000_000
-
-
 def test_a_mesh_beyond_the_budget_is_refused(scene):
     radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(max_memory_bytes=10**9))
     radar_map.mesh(0.1)

@@ -14,11 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-MAX_POSITION_M = 1e12
-"""Largest coordinate, m. Squares of it, and products of three, are far from overflow in float64."""
-
-MAX_TIME_S = 1e11
-"""Latest time, s, before or after 0: times since 1970 in milliseconds or smaller units are beyond it."""
+MAX_POSITION_M = (
+    1e12  # largest coordinate: squares of it, and products of three, are far from overflow in float64
+)
+MAX_TIME_S = (
+    1e11  # latest time before or after 0: times since 1970 in milliseconds or smaller units are beyond it
+)
+MISSING_POSES = (
+    "poses are missing: T_world_sensor (4, 4) of each scan; "
+    "radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
+)
 
 _Kind = TypeVar("_Kind")
 
@@ -49,7 +54,7 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
 
 
 def refuse_masked(values: Any, name: str) -> None:
-    """Raises a ValueError where values are masked: NumPy would take what is under the mask for a value."""
+    """Refuse masked values: NumPy would take what is under the mask for a value."""
     parts = values if isinstance(values, (list, tuple)) else [values]
     masked = any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts)
     _require(not masked, f"{name} has masked values: leave them out")
@@ -65,7 +70,7 @@ def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def check_box(box: ArrayLike) -> NDArray[np.float64]:
-    """Lower and upper corner (2, 3), world, m. Raises a ValueError if they are none."""
+    """Lower and upper corner (2, 3), world, m."""
     corners = real_array(box, "box")
     ordered = corners.shape == (2, 3) and (corners[0] < corners[1]).all()
     _require(ordered, "box must be a lower and an upper corner, (2, 3), the lower corner first")
@@ -73,41 +78,35 @@ def check_box(box: ArrayLike) -> NDArray[np.float64]:
 
 
 def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
-    """Raises a ValueError unless there are scans, each an array (N, 3)."""
+    """Refuse no scans, and scans that are not arrays (N, 3)."""
     _require(scans, "points holds no scans")
     for i, scan in enumerate(scans):
         check_scan_shape(scan, i)
 
 
 def check_scan_shape(scan: NDArray[Any], number: int) -> None:
-    """Raises a ValueError unless scan `number` is an array (N, 3)."""
     fits = scan.ndim == 2 and scan.shape[1] == 3
     _require(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
-    """Raises a ValueError unless the values are arrays (N,) for scans (N, 3)."""
+    """Refuse values that are not arrays (N,) for scans (N, 3)."""
     check_equal_numbers(len(values), len(scans), name)
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
         check_values_of_scan(value, scan, name, i)
 
 
 def check_equal_numbers(num_values: int, num_scans: int, name: str) -> None:
-    """Raises a ValueError unless there are as many arrays of values as scans."""
     _require(num_values == num_scans, f"{name} holds {num_values} scans, points {num_scans}")
 
 
 def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, number: int) -> None:
-    """Raises a ValueError unless the values are an array (N,) for scan `number`, (N, 3)."""
     fits = value.shape == (len(scan),)
     _require(fits, f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}")
 
 
-MISSING_POSES = "poses are missing: T_world_sensor (4, 4) of each scan; radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
-
-
 def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
-    """`poses` as (F, 4, 4) float64, of any numbers. Raises a ValueError if the shape is wrong."""
+    """`poses` as (F, 4, 4) float64, of any numbers."""
     T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
     shape = T_world_sensor.shape
     count = (shape or (0,))[0] if num_scans is None else num_scans
@@ -117,7 +116,7 @@ def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.
 
 
 def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
-    """`pose` as (4, 4) float64 T_a_b, m. Raises a ValueError if it is not a rigid transform."""
+    """`pose` as (4, 4) float64 T_a_b, m, which must be a rigid transform."""
     matrix: NDArray[np.float64] = real_array(pose, name)
     _require(matrix.shape == (4, 4), f"{name} must have shape (4, 4), not {matrix.shape}")
     _require(are_rigid(matrix[None]).all(), f"{name} is not a rigid transform ({_RIGID})")
@@ -125,10 +124,7 @@ def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
 
 
 def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
-    """`poses` as (F, 4, 4) float64 T_world_sensor, m: as many as scans, where their number is given.
-
-    A ValueError names the first pose that is not a rigid transform.
-    """
+    """`poses` as (F, 4, 4) float64 T_world_sensor, m: rigid transforms, as many as scans if their number is given."""
     T_world_sensor = pose_matrices(poses, num_scans)
     for i in np.flatnonzero(~are_rigid(T_world_sensor))[:1]:
         msg = f"pose {i} is not a rigid transform ({_RIGID})"
@@ -139,10 +135,7 @@ def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.fl
 def usable_poses(
     poses: ArrayLike, num_scans: int | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """:func:`check_poses`, but a minority of poses that are not rigid transforms is replaced by interpolation.
-
-    Returns (F, 4, 4) float64 T_world_sensor, m, and a mask (F,) of those as given: the scans of the others are to be left out.
-    """
+    """:func:`check_poses`, but a minority of poses that are not rigid transforms is interpolated, and False in a mask (F,)."""
     T_world_sensor = pose_matrices(poses, num_scans)
     rigid = are_rigid(T_world_sensor)
     if rigid.all() or 2 * np.count_nonzero(rigid) <= len(rigid):
@@ -183,8 +176,7 @@ def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
     one_by_one = hasattr(values, "__iter__") or hasattr(values, "__getitem__")
     if not one_by_one or getattr(values, "ndim", 1) == 0:
         raise _wrong_type(name, "a list of arrays, one a scan", values)
-    found: Iterable[Any] = values
-    return found
+    return values  # type: ignore[no-any-return]
 
 
 def path_of(value: Any, name: str) -> Path:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 from typing import Any
 
 REQUIREMENTS = {
@@ -19,19 +18,18 @@ REQUIREMENTS = {
 
 
 def require(*modules: str, what: str) -> Any:
-    """Import libraries of `REQUIREMENTS` that may not be installed, and return the last one.
+    """Import libraries that may not be installed, and return the last one.
 
-    `what` needs them, with its verb, such as "the viewer needs". An ImportError names all that are missing, and the command
-    that installs them.
+    `what` needs them, such as "the viewer needs". An ImportError names all that are missing, and the command to install.
     """
     missing: list[str] = []
     for name in modules:
         try:
-            importlib.import_module(name)
+            found = importlib.import_module(name)
         except ImportError:
             missing.append(name.partition(".")[0])
     if missing:
         wanted = " ".join(f'"{REQUIREMENTS[name]}"' for name in missing)
         msg = f"{what} {' and '.join(missing)}: pip install {wanted}"
         raise ImportError(msg)
-    return sys.modules[modules[-1]]
+    return found

@@ -19,10 +19,8 @@ _FIRST_CORNER = -1 / 3
 class WorldLattice(NamedTuple):
     """Leaf cells, and blocks of them, which are numbered along the axes of the world."""
 
-    cell_m: float
-    """Edge of a leaf cell, m."""
-    block_cells: int
-    """Edge of a block, leaf cells: a multiple of the edge of the coarsest cell."""
+    cell_m: float  # edge of a leaf cell, m
+    block_cells: int  # edge of a block, leaf cells: a multiple of the edge of the coarsest cell
 
     @property
     def block_m(self) -> float:

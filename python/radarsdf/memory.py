@@ -35,9 +35,8 @@ def check_views(
     `cells`: leaf cells of a map whose surface has yet to be made for views; `patches` of that surface; `beams` of one
     view; `returns` of all views that are kept.
     """
-    needed = (
-        cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM + returns * _PER_RETURN_SEEN
-    )
+    of_map = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN
+    needed = of_map + beams * _PER_BEAM + returns * _PER_RETURN_SEEN
     way_out = "ask for fewer poses or returns, or make the map of a part of the scans"
     _check("these views", needed, max_memory_bytes, way_out)
 
@@ -50,38 +49,28 @@ def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, way_out
 
 
 def limit_bytes(max_memory_bytes: int | None) -> int | None:
+    """`max_memory_bytes`, or what is available."""
     return available_bytes() if max_memory_bytes is None else max_memory_bytes
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:
-    """Memory that this process can still get, bytes: the least of what system and control groups have left.
+    """Memory that this process can still get, bytes: the least of what system and control group have left.
 
-    None if it cannot be found out, as on systems other than Linux. `root` is the root of the file system, for
-    tests.
+    None if it cannot be found out, as on systems other than Linux. `root` is the root of the file system, for tests.
     """
-    found = []
     try:
         lines = (root / "proc/meminfo").read_text().splitlines()
-        found.append(next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable")))
-        groups = (root / "proc/self/cgroup").read_text().splitlines()
+        available = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
+        _, _, group = (root / "proc/self/cgroup").read_text().partition("0::")
     except (OSError, StopIteration):
-        groups = []
+        return None
     top = root / "sys/fs/cgroup"
-    folders = [(top, "memory.max", "memory.current")]
-    for line in groups:
-        _, controllers, path = line.split(":", 2)
-        if controllers == "":
-            folders.append((top / path.lstrip("/"), "memory.max", "memory.current"))
-        elif "memory" in controllers.split(","):
-            names = ("memory.limit_in_bytes", "memory.usage_in_bytes")
-            folders += [(top / "memory" / path.lstrip("/"), *names), (top / "memory", *names)]
-    for folder, limit, usage in folders:
+    for folder in (top, top / group.strip().lstrip("/")):  # a container sees its own group at the top
         try:
-            left = int((folder / limit).read_text()) - int((folder / usage).read_text())
+            left = int((folder / "memory.max").read_text()) - int((folder / "memory.current").read_text())
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
         except (OSError, ValueError):  # there is no such group, or its limit is "max"
             continue
-        found.append(
-            max(0, left + int(stat.get("inactive_file", 0)))
-        )  # cached files, which the system can drop
-    return min(found) if found else None
+        left += int(stat.get("inactive_file", 0))  # cached files, which the system can drop
+        available = min(available, max(0, left))
+    return available

@@ -15,7 +15,7 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property
 from typing import TypeVar
@@ -42,15 +42,13 @@ if _wanted and _wanted not in _known:  # the core goes on with its own choice
 
 
 class _State:
-    """What PyTorch's settings were, and who has changed them. There is one, of the process."""
+    """PyTorch's settings of the process, and who has changed them."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.open_blocks = 0
-        self.usual_threads = 0
-        """PyTorch's number before the first block that is still open."""
-        self.here = threading.local()
-        """Its `inside`: whether this thread is in a block."""
+        self.usual_threads = 0  # PyTorch's number before the first block that is still open
+        self.here = threading.local()  # its `inside`: whether this thread is in a block
 
 
 _state = _State()
@@ -100,10 +98,7 @@ def resolve_num_threads(num_threads: int) -> int:
 
 @contextmanager
 def torch_threads(num_threads: int) -> Iterator[None]:
-    """A block in which PyTorch uses this number of threads. 0: as before.
-
-    For several processes: two with two threads on two processors took twice the processor time for a mesh.
-    """
+    """A block in which PyTorch uses this number of threads, for several processes. 0: as before."""
     before = torch.get_num_threads()
     torch.set_num_threads(num_threads or before)
     try:
@@ -113,12 +108,11 @@ def torch_threads(num_threads: int) -> Iterator[None]:
 
 
 class Workers:
-    """A pool of `num_threads` threads for a ``with`` block. 0: as many as PyTorch uses.
+    """A pool of `num_threads` threads for a ``with`` block. 0: as many as PyTorch uses."""
 
-    PyTorch keeps its number of threads for each thread; a new thread starts with what any thread set last. So the outermost
-    block of each thread sets 1, and restores the number from before the first block that is still open, because a thread
-    that first used PyTorch since then has read 1.
-    """
+    # PyTorch keeps its number of threads for each thread; a new thread starts with what any thread set last. So the outermost
+    # block of each thread sets 1, and restores the number from before the first block that is still open, because a thread
+    # that first used PyTorch since then has read 1.
 
     def __init__(self, num_threads: int = 0) -> None:
         self.num_threads = resolve_num_threads(num_threads)
@@ -166,17 +160,8 @@ class Workers:
         # If every item gets a thread, the calling thread computes the first one itself: to sleep and be woken
         # would take a noticeable part of an iteration.
         own = 0 if len(items) > self.num_threads else 1
-        futures: list[Future[_Result]] = []
-        try:
-            for item in items[own:]:
-                futures.append(self._pool.submit(function, item))
-        except RuntimeError as error:
-            # Pools take nothing more once the main thread is done, while the interpreter still waits for this thread.
-            if "cannot schedule" not in str(error):
-                raise
+        futures = [self._pool.submit(function, item) for item in items[own:]]
+        futures.reverse()  # a result is let go once it is used
         with torch.enable_grad():  # as in the threads of the pool
             first = [function(item) for item in items[:own]]
-            rest = [function(item) for item in items[own + len(futures) :]]
-        futures.reverse()  # a result is let go once it is used
-        submitted = (futures.pop().result() for _ in range(len(futures)))
-        return itertools.chain(first, submitted, rest)
+        return itertools.chain(first, (futures.pop().result() for _ in range(len(futures))))

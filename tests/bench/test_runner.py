@@ -5,11 +5,13 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 import trimesh
 from radarsdf import FitConfig
+from radarsdf.render.picture import save_picture
 
 from bench import runner
 from bench.paper.__main__ import EXPERIMENTS
@@ -31,6 +33,7 @@ def peers(monkeypatch):
         return Reconstruction(mesh, "", 1.0 + len(points), peak_bytes=10**8, map_bytes=1000 * len(points))
 
     monkeypatch.setattr("bench.paper.surface.reconstruct", reconstruct)
+    monkeypatch.setattr("bench.paper.surface.save_picture", partial(save_picture, width=160, height=100))
 
 
 def run(tmp_path, *words):
@@ -103,7 +106,9 @@ def test_settings_are_words():
 @pytest.mark.usefixtures("peers")
 def test_surface(tmp_path):
     meshes = tmp_path / "meshes"
-    table, values = run(tmp_path, "surface", "wall", "--peers", "BPA", "Poisson", "--meshes", str(meshes))
+    table, values = run(
+        tmp_path, "surface", "wall", "--peers", "BPA", "Poisson", "--samples", "3000", "--meshes", str(meshes)
+    )
     assert sorted(path.name for path in meshes.iterdir()) == [
         "wall, 4 scans, BPA.ply",
         "wall, 4 scans, BPA.png",
@@ -111,7 +116,7 @@ def test_surface(tmp_path):
     ball, poisson = values["rows"]
     assert ball["seconds"] == 5.0
     assert 0 <= ball["f_score"] <= 1
-    assert ball["num_mesh_samples"] == 100_000
+    assert ball["num_mesh_samples"] == 3_000
     assert poisson["why_not"] == "Open3D is not here"
     assert "- Poisson: Open3D is not here" in table
     for key in ("command", "commit", "processor", "threads"):
@@ -120,12 +125,12 @@ def test_surface(tmp_path):
 
 @pytest.mark.usefixtures("peers")
 def test_map_size_of_the_octree_is_the_reference(tmp_path):
-    table, values = run(tmp_path, "map-size", "wall", "--frames", "10")
+    table, values = run(tmp_path, "map-size", "wall", "--frames", "4")
     sizes = {(row["method"], row["scans"]): row["bytes"] for row in values["rows"]}
-    assert sizes["3QFPI", "10 scans"] < sizes["SHINE (octree)", "10 scans"]
-    assert sizes["radarsdf", "1 scans"] < sizes["radarsdf", "10 scans"]
-    assert sizes["VDBFusion", "10 scans"] == 10_000
-    assert "of the octree, %, 10 scans" in table
+    assert sizes["3QFPI", "4 scans"] < sizes["SHINE (octree)", "4 scans"]
+    assert sizes["radarsdf", "1 scans"] < sizes["radarsdf", "4 scans"]
+    assert sizes["VDBFusion", "4 scans"] == 4_000
+    assert "of the octree, %, 4 scans" in table
 
 
 @pytest.mark.usefixtures("peers")
@@ -145,7 +150,7 @@ def test_curve_has_budgets_settings_and_peers_by_turns(tmp_path):
 
 @pytest.mark.usefixtures("peers")
 def test_kinds_have_scores_and_a_calibration(tmp_path):
-    table, values = run(tmp_path, "kinds", "wall", "--peers", "BPA", "Poisson")
+    table, values = run(tmp_path, "kinds", "wall", "--peers", "BPA", "Poisson", "--samples", "3000")
     assert "- wall: Open3D is not here" in table
     judged = [row for row in values["rows"] if "auc" in row]
     assert [row["method"] for row in judged] == ["radarsdf", "radarsdf, quick"]
@@ -160,7 +165,9 @@ def test_calibration_has_all_parts(tmp_path):
 
 
 def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
-    few = {"training": {"sdf_iterations": 5, "intensity_iterations": 5}}  # enough to differ
+    few = {
+        "training": {"sdf_iterations": 3, "intensity_iterations": 3, "batch_size": 512}
+    }  # enough to differ
     monkeypatch.setattr("bench.scenes.QUICK", few)
     neighbours, *ours = run(tmp_path, "intensity", "wall", "--base", "default", "--repetitions", "2")[1][
         "rows"
@@ -170,12 +177,12 @@ def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
     assert ours[0]["mae"] != ours[1]["mae"]
     rows = run(tmp_path, "ablation", "wall", "--repetitions", "1")[1]["rows"]
     assert len({row["mae"] for row in rows}) == len(rows) == 5  # each variant really changes the fit
-    table, values = run(tmp_path, "views", "wall", "--base", "default", "--frames", "20")
+    table, values = run(tmp_path, "views", "wall", "--base", "default", "--frames", "8")
     assert (
         len(values["rows"]) == 8
     )  # with and without direction, measured and noiseless, at the reflector and elsewhere
     assert "### wall, at the reflector" in table
-    rows = run(tmp_path, "poses", "wall", "--repetitions", "1", "--frames", "8", "--samples", "1e4")[1][
+    rows = run(tmp_path, "poses", "wall", "--repetitions", "1", "--frames", "6", "--samples", "3e3")[1][
         "rows"
     ]
     assert {"none", "walk of 0.02 m, 0.1°", "returns alone"} <= {row["poses"] for row in rows}

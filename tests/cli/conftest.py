@@ -7,6 +7,7 @@ from __future__ import annotations
 from functools import partial
 
 import pytest
+from radarsdf.evaluation import surface_metrics
 from radarsdf.io.npz import write_scans
 from radarsdf.render import picture
 
@@ -31,9 +32,14 @@ def map_file(scans_file, tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def small_pictures_of_meshes(monkeypatch):
-    """Most of the time of a command with a picture is that of its pixels."""
+def little_work(monkeypatch):
+    """Most of the time of a command with a picture is that of its pixels, and of the demo that of its samples."""
+
+    def few_samples(mesh, truth, samples, **options):
+        return surface_metrics(mesh, truth, samples=min(samples, 20_000), **options)
+
     monkeypatch.setattr(picture, "save_picture", partial(picture.save_picture, width=160, height=100))
+    monkeypatch.setattr("radarsdf.evaluation.surface_metrics", few_samples)
 
 
 @pytest.fixture

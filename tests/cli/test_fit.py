@@ -30,10 +30,7 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     assert call("fit", scans_file, "-o", path, "--geometry-only", "--holdout", 3, *QUICK) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].startswith("6000 of 6000 returns in 4 scans")
-    assert printed[-2:] == [
-        f"next: radarsdf mesh {path} -o {path.with_suffix('.ply')} --voxel 0.2",
-        f"and: radarsdf eval {path} {scans_file} --holdout 3",
-    ]
+    assert printed[-1] == f"next: radarsdf mesh {path} -o {path.with_suffix('.ply')} --voxel 0.2"
     radar_map = radarsdf.load(path)
     assert not radar_map.has_intensity
     assert radar_map.config == radarsdf.FitConfig.quick()
@@ -109,11 +106,9 @@ def broken_folder(tmp_path, monkeypatch):
     return out, spare
 
 
-@pytest.mark.parametrize("command", ["fit", "demo"])
-def test_a_map_that_cannot_be_written_is_kept_elsewhere(command, scans_file, broken_folder, capsys):
+def test_a_map_that_cannot_be_written_is_kept_elsewhere(scans_file, broken_folder, capsys):
     out, spare = broken_folder
-    words = {"fit": [scans_file, "-o", out / "map.safetensors"], "demo": ["--frames", 4, "-o", out]}[command]
-    assert call(command, *words, *QUICK[:2]) == 1
+    assert call("fit", scans_file, "-o", out / "map.safetensors", *QUICK) == 1
     (kept,) = files(spare)
     assert f"saved in {spare / kept}" in capsys.readouterr().err
     assert len(radarsdf.load(spare / kept).mesh(0.4).faces) > 0
@@ -146,15 +141,13 @@ def test_the_demo_writes_everything_and_prints_the_errors(tmp_path, capsys):
     assert (out / "picture.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize(("screen", "words", "shown"), [(True, [], 1), (False, [], 0), (True, ["--json"], 0)])
-def test_the_viewer_ends_the_demo_where_somebody_looks(screen, words, shown, tmp_path, monkeypatch):
+@pytest.mark.parametrize("screen", [True, False])
+def test_the_viewer_ends_the_demo_where_somebody_looks(screen, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="the extra view is not installed")
     calls = []
     monkeypatch.setattr("radarsdf.view.serving.has_display", lambda: screen)
-    monkeypatch.setattr("radarsdf.cli.fits.show", lambda *_, **__: calls.append(1))
+    monkeypatch.setattr("radarsdf.cli.fits.show_map", lambda *_, **__: calls.append(1))
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    assert (
-        call("demo", "--scene", "wall", "--frames", 2, "-o", tmp_path, "--voxel", 0.4, *QUICK[:2], *words)
-        == 0
-    )
-    assert len(calls) == shown
+    words = ["--scene", "wall", "--frames", 2, "-o", tmp_path, "--voxel", 0.4]
+    assert call("demo", *words, *QUICK[:2]) == 0
+    assert len(calls) == screen

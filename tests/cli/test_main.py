@@ -49,21 +49,17 @@ def test_the_overview_lists_every_command_and_imports_nothing():
     assert python(IMPORTED).stdout == done.stdout
 
 
-def test_help_of_a_command_imports_typer_alone():
-    """Neither NumPy and PyTorch nor pydantic and rich, which take longer than all else."""
-    imported = set(python(IMPORTED, "fit", "--help").stdout.splitlines()[-1].split()[1:])
-    assert {"radarsdf", "typer"} <= imported
-    assert not imported & {"numpy", "pydantic", "rich", "scipy", "torch", "trimesh"}
+def test_help_of_a_command_imports_nothing():
+    assert python(IMPORTED, "fit", "--help").stdout.splitlines()[-1] == "imported: radarsdf"
 
 
 @pytest.mark.parametrize(
     "words", [*([name] for name in NAMES), *(["tiles", step] for step in TILE_STEPS)], ids=" ".join
 )
-def test_help(words, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+def test_help(words, capsys):
     assert call(*words, "--help") == 0
     said = capsys.readouterr().out
-    assert f"Usage: radarsdf {' '.join(words)} " in said
+    assert f"sage: radarsdf {' '.join(words)} " in said
     assert ("--json" in said) == (words[-1] not in ("config", "view", "tiles"))
     makes_a_mesh = words[-1] in ("demo", "mesh", "view", "report", "eval", "run")
     assert ("--min-confidence" in said) == makes_a_mesh
@@ -74,21 +70,13 @@ def test_the_version(capsys):
     assert capsys.readouterr().out == f"radarsdf {radarsdf.__version__}\n"
 
 
-def test_completion_of_shells(capsys, monkeypatch):
-    monkeypatch.setenv("_RADARSDF_COMPLETE", "complete_bash")
-    monkeypatch.setenv("COMP_WORDS", "radarsdf con")
-    monkeypatch.setenv("COMP_CWORD", "1")
-    call()
-    assert capsys.readouterr().out.split() == ["convert", "config"]
-
-
 @pytest.mark.parametrize(
     ("words", "named"),
     [
         (["paint"], "paint"),
         (["--paint"], "--paint"),
         (["fit", "scans"], "-o"),
-        (["fit", "-o", "map.safetensors"], "SCANS"),
+        (["fit", "-o", "map.safetensors"], "scans"),
         (["fit", "scans", "-o", "map.safetensors", "--dry-run"], "--dry-run"),
         (["fit", "scans", "-o", "map"], ".safetensors"),
         (["fit", "scans", "-o", "map.safetensors", "--quick", "--paper"], "--paper"),
@@ -97,16 +85,16 @@ def test_completion_of_shells(capsys, monkeypatch):
         (["mesh", "map", "-o", "mesh", "--box", "1"], "--box"),
         (["mesh", "map", "-o", "mesh", "--voxel", "x"], "--voxel"),
         (["view", "map", "--port", "x"], "--port"),
-        (["eval", "mesh"], "SCANS"),
+        (["eval", "mesh"], "scans"),
         (["demo", "--scene", "moon"], "moon"),
         (["demo", "--frames", "1"], "--frames"),
         (["render", "map", "-o", "a.jpg", "--pose", "1", "2", "3"], ".npz, .ply, .png"),
         (["render", "map", "-o", "a.npz", "--pose", "1", "2"], "--pose"),
-        (["render", "map", "-o", "a.npz", "--pose", "1", "2", "3", "0", "0", "0", "0"], "length 1"),
+        (["render", "map", "-o", "a.npz", "--pose", "1", "2", "3", "0", "0", "0"], "--pose"),
         (["render", "map", "-o", "a.npz", "--pose", "1", "2", "3", "--seed", "-1"], "--seed"),
         (["report", "map", "-o", "a.html", "--holdout", "3"], "--holdout"),
         (["tiles", "scans"], "--out"),
-        (["tiles", "fit"], "FOLDER"),
+        (["tiles", "fit"], "folder"),
         (["tiles", "clean", "city", "--quick"], "--quick"),
         (["tiles", "fit", "city", "--processes", "0"], "--processes"),
         (["info", "map", "more"], "more"),

@@ -27,7 +27,7 @@ def test_info(map_file, capsys):
     assert set(of_map) > {name.replace(" ", "_") for name in names}
     assert (of_map["scans"], of_map["returns"], of_map["leaf_size_m"]) == (4, 6000, 0.2)
     assert call("info", map_file) == 0
-    assert f"{of_map['leaf_cells']} of 0.2 m" in capsys.readouterr().out
+    assert str(of_map["leaf_cells"]) in capsys.readouterr().out
 
 
 def test_a_mesh_of_a_part_in_colour_with_a_picture(map_file, tmp_path, capsys):

@@ -7,13 +7,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from radarsdf import FitConfig
-from radarsdf.cli.options import Recording, Settings, words_of
+from radarsdf.cli.inputs import read_scans
+from radarsdf.cli.options import Parser
+from radarsdf.cli.settings import load_config
 
 from .calls import call, refusal
 
 
-def config(*, changes=(), **options):
-    return Settings(set=list(changes), **options).load()
+def given(command, *words):
+    """What the words after a command mean."""
+    return Parser(command).parse_args([str(word) for word in words])
+
+
+def config(*words):
+    return load_config(given("config", *words))
 
 
 def test_a_preset_then_a_file_then_single_settings(tmp_path):
@@ -26,8 +33,9 @@ def test_a_preset_then_a_file_then_single_settings(tmp_path):
         "networks.normals=true",
     ]
     assert config() == FitConfig()
-    assert config(paper=True) == FitConfig.paper()
-    assert config(quick=True, config=path, changes=changes) == FitConfig.quick(
+    assert config("--paper") == FitConfig.paper()
+    words = [word for change in changes for word in ("--set", change)]
+    assert config("--quick", "--config", path, *words) == FitConfig.quick(
         seed=3,
         training={"sdf_iterations": 7, "batch_size": 32},
         encoding={"kind": "octree"},
@@ -77,19 +85,12 @@ def test_options_are_the_parameters_of_read(tmp_path):
         row.tofile(tmp_path / "scans" / f"{100 + 2 * i}.0.bin")
     poses = tmp_path / "poses.tum"
     poses.write_text("".join(f"{100 + 4 * i} {i} 0 0 0 0 0 1\n" for i in range(3)))
-    for max_gap, count in ((None, 2), (5.0, 4)):
-        recording = Recording(tmp_path / "scans", poses, columns="power,x,y,z", max_gap=max_gap)
-        scans = recording.read()
+    words = [tmp_path / "scans", poses, "--columns", "power,x,y,z"]
+    for gap, count in (([], 2), (["--max-gap", 5.0], 4)):
+        scans = read_scans(given("check", *words, *gap))
         assert len(scans) == count
         np.testing.assert_array_equal(scans.points[0], [[5, 1, 2], [6, 2, 3]])
-    words = [tmp_path / "scans", poses, "--columns", "power,x,y,z", "--max-gap", 5.0]
-    assert words_of(recording, Settings(quick=True, set=["seed=1"])) == [
-        *map(str, words),
-        "--quick",
-        "--set",
-        "seed=1",
-    ]
     with pytest.raises(ValueError, match="world_frame"):
-        Recording(tmp_path / "scans", poses, columns="power,x,y,z", world_frame="map").read()
+        read_scans(given("check", *words, "--world-frame", "map"))
     with pytest.raises(ValueError, match=r"poses\.tum"):
-        Recording(tmp_path / "scans", poses, columns="power,x,y,z", extrinsic=poses).read()
+        read_scans(given("check", *words, "--extrinsic", poses))

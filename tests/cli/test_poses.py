@@ -67,7 +67,6 @@ def test_poses_that_drift_are_refined(drive, drifted_file, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "The refined poses make a sharper map" in said
     assert "they moved by" in said
-    assert f"next: radarsdf fit {out} -o mended.safetensors" in said
     given, mended = read_scans(drifted_file), read_scans(out)
     assert errors(mended.poses, drive.poses)[0] < 0.5 * errors(given.poses, drive.poses)[0]
     for one, other in zip(given.points, mended.points, strict=True):
@@ -79,20 +78,10 @@ def test_scans_without_poses_get_some(drive, unposed, tmp_path, capsys):
     out = tmp_path / "poses.tum"
     said = values(capsys, "poses", unposed, "-o", out)
     assert said["poses"]["pieces"] == 1
-    assert said["next"] == f"radarsdf fit {unposed} {out} -o poses.safetensors"
     scans = radarsdf.io.read(unposed, out)
     assert errors(scans.poses, drive.poses)[0] < 0.05
     again = ["--find", "-o", tmp_path / "again.tum"]
     assert "--find" in refusal(capsys, tmp_path, "poses", unposed, out, *again, status=2)
-
-
-def test_a_fit_finds_the_poses_that_are_missing(unposed, tmp_path, capsys):
-    out = tmp_path / "map.safetensors"
-    assert call("fit", unposed, "-o", out, "--quick") == 0
-    said = capsys.readouterr()
-    assert "there are no poses: they were found from the radar alone" in said.err
-    assert "placed by returns and Doppler" in said.out
-    assert len(radarsdf.load(out).mesh(0.2).faces) > 1000
 
 
 def test_a_fit_mends_the_poses(drive, drifted_file, tmp_path, capsys):

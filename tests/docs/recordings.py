@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 START_S = 1717252210.0
 _STEP_S = 0.1
-_FRAMES = 12
+_FRAMES = 8
 
 
 def write_demo(folder: Path) -> None:

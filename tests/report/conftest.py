@@ -23,7 +23,7 @@ def subject(scene, radar_map):
     scans = with_truth(scene)
     train, test = scans.select(np.arange(1, 6)), scans.select(np.arange(1))
     findings = [radarsdf.Finding("made_up", "warning", "<b>1 of 2</b>", "Repair <i>it</i>.")]
-    return Subject(radar_map, HOSTILE, train, test, findings, voxel_size_m=0.25, progress=False)
+    return Subject(radar_map, HOSTILE, train, test, findings, voxel_size_m=0.4, progress=False)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -51,7 +51,7 @@ def test_each_change_is_named_listed_and_shown(kinds, tmp_path):
         assert region.words in page.sections["changes"]
     assert len(regions) == len(kinds) - 1
     assert len(page.all("tr")) == (1 + len(regions) if regions else 0)
-    assert len(page.all("img")) == 3 + len(regions)
+    assert len(page.all("img")) == 2
     assert len(page.frames) == 1
     styles = [found.get("style", "") for found in page.all("i")]
     assert all("background:rgb({} {} {})".format(*color) in styles for color in COLORS.values())

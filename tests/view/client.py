@@ -29,38 +29,27 @@ STEP_S = 0.05
 
 @dataclass(frozen=True)
 class Received:
-    """One message of the server, as it arrived."""
-
     at_s: float
-    """When, s, of `time.perf_counter`."""
     frame_bytes: int
-    """Size of the frame that it came in, with what came along."""
     message: dict[str, Any]
-    """Its fields. Arrays are given as their dtype and place in the frame."""
 
     @property
     def kind(self) -> str:
-        """Its type."""
         return str(self.message["type"])
 
     @property
     def name(self) -> str:
-        """The node of the scene that it is about."""
         return str(self.message.get("name", ""))
 
     def changes(self, name: str, what: str) -> bool:
-        """Whether it changes a property of a node."""
         return self.name == name and what in self.message.get("updates", {})
 
 
 def is_mesh(message: Received) -> bool:
-    """Whether it is the surface, at rest."""
     return message.kind == "GlbMessage"
 
 
 class PlainClient:
-    """Connects to a viewer as its page does. A thread of it receives."""
-
     def __init__(self, host: str, port: int) -> None:
         protocol = Subprotocol(f"viser-v{viser.__version__}")
         # Whole meshes come in one frame; its answers to pings must not wait for them.
@@ -85,21 +74,17 @@ class PlainClient:
         )
 
     def __enter__(self) -> Self:
-        """The client, which the end of the block closes."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self._socket.close()
         self._thread.join()
 
     def received(self, since: int = 0) -> list[Received]:
-        """All messages, without the first ones."""
         with self._news:
             return self._received[since:]
 
     def wait_for(self, wanted: Any, since: int = 0, timeout_s: float = 30.0) -> Received:
-        """The first message after the first ones of which the function `wanted` is true."""
 
         def found() -> Received | None:
             return next((message for message in self._received[since:] if wanted(message)), None)
@@ -112,11 +97,9 @@ class PlainClient:
         return message
 
     def send(self, kind: str, **fields: Any) -> None:
-        """Send a message."""
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     def move_sensor(self, position: tuple[float, float, float]) -> None:
-        """A step of a drag, to a position in the frame of the page, m."""
         self.send(
             "TransformControlsUpdateMessage",
             name="/sensor",
@@ -126,7 +109,6 @@ class PlainClient:
         )
 
     def drag(self, seconds: float) -> tuple[float, float]:
-        """Drag the sensor to and fro along x. Returns when it began and ended, s, of `time.perf_counter`."""
         began_s = time.perf_counter()
         self.send("TransformControlsDragStartMessage", name="/sensor", owner="")
         steps = round(seconds / STEP_S)
@@ -159,18 +141,12 @@ class PlainClient:
 
 
 class Glb(NamedTuple):
-    """What a GLB file of one mesh holds."""
-
     vertices: NDArray[np.float32]
-    """(V, 3)."""
     faces: NDArray[np.uint32]
-    """(F, 3)."""
     light: NDArray[np.float32]
-    """(V, 3) linear, as glTF has colours."""
 
     @property
     def colors(self) -> NDArray[np.float64]:
-        """(V, 3) sRGB that the page shows, 0 to 255: after three.js's ACESFilmicToneMapping."""
         a, b, c, d, e = glb._FIT
         x = self.light.astype(np.float64) @ glb._IN.T / glb._EXPOSURE
         linear = np.clip((x * (x + a) - b) / (x * (c * x + d) + e) @ glb._OUT.T, 0, 1)
@@ -181,7 +157,6 @@ class Glb(NamedTuple):
 
     @classmethod
     def of(cls, data: bytes) -> Glb:
-        """Read it."""
         described = int.from_bytes(data[12:16], "little")
         tree = json.loads(data[20 : 20 + described])
         binary = data[28 + described :]

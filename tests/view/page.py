@@ -28,7 +28,6 @@ _FLAGS = [
 
 
 def why_no_browser() -> str | None:
-    """Why no browser can be driven here. None: one can."""
     try:
         import playwright.sync_api  # noqa: F401, PLC0415 - may be missing
     except ImportError:
@@ -40,7 +39,6 @@ def why_no_browser() -> str | None:
 
 @contextmanager
 def open_page(url: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
-    """The page in a browser, when it has drawn the scene."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     with sync_playwright() as playwright:
@@ -56,14 +54,10 @@ def open_page(url: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
 
 
 class Page:
-    """A tab."""
-
     def __init__(self, tab: Any) -> None:
         self.tab = tab
         self.requests: list[str] = []
-        """Addresses of all that the page and its frames asked for, itself too."""
         self.errors: list[str] = []
-        """What they wrote to the console as errors, and what their scripts did not catch."""
         tab.on("request", lambda request: self.requests.append(request.url))
         tab.on("pageerror", lambda error: self.errors.append(str(error)))
         tab.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
@@ -71,15 +65,12 @@ class Page:
         self._session: Any = None
 
     def screenshot(self) -> NDArray[np.uint8]:
-        """(H, W, 3) what is seen now."""
         return _pixels(self.tab.screenshot())
 
     def screenshot_of(self, selector: str) -> NDArray[np.uint8]:
-        """(H, W, 3) what is seen of an element now."""
         return _pixels(self.tab.locator(selector).screenshot())
 
     def start_recording(self) -> None:
-        """Keep each frame that the browser draws."""
         self._session = self.tab.context.new_cdp_session(self.tab)
 
         def on_frame(event: Any) -> None:
@@ -90,17 +81,14 @@ class Page:
         self._session.send("Page.startScreencast", {"format": "png", "everyNthFrame": 1})
 
     def stop_recording(self) -> list[tuple[float, NDArray[np.uint8]]]:
-        """The frames since the start, (H, W, 3), and when they arrived, s, of `time.perf_counter`."""
         self._session.send("Page.stopScreencast")
         frames, self._frames = self._frames, []
         return [(at_s, _pixels(base64.b64decode(data))) for at_s, data in frames]
 
     def pause(self, seconds: float) -> None:
-        """Let the browser go on."""
         self.tab.wait_for_timeout(1000 * seconds)
 
     def wait_until(self, done: Callable[[], bool], timeout_s: float = 60.0) -> None:
-        """Let the browser go on until a function is true."""
         until_s = time.monotonic() + timeout_s
         while not done():
             if time.monotonic() > until_s:
@@ -109,7 +97,6 @@ class Page:
             self.pause(0.1)
 
     def settle(self, pause_s: float = 0.5) -> NDArray[np.uint8]:
-        """Wait until the page does not change, and return what is seen then."""
         last, seen = None, self.screenshot()
         while last is None or not np.array_equal(last, seen):
             self.pause(pause_s)
@@ -117,7 +104,6 @@ class Page:
         return seen
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int, step_s: float) -> None:
-        """Press the mouse at a pixel, move it to another and let go."""
         mouse = self.tab.mouse
         mouse.move(*start)
         self.pause(step_s)
@@ -128,16 +114,13 @@ class Page:
         mouse.up()
 
     def click(self, at: tuple[float, float]) -> None:
-        """Click on a pixel."""
         self.tab.mouse.click(*at)
 
     def text(self) -> str:
-        """All words on the page."""
         return str(self.tab.inner_text("body"))
 
 
 def camera_of(server: Any, timeout_s: float = 30.0) -> Any:
-    """The camera of the first page, as it told the viser server."""
     until_s = time.monotonic() + timeout_s
     while time.monotonic() < until_s:
         for client in server.get_clients().values():
@@ -148,7 +131,6 @@ def camera_of(server: Any, timeout_s: float = 30.0) -> Any:
 
 
 def pixel_of(camera: Any, point: NDArray[np.float64]) -> tuple[float, float]:
-    """The pixel in which the page draws a point (3,), frame of the page, m."""
     R_page_camera = Rotation.from_quat(np.roll(camera.wxyz, -1))
     right, down, forward = R_page_camera.inv().apply(point - camera.position)
     focal = camera.image_height / 2 / np.tan(camera.fov / 2)
@@ -159,7 +141,6 @@ def pixel_of(camera: Any, point: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def drawn(frame: NDArray[np.uint8]) -> int:
-    """Pixels of a frame (H, W, 3) that are not of the background, which is white; of the left part, without the panel."""
     scene = frame[:, : frame.shape[1] * 2 // 3]
     return int((scene.min(axis=2) < 235).sum())
 

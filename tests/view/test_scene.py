@@ -52,7 +52,7 @@ def page(sharp_map, monkeypatch):
     scene, waits, shown = Scene(), [], []
     monkeypatch.setattr(module, "wait_until_drawn", lambda *_: waits.append(scene.seen()))
     surface = ShownSurface.of(sharp_map, 0.4, max_vertices=100_000, progress=False)
-    quantities = quantities_of(sharp_map, surface, None, ALL.sensor)
+    quantities = quantities_of(sharp_map, surface, ALL.sensor)
     return scene, Canvas(scene, sharp_map, surface, quantities, None, shown.append), waits, shown
 
 

@@ -19,7 +19,6 @@ from radarsdf.map.colors import intensity_colors
 from radarsdf.view.glb import shaded
 from radarsdf.view.serving import start_server
 from radarsdf.view.viewer import Viewer
-from scipy.spatial import cKDTree
 
 from ..conftest import ground_and_wall
 
@@ -82,12 +81,12 @@ def test_a_new_client_gets_the_scene(client, viewer):
 
 def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map):
     before = len(client.received())
-    _, ended_s = client.drag(1.0)
+    _, ended_s = client.drag(0.5)
     new_mesh = client.wait_for(is_mesh, before)
     assert new_mesh.at_s > ended_s
     moving = [m for m in client.received(before) if m.at_s < ended_s]
     updates = [m for m in moving if m.changes(CLOUD, "colors")]
-    assert len(updates) >= 3  # of at most 20
+    assert len(updates) >= 3  # of at most 10
     assert not any(m.changes(CLOUD, "points") for m in moving)  # only what changed is sent
     assert min(m.frame_bytes for m in updates) < 3 * len(viewer.surface.vertices) + 1000
 
@@ -97,8 +96,8 @@ def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map
         colors = viewer.quantities["intensity"].colors(np.arange(len(viewer.surface.vertices)), sensor)
         return np.abs(shaded(colors, viewer.surface.lightness) - mesh_of(new_mesh).colors).mean()
 
-    assert difference([2.0, 0.0, 1.0]) < 2
-    assert difference([1.0, 0.0, 1.0]) > 4
+    assert difference([1.0, 0.0, 1.0]) < 2
+    assert difference([0.0, 0.0, 1.0]) > 4
 
 
 def test_limits_hide_triangles(client, viewer):
@@ -125,10 +124,14 @@ def test_a_scan_is_shown_and_the_sensor_moves_there(client, viewer, scans, sharp
     assert f"{len(scans.points[4])} returns measured, {len(view)} predicted; median error" in str(
         text.message
     )
-    shown = viewer._clouds._clouds["predicted"].points
+    shown = viewer._clouds.nodes["predicted"].points
     np.testing.assert_allclose(shown, view.world_points - sharp_map.origin, atol=1e-4)
-    slide(client, "all scans", value=True)
-    client.wait_for(lambda m: m.name == "/scans/all" and m.kind == "PointCloudMessage", before)
+    before = len(client.received())
+    slide(client, "predicted", value=False)
+    client.wait_for(
+        lambda m: m.changes("/scans/predicted", "visible") or m.name == "/scans/predicted", before
+    )
+    slide(client, "predicted", value=True)
 
 
 def test_a_click_shows_what_the_map_knows(client, viewer, sharp_map):
@@ -155,7 +158,7 @@ def test_a_click_shows_what_the_map_knows(client, viewer, sharp_map):
     assert not any(map(content, client.received(before)))
 
 
-def test_the_surface_is_coloured_by_what_is_chosen(client, viewer, scans, sharp_map):
+def test_the_surface_is_coloured_by_what_is_chosen(client, viewer):
     surface = viewer.surface
     for name, values, limits in (
         ("uncertainty", surface.uncertainty_m, np.percentile(surface.uncertainty_m, [2, 98])),
@@ -169,12 +172,6 @@ def test_the_surface_is_coloured_by_what_is_chosen(client, viewer, scans, sharp_
         expected = shaded(intensity_colors(values, *limits)[:, :3], surface.lightness)
         np.testing.assert_allclose(shown, expected, atol=1)
     before = len(client.received())
-    slide(client, "colour by", "observed")
-    shown = mesh_of(client.wait_for(is_mesh, before)).colors
-    returns = np.concatenate([scan.world_points for scan in scans])
-    seen = cKDTree(returns).query(surface.vertices)[0] <= sharp_map.config.leaf_size_m
-    assert 0.5 < seen.mean() < 1
-    np.testing.assert_array_equal(shown[:, 0] > 1.05 * shown[:, 2], ~seen)  # orange, not grey
     slide(client, "colour by", "intensity")
     client.wait_for(lambda m: "intensity" in content(m), before)
 
@@ -221,7 +218,7 @@ def test_connections_that_ended_leave_nothing(viewer):
 
     gc.disable()  # which would free some by chance
     try:
-        for _ in range(6):
+        for _ in range(4):
             with PlainClient(viewer.host, viewer.port) as client:
                 client.wait_for(lambda message: message.kind == "GlbMessage")
         until_s = time.monotonic() + 20

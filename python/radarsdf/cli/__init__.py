@@ -2,14 +2,12 @@
 # SPDX-License-Identifier: MIT
 """The command line: ``radarsdf COMMAND``.
 
-`commands` lists them, `app` makes a typer application of their functions, `options` has what several of them share,
-`results` how they print; the other modules are the commands. They import PyTorch, NumPy and trimesh only while a command
-runs, so help and usage errors are immediate.
+`commands` lists them, `app` runs one and prints its error, `options` and `results` are what several of them share; the other
+modules are the commands. They import PyTorch, NumPy and trimesh only while a command runs, so help is immediate.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 
@@ -31,8 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         wrong, 130 if Ctrl-C stopped it.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
-    completes = "_RADARSDF_COMPLETE" in os.environ  # a shell asks for words, and gives none
-    if words in ([], ["--help"], ["-h"]) and not completes:  # to import typer would take three times as long
+    if words in ([], ["--help"], ["-h"]):
         print(overview())
         return 0
 

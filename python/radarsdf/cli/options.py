@@ -1,221 +1,189 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Groups of options that several commands share. The lines of a docstring are the help of its fields."""
+"""The arguments and options of the commands: tables, here and not next to the commands, so that help imports none of these."""
 
 from __future__ import annotations
 
-import ast
-import dataclasses
-from dataclasses import KW_ONLY, dataclass
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
-
-from radarsdf.cli.app import refuse_if
-
-if TYPE_CHECKING:
-    from radarsdf import FitConfig
-    from radarsdf.io.poses import StampedPoses
-    from radarsdf.io.scans import Scans
-
-MAP_SUFFIX = ".safetensors"
-"""By which the file of a map is known from a mesh."""
-
-Box = tuple[float, float, float, float, float, float] | None
-"""The lower and the upper corner."""
+from typing import Any, NoReturn
 
 
-def is_map(path: Path) -> bool:
-    """Whether a path looks like a map and not like scans or a mesh."""
-    return path.is_dir() or path.suffix == MAP_SUFFIX
+class UsageError(Exception):
+    """The command line is wrong: exit status 2."""
 
 
-def corners_of(box: Box) -> list[list[float]] | None:
-    """The lower and the upper corner of ``--box``, world frame, m."""
-    return None if box is None else [list(box[:3]), list(box[3:])]
+class Parser(argparse.ArgumentParser):
+    """Parses the words after a command, or a step of ``radarsdf tiles`` such as ``tiles fit``."""
 
-
-@dataclass
-class Recording:
-    """The scans of a command, their poses, and how both are read.
-
-    scans: The scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set.
-    poses: Their poses, where the scans have none: a file in TUM or KITTI format, or of 4 x 4 matrices.
-    extrinsic: File of the 4 x 4 matrix from the sensor's frame to that of the poses, T_base_sensor, if they differ.
-    topic: In a bag: the topic of the scans; may be repeated.
-    pose_topic: In a bag: the topic of the poses.
-    imu_topic: In a bag: the topic of the inertial measurements, for poses that are found.
-    imu_rotation: File of the 3 x 3 matrix from the axes of the IMU to those of the radar, R_sensor_imu; default: of the
-        bag, or found.
-    field: Which field of the file holds x, y, z, intensity or doppler, such as intensity=Power; may be repeated.
-    columns: In files without a header: the number of columns, or their names, such as x,y,z,intensity,doppler.
-    max_gap: Longest gap between two poses that is interpolated, s; default: 0.5.
-    world_frame: In a bag with TF: the frame of the world.
-    stamps: In a bag: whether a scan has the time of its header or of its record; default: header, unless its stamps are zero
-        or constant.
-    """
-
-    scans: Path
-    poses: Path | None = None
-    _: KW_ONLY
-    extrinsic: Path | None = None
-    topic: list[str] | None = None
-    pose_topic: str | None = None
-    imu_topic: str | None = None
-    imu_rotation: Path | None = None
-    field: list[str] | None = None
-    columns: str | None = None
-    max_gap: float | None = None
-    world_frame: str | None = None
-    stamps: Literal["header", "record"] | None = None
-
-    def read(self, poses: StampedPoses | None = None) -> Scans:
-        """The scans, with `poses` in place of theirs. What was assumed or left out is logged on standard error."""
-        from radarsdf.io.read import read
-        from radarsdf.io.text import read_numbers
-
-        columns, base, imu = self.columns, self.extrinsic, self.imu_rotation
-        replaced: Any = self.poses if poses is None else poses
-        return read(
-            self.scans,
-            replaced,
-            extrinsic=None if base is None else read_numbers(base, 4),
-            topic=self.topic,
-            pose_topic=self.pose_topic,
-            imu_topic=self.imu_topic,
-            R_sensor_imu=None if imu is None else read_numbers(imu, 3),
-            fields=dict(_role_and_name(text) for text in self.field or ()) or None,
-            columns=int(columns) if columns and columns.isdecimal() else columns and columns.split(","),
-            world_frame=self.world_frame,
-            stamps=self.stamps,
-            **({} if self.max_gap is None else {"max_gap_s": self.max_gap}),
-        )
-
-    @property
-    def inputs(self) -> list[Path]:
-        """The input files and folders, which no output may overwrite."""
-        paths = (self.scans, self.poses, self.extrinsic, self.imu_rotation)
-        return [path for path in paths if path is not None]
-
-
-@dataclass
-class MaybeRecording(Recording):
-    """The same for commands that work without scans: the field `scans` may be None."""
-
-    scans: Path | None = None  # type: ignore[assignment]
-
-
-MaybeRecording.__doc__ = Recording.__doc__
-
-
-def _role_and_name(text: str) -> tuple[str, str]:
-    role, equals, name = text.partition("=")
-    refuse_if(not (equals and role and name), f"--field takes ROLE=NAME, not {text!r:.50}")
-    return role, name
-
-
-@dataclass(kw_only=True)
-class Settings:
-    """The configuration of a fit: a preset, then the changes of a file, then single ones.
-
-    paper: Use the published configuration: slower, for comparison.
-    quick: Average distances instead of training the surface: less accurate, but done in under a second; mesh the map with
-        --voxel 0.2.
-    config: Change the settings that this TOML file has; radarsdf config prints all of them.
-    set: Change one setting, such as leaf_size_m=0.3 or training.sdf_iterations=200; may be repeated.
-    """
-
-    paper: bool = False
-    quick: bool = False
-    config: Path | None = None
-    set: list[str] | None = None
-
-    def __post_init__(self) -> None:
-        refuse_if(self.paper and self.quick, "--paper and --quick are two presets: leave out one of them")
-
-    def load(self) -> FitConfig:
-        """The configuration."""
-        from radarsdf.config.fit_config import FitConfig
-        from radarsdf.config.toml import read_toml
-
-        config = FitConfig.paper() if self.paper else FitConfig.quick() if self.quick else FitConfig()
-        if self.config is not None:
-            config = config.override(**read_toml(self.config))
-        for text in self.set or ():
-            config = config.override(**setting_of(text))
-        return config
-
-
-def setting_of(text: str) -> dict[str, Any]:
-    """One ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
-    path, equals, value = text.partition("=")
-    refuse_if(not equals, f"--set takes NAME=VALUE, not {text!r:.50}")
-    group, dot, name = path.partition(".")
-    try:
-        read = ast.literal_eval(value)
-    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
-        read = {"true": True, "false": False}.get(value, value)  # as in TOML
-    return {group: {name: read}} if dot else {path: read}
-
-
-def words_of(*groups: Recording | Settings) -> list[str]:
-    """Arguments and options as one would type them again."""
-    words: list[str] = []
-    for group in groups:
-        for field in dataclasses.fields(group):
-            value = getattr(group, field.name)
-            option = f"--{field.name.replace('_', '-')}"
-            if value in (None, False):
-                continue
-            if value is True:
-                words.append(option)
-            elif not field.kw_only:
-                words.append(str(value))
+    def __init__(self, command: str, usage: str = "", text: str = "") -> None:
+        super().__init__(f"radarsdf {command}", usage or None, text, allow_abbrev=False)
+        for name in OF_COMMANDS[command].split():
+            if name in GROUPS:
+                group = self.add_argument_group(name)
+                for member in GROUPS[name].split():
+                    _add(self if not member.startswith("-") else group, command, member)
             else:
-                for one in value if isinstance(value, list) else [value]:
-                    words += [option, str(one)]
-    return words
+                _add(self, command, name)
+
+    def error(self, message: str) -> NoReturn:
+        msg = f"{message}; {self.prog} --help lists the options"
+        raise UsageError(msg)
 
 
-@dataclass(kw_only=True)
-class Surface:
-    """The voxels of a mesh, and what it leaves out.
-
-    voxel: Edge length of a voxel, m.
-    min_confidence: Leave out surface with a confidence below this, 0 to 1; default: that of the highest expected F-score.
-    max_uncertainty: Leave out surface with a standard error above this, m; default: no limit.
-    min_component: Leave out connected components of fewer triangles; default: 30, and fewer in voxels above 0.1 m.
-    """
-
-    voxel: float = 0.1
-    min_confidence: float | None = None
-    max_uncertainty: float | None = None
-    min_component: int | None = None
-
-    @property
-    def limits(self) -> dict[str, Any]:
-        """What the mesh leaves out, as arguments of ``Map.mesh``."""
-        return {
-            "min_confidence": self.min_confidence,
-            "max_uncertainty": self.max_uncertainty,
-            "min_component_triangles": self.min_component,
-        }
+def _add(group: Any, command: str, name: str) -> None:
+    kind, text = OPTIONS.get(f"{command} {name}") or OPTIONS[name]
+    group.add_argument(*(("-o", "--out") if name == "-o" else (name,)), help=text, **kind)
 
 
-@dataclass(kw_only=True)
-class Address:
-    """Where a page is served.
+class _Corners(argparse.Action):
+    """The lower and the upper corner of six numbers."""
 
-    host: Address to listen on. 127.0.0.1 is reached from this machine alone; with 0.0.0.0 everyone who can reach the machine
-        sees the map, by its address or its name.
-    port: Port to listen on; default: 8080, or the next that is free.
-    """
+    def __call__(self, _parser: Any, namespace: Any, values: Any, _option: Any = None) -> None:
+        setattr(namespace, self.dest, [values[:3], values[3:]])
 
-    host: str = "127.0.0.1"
-    port: int | None = None
 
-    def check(self) -> None:
-        """Raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
-        from radarsdf.view.serving import free_port, require_viser
+OF_COMMANDS = {
+    "demo": "--scene --frames -o --view results surface settings",
+    "check": "results reading settings",
+    "fit": "-o --dry-run --holdout --refine --geometry-only --no-check --checkpoint --report results reading settings",
+    "mesh": "map -o --box --viewpoint --picture results surface",
+    "poses": "-o --find --picture results reading settings",
+    "live": "-o --trajectory --rate --find --view results reading page settings",
+    "view": "map --open --max-vertices --box --quiet reading page surface",
+    "report": "map -o --holdout --box results reading surface",
+    "eval": "what --samples --holdout --box results reading surface",
+    "render": "map --pose -o --returns --noise --seed results",
+    "compare": "map -o --report --view --align --min-area --box results reading page",
+    "grid": "map -o --voxel --box --heights --distances --costmap --picture results",
+    "convert": "-o results reading",
+    "config": "settings",
+    "info": "map results",
+    "tiles run": "-o tiles workers results reading surface settings",
+    "tiles plan": "-o tiles workers results reading settings",
+    "tiles fit": "folder --tile workers results",
+    "tiles mesh": "folder -o results surface",
+    "tiles status": "folder --tile results",
+}
+GROUPS = {
+    "results": "--quiet --json",
+    "reading": "scans poses --extrinsic --topic --pose-topic --imu-topic --imu-rotation --field --columns --max-gap "
+    "--world-frame --stamps",
+    "settings": "--paper --quick --config --set",
+    "surface": "--voxel --min-confidence --max-uncertainty --min-component",
+    "page": "--host --port",
+    "tiles": "--tile-size --halo --geometry-only --no-check",
+    "workers": "--processes --cluster",
+}
 
-        require_viser()
-        free_port(self.host, self.port)
+_Kind = dict[str, Any]
+_FLAG: _Kind = {"action": "store_true"}
+_SWITCH: _Kind = {"action": argparse.BooleanOptionalAction}
+_FILE: _Kind = {"type": Path, "metavar": "FILE"}
+_OUT: _Kind = _FILE | {"required": True}
+_PATH: _Kind = {"type": Path}
+_MAYBE: _Kind = _PATH | {"nargs": "?"}
+_COUNT: _Kind = {"type": int, "metavar": "N"}
+_METRES: _Kind = {"type": float, "metavar": "M"}
+_NAME: _Kind = {"metavar": "NAME"}
+_NAMES: _Kind = _NAME | {"action": "append"}
+_POINT: _Kind = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z")}
+_BOX: _Kind = {"type": float, "nargs": 6, "action": _Corners, "metavar": ("X0", "Y0", "Z0", "X1", "Y1", "Z1")}
+
+# fmt: off
+OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o"
+    "map": (_PATH, "the map: .safetensors of radarsdf fit, or the folder of radarsdf tiles"),
+    "info map": (_MAYBE, "also report what is in this map"),
+    "what": (_PATH, "a mesh, or a map"),
+    "folder": (_PATH, "the folder that radarsdf tiles plan wrote"),
+
+    "scans": (_PATH, "the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"),
+    "view scans": (_MAYBE, "scans to browse, as for radarsdf fit"),
+    "report scans": (_MAYBE, "the scans of the map, as for radarsdf fit"),
+    "eval scans": (_PATH, ("the truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
+                   "(.ply, .obj, .off, .stl, .glb), or scans as for radarsdf fit, with lidar points or with --holdout")),
+    "compare scans": (_PATH, "the later map, or later scans, as for radarsdf fit"),
+    "convert scans": (_PATH, "the scans, as for radarsdf fit; or a mesh: .ply, .obj, .off, .stl, .glb"),
+    "poses": (_MAYBE, "their poses, if they have none: TUM, KITTI, 4 x 4 matrices"),
+    "--extrinsic": (_FILE, "T_base_sensor, 4 x 4, if the poses are those of another frame"),
+    "--topic": (_NAMES, "in a bag: the topic of the scans; may be repeated"),
+    "--pose-topic": (_NAME, "in a bag: the topic of the poses"),
+    "--imu-topic": (_NAME, "in a bag: the topic of the IMU, for poses that are found"),
+    "--imu-rotation": (_FILE, "R_sensor_imu, 3 x 3; default: of the bag, or found"),
+    "--field": (_NAMES | {"metavar": "ROLE=NAME"}, "which field holds x, y, z, intensity or doppler; may be repeated"),
+    "--columns": (_NAME, "in files without a header: how many, or their names, such as x,y,z,intensity,doppler"),
+    "--max-gap": (_METRES | {"metavar": "S", "default": 0.5}, "longest gap between poses to interpolate; default: 0.5 s"),
+    "--world-frame": (_NAME, "in a bag with TF: the frame of the world"),
+    "--stamps": ({"choices": ("header", "record")}, "in a bag: whether a scan has the time of its header or record"),
+
+    "fit -o": (_FILE, "the map to write, .safetensors"),
+    "live -o": (_FILE, "the map to write in the end, .safetensors"),
+    "mesh -o": (_OUT, "the mesh to write: .ply, .obj, .stl, .glb"),
+    "poses -o": (_OUT, "the poses to write: .tum (with times), .kitti, .npy; or .npz: the scans with these poses"),
+    "report -o": (_OUT, "the page to write, .html"),
+    "render -o": (_OUT, ".npz, scans as radarsdf fit takes them; .ply, points in the world frame; .png, a picture"),
+    "compare -o": (_FILE, "a mesh in colours to write, such as changes.ply, or .npz with all arrays"),
+    "grid -o": (_OUT | {"action": "append"}, ("a file to write, may be repeated: .npz with all arrays, .bt for OctoMap, "
+                ".yaml and .pgm for ROS's map_server")),
+    "convert -o": (_OUT, (".npz: the scans with their poses; .ply, .pcd, .las, .laz, .npy, .csv: all returns in the world "
+                   "frame, with intensity, doppler, number and time of the scan; of a mesh, a mesh")),
+    "demo -o": (_FILE | {"default": Path("radarsdf_demo")}, "the folder to write; default: radarsdf_demo"),
+    "tiles mesh -o": (_FILE, "one file, or a .json file for 3D Tiles; default: mesh.ply in the folder"),
+    "-o": (_OUT, "the folder to write"),
+
+    "--quiet": (_FLAG, "show no progress bar"),
+    "--json": (_FLAG, "print the results as one JSON object, lengths in m; all else goes to standard error"),
+    "--paper": (_FLAG, "use the published configuration: slower, for comparison"),
+    "--quick": (_FLAG, "average distances instead of training: less accurate, under a second; mesh with --voxel 0.2"),
+    "--config": (_FILE, "change the settings in this TOML file; radarsdf config prints all"),
+    "--set": (_NAMES | {"metavar": "NAME=VALUE"}, "change a setting, such as training.sdf_iterations=200; may be repeated"),
+    "--voxel": (_METRES | {"default": 0.1}, "edge length of a voxel; default: 0.1 m"),
+    "grid --voxel": (_METRES | {"default": 0.2}, "edge length of a voxel; default: 0.2 m"),
+    "--min-confidence": (_METRES | {"metavar": "P"},
+                         "leave out surface below this, 0 to 1; default: that of the highest expected F-score"),
+    "--max-uncertainty": (_METRES, "leave out surface with a standard error above this"),
+    "--min-component": (_COUNT, "leave out components of fewer triangles; default: 30, and fewer in large voxels"),
+    "--host": ({"default": "127.0.0.1"}, ("address to listen on; default: 127.0.0.1, this machine alone; with 0.0.0.0, "
+               "everyone who can reach this machine sees the map")),
+    "--port": ({"type": int}, "port to listen on; default: 8080, or the next that is free"),
+    "--box": (_BOX, "use only the part between these two corners: lower, upper, world frame, m"),
+    "--holdout": (_COUNT, "compare intensities with the scans that radarsdf fit --holdout N left out"),
+    "fit --holdout": (_COUNT, "leave out the first scan and then every N-th scan, for radarsdf eval --holdout N"),
+    "--refine": (_FLAG, "refine the poses by the returns first; radarsdf poses writes refined poses"),
+    "--geometry-only": (_FLAG, "do not use the intensities"),
+    "--no-check": (_FLAG, "do not refuse scans in which radarsdf check would find an error"),
+
+    "--scene": ({"choices": ("hugin", "oculii", "wall", "astyx"), "default": "hugin"}, "the radar and the place"),
+    "--frames": (_COUNT, "number of scans; default: depends on the scene"),
+    "demo --view": (_SWITCH, "show the map in the browser at the end; default: in a terminal of a machine with a screen"),
+    "--view": (_FLAG, "show the result in the browser, until Ctrl-C"),
+    "--dry-run": (_FLAG, "only estimate memory and time"),
+    "--checkpoint": (_FILE, "save the state of the fit here from time to time, and continue from it"),
+    "--report": (_FILE, "also write a page, .html: pictures, errors, plots"),
+    "--viewpoint": (_POINT, "colour the mesh by the intensity seen from here, world frame, m"),
+    "--picture": (_FILE, "also draw a picture, .png"),
+    "--find": (_FLAG, "do not use the poses of the scans: find them from returns and Doppler"),
+    "--trajectory": (_FILE, "also write where the scans were placed: .tum, .kitti or .npy"),
+    "--rate": ({"type": float, "default": 1.0},
+               "multiplies the recorded speed, which is 0.1 s a scan without times; 0: as fast as possible"),
+    "--open": (_SWITCH, "open the page in a browser here; default: if there is a screen"),
+    "--max-vertices": (_COUNT | {"default": 500_000}, "simplify a mesh that has more; default: 500000"),
+    "--samples": (_COUNT | {"default": 10_000_000}, "points sampled on the mesh; default: 10000000"),
+    "--pose": ({"nargs": "+", "action": "append", "required": True, "metavar": "P"}, ("where the sensor is, world frame: "
+               "x y z, m, or x y z qx qy qz qw, or a file of poses as for radarsdf fit; may be repeated")),
+    "--returns": (_METRES | {"metavar": "N"}, "number of returns in a scan; default: that of the map's sensor"),
+    "--noise": (_FLAG, "add the noise of the sensor"),
+    "--seed": (_COUNT | {"default": 0}, "seed of the noise"),
+    "--align": (_SWITCH | {"default": True}, "move the later map if its surface is then nearer to the earlier one"),
+    "--min-area": (_METRES | {"metavar": "M2", "default": 0.1}, "smallest region that is listed; default: 0.1 m2"),
+    "--heights": ({"type": float, "nargs": 2, "default": (0.3, 2.0), "metavar": ("LOW", "HIGH")},
+                  "range of heights above the ground that the .yaml map covers, m; default: 0.3 2.0"),
+    "--distances": (_FILE, "also write the Euclidean distance field of the grid, as .npz"),
+    "--costmap": (_FILE, "also write heights, slopes, steps and costs for wheels, as .npz"),
+    "--tile-size": (_METRES, "edge of a tile; default: 512 leaf cells"),
+    "--halo": (_METRES, "margin around a tile that its fit sees"),
+    "--tile": (_NAMES, "only the tile of this name; may be repeated"),
+    "--processes": (_COUNT, "worker processes; each fits one tile at a time"),
+    "--cluster": ({"metavar": "ADDRESS"}, "of dask.distributed's scheduler, such as tcp://host:8786"),
+}
+# fmt: on

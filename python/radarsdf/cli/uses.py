@@ -4,59 +4,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+from argparse import Namespace
 
-import typer
-
-from radarsdf.cli.options import Address, Box, Recording, corners_of, is_map
-from radarsdf.cli.results import Results, load_map, until_stopped
-
-if TYPE_CHECKING:
-    from radarsdf.changes.changes import Region
+from radarsdf.changes.compare import compare as compare_maps
+from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, read_scans
+from radarsdf.cli.results import Results, until_stopped
+from radarsdf.extras import require
+from radarsdf.grids.files import check_suffix
+from radarsdf.grids.grid import save_arrays
+from radarsdf.grids.occupancy import grid as grid_of
+from radarsdf.io.files import check_outputs
+from radarsdf.io.meshes import check_mesh_path
+from radarsdf.render.figures import save_grid_picture
+from radarsdf.report.changes import write_changes_report
+from radarsdf.report.page import require_extras
+from radarsdf.view.pages import ChangesView
+from radarsdf.view.serving import url_of
 
 _LISTED = 10  # regions, the largest first
 
 
-def compare(
-    map_path: Path,
-    recording: Recording,
-    *,
-    out: Path | None = None,
-    report: Path | None = None,
-    view: bool = False,
-    align: bool = True,
-    min_area: float = 0.1,
-    box: Box = None,
-    address: Address,
-    results: Results,
-) -> None:
-    """Compare, write the surfaces, report what changed.
-
-    scans: The later map, or later scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set.
-    out: The file to write: a mesh in colours, such as changes.ply, or .npz with all arrays.
-    report: Also write a page about what changed, such as changes.html.
-    view: Show what changed in the browser at the end, until Ctrl-C.
-    align: Move the later map as a whole if its surface is then nearer to the earlier one.
-    min_area: Smallest region that is listed, m2.
-    """
-    from radarsdf.changes.compare import compare as compare_maps
-    from radarsdf.io.files import check_outputs
-    from radarsdf.io.meshes import check_mesh_path
-    from radarsdf.report.changes import write_changes_report
-    from radarsdf.report.page import require_extras
-
+def compare(given: Namespace, results: Results) -> None:
+    """Compare, write the surfaces, report what changed."""
+    out, report = given.out, given.report
     if out is not None and out.suffix != ".npz":
         check_mesh_path(out)
-    check_outputs([out, report], [map_path, *recording.inputs])
+    check_outputs([out, report], inputs_of(given))
     if report is not None:
         require_extras()
-    if view:
-        address.check()
-    later = load_map(recording.scans) if is_map(recording.scans) else recording.read()
-    earlier = load_map(map_path)
-    changes = compare_maps(earlier, later, align_frames=align, box=corners_of(box))
+    if given.view:
+        check_address(given)
+    later = load_map(given.scans) if is_map(given.scans) else read_scans(given)
+    earlier = load_map(given.map)
+    changes = compare_maps(earlier, later, align_frames=given.align, box=given.box)
     found = changes.report
     results.add(found["alignment"], alignment=found["alignment"], T_before_after=changes.T_before_after)
     results.add(found["reflectance"], reflectance=found["reflectance"])
@@ -66,87 +46,55 @@ def compare(
         areas_m2=found["areas_m2"],
         compared_m2=found["compared_m2"],
     )
-    regions = changes.regions(min_area)
+    regions = changes.regions(given.min_area)
     results.add(regions=[vars(region) for region in regions])
+    rows = [["region", "m2", "x, m", "y, m", "z, m", "probability"]]
+    for region in regions[:_LISTED]:
+        numbers = (region.area_m2, *region.box.mean(axis=0), region.probability)
+        rows.append([region.words, *(f"{number:.2f}" for number in numbers)])
     if regions:
-        headings = ("region", "m2", "x, m", "y, m", "z, m", "probability")
-        results.table(map(_region_row, regions[:_LISTED]), headings)
+        results.table(rows)
+    edge_m = earlier.config.leaf_size_m
     if out is not None:
         changes.save(out)
         results.add(f"{out} written", out=out)
-    edge_m = earlier.config.leaf_size_m
     if report is not None:
-        names = map_path.absolute().name, recording.scans.absolute().name
+        names = given.map.absolute().name, given.scans.absolute().name
         write_changes_report(report, changes, names, edge_m, regions)
         results.add(f"{report} written", report=report)
-    if view:
+    if given.view:
         results.end()
-        from radarsdf.view.pages import ChangesView
-        from radarsdf.view.serving import url_of
-
-        with ChangesView(changes, regions, edge_m, host=address.host, port=address.port) as page:
-            typer.echo(f"what changed is on {url_of(page.host, page.port)}; Ctrl-C ends it")
+        with ChangesView(changes, regions, edge_m, host=given.host, port=given.port) as page:
+            print(f"what changed is on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
             until_stopped(page)
 
 
-def _region_row(region: Region) -> Sequence[str]:
-    centre = (f"{x:.1f}" for x in region.box.mean(axis=0))
-    return (region.words, f"{region.area_m2:.2f}", *centre, f"{region.probability:.2f}")
-
-
-def grid(
-    map_path: Path,
-    *,
-    out: list[Path],
-    voxel: float = 0.2,
-    box: Box = None,
-    heights: tuple[float, float] = (0.3, 2.0),
-    distances: Path | None = None,
-    costmap: Path | None = None,
-    picture: Path | None = None,
-    results: Results,
-) -> None:
-    """Make the grid, write its files, draw it.
-
-    out: A file to write, may be repeated: .npz with all arrays, .bt for OctoMap, .yaml and .pgm for ROS's map_server.
-    voxel: Edge length of a voxel, m.
-    heights: Range of heights above the ground that the .yaml map covers, m.
-    distances: Also write the Euclidean distance field of the grid, as .npz.
-    costmap: Also write heights, slopes, steps and costs for wheels, as .npz.
-    picture: Also draw heights, costs and free space, as .png.
-    """
-    from radarsdf.extras import require
-    from radarsdf.grids.files import check_suffix
-    from radarsdf.grids.grid import save_arrays
-    from radarsdf.grids.occupancy import grid as grid_of
-    from radarsdf.io.files import check_outputs
-    from radarsdf.render.figures import save_grid_picture
-
+def grid(given: Namespace, results: Results) -> None:
+    """Make the grid, write its files, draw it."""
+    out, heights = given.out, given.heights
     flat = [path for path in out if path.suffix == ".yaml"]
-    whole = [path for path in out if path.suffix != ".yaml"]
-    for path in whole:
+    for path in out:
         check_suffix(path, ".npz", ".bt", ".yaml")
-    for arrays_path in (distances, costmap):
+    for arrays_path in (given.distances, given.costmap):
         if arrays_path is not None:
             check_suffix(arrays_path, ".npz")
-    if picture is not None:
+    if given.picture is not None:
         require("matplotlib", what="pictures need")
-    outputs = [*out, *(path.with_suffix(".pgm") for path in flat), distances, costmap, picture]
-    check_outputs(outputs, [map_path])
-    radar_map = load_map(map_path)
-    corners = corners_of(box)
-    found = grid_of(radar_map, radar_map.extent if corners is None else corners, voxel)
-    low, high = heights
-    for path in whole:
-        found.save(path)
-    for path in flat:
-        found.flat(low, high).save(path)
-    if distances is not None:
-        save_arrays(distances, found, found.distances())
-    if costmap is not None:
-        save_arrays(costmap, found, found.costmap())
-    if picture is not None:
-        save_grid_picture(picture, found, low, high)
+    pgm = [path.with_suffix(".pgm") for path in flat]
+    outputs = [
+        path for path in (*out, *pgm, given.distances, given.costmap, given.picture) if path is not None
+    ]
+    check_outputs(outputs, [given.map])
+    radar_map = load_map(given.map)
+    found = grid_of(radar_map, radar_map.extent if given.box is None else given.box, given.voxel)
+    for path in out:
+        (found.flat(*heights) if path in flat else found).save(path)
+    if given.distances is not None:
+        save_arrays(given.distances, found, found.distances())
+    if given.costmap is not None:
+        save_arrays(given.costmap, found, found.costmap())
+    if given.picture is not None:
+        save_grid_picture(given.picture, found, *heights)
     shares = {name: float(getattr(found, name).mean()) for name in ("occupied", "free", "unknown")}
     size = " x ".join(map(str, found.shape))
     origin = " ".join(f"{coordinate:.2f}" for coordinate in found.origin)
@@ -158,7 +106,4 @@ def grid(
         voxel_size=found.voxel_size,
         **shares,
     )
-    written = [path for path in outputs if path is not None]
-    for path in written:
-        results.add(f"{path} written")
-    results.add(out=written)
+    results.add(f"wrote {', '.join(map(str, outputs))}", out=outputs)

@@ -23,13 +23,7 @@ _MAX_RETURNS = 60_000  # that a picture of trajectories shows
 
 
 def new_figure(**options: Any) -> Any:
-    """Create a matplotlib figure without a display; `options` are those of ``matplotlib.figure.Figure``.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib is not installed.
-    """
+    """A matplotlib figure that needs no display; `options` are those of ``matplotlib.figure.Figure``."""
     require("matplotlib", what="pictures need")
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - an extra
     from matplotlib.figure import Figure  # noqa: PLC0415 - likewise
@@ -40,7 +34,7 @@ def new_figure(**options: Any) -> Any:
 
 
 def png_of(figure: Any, **options: Any) -> bytes:
-    """Encode a figure as PNG; `options` are those of ``Figure.savefig``."""
+    """A figure as PNG; `options` are those of ``Figure.savefig``."""
     file = io.BytesIO()
     figure.savefig(file, format="png", **options)
     return file.getvalue()
@@ -95,24 +89,12 @@ def save_view_picture(
 
 
 def _draw_returns(
-    axes: Any,
-    view: View,
-    points: NDArray[Any],
-    values: NDArray[Any] | None,
-    limits: NDArray[np.float64],
-    title: str,
+    axes: Any, view: View, points: NDArray[Any], values: NDArray[Any] | None, limits: Any, title: str
 ) -> Any:
     azimuth_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 0]))
-    colors = "tab:blue" if values is None else values
-    drawn = axes.scatter(
-        azimuth_deg,
-        np.linalg.norm(points, axis=1),
-        2,
-        colors,
-        vmin=limits[0],
-        vmax=limits[1],
-        linewidths=0,
-    )
+    range_m, colors = np.linalg.norm(points, axis=1), "tab:blue" if values is None else values
+    low, high = limits
+    drawn = axes.scatter(azimuth_deg, range_m, 2, colors, vmin=low, vmax=high, linewidths=0)
     axes.set(title=f"{title}: {len(points)} returns", xlabel="azimuth, °", ylabel="range, m")
     axes.set(xlim=np.rad2deg(view.sensor.azimuth_rad)[::-1], ylim=(0, view.sensor.range_m[1]))
     return drawn
@@ -170,7 +152,7 @@ def save_trajectory_picture(
     )
     paths = {name: path[:, :2, 3] for name, path in trajectories.items()}
     positions = np.concatenate(list(paths.values()))
-    low, high = np.percentile(np.concatenate([world, positions]), [1, 99], axis=0)
+    low, high = np.percentile(world, [1, 99], axis=0)
     low, high = np.minimum(low, positions.min(axis=0)), np.maximum(high, positions.max(axis=0))
     width, height = np.maximum(high - low, 1.0)
 

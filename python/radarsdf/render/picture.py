@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,8 +116,6 @@ def save_picture(
     *,
     scalar: ArrayLike | None = None,
     label: str = "intensity",
-    low: float | None = None,
-    high: float | None = None,
     width: int = 1600,
     height: int = 1000,
     viewpoint: ArrayLike | None = None,
@@ -131,11 +129,10 @@ def save_picture(
     mesh : trimesh.Trimesh
         The surface, m, with z up.
     scalar : (V,) array_like, optional
-        A value per vertex, such as its intensity. NaN is grey. None: all of the surface is light grey.
+        A value per vertex, such as its intensity, coloured from the 2nd to the 98th percentile. NaN is grey. None: all of
+        the surface is light grey.
     label : str
         Text of the colour bar, with the unit.
-    low, high : float, optional
-        Limits of the colour scale. None: the 2nd and the 98th percentile.
     width, height : int
         Size of the picture in pixels.
     viewpoint : (3,) array_like, optional
@@ -163,17 +160,13 @@ def save_picture(
             msg = f"scalar must be ({len(mesh.vertices)},), one value per vertex, not {values.shape}"
             raise ValueError(msg)
         known = values[np.isfinite(values)]
-        limits = np.percentile(known, [2, 98]) if known.size else np.array([0.0, 1.0])
-        lower, upper = float(limits[0] if low is None else low), float(limits[1] if high is None else high)
+        lower, upper = map(float, np.percentile(known, [2, 98]) if known.size else (0.0, 1.0))
         colors = intensity_colors(values, lower, upper)
         image = render(mesh, colors, width=round(0.9 * width), height=height, viewpoint=viewpoint)
         axes = figure.add_axes((0.92, 0.3, 0.012, 0.4))
         steps = intensity_colors(np.linspace(0, 1, 256), 0, 1) / 255.0
-        beyond = int((known < lower).any()) + 2 * int((known > upper).any())
-        extend: Any = ("neither", "min", "max", "both")[beyond]
-        bar = figure.colorbar(
-            ScalarMappable(Normalize(lower, upper), ListedColormap(steps)), cax=axes, extend=extend
-        )
+        shades = ScalarMappable(Normalize(lower, upper), ListedColormap(steps))
+        bar = figure.colorbar(shades, cax=axes, extend="both")
         bar.set_label(label, size=13)
         bar.ax.tick_params(labelsize=12)
         bar.outline.set_visible(False)
@@ -205,14 +198,11 @@ def middle_of(points: _Floats) -> tuple[_Floats, float]:
 def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tuple[_Floats, _Floats]:
     """Position (3,) of the eye relative to `origin`, and its axes (3, 3): right, up, forward."""
     center, radius = middle_of(points)
-    if viewpoint is None:
-        eye = eye_around(points)
-    else:
-        eye = real_array(viewpoint, "viewpoint")
-        if eye.shape != (3,) or not np.isfinite(eye).all():
-            msg = "viewpoint must be (3,) and finite"
-            raise ValueError(msg)
-        eye = eye - origin
+    eye = eye_around(points) + origin if viewpoint is None else real_array(viewpoint, "viewpoint")
+    if eye.shape != (3,) or not np.isfinite(eye).all():
+        msg = "viewpoint must be (3,) and finite"
+        raise ValueError(msg)
+    eye = eye - origin
     forward = center - eye
     if np.linalg.norm(forward) < 1e-9 * radius:
         forward = np.array([0.0, 1.0, 0.0])
@@ -245,9 +235,8 @@ def _barycentric(points: _Floats, corners: _Floats) -> _Floats:
     a, b, c = (corners[:, i] - points for i in range(3))
     across = np.cross(b - a, c - a)
     weight = np.stack([np.einsum("nj,nj->n", across, np.cross(*two)) for two in ((b, c), (c, a), (a, b))], 1)
-    weight = (
-        np.maximum(weight, 0.0) + 1e-300
-    )  # rounding can put a point outside, and triangles can have no area
+    # Rounding can put a point outside, and triangles can have no area.
+    weight = np.maximum(weight, 0.0) + 1e-300
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 

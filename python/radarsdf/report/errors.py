@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from radarsdf.evaluation import KNNIntensity, intensity_metrics, surface_metrics, uncertainty_metrics
 from radarsdf.report import plots
@@ -26,37 +25,21 @@ _MATCH_M = 0.4  # a vertex farther from the truth is an outlier, not a surface w
 _MIN_MATCHES = 100
 _MAX_RETURNS = 100_000  # evenly spread; more would change no plot
 _ANGLE_EDGES_DEG = np.arange(0, 97.5, 7.5)
-_RANGE_BINS = 16
-POINTS = {
-    "lidar": ("lidar point", "lidar points"),
-    "simulated": ("point of the simulated truth", "points of the simulated truth"),
-    "given": ("point of the given truth", "points of the given truth"),
-}
-"""What a ground-truth point is called, and several, by the kind of truth."""
 
 
 def error_values(subject: Subject) -> dict[str, Any] | None:
     """Values of the section of surface errors, or None without a truth or a surface."""
     truth, mesh = subject.ground_truth, subject.mesh
-    if truth is None or subject.scans is None or len(mesh.faces) == 0:
+    if truth is None or len(mesh.faces) == 0:
         return None
     metrics = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
     shown, _ = subject.shown
-    distance_m = _distances_m(subject.truth_tree, mesh.vertices)
-    shown_m = distance_m if shown is mesh else _distances_m(subject.truth_tree, shown.vertices)
+    shown_m, _ = subject.truth_tree.query(shown.vertices, workers=resolve_num_threads(0))
     colors, legend = colored(shown_m, len(shown_m), "distance to the truth, m", (0.0, _MATCH_M))
-    both = {
-        "surface to truth": distance_m,
-        "truth to surface": _distances_m(cKDTree(mesh.vertices), truth),
-    }
-    point, points = POINTS[subject.scans.truth_kind]
     return {
         "metrics": metrics,
-        "point": point,
-        "points": points,
         "picture": picture(shown, colors),
         "legend": legend,
-        "distances": plots.distances(both, metrics["threshold_m"]),
         "in_box": subject.box is not None,
     }
 
@@ -70,23 +53,23 @@ def uncertainty_values(subject: Subject) -> dict[str, Any] | None:
     low, high = np.nanpercentile(sigma_m, [2, 98])
     shown_m = shown.vertex_attributes["uncertainty_m"]
     colors, legend = colored(shown_m, len(shown_m), "standard error, m", (float(low), float(high)))
-    percentiles = [10, 50, 90]
+    percentiles, confidence = [10, 50, 90], mesh.vertex_attributes["confidence"]
     return {
         "picture": picture(shown, colors),
         "legend": legend,
-        "histogram": plots.uncertainties(sigma_m),
         "percentiles": percentiles,
-        "sigma_m": np.nanpercentile(sigma_m, percentiles),
-        "confidence": np.nanpercentile(mesh.vertex_attributes["confidence"], percentiles),
+        "rows": [
+            ("Uncertainty, m", *(f"{x:.3f}" for x in np.nanpercentile(sigma_m, percentiles))),
+            ("Confidence", *(f"{x:.2f}" for x in np.nanpercentile(confidence, percentiles))),
+        ],
         "against_truth": _calibration(subject, sigma_m),
-        "has_truth": subject.ground_truth is not None,
     }
 
 
 def _calibration(subject: Subject, sigma_m: _Floats) -> dict[str, Any] | None:
     """Errors compared with predicted uncertainties, or None if too little of the surface is near the truth."""
     mesh, truth = subject.mesh, subject.ground_truth
-    if truth is None or subject.scans is None:
+    if truth is None:
         return None
     vertices = np.asarray(mesh.vertices, np.float64)
     distance_m, nearest = subject.truth_tree.query(vertices, workers=resolve_num_threads(0))
@@ -96,7 +79,6 @@ def _calibration(subject: Subject, sigma_m: _Floats) -> dict[str, Any] | None:
         return None
     metrics = uncertainty_metrics(error_m, sigma_m)
     return {
-        "point": POINTS[subject.scans.truth_kind][0],
         "plot": plots.reliability(metrics["decile_predicted_m"], metrics["decile_rmse_m"]),
         "matched": metrics["num_points"] / len(vertices),
         "match_m": _MATCH_M,
@@ -121,11 +103,10 @@ def intensity_values(subject: Subject) -> dict[str, Any] | None:
         "held_out": subject.held_out is not None,
         "scans": len(scans),
         "returns": len(rays),
-        "usable": len(usable),
-        "outliers": len(every_ray) - len(usable),
-        "outside": len(rows) - len(rays),
+        "left_out": {"outliers": len(every_ray) - len(usable), "in no tile": len(rows) - len(rays)},
         "errors": {"This map": (metrics["mae"], metrics["medae"]), **_baselines(subject, rays, measured)},
-        **_intensity_plots(subject, rays, measured, found),
+        "density": plots.predicted_over_measured(measured, found),
+        "by_angle": _by_angle(subject, rays, measured, found),
     }
 
 
@@ -143,25 +124,9 @@ def _baselines(subject: Subject, rays: Rays, measured: _Floats) -> dict[str, tup
     return errors | {"Median of all returns": (float(deviation.mean()), float(np.median(deviation)))}
 
 
-def _intensity_plots(subject: Subject, rays: Rays, measured: _Floats, found: _Floats) -> dict[str, bytes]:
+def _by_angle(subject: Subject, rays: Rays, measured: _Floats, found: _Floats) -> bytes:
     normal = np.asarray(subject.radar_map.gradient(rays.in_world()[0], extrapolate=True), np.float64)
-    length = np.linalg.norm(normal, axis=1)
-    length[length == 0] = np.nan
-    cosine = np.abs((normal * rays.directions).sum(axis=1)) / length
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine = np.abs((normal * rays.directions).sum(axis=1)) / np.linalg.norm(normal, axis=1)
     angle_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
-    known = np.isfinite(angle_deg)
-    ranges_m = rays.ranges_m.astype(np.float64)
-    range_edges_m = np.linspace(0, float(np.percentile(ranges_m, 99.5)), _RANGE_BINS + 1)
-    return {
-        "density": plots.predicted_over_measured(measured, found),
-        "by_angle": plots.intensities_by(
-            _ANGLE_EDGES_DEG, angle_deg[known], measured[known], found[known], "angle of incidence, °"
-        ),
-        "by_range": plots.intensities_by(range_edges_m, ranges_m, measured, found, "range, m"),
-    }
-
-
-def _distances_m(tree: Any, points: _Floats) -> _Floats:
-    """(N,) distance of each point (N, 3) to the nearest one of a tree, m."""
-    distance_m: _Floats = tree.query(points, workers=resolve_num_threads(0))[0]
-    return distance_m
+    return plots.intensities_by(_ANGLE_EDGES_DEG, angle_deg, measured, found, "angle of incidence, °")

@@ -71,6 +71,7 @@ def _environment() -> jinja2.Environment:
         "degrees": math.degrees,
         "fixed": fixed,
         "percent": percent,
+        "with_two_digits": lambda row: (row[0], *(fixed(value, 2) for value in row[1])),
     }
     environment.filters.update(filters)
     return environment

@@ -46,30 +46,6 @@ def losses(history: Mapping[str, Mapping[str, Sequence[float]]]) -> bytes:
     return _png(figure)
 
 
-def uncertainties(sigma_m: _Floats) -> bytes:
-    """Histogram of the uncertainty (N,) of the surface. The last bin holds everything above."""
-    figure, (ax,) = _subplots(1)
-    most_m = float(np.nanpercentile(sigma_m, 99.5))
-    weights = np.full(len(sigma_m), 100 / len(sigma_m))
-    ax.hist(np.minimum(sigma_m, most_m), np.linspace(0, most_m, 41), weights=weights, color=_FIRST)
-    ax.set(xlabel="uncertainty, m", ylabel="share of the surface, %", xlim=(0, most_m))
-    ax.locator_params(axis="x", nbins=6)
-    return _png(figure)
-
-
-def distances(series: Mapping[str, _Floats], threshold_m: float) -> bytes:
-    """Cumulative distribution of distances (N,) up to 1 m, with a line at the threshold."""
-    figure, (ax,) = _subplots(1)
-    x = np.linspace(0, 1, 201)
-    for (name, values_m), color in zip(series.items(), (_FIRST, _SECOND), strict=False):
-        share = 100 * np.searchsorted(np.sort(values_m), x) / len(values_m)
-        ax.plot(x, share, color=color, label=name)
-    ax.axvline(threshold_m, color="gray", linestyle="--", linewidth=1)
-    ax.set(xlabel="distance, m", ylabel="share below, %", xlim=(0, 1), ylim=(0, 100))
-    ax.legend(frameon=False, loc="lower right")
-    return _png(figure)
-
-
 def reliability(predicted_m: Sequence[float], measured_m: Sequence[float]) -> bytes:
     """RMS error over predicted uncertainty, in bins."""
     figure, (ax,) = _subplots(1)
@@ -138,16 +114,4 @@ def trajectory(before: _Floats | None, after: _Floats) -> bytes:
     height.set(xlabel="distance travelled, m", ylabel="z, m")
     if before is not None:
         above.legend(frameon=False)
-    return _png(figure)
-
-
-def pose_uncertainties(scans: NDArray[Any], sigma_m: _Floats, sigma_deg: _Floats) -> bytes:
-    """Standard deviations (N,) of position and rotation over the scan numbers (N,)."""
-    figure, axes = _subplots(1, 1, height_in=5.2)
-    shown = (("position, m", sigma_m, _FIRST), ("rotation, °", sigma_deg, _SECOND))
-    for ax, (name, values, color) in zip(axes, shown, strict=True):
-        ax.plot(scans, values, color=color, linewidth=1.5)
-        ax.set(ylabel=name)
-        ax.set_ylim(bottom=0)
-    axes[-1].set(xlabel="scan")
     return _png(figure)

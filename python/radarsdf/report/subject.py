@@ -18,8 +18,7 @@ from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
 from radarsdf.view.surface import thinned
 
-MAX_VERTICES = 160_000
-"""Of the mesh in the 3D scene and the pictures. A larger one is thinned for them."""
+MAX_VERTICES = 160_000  # of the mesh in the 3D scene and the pictures; a larger one is thinned for them
 
 
 @dataclass(frozen=True)
@@ -27,22 +26,16 @@ class Subject:
     """A map and the data it is compared with."""
 
     radar_map: Map
-    name: str
-    """Title of the page."""
-    scans: Scans | None = None
-    """The scans that the map was fitted to, or is compared with."""
-    held_out: Scans | None = None
-    """Scans that the fit left out, if known."""
-    findings: Sequence[Finding] | None = None
-    """The result of :func:`radarsdf.check` on all scans. None: they were not checked."""
-    voxel_size_m: float = 0.1
-    """Voxel edge of the mesh that is evaluated."""
-    box: ArrayLike | None = None
-    """(2, 3) corners of the part of the world to report on, m. None: all."""
+    name: str  # title of the page
+    scans: Scans | None = None  # that the map was fitted to, or is compared with
+    held_out: Scans | None = None  # that the fit left out, if known
+    findings: Sequence[Finding] | None = None  # of `radarsdf.check` on all scans; None: they were not checked
+    voxel_size_m: float = 0.1  # of the mesh that is evaluated
+    box: ArrayLike | None = None  # (2, 3) corners of the part of the world to report on, m; None: all
     progress: bool | None = None
-    """As for :meth:`Map.mesh`."""
-    limits: Mapping[str, Any] = field(default_factory=dict)
-    """What the mesh leaves out, such as `min_confidence`: keyword arguments of :meth:`Map.mesh`."""
+    limits: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # what the mesh leaves out: arguments of `Map.mesh`
 
     @property
     def viewpoint(self) -> NDArray[np.float64]:

@@ -32,7 +32,6 @@ _ICON = re.compile(r'<link\s+rel="icon".*?/>', re.DOTALL)
 _FIRST_SIDE = (25.0, 36.0)
 SIDES = {
     "One long side": _FIRST_SIDE,
-    "The other long side": (205.0, 36.0),
     "Steeply from above": (0.0, 70.0),  # not straight down: walls would be lines
 }
 """Name, turn and rise of each view, degrees."""
@@ -100,10 +99,9 @@ def jpeg(mesh: Any, colors: _Colors, viewpoint: _Floats) -> bytes:
 def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Floats | None = None) -> str:
     """Self-contained HTML page that shows a mesh in 3D, made by viser.
 
-    `vertices` (V, 3) and `sensors` (F, 3), which are drawn as points, are in m near the origin, since the page computes
-    in float32. viser exports the scene of a server, which listens on this machine for less than a second. Its
-    compressed program contains addresses of other machines, which this scene does not use; the report's content
-    security policy forbids fetching them.
+    `vertices` (V, 3) and `sensors` (F, 3), which are drawn as points, are in m near the origin, since the page computes in
+    float32. viser exports the scene of a server, which listens on this machine for less than a second. The addresses of
+    other machines in its program are not used; the report's content security policy forbids fetching them.
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
     to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]

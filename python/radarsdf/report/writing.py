@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from os import PathLike
 from typing import Any
@@ -14,10 +15,27 @@ from radarsdf.config.fit_config import FitConfig, flat_settings
 from radarsdf.config.toml import to_toml
 from radarsdf.report import plots
 from radarsdf.report.errors import error_values, intensity_values, uncertainty_values
-from radarsdf.report.page import require_extras, write_page
+from radarsdf.report.page import fixed, require_extras, write_page
 from radarsdf.report.subject import Subject
 from radarsdf.report.surface import surface_values
 from radarsdf.versions import versions
+
+_COUNTS = {
+    "tiles": "Tiles",
+    "returns": "Returns",
+    "ghosts": "Ghosts, left out of the surface",
+    "movers": "Moving returns, left out",
+    "wild_intensities": "Intensity outliers, left out of the reflectance",
+    "leaf_cells": "Leaf cells",
+    "vertices": "Cell vertices",
+}
+_DURATIONS = {
+    "prepare_s": "Scan checks",
+    "ghosts_s": "Planes, sensor noise, ghosts",
+    "occupied_cells_s": "Cells and averaged surface",
+    "start_s": "Initial values, evidence of the cells",
+    "training_s": "Training",
+}
 
 
 def write_report(path: str | PathLike[str], subject: Subject) -> int:
@@ -41,6 +59,9 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
         uncertainty=uncertainty_values(subject),
         intensity=intensity_values(subject),
         losses=_loss_plot(report.get("loss_history", {})),
+        training=_training(report),
+        durations=[(name, fixed(report[key], 2, "s")) for key, name in _DURATIONS.items() if key in report],
+        skipped=_skipped(report),
         configuration=_configuration(subject.radar_map.config),
         versions=versions(),
     )
@@ -52,19 +73,32 @@ def pose_values(poses: Mapping[str, Any] | None) -> dict[str, Any] | None:
         return None
     after = np.array(poses["after"])
     before = None if poses["before"] is None else np.array(poses["before"])
-    sigma_m, sigma_deg = np.array(poses["sigma_m"]), np.degrees(poses["sigma_rad"])
-    known = bool(sigma_m.any())
+    sigma_m, sigma_deg = np.median(poses["sigma_m"]), np.degrees(np.median(poses["sigma_rad"]))
     return {
         "verdict": poses["verdict"],
         "improved": poses["improved"],
         "trajectory": plots.trajectory(before, after),
-        "uncertainties": plots.pose_uncertainties(poses["scans"], sigma_m, sigma_deg) if known else None,
-        "sigma": (np.median(sigma_m), np.median(sigma_deg)) if known else None,
+        "sigma": (sigma_m, sigma_deg) if sigma_m else None,
         "length_m": np.linalg.norm(np.diff(after, axis=0), axis=1).sum(),
         "moved_m": None if before is None else np.linalg.norm(after - before, axis=1),
-        "step_m": poses["step_m"],
-        "step_deg": None if poses["step_rad"] is None else np.degrees(poses["step_rad"]),
     }
+
+
+def _training(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    rows = [(name, f"{report[key]:,}") for key, name in _COUNTS.items() if key in report]
+    if missing := report.get("missing_tiles"):
+        rows.append(("Missing tiles", ", ".join(missing)))
+    for stage, done in report.get("iterations_done", {}).items():
+        rows.append((f"Iterations, {stage}", f"{done:,} of {report['iterations'][stage]:,}"))
+    return rows
+
+
+def _skipped(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    names, saved_s = report.get("skipped", []), report.get("skipped_s", [])
+    return [
+        (name, "–" if seconds is None else f"about {seconds:.1f} s")
+        for name, seconds in itertools.zip_longest(names, saved_s)
+    ]
 
 
 def _loss_plot(history: Mapping[str, Any]) -> bytes | None:

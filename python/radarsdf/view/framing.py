@@ -10,10 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FOV_RAD = 0.85
-"""Vertical field of view: less than viser's, so that walls stay upright."""
-ASPECT = 1.3
-"""Width over height of a page's frame, until the page reports its own."""
+FOV_RAD = 0.85  # vertical field of view: less than viser's, so that walls stay upright
+ASPECT = 1.3  # width over height of a page's frame, until the page reports its own
 _TO_EYE = np.array([-0.33, -0.57, 0.5])
 _MARGIN = 1.08
 
@@ -23,10 +21,8 @@ _Floats = NDArray[np.float64]
 class Look(NamedTuple):
     """A camera pose."""
 
-    position: _Floats
-    """(3,) m."""
-    look_at: _Floats
-    """(3,) the point in the middle, which the user rotates the view about, m."""
+    position: _Floats  # (3,) m
+    look_at: _Floats  # (3,) the point in the middle, which the user rotates the view about, m
 
 
 def look_at_all(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT) -> Look:

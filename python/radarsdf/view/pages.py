@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
 from radarsdf.view.framing import look_at_all
 from radarsdf.view.glb import glb, lightness_of, shaded
-from radarsdf.view.legends import key, paragraph, table
+from radarsdf.view.quantities import key, paragraph, table
 from radarsdf.view.scene import add_path
 from radarsdf.view.serving import Page, begin_at
 from radarsdf.view.surface import thinned
@@ -37,7 +37,7 @@ def centre_of(region: Region) -> str:
 
 
 class GrowingView(Page):
-    """Serves the current surface and trajectory until it is stopped. `host`, `port`: as for :class:`Page`."""
+    """Serves the current surface and trajectory."""
 
     def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
         super().__init__(host, port)
@@ -63,11 +63,7 @@ class GrowingView(Page):
 
 
 class ChangesView(Page):
-    """Serves the coloured surface of :meth:`Changes.mesh` with a legend until it is stopped.
-
-    `regions`: the changes to list. `edge_m`: vertex spacing of the surfaces. `host`, `port`: as for :class:`Page`.
-    Raises a ValueError if there is no surface.
-    """
+    """Serves the coloured surface of :meth:`Changes.mesh`, whose vertices are `edge_m` apart, and lists its regions."""
 
     def __init__(
         self,

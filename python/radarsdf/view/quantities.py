@@ -1,76 +1,67 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Quantities that the surface can be coloured by, with their colour scales."""
+"""Quantities that the surface can be coloured by, and legends as HTML."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from radarsdf.io.scans import Scans
-from radarsdf.map.colors import NEUTRAL, intensity_colors
+from radarsdf.map.colors import intensity_colors
 from radarsdf.map.map import Map
-from radarsdf.threads import resolve_num_threads
 from radarsdf.view.surface import ShownSurface
 
 Color = tuple[int, int, int]
 Position = tuple[float, float, float]
 _Rows = NDArray[np.int64]
 
-_BRIDGED = (213, 94, 0)  # distinct from NEUTRAL for colour-blind readers, too
 _SAMPLES = 30_000  # vertices that the limits of the intensities are taken from
 
 
 @dataclass(frozen=True)
-class Colors:
+class Scale:
     """A fixed scale of sRGB colours from `low` to `high`. NaN is grey."""
 
     low: float
     high: float
 
+    @classmethod
+    def of(cls, values: NDArray[Any]) -> Scale:
+        """From the 2nd to the 98th percentile of values (N,)."""
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
+        return cls(float(low), float(high))
+
     def __call__(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """(N, 3) sRGB of values (N,)."""
         return intensity_colors(values, self.low, self.high)[:, :3]
 
-
-@dataclass(frozen=True)
-class Classes:
-    """sRGB colours of no and yes, and what these mean."""
-
-    names: tuple[str, str]
-    colors: tuple[Color, Color] = (_BRIDGED, NEUTRAL)
-
-    def __call__(self, values: NDArray[Any]) -> NDArray[np.uint8]:
-        """(N, 3) sRGB of values (N,) bool."""
-        return np.array(self.colors, np.uint8)[np.asarray(values, np.int64)]
+    @property
+    def css(self) -> str:
+        """The colours from low to high, as CSS."""
+        return ",".join(map(_css, self(np.linspace(self.low, self.high, 9)).tolist()))
 
 
 @dataclass(frozen=True)
 class Quantity:
     """A value of each vertex."""
 
-    label: str
-    """What it is, with its unit."""
-    values: Callable[[_Rows, Position], NDArray[Any]]
-    """Of vertices (N,), for a sensor position, world, m: (N,)."""
-    scale: Colors | Classes
-    of_sensor: bool = False
-    """Whether it depends on the sensor position."""
+    label: str  # with its unit
+    values: Callable[[_Rows, Position], NDArray[Any]]  # (N,) of vertices (N,), for a sensor at a position
+    scale: Scale
+    of_sensor: bool = False  # whether it depends on the sensor position
 
     def colors(self, rows: _Rows, sensor: Position) -> NDArray[np.uint8]:
         """(N, 3) sRGB of vertices (N,)."""
         return self.scale(self.values(rows, sensor))
 
 
-def quantities_of(
-    radar_map: Map, surface: ShownSurface, scans: Scans | None, sensor: Position
-) -> dict[str, Quantity]:
+def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
     """The quantities by name, the default first. The intensity scale is that for the first `sensor` position."""
     vertices, found = surface.vertices, {}
 
@@ -80,37 +71,66 @@ def quantities_of(
 
     if radar_map.has_intensity:
         some = np.arange(0, len(vertices), max(1, len(vertices) // _SAMPLES))
-        scale = _scale(intensity(some, sensor))
+        scale = Scale.of(intensity(some, sensor))
         found["intensity"] = Quantity("predicted intensity, sensor units", intensity, scale, of_sensor=True)
-    for name, label, values in (
-        ("uncertainty", "uncertainty (standard error), m", surface.uncertainty_m),
-        ("confidence", "confidence (probability)", surface.confidence),
-        ("height", "height, m", vertices[:, 2]),
-    ):
-        scale = Colors(0.0, 1.0) if name == "confidence" else _scale(values)
+    of_vertices: dict[str, tuple[str, NDArray[Any]]] = {
+        "uncertainty": ("uncertainty (standard error), m", surface.uncertainty_m),
+        "confidence": ("confidence (probability)", surface.confidence),
+        "height": ("height, m", vertices[:, 2]),
+    }
+    for name, (label, values) in of_vertices.items():
+        scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
         found[name] = Quantity(label, _looked_up(values), scale)
-    if scans is not None:
-        edge_m = radar_map.config.leaf_size_m
-        observed = functools.cache(lambda: _near_returns(vertices, scans, edge_m))
-        names = (f"bridged: no return within {edge_m:g} m", "observed")
-        found["observed"] = Quantity("observed by returns", lambda rows, _: observed()[rows], Classes(names))
     return found
-
-
-def _near_returns(vertices: NDArray[np.float64], scans: Scans, distance_m: float) -> NDArray[np.bool_]:
-    """(V,) whether a return is near a vertex (V, 3): elsewhere the surface was continued. Takes seconds of many returns."""
-    returns = np.concatenate([scan.world_points for scan in scans])
-    workers = resolve_num_threads(0)
-    nearest_m, _ = cKDTree(returns).query(vertices, distance_upper_bound=distance_m, workers=workers)
-    return np.asarray(np.isfinite(nearest_m))
 
 
 def _looked_up(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
     return lambda rows, _: values[rows]
 
 
-def _scale(values: NDArray[Any]) -> Colors:
-    """The scale from the 2nd to the 98th percentile of values (N,)."""
-    known = values[np.isfinite(values)]
-    low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
-    return Colors(float(low), float(high))
+def legend(quantity: Quantity) -> str:
+    """The colour scale of a quantity."""
+    scale = quantity.scale
+    bar = f"height:0.8em;border-radius:0.2em;background:linear-gradient(to right,{scale.css})"
+    ends = "display:flex;justify-content:space-between;font-variant-numeric:tabular-nums"
+    return _block(
+        f'<div>{quantity.label}</div><div style="{bar}"></div>'
+        f'<div style="{ends}"><span>{scale.low:.3g}</span><span>{scale.high:.3g}</span></div>'
+    )
+
+
+def key(colors: Mapping[str, Color | Scale]) -> str:
+    """The meaning of colours and scales."""
+    rows = []
+    for name, color in colors.items():
+        limits = ""
+        if isinstance(color, Scale):
+            background = f"linear-gradient(135deg,{color.css})"
+            limits = f", {color.low:.3g} to {color.high:.3g}"
+        else:
+            background = _css(color)
+        mark = f"flex:none;width:0.8em;height:0.8em;border-radius:0.2em;background:{background}"
+        rows.append(
+            '<div style="display:flex;align-items:center;gap:0.5em">'
+            f'<i style="{mark}"></i><span>{escape(name)}{limits}</span></div>'
+        )
+    return _block("".join(rows))
+
+
+def paragraph(text: str) -> str:
+    """A text."""
+    return _block(escape(text))
+
+
+def table(rows: Mapping[str, str]) -> str:
+    """Names and values."""
+    cells = (f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows.items())
+    return _block(f'<table style="border-spacing:0.6em 0">{"".join(cells)}</table>')
+
+
+def _block(html: str) -> str:
+    return f'<div style="margin:0.4em 0.8em;font-size:0.85em;line-height:1.4">{html}</div>'
+
+
+def _css(color: Color) -> str:
+    return "rgb({},{},{})".format(*color)

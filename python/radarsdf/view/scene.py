@@ -22,14 +22,12 @@ from radarsdf.io.scans import Scan, Scans
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
 from radarsdf.view.glb import glb, shaded
-from radarsdf.view.quantities import Colors, Position, Quantity
+from radarsdf.view.quantities import Position, Quantity, Scale
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
 from radarsdf.view.surface import ShownSurface, spread_evenly
 
-HELD_S = 2.0
-"""The mesh is drawn after the sensor was held still for so long."""
-SLID_S = 0.25
-"""A slider reports no end of a drag: this pause counts as one."""
+HELD_S = 2.0  # the mesh is drawn after the sensor was held still for so long
+SLID_S = 0.25  # a slider reports no end of a drag: this pause counts as one
 PATH_COLOR = (40, 44, 52)
 MEASURED_COLOR = (0, 72, 140)  # without intensities
 PREDICTED_COLOR = (0, 158, 115)  # not on the intensity scale, so that predictions stand out from the surface
@@ -37,30 +35,22 @@ PREDICTED_COLOR = (0, 158, 115)  # not on the intensity scale, so that predictio
 # On two cores, intensities of 30,000 points take about 0.025 s, of 400,000 about 0.4 s.
 _DRAG_POINTS = 30_000
 _POINT_SIZE = 1.4  # in vertex spacings, so that there are no holes between points
-_MAX_RETURNS = 200_000  # of all scans together
+_STYLES = {"measured": ("circle", 0.25), "predicted": ("diamond", 0.2)}  # size, m
 # In float16 points would be on a grid of 3 cm at 60 m.
 _POINTS = {"point_shading": "flat", "precision": "float32"}
-_CLOUD_STYLES = {
-    "measured": ("circle", 0.25),
-    "predicted": ("diamond", 0.2),
-    "all": ("circle", 0.2),
-}  # size, m
 
 
 @dataclass(frozen=True)
 class State:
     """What the page is to show."""
 
-    sensor: Position
-    """World, m."""
+    sensor: Position  # world, m
     max_uncertainty_m: float
     min_confidence: float
     quantity: str = ""
     scan: int | None = None
-    coarse: bool = False
-    """Whether the sensor is moving: the cloud is shown first."""
-    settle_s: float = 0.0
-    """The mesh is drawn if nothing changes for so long."""
+    coarse: bool = False  # whether the sensor is moving: the cloud is shown first
+    settle_s: float = 0.0  # the mesh is drawn if nothing changes for so long
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -73,8 +63,7 @@ class Painter:
 
     def __init__(self, canvas: Any, state: State) -> None:
         self._canvas = canvas
-        self.newest = state
-        """The state, which may not be drawn yet."""
+        self.newest = state  # which may not be drawn yet
         self._changed = threading.Condition()
         self._pending, self._stopped = True, False
         self._ended = threading.Event()
@@ -143,14 +132,10 @@ class Canvas:
         self._cloud_limits: tuple[float, float] | None = None
         self._drawn: Hashable = None  # what the mesh depends on
         self._meshes: list[Any] = []  # the newest is last; the others go when the page has drawn that
-        self.sent = 0
-        """Meshes sent so far."""
-        self.faces = surface.faces
-        """(F, 3) the triangles that are shown, rows of the vertices."""
-        self.coarse = False
-        """Whether the cloud is shown."""
-        self.node: Any = server.scene.add_frame("/surface", show_axes=False)
-        """The parent of mesh and cloud."""
+        self.sent = 0  # meshes so far
+        self.faces = surface.faces  # (F, 3) the triangles that are shown, rows of the vertices
+        self.coarse = False  # whether the cloud is shown
+        self.node: Any = server.scene.add_frame("/surface", show_axes=False)  # the parent of mesh and cloud
         self._cloud: Any = None
         if any(quantity.of_sensor for quantity in quantities.values()):
             self._cloud = server.scene.add_point_cloud(
@@ -222,27 +207,18 @@ class Canvas:
 
 
 class ScanClouds:
-    """The sensor's path, and the returns of one scan, measured and predicted, or of all scans.
+    """The sensor's path, and the returns of one scan, measured and predicted.
 
-    `colors`: the scale of measured intensities. `text`: what shows a sentence about the scan that is shown.
+    `scale`: of measured intensities. `text`: what shows a sentence about the scan that is shown.
     """
 
-    def __init__(
-        self,
-        server: Any,
-        radar_map: Map,
-        scans: Scans,
-        colors: Colors | None,
-        text: Any,
-    ) -> None:
+    def __init__(self, server: Any, radar_map: Map, scans: Scans, scale: Scale | None, text: Any) -> None:
         self._server, self._map, self._scans = server, radar_map, list(scans)
-        self._colors, self._text = colors, text
+        self._scale, self._text = scale, text
         self._shown: int | None = None
-        self._clouds: dict[str, Any] = {}
-        self._visible = {"measured": True, "predicted": True, "all": False}
-        self.every = max(1, -(-sum(map(len, self._scans)) // _MAX_RETURNS))
-        """Of all returns together, one in so many is shown."""
-        self.path: Any = add_path(server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, PATH_COLOR)
+        path = add_path(server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, PATH_COLOR)
+        self.nodes: dict[str, Any] = {"trajectory": path}
+        self.show(0)
 
     def sensor(self, index: int) -> Position:
         """Sensor position of a scan, world, m."""
@@ -267,30 +243,20 @@ class ScanClouds:
             text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
         self._text.content = text
 
-    def set_visible(self, what: str, visible: bool) -> None:
-        """Show or hide the cloud ``measured``, ``predicted`` or ``all``."""
-        self._visible[what] = visible
-        if what == "all" and visible and "all" not in self._clouds:
-            world = np.concatenate([scan.world_points for scan in self._scans])
-            colors = np.concatenate([self._colors_of(scan) for scan in self._scans])
-            self._draw("all", world[:: self.every], colors[:: self.every])
-        if what in self._clouds:
-            self._clouds[what].visible = visible
-
     def _colors_of(self, scan: Scan) -> NDArray[np.uint8]:
         """(N, 3) sRGB of measured returns."""
-        if scan.intensities is None or self._colors is None:
+        if scan.intensities is None or self._scale is None:
             return np.full((len(scan), 3), MEASURED_COLOR, np.uint8)
-        return self._colors(np.asarray(scan.intensities, np.float64))
+        return self._scale(np.asarray(scan.intensities, np.float64))
 
     def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
         local = (world - self._map.origin).astype(np.float32)
-        if what in self._clouds:
-            self._clouds[what].points, self._clouds[what].colors = local, colors
+        if what in self.nodes:
+            self.nodes[what].points, self.nodes[what].colors = local, colors
             return
-        shape, size_m = _CLOUD_STYLES[what]
-        options = _POINTS | {"point_shape": shape, "point_size": size_m, "visible": self._visible[what]}
-        self._clouds[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
+        shape, size_m = _STYLES[what]
+        options = _POINTS | {"point_shape": shape, "point_size": size_m}
+        self.nodes[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
 
 
 def add_path(server: Any, name: str, path: NDArray[Any], color: tuple[int, int, int]) -> Any:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import gc
+import importlib.util
 import io
 import ipaddress
 import os
@@ -26,8 +27,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _FIRST_PORT, _PORTS_TRIED = 8080, 100
-WAIT_STEP_S = 0.2
-"""The main thread waits in such steps: Windows does not interrupt an endless wait by Ctrl-C."""
+WAIT_STEP_S = 0.2  # the main thread waits in such steps: Windows does not interrupt an endless wait by Ctrl-C
 
 
 def require_viser() -> None:
@@ -35,15 +35,19 @@ def require_viser() -> None:
     require("viser", what="the viewer needs")
 
 
+def has_viser() -> bool:
+    """Whether viser is installed."""
+    return importlib.util.find_spec("viser") is not None
+
+
 def free_port(host: str, port: int | None) -> int:
     """The port to listen on: `port`, or if that is None, from 8080 on the next that is free.
 
-    Raises an OSError if none is free or the host is not an address of this machine.
+    Raises an OSError if none is free or the host is not an address of this machine: viser would wait forever.
     """
     candidates = range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED)
     if port is not None:
         candidates = range(whole_number(port, "--port", 0, 65535), port + 1)
-    # viser would wait forever for an address that it cannot listen on.
     for candidate in candidates:
         try:
             family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
@@ -51,7 +55,7 @@ def free_port(host: str, port: int | None) -> int:
                 found: int = listening.getsockname()[1]
                 return found
         except OSError as error:  # also for an unknown host name
-            reason = (error.strerror or str(error)).partition(" (while")[0]
+            reason = error.strerror or str(error)
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 break
     msg = f"cannot listen on {host}, port {candidate}: {reason}; --host takes an address of this machine, --port a free port"
@@ -67,7 +71,7 @@ def start_server(host: str, port: int) -> Any:
     if not all(ipaddress.ip_address(address[4][0]).is_loopback for address in addresses):
         msg = f"--host {host}: anyone who can reach this address can see and operate the page"
         warnings.warn(msg, RuntimeWarning, stacklevel=2)
-    with _silence(), guarded(host):
+    with contextlib.redirect_stdout(io.StringIO()), guarded(host):  # viser prints
         server: Any = viser.ViserServer(host, port, "radarsdf", verbose=False)
     # viser's objects of a connection form cycles that hold all that was sent, 1 MB each with a mesh of 1 MB.
     server.on_client_disconnect(lambda _: gc.collect())
@@ -83,13 +87,8 @@ def start_server(host: str, port: int) -> Any:
 
 def stop_server(server: Any) -> None:
     """Close all connections and end the threads of a server."""
-    with _silence():
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints
         server.stop()
-
-
-def _silence() -> contextlib.AbstractContextManager[Any]:
-    """Keep what viser prints from standard output."""
-    return contextlib.redirect_stdout(io.StringIO())
 
 
 def begin_at(server: Any, look: Look) -> None:
@@ -102,9 +101,8 @@ def begin_at(server: Any, look: Look) -> None:
 def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: float = 20.0) -> None:
     """Wait until each page has drawn what was sent so far, or something newer is to be drawn.
 
-    viser does not report that, but a page answers a question after what came before it. The first answer says that
-    earlier messages have arrived and the last ones are on their way, the second that these have arrived, the third
-    that the page has drawn another frame.
+    viser does not report that, but a page answers a question after what came before it. The first answer says that the last
+    messages are on their way, the second that these have arrived, the third that another frame was drawn.
     """
     time.sleep(0.05)  # viser collects messages for a sixtieth of a second
     for client in server.get_clients().values():
@@ -122,10 +120,7 @@ def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: fl
 
 
 class Page:
-    """A page that is served on `host` and `port`, or from 8080 on the next free one, until it is stopped.
-
-    The port is chosen first, so that one that is taken is reported before any work: an OSError.
-    """
+    """A page that is served until it is stopped. An OSError reports a port that is taken before any work."""
 
     def __init__(self, host: str, port: int | None) -> None:
         require_viser()
@@ -145,11 +140,9 @@ class Page:
         stop_server(self._server)
 
     def __enter__(self) -> Self:
-        """The page itself, which is stopped at the end of the block."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop."""
         self.stop()
 
 
@@ -162,16 +155,6 @@ def has_display() -> bool:
 
 def url_of(host: str, port: int) -> str:
     """The page's address for a browser on this machine."""
-    return f"http://{_reached(host)}:{port}"
-
-
-def ssh_line(host: str, port: int) -> str:
-    """The command that forwards the page of this machine to another one."""
-    return f"ssh -L {port}:{_reached(host)}:{port} {socket.gethostname()}"
-
-
-def _reached(host: str) -> str:
-    """The name by which this machine reaches a server that listens on `host`."""
     if host in ("127.0.0.1", "::1", "0.0.0.0", "::"):
-        return "localhost"
-    return f"[{host}]" if ":" in host else host
+        return f"http://localhost:{port}"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -32,20 +32,13 @@ _MIN_VERTICES = 1000  # of max_vertices: fewer are not worth a look
 class ShownSurface:
     """Triangles and what the map knows about their vertices."""
 
-    vertices: _Floats
-    """(V, 3) world, m."""
-    faces: NDArray[np.int32]
-    """(F, 3) rows of vertices. Normals point into free space."""
-    uncertainty_m: NDArray[np.float32]
-    """(V,) see `Map.uncertainty`."""
-    confidence: NDArray[np.float32]
-    """(V,) see `Map.confidence`."""
-    lightness: NDArray[np.float32]
-    """(V,) lightness factor of colours."""
-    threshold: Threshold
-    """The confidence from which on the mesh was kept."""
-    spacing_m: float
-    """Vertex spacing: the voxel edge, or more if the mesh was thinned."""
+    vertices: _Floats  # (V, 3) world, m
+    faces: NDArray[np.int32]  # (F, 3) rows of vertices; normals point into free space
+    uncertainty_m: NDArray[np.float32]  # (V,)
+    confidence: NDArray[np.float32]  # (V,)
+    lightness: NDArray[np.float32]  # (V,) factor of colours
+    threshold: Threshold  # the confidence from which on the mesh was kept
+    spacing_m: float  # of vertices: the voxel edge, or more if the mesh was thinned
 
     @classmethod
     def of(

@@ -13,9 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
 from radarsdf.view.framing import FOV_RAD, Look, look_at_all
-from radarsdf.view.legends import legend, marks, paragraph, table
-from radarsdf.view.quantities import Colors, quantities_of
-from radarsdf.view.scene import HELD_S, MEASURED_COLOR, SLID_S, Canvas, Painter, ScanClouds, State
+from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
+from radarsdf.view.scene import (
+    HELD_S,
+    MEASURED_COLOR,
+    PATH_COLOR,
+    PREDICTED_COLOR,
+    SLID_S,
+    Canvas,
+    Painter,
+    ScanClouds,
+    State,
+)
 from radarsdf.view.serving import Page, begin_at
 from radarsdf.view.surface import ShownSurface, first_hit
 
@@ -25,28 +34,11 @@ _MARK_COLOR = (0, 190, 255)  # not on the colour scale
 
 
 class Viewer(Page):
-    """Serves a map in the browser until it is stopped.
+    """Serves a map, and scans to browse, in the browser until it is stopped.
 
-    While the sensor is dragged, 30,000 vertices, spread evenly, are recoloured; all of them are when the drag ends. The
-    colour scale is fixed: from the 2nd to the 98th percentile of the values on the surface, for intensities of those
-    predicted for the first sensor position. The page computes in float32 in the map's local frame, but displays world
-    coordinates.
-
-    Parameters
-    ----------
-    radar_map : RadarMap or TiledMap
-        The map.
-    scans : Scans, optional
-        Scans with poses to browse, which are kept in memory.
-    voxel_size, box, progress, **limits
-        As for :meth:`Map.mesh`, with its errors.
-    max_vertices : int
-        A mesh with more vertices is thinned.
-    host : str
-        Address to listen on. With any but a loopback address, everyone who can reach it sees the page. Requests from
-        other web pages are refused.
-    port : int, optional
-        Port to listen on. None: 8080, or the next that is free.
+    While the sensor is dragged, 30,000 vertices are recoloured; all of them are when the drag ends. The page computes in
+    float32 in the map's local frame, but displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for
+    :meth:`Map.mesh`, with its errors.
     """
 
     def __init__(
@@ -67,7 +59,6 @@ class Viewer(Page):
         self.surface = ShownSurface.of(
             radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
-        """The mesh that is shown."""
         self._start()
         try:
             self._fill(scans)
@@ -76,7 +67,7 @@ class Viewer(Page):
             raise
 
     def wait(self) -> None:
-        """Wait until the viewer is stopped, from another thread or by Ctrl-C. Raises an error of its thread."""
+        """Wait until the viewer is stopped. Raises an error of its thread."""
         self._painter.wait()
 
     def stop(self) -> None:
@@ -92,58 +83,82 @@ class Viewer(Page):
         self._extent = np.concatenate([surface.vertices - origin, path])
         begin_at(server, look_at_all(self._extent))
         x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
-        self.quantities = quantities_of(radar_map, surface, scans, (x, y, z))
-        """What the surface can be coloured by."""
+        self.quantities = quantities_of(radar_map, surface, (x, y, z))  # what the surface can be coloured by
         self._clicked: NDArray[np.float64] | None = None
-        scale = self.quantities["intensity"].scale if radar_map.has_intensity else None
-        measured = scale if isinstance(scale, Colors) else None
-        self._add_controls(0 if scans is None else len(scans), measured)
-        self._clouds = None
-        if scans is not None:
-            self._clouds = ScanClouds(server, radar_map, scans, measured, self._scan_text)
+        panel = self._add_controls()
+        self._clouds = None if scans is None else self._add_scans(panel, scans)
         self._canvas = Canvas(server, radar_map, surface, self.quantities, self._clouds, self._describe)
         self._gizmo: Any = None
         if radar_map.has_intensity:
             self._add_sensor(np.array([x, y, z]) - origin)
         state = State((x, y, z), **self._surface_state(), scan=None if scans is None else 0)
         self._painter = Painter(self._canvas, state)
-        self._connect_controls()
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
 
-    def _add_controls(self, scans: int, measured: Colors | None) -> None:
-        """Add the panels. A narrow screen shows the second one folded, so that little covers the map."""
+    # Callbacks are coroutines, because viser would run functions in several threads, in any order.
+    def _add_controls(self) -> Any:
+        """Add the panels. A narrow screen shows the second one, which is returned, folded, so that little covers the map."""
         gui, surface = self._server.gui, self.surface
         self._legend = gui.add_html(legend(next(iter(self.quantities.values()))))
         self._quantity = gui.add_dropdown("colour by", tuple(self.quantities), hint="what the surface shows")
         hint = "Click on the surface to query the map. Drag the sensor by its arrows."
         self._answer = gui.add_html(paragraph(hint))
-        self._reset = gui.add_button("Reset view")
+        reset = gui.add_button("Reset view")
         gui.main_panel.dock_right()
         panel = gui.add_panel()
         panel.dock_below(gui.main_panel)
+        tab = panel.add_tab("controls")
         largest_m = float(surface.uncertainty_m.max())
         step_m = 10.0 ** math.floor(math.log10(max(largest_m, 1e-6) / 100))
         end_m = math.ceil(largest_m / step_m) * step_m
-        with panel.add_tab("controls"):
-            with gui.add_folder("surface"):
-                self._show = gui.add_checkbox("show", True)
-                hint = "hides what is more uncertain"
-                self._uncertainty = gui.add_slider("uncertainty ≤ m", 0.0, end_m, step_m, end_m, hint=hint)
-                hint = f"hides what is less probable; the mesh is {surface.threshold}"
-                self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
-            if scans:
-                with gui.add_folder("scans"):
-                    gui.add_html(marks(measured or MEASURED_COLOR))
-                    self._scan = gui.add_slider("scan", 0, max(scans - 1, 1), 1, 0, disabled=scans == 1)
-                    self._scan_text = gui.add_markdown("")
-                    hint = "returns that the map predicts for this scan"
-                    self._layers = {
-                        "measured": gui.add_checkbox("measured", True),
-                        "predicted": gui.add_checkbox("predicted", True, hint=hint),
-                        "all": gui.add_checkbox("all scans", False),
-                    }
-                    self._path = gui.add_checkbox("trajectory", True)
+        with tab, gui.add_folder("surface"):
+            hint = "hides what is more uncertain"
+            self._uncertainty = gui.add_slider("uncertainty ≤ m", 0.0, end_m, step_m, end_m, hint=hint)
+            hint = f"hides what is less probable; the mesh is {surface.threshold}"
+            self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
+
+        async def on_limit(_: Any) -> None:
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=SLID_S)
+
+        async def on_quantity(_: Any) -> None:
+            self._legend.content = legend(self.quantities[self._quantity.value])
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=0.0)
+
+        async def on_reset(event: Any) -> None:
+            self._look_at_all(event.client)
+
+        self._uncertainty.on_update(on_limit)
+        self._confidence.on_update(on_limit)
+        self._quantity.on_update(on_quantity)
+        reset.on_click(on_reset)
+        return tab
+
+    def _add_scans(self, tab: Any, scans: Scans) -> ScanClouds:
+        """Add the returns of scans, and the controls that choose one and what is shown of it."""
+        gui = self._server.gui
+        scale = self.quantities["intensity"].scale if self._map.has_intensity else None
+        colors = {"measured": scale or MEASURED_COLOR, "predicted": PREDICTED_COLOR, "trajectory": PATH_COLOR}
+        with tab, gui.add_folder("scans"):
+            gui.add_html(key(colors))
+            slider = gui.add_slider("scan", 0, max(len(scans) - 1, 1), 1, 0, disabled=len(scans) == 1)
+            clouds = ScanClouds(self._server, self._map, scans, scale, gui.add_markdown(""))
+            boxes = {name: gui.add_checkbox(name, True) for name in colors}
+
+        async def on_scan(_: Any) -> None:
+            sensor = clouds.sensor(int(slider.value))
+            if self._gizmo is not None:
+                self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
+            self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=SLID_S)
+
+        async def on_box(_: Any) -> None:
+            for name, box in boxes.items():
+                clouds.nodes[name].visible = box.value
+
+        slider.on_update(on_scan)
+        for box in boxes.values():
+            box.on_update(on_box)
+        return clouds
 
     def _surface_state(self) -> dict[str, Any]:
         """The fields of :class:`State` that the controls of the surface set."""
@@ -153,48 +168,7 @@ class Viewer(Page):
             "quantity": str(self._quantity.value),
         }
 
-    def _connect_controls(self) -> None:
-        # Coroutines, because viser would run functions in several threads, in any order.
-        async def on_limit(_: Any) -> None:
-            self._painter.change(**self._surface_state(), coarse=False, settle_s=SLID_S)
-
-        async def on_quantity(_: Any) -> None:
-            self._legend.content = legend(self.quantities[self._quantity.value])
-            self._painter.change(**self._surface_state(), coarse=False, settle_s=0.0)
-
-        async def on_show(_: Any) -> None:
-            self._canvas.node.visible = self._show.value
-
-        async def on_reset(event: Any) -> None:
-            self._look_at_all(event.client)
-
-        self._uncertainty.on_update(on_limit)
-        self._confidence.on_update(on_limit)
-        self._quantity.on_update(on_quantity)
-        self._show.on_update(on_show)
-        self._reset.on_click(on_reset)
-        clouds = self._clouds
-        if clouds is None:
-            return
-
-        async def on_scan(_: Any) -> None:
-            self._go_to_scan(clouds, int(self._scan.value))
-
-        async def on_path(_: Any) -> None:
-            clouds.path.visible = self._path.value
-
-        def on_layer(event: Any) -> None:  # in a thread: all scans take a while
-            for name, box in self._layers.items():
-                if box is event.target:
-                    clouds.set_visible(name, visible=box.value)
-
-        self._scan.on_update(on_scan)
-        self._path.on_update(on_path)
-        for box in self._layers.values():
-            box.on_update(on_layer)
-
     def _look_at_all(self, client: Any) -> Look:
-        """Let a page show everything."""
         camera = client.camera
         look = look_at_all(self._extent, aspect=_aspect(camera))
         with client.atomic():
@@ -203,7 +177,6 @@ class Viewer(Page):
             camera.position, camera.look_at = look
         return look
 
-    # Coroutines, because viser would run functions in several threads, in any order.
     async def _on_connect(self, client: Any) -> None:
         """Let a new page show everything, also after its frame has changed, until the user moves the camera."""
         first = look_at_all(self._extent)  # which a page may take after it was told a better one
@@ -237,13 +210,6 @@ class Viewer(Page):
             )
 
         self._gizmo.on_update(on_update)
-
-    def _go_to_scan(self, clouds: ScanClouds, index: int) -> None:
-        """Show a scan, and move the sensor to its pose."""
-        sensor = clouds.sensor(index)
-        if self._gizmo is not None:
-            self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
-        self._painter.change(scan=index, sensor=sensor, coarse=True, settle_s=SLID_S)
 
     def _on_click(self, event: Any) -> None:
         vertices = self.surface.vertices - self._map.origin
@@ -282,15 +248,11 @@ class Viewer(Page):
     @property
     def notes(self) -> list[str]:
         """What is shown more coarsely than it is, in words."""
-        notes = []
-        if self.surface.spacing_m > self._voxel_size:
-            notes.append(
-                f"the mesh is thinned to {len(self.surface.vertices)} vertices, {self.surface.spacing_m:.2g} m apart: "
-                "--max-vertices allows more, --box shows a part"
-            )
-        if self._clouds is not None and self._clouds.every > 1:
-            notes.append(f"of all returns together, one in {self._clouds.every} is shown")
-        return notes
+        shown, spacing_m = len(self.surface.vertices), self.surface.spacing_m
+        thinned = (
+            f"the mesh is thinned to {shown} vertices, {spacing_m:.2g} m apart: --max-vertices allows more"
+        )
+        return [thinned] if spacing_m > self._voxel_size else []
 
 
 def _aspect(camera: Any) -> float:

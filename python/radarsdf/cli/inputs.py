@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""What the arguments of a command stand for: scans, a configuration, a map."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from radarsdf.cli.app import refuse_if, warn
+from radarsdf.evaluation import holdout
+from radarsdf.io.poses import UNPOSED, NoPoses, StampedPoses
+from radarsdf.io.read import read
+from radarsdf.io.scans import Scans
+from radarsdf.io.text import read_numbers
+from radarsdf.map.map import Map
+from radarsdf.tiles.tiled_map import lacking, load
+from radarsdf.view.serving import free_port, require_viser
+
+MAP_SUFFIX = ".safetensors"
+
+
+def is_map(path: Path) -> bool:
+    """Whether a path looks like a map and not like scans or a mesh."""
+    return path.is_dir() or path.suffix == MAP_SUFFIX
+
+
+def load_map(path: Path) -> Map:
+    """Load a map, and warn of tiles that are missing."""
+    radar_map = load(path)
+    if tiles := lacking(radar_map):
+        warn(f"warning: {path} lacks {tiles}: radarsdf tiles status {path} lists the reasons")
+    return radar_map
+
+
+def read_scans(given: Namespace, poses: StampedPoses | None = None) -> Scans:
+    """The scans, with `poses` in place of theirs. What was assumed or left out is logged on standard error."""
+    fields = [text.partition("=") for text in given.field or ()]
+    for role, _, name in fields:
+        refuse_if(not (role and name), f"--field takes ROLE=NAME, not {role!r:.50}")
+    columns = given.columns
+    return read(
+        given.scans,
+        given.poses if poses is None else poses,
+        extrinsic=None if given.extrinsic is None else read_numbers(given.extrinsic, 4),
+        topic=given.topic,
+        pose_topic=given.pose_topic,
+        imu_topic=given.imu_topic,
+        R_sensor_imu=None if given.imu_rotation is None else read_numbers(given.imu_rotation, 3),
+        fields={role: name for role, _, name in fields} or None,
+        columns=int(columns) if columns and columns.isdecimal() else columns and columns.split(","),
+        world_frame=given.world_frame,
+        stamps=given.stamps,
+        max_gap_s=given.max_gap,
+    )
+
+
+def scans_or_unposed(given: Namespace, *, find: bool = False) -> tuple[Scans, bool]:
+    """Read scans, and whether their poses are to be found: there are none, or `find` says so."""
+    if not find:
+        try:
+            return read_scans(given), False
+        except NoPoses:
+            warn(f"note: {given.scans} has no poses: they are found from the radar alone")
+    return read_scans(given, UNPOSED), True
+
+
+def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
+    """The scans of a fit, and those that ``--holdout`` leaves out."""
+    if every is None:
+        return scans, None
+    train, test = holdout(len(scans.points), every)
+    return scans.select(train), scans.select(test)
+
+
+def inputs_of(given: Namespace) -> list[Path]:
+    """The input files and folders, which no output may overwrite."""
+    paths = (vars(given).get("map"), given.scans, given.poses, given.extrinsic, given.imu_rotation)
+    return [path for path in paths if path is not None]
+
+
+def mesh_limits(given: Namespace) -> dict[str, Any]:
+    """What the mesh leaves out, as arguments of ``Map.mesh``."""
+    return {
+        "min_confidence": given.min_confidence,
+        "max_uncertainty": given.max_uncertainty,
+        "min_component_triangles": given.min_component,
+    }
+
+
+def check_address(given: Namespace) -> None:
+    """Raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
+    require_viser()
+    free_port(given.host, given.port)
