@@ -20,16 +20,8 @@ _FEATURE_STD = 0.05  # standard deviation of the features at the start (3QFP)
 class VertexFeatures(nn.Module):
     """A learnable feature, 8 floats, at each vertex of the occupied cells, interpolated inside the cells.
 
-    Parameters
-    ----------
-    leaf_keys : ndarray
-        (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
-    leaf_size_m : float
-        Edge of a leaf cell, which is a cell of the finest level, m.
-    num_levels : int
-        Levels of cells. The cells of each level are twice as large as those of the level before.
-    num_threads : int
-        Threads that build the table of vertices. 0: as many as OpenMP uses.
+    `leaf_keys` (C,): Morton keys of the occupied leaf cells, ascending. The cells of each of the levels are twice as large as
+    those of the level before.
     """
 
     encoding: Encoding
@@ -96,10 +88,3 @@ class Fourier(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         return kernels.fourier(points, self.half_width_m, 0, self.num_frequencies)
-
-
-class SphericalHarmonics(nn.Module):
-    """Real spherical harmonics of degree 0 to 3 ("degree 4" in 3QFPI) of unit vectors (N, 3): (N, 16)."""
-
-    def forward(self, directions: Tensor) -> Tensor:
-        return kernels.spherical_harmonics(directions)

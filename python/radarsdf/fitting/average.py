@@ -42,16 +42,13 @@ CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
 class SurfaceReturns:
     """The returns that the surface is made of, and what is known of them."""
 
-    rays: Rays
-    """Without ghosts. If a field is trained on them, they are moved towards the flat surfel of their cell."""
-    surfels: Surfels
-    """Surfels of all returns."""
+    rays: Rays  # without ghosts; if a field is trained on them, moved towards the flat surfel of their cell
+    surfels: Surfels  # of all returns
     noise: SensorNoise
-    """Noise of the returns."""
-    means: MeanRays | None
-    """Mean rays of the leaf cells, without ghosts, which are averaged. None: a field is trained on `rays`."""
-    true: NDArray[np.bool_] | None
-    """(N,) which of all rays end at no ghost. None: ghosts were not looked for."""
+    means: (
+        MeanRays | None
+    )  # of the leaf cells, without ghosts, to average. None: a field is trained on `rays`
+    true: NDArray[np.bool_] | None  # (N,) which of all rays end at no ghost. None: ghosts were not looked for
 
     @classmethod
     def of(
@@ -154,14 +151,7 @@ def average_surface(
 ) -> GridField:
     """The average of the rays' truncated signed distances (Curless and Levoy, 1996), smoothed.
 
-    Parameters
-    ----------
-    leaf_keys : ndarray
-        (C,) uint64, Morton keys of the leaf cells of the field, ascending.
-    means, returns : MeanRays, ReturnsOfCells
-        The mean ray of each cell with returns, and what these tell, in the same order.
-    surfels : Surfels
-        Planes of the returns.
+    `leaf_keys` (C,): of the field, ascending. `means`, `returns`: of each cell with returns, in the same order.
     """
     field = GridField(leaf_keys, config.leaf_size_m, num_threads)
     normals = normals_at(means, surfels, num_threads)
@@ -208,17 +198,7 @@ def average_at_corners(
 
 
 def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads: int) -> Reflectance:
-    """Intensities in closed form, or what the network of a map leaves of them.
-
-    Parameters
-    ----------
-    contents : MapContents
-        The map, with what its field answers for intensities so far.
-    rays : Rays
-        Returns that the map is made of, with ghosts.
-    surfels : Surfels
-        Of all returns.
-    """
+    """Intensities of `rays` in closed form, ghosts included, or what the network of the map leaves of them."""
     scale = contents.intensity_scale
     assert scale is not None
     known = rays.with_intensity

@@ -30,11 +30,11 @@ class Optimiser(ABC):
 
     @abstractmethod
     def state(self) -> dict[str, Tensor]:
-        """All that the next steps depend on, except the parameters. The tensors are not copied."""
+        """All that the next steps depend on, except the parameters. Not copied."""
 
     @abstractmethod
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of an optimiser of the same parameters returned. ValueError: none can have that state."""
+        """Restores a :meth:`state`. ValueError: no optimiser of these parameters can have it."""
 
     @abstractmethod
     def step(self, gradients: Sequence[Tensor]) -> None:
@@ -139,13 +139,6 @@ class RowAdam:
     The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
     change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.
     Measured: the surface is as good without that, and a fit of `hugin` takes 4.2 s instead of 5.2.
-
-    Attributes
-    ----------
-    learning_rate : float
-        Learning rate of the next step.
-    full_rate : float
-        Learning rate at the start.
     """
 
     def __init__(self, cells: VertexFeatures, learning_rate: float) -> None:
@@ -160,16 +153,13 @@ class RowAdam:
 
     @property
     def features(self) -> Tensor:
-        """(num_rows, 8), the tensor that is optimised."""
         return self._cells.features
 
     def state(self) -> dict[str, Tensor]:
-        """All that the next steps depend on, except the features. The tensors are not copied."""
         count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
         return {"moments": self._moments, "last_step": self._marks[:, :1], "step_count": count}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` returned. ValueError: a row changed later than the last step."""
         count, last_step = int(state["step_count"]), state["last_step"]
         first, last = (int(last_step.min()), int(last_step.max())) if last_step.numel() else (0, 0)
         if not 0 <= first <= last <= count:
