@@ -10,18 +10,9 @@ from torch.nn import functional
 
 
 def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
-    """Binary cross-entropy of sigmoid(logit) against sigmoid(sdf / sigma) (SHINE-Mapping).
+    """Binary cross-entropy of sigmoid(logit) against sigmoid(sdf / sigma), (B,) each (SHINE-Mapping).
 
     The sigmoid gives errors near the surface the most weight.
-
-    Parameters
-    ----------
-    logit : Tensor
-        (B,) output of the SDF network: signed distance / sigma, positive in free space.
-    sdf_m : Tensor
-        (B,) label, m, positive in free space.
-    sigma_m : float
-        Scale of the sigmoid, m.
     """
     return functional.binary_cross_entropy_with_logits(logit, torch.sigmoid(sdf_m / sigma_m))
 

@@ -35,14 +35,11 @@ class WholeMap:
 class MapContents(WholeMap):
     """The parts of a map."""
 
-    field: Field
-    """Signed distance and intensity, in the local frame."""
+    field: Field  # signed distance and intensity, in the local frame
     intensity_scale: IntensityScale | None
     """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
-    evidence: Evidence
-    """What the returns tell of each leaf cell."""
-    sensor: Sensor
-    """The radar, as the scans of the fit show it."""
+    evidence: Evidence  # what the returns tell of each leaf cell
+    sensor: Sensor  # the radar, as the scans of the fit show it
     report: dict[str, Any]
     """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
     passages: Passages = dataclasses.field(default_factory=Passages.none)

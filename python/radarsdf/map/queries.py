@@ -331,15 +331,15 @@ def passage_odds(contents: MapContents) -> NDArray[np.float64]:
     Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
     on the way to false returns.
     """
-    cells = lattice_of(leaf_keys(contents))
-    cells = cells[:: max(1, len(cells) // _ODDS_CELLS)]
+    keys = leaf_keys(contents)
+    keys = keys[:: max(1, len(keys) // _ODDS_CELLS)]
     leaf_m = contents.config.leaf_size_m
-    centres = torch.from_numpy(((cells + 0.5) * leaf_m).astype(np.float32))
+    centres = torch.from_numpy(((lattice_of(keys) + 0.5) * leaf_m).astype(np.float32))
     distances_m = signed_distance(contents, centres).numpy()
     # Along grazing rays the field is longer than the distance, and where returns are noisy shorter; so is its gradient.
     edge = leaf_m * np.linalg.norm(gradient(contents, centres).numpy(), axis=1)
     weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
-    passed = contents.passages.at(cells)
+    passed = contents.passages.at(keys)
 
     def shares(side: NDArray[np.bool_]) -> NDArray[np.float64]:
         counts = np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1
