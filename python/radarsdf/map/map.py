@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class MapParts(ABC):
-    """What each kind of map implements, at positions that were checked, and what grids and comparisons read."""
+    """What each kind of map implements, at positions (N, 3), world, m, and what grids and comparisons read."""
 
     @abstractmethod
     def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
@@ -55,20 +55,16 @@ class MapParts(ABC):
         return queries.passage_odds(self._contents_of_any)
 
     @abstractmethod
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`Map.sdf` at positions (N, 3), world, m: (N,)."""
+    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor: ...
 
     @abstractmethod
-    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`Map.gradient` there, (N, 3)."""
+    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor: ...
 
     @abstractmethod
-    def _observed(self, world: Tensor) -> Tensor:
-        """:meth:`Map.observed` there, (N,) bool."""
+    def _observed(self, world: Tensor) -> Tensor: ...
 
     @abstractmethod
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`Map.intensity` there, (N,), for sensors at (N, 3)."""
+    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor: ...
 
     @abstractmethod
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
@@ -302,15 +298,9 @@ class Map(MapParts):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
-        return self._mesh_seen_from(
-            viewpoint,
-            voxel_size,
-            box=box,
-            min_confidence=min_confidence,
-            max_uncertainty=max_uncertainty,
-            min_component_triangles=min_component_triangles,
-            progress=progress,
-        )
+        limits = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
+        limits |= {"min_component_triangles": min_component_triangles}
+        return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
 
     def _mesh_seen_from(
         self, viewpoint: ArrayLike | None, voxel_size: float, **wanted: Any
@@ -431,22 +421,22 @@ class Map(MapParts):
     @property
     @abstractmethod
     def origin(self) -> NDArray[np.float64]:
-        """(3,) float64, origin of the local frame in world coordinates, m."""
+        """Origin of the local frame, (3,) float64, world, m. Queries subtract it in float64."""
 
     @property
     @abstractmethod
     def extent(self) -> NDArray[np.float64]:
-        """(2, 3) lower and upper corner of all leaf cells, world, m."""
+        """Lower and upper corner of the box that encloses all leaf cells, (2, 3) float64, world, m."""
 
     @property
     @abstractmethod
     def num_cells(self) -> int:
-        """Number of leaf cells."""
+        """Number of leaf cells, in which the map was observed: int."""
 
     @property
     @abstractmethod
     def file_bytes(self) -> int:
-        """Size of the file that :meth:`save` writes, without the names of its arrays: less than 4 kB; bytes."""
+        """Size of the file that :meth:`save` writes, but for the up to 4 kB of its header: int, bytes."""
 
 
 def _as_positions(x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:

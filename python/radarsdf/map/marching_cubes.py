@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: MIT
 """Triangle meshes of the level sets of sampled fields, by marching cubes; of tensors with gradients.
 
-A cell here is a cube of eight neighbouring samples: a voxel of marching cubes. Its corners are in C order:
-corner ``4 * dx + 2 * dy + dz`` is at ``(dx, dy, dz)`` from the lower one. Results do not depend on the number
-of threads.
-
-A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length.
-It moves along this edge when a or b changes, and depends on no other sample. Triangles have no gradient: they
-change only where a sample changes its sign.
+A cell here is a cube of eight neighbouring samples, corner ``4 * dx + 2 * dy + dz`` of which is at ``(dx, dy, dz)`` from the
+lower one. A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length: it
+depends on no other sample. Triangles have no gradient: they change only where a sample changes its sign.
 """
 
 from __future__ import annotations
@@ -143,11 +139,7 @@ def extract_cells(
 def sparse_lattice(
     cells: NDArray[Any], *, num_threads: int = 0
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Number the corners that cells (M, 3) share, given by the lattice coordinates of their lower corners.
-
-    Returns the different cells (M', 3), sorted by x, then y, then z; their corners (K, 3), sorted likewise; and rows (M', 8)
-    of the corners for each cell, in C order.
-    """
+    """Different cells (M', 3) of those with lower corners (M, 3), sorted; their corners (K, 3), sorted; rows of these (M', 8)."""
     return _core.sparse_lattice(_as_int32(cells), num_threads)
 
 
@@ -167,12 +159,10 @@ class _MarchingCubes(torch.autograd.Function):
         level: float,
         num_threads: int,
     ) -> tuple[Tensor, Tensor]:
-        vertices, faces, edges = map(
-            torch.from_numpy,
-            _core.marching_cubes_dense_with_edges(
-                samples.detach().numpy(), mask, spacing, origin, level, num_threads
-            ),
+        found = _core.marching_cubes_dense_with_edges(
+            samples.detach().numpy(), mask, spacing, origin, level, num_threads
         )
+        vertices, faces, edges = map(torch.from_numpy, found)
         ctx.save_for_backward(samples, edges)
         ctx.placement = spacing, level, num_threads
         ctx.mark_non_differentiable(faces)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,17 +59,14 @@ class Surface:
         progress: bool | None = False,
     ) -> Surface:
         """The surface in voxels of this edge, m, in the whole map or in a `box` (2, 3), local frame, m."""
-        lattice = sample_lattice(contents, voxel_size, box, progress)
+        corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
+        spacing, threads = [voxel_size] * 3, torch.get_num_threads()
         vertices, faces = extract_cells(
-            lattice.corners,
-            lattice.distances_m,
-            lattice.voxel_corners,
-            spacing=[voxel_size] * 3,
-            num_threads=torch.get_num_threads(),
+            corners, distances_m, voxel_corners, spacing=spacing, num_threads=threads
         )
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
-        return cls.told_by(contents, vertices, faces, evidence, lattice.cells_searched)
+        return cls.told_by(contents, vertices, faces, evidence, searched)
 
     @classmethod
     def told_by(
@@ -120,31 +117,20 @@ class Surface:
 
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """What the limits leave, in the world. `leaf_cells`: of the whole map."""
-        return self.part(
-            origin,
-            self.kept(limits),
+        used, faces = renumbered(len(self.vertices), self.faces[self.kept(limits)])
+        return described_mesh(
+            self.vertices[used] + origin,
+            faces,
+            self.confidence[used],
+            self.uncertainty_m[used],
             leaf_cells=leaf_cells,
             leaf_cells_searched=self.cells_searched,
             **self.threshold(limits).metadata,
         )
 
-    def part(
-        self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
-    ) -> trimesh.Trimesh:
-        """The faces that are `kept` (F,), in the world."""
-        used, faces = renumbered(len(self.vertices), self.faces[kept])
-        return described_mesh(
-            self.vertices[used] + origin, faces, self.confidence[used], self.uncertainty_m[used], **metadata
-        )
-
 
 def extract_mesh(
-    contents: MapContents,
-    voxel_size: float,
-    *,
-    box: ArrayLike | None,
-    progress: bool | None,
-    **wanted: Any,
+    contents: MapContents, voxel_size: float, *, box: ArrayLike | None, progress: bool | None, **wanted: Any
 ) -> trimesh.Trimesh:
     """The mesh of one map; `wanted`: the limits of :meth:`Map.mesh`."""
     voxel_size = positive(voxel_size, "voxel_size")
@@ -206,28 +192,23 @@ def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.
 # Voxels
 
 
-class SampledLattice(NamedTuple):
-    """Signed distances at the corners of voxels."""
-
-    corners: NDArray[np.int32]  # (K, 3) lattice coordinates
-    voxel_corners: NDArray[np.int32]  # (M, 8) rows of `corners` for each voxel
-    distances_m: NDArray[np.float32]  # (K,) signed distance at each corner, m
-    cells_searched: int  # number of leaf cells in which the surface can be
-
-
 def sample_lattice(
     contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
-) -> SampledLattice:
-    """The voxels of leaf cells in which the surface can be. `box` (2, 3), local frame, m, limits their centres."""
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], int]:
+    """The voxels of leaf cells in which the surface can be. `box` (2, 3), local frame, m, limits their centres.
+
+    Returns lattice coordinates of corners (K, 3), rows of these for each voxel (M, 8), signed distances at the corners (K,), m,
+    and the number of leaf cells that were searched.
+    """
     config, num_threads = contents.config, torch.get_num_threads()
     leaf_size_m = config.leaf_size_m
-    cells = queries.leaf_cells(contents)
+    cells = contents.field.table.leaf_cells()
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
     stored = contents.field.leaf_corners() if voxel_size == leaf_size_m and box is None else None
     if stored is not None:
-        return SampledLattice(*stored, len(cells))
+        return *stored, len(cells)
     if voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
     voxels = _voxels_of(cells, voxel_size, config)
@@ -235,10 +216,12 @@ def sample_lattice(
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     if voxel_size < leaf_size_m and not _per_cell(voxel_size, leaf_size_m)[1]:
-        voxels = _in_map(contents, voxels, voxel_size)
+        # Only those with their centre in an occupied cell: others would continue the surface beyond the map.
+        centre = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+        voxels = voxels[_occupied(contents, centre)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
-    return SampledLattice(corners, voxel_corners, distances_m, len(cells))
+    return corners, voxel_corners, distances_m, len(cells)
 
 
 def crossed(
@@ -246,10 +229,7 @@ def crossed(
     leaf_size_m: float,
     distances_at: Callable[[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]], NDArray[Any]],
 ) -> NDArray[np.int32]:
-    """Those of the leaf cells (M, 3) whose corners are not all clearly on one side of the surface.
-
-    `distances_at`: signed distances (K,), m, of what :func:`sparse_lattice` gives.
-    """
+    """Those of the leaf cells (M, 3) whose corners, by `distances_at`, are not all clearly on one side of the surface."""
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
     values = distances_at(unique, corners, cell_corners)[cell_corners]
     margin_m = _CLEARLY * leaf_size_m
@@ -264,7 +244,6 @@ def _per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
 
 
 def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(N,) whether each of the points (N, 3), local frame, m, is in an occupied leaf cell."""
     inside: NDArray[np.bool_] = queries.occupied(contents, torch.from_numpy(points)).numpy()
     return inside
 
@@ -291,12 +270,6 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
     return voxels.reshape(-1, 3)
 
 
-def _in_map(contents: MapContents, voxels: NDArray[np.int32], voxel_size: float) -> NDArray[np.int32]:
-    """The voxels with their centre in an occupied cell. Others would continue the surface beyond the map."""
-    centres = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-    return voxels[_occupied(contents, centres)]
-
-
 def _corner_distances(
     contents: MapContents,
     voxel_size: float,
@@ -318,9 +291,8 @@ def _corner_distances(
     # last.
     owners = np.zeros(len(corners), np.int32)
     for part in _parts(len(voxels)):
-        owners[voxel_corners[part].reshape(-1)] = np.repeat(
-            np.arange(part.start, part.stop, dtype=np.int32), 8
-        )
+        rows = np.arange(part.start, part.stop, dtype=np.int32)
+        owners[voxel_corners[part].reshape(-1)] = np.repeat(rows, 8)
     moved = np.flatnonzero(outside)
     moved_m = np.zeros(len(moved), np.float32)
     for part in _parts(len(moved)):

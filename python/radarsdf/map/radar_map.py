@@ -47,7 +47,7 @@ class RadarMap(Map):
         return self._where_observed(queries.gradient, world, extrapolate=extrapolate)
 
     def _observed(self, world: Tensor) -> Tensor:
-        return queries.observed(self._contents, queries.to_local(self._contents, world))
+        return queries.into_cells(self._contents, queries.to_local(self._contents, world))[1]
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         return self._where_observed(queries.intensity, world, sensors, extrapolate=extrapolate)
@@ -78,9 +78,8 @@ class RadarMap(Map):
 
     def echoes(self) -> EchoesAt:
         scale = self.intensity_scale
-        return self._contents.echoes.in_world(
-            self.origin, *((0, 1) if scale is None else (scale.low, scale.high))
-        )
+        low, high = (0, 1) if scale is None else (scale.low, scale.high)
+        return self._contents.echoes.in_world(self.origin, low, high)
 
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
         return self._viewed

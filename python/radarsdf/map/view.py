@@ -107,9 +107,10 @@ class ViewedMap:
     rates: _Floats  # (P,) detection rate: share of the scans that reached a patch that have a return there
     origin: _Floats  # (3,) of the local frame, world, m
     roughness: float  # See :func:`radarsdf.map.queries.roughness`
-    intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None
-    """Intensities (N,) of returns from points (N, 3) to a sensor (3,), m. None: the map has none."""
-    max_memory_bytes: int | None  # what views may take. None: what the system has left.
+    intensity: (
+        Callable[[_Floats, _Floats], NDArray[np.float32]] | None
+    )  # of points (N, 3) and a sensor (3,), m
+    max_memory_bytes: int | None  # what views may take. None: what the system has left
 
     @classmethod
     def of(cls, contents: MapContents) -> ViewedMap:
@@ -204,18 +205,15 @@ def _patches(
     surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, count: int
 ) -> NDArray[np.int64]:
     """Rows of the patches that have a return: `count`, spread evenly by the number that is expected of each."""
-    rows = np.concatenate(
-        [
-            first + _in_view(surface.centres[first : first + _BLOCK], R, position, sensor)
-            for first in range(0, len(surface.centres), _BLOCK)
-        ]
-        or [np.zeros(0, np.int64)]
-    )
+    centres, found = surface.centres, [np.zeros(0, np.int64)]
+    for first in range(0, len(centres), _BLOCK):
+        found.append(first + _in_view(centres[first : first + _BLOCK], R, position, sensor))
+    rows = np.concatenate(found)
     if len(rows) == 0 or count == 0:
         return rows[:0]
-    order = cell_keys(surface.centres[rows].astype(np.float32), _ORDER_M, 1)
+    order = cell_keys(centres[rows].astype(np.float32), _ORDER_M, 1)
     rows = rows[np.argsort(order, kind="stable")]
-    to_patch = surface.centres[rows] - position
+    to_patch = centres[rows] - position
     ranges_m = np.sqrt(np.einsum("ni,ni->n", to_patch, to_patch))
     to_patch /= ranges_m[:, None]
     first_m = surface.ranges(position, to_patch, float(sensor.range_m[1]))
@@ -237,10 +235,7 @@ def _in_view(centres: _Floats, R: _Floats, position: _Floats, sensor: Sensor) ->
 
 
 def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
-    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums.
-
-    Where a row expects more than one place, others get more of them, until there are `count` rows.
-    """
+    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums."""
     sums = np.cumsum(expected)
     count = min(count, int(np.count_nonzero(expected)))
     if count == 0:
@@ -251,6 +246,7 @@ def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
         up_to = np.minimum(np.floor(sums * (places / sums[-1]) + 0.5), places)
         return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
 
+    # Where a row expects more than one place, others get more of them, until there are `count` rows.
     chosen, places, step, grows = rows_of(count), count, count, True
     while 0 < step < _MOST_PLACES and len(chosen) < count:
         more = rows_of(places + step)
@@ -264,11 +260,10 @@ def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
 
 def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
     ranges_m, azimuth, elevation = _polar(points)
-    errors = rng.standard_normal((3, len(points)))
-    directions = sensor.directions(
-        azimuth + sensor.noise.azimuth_rad * errors[1], elevation + sensor.noise.elevation_rad * errors[2]
-    )
-    noisy: _Floats = directions * np.maximum(ranges_m + sensor.noise.range_m * errors[0], 0.0)[:, None]
+    errors, noise = rng.standard_normal((3, len(points))), sensor.noise
+    angles = azimuth + noise.azimuth_rad * errors[1], elevation + noise.elevation_rad * errors[2]
+    noisy_m = np.maximum(ranges_m + noise.range_m * errors[0], 0.0)
+    noisy: _Floats = sensor.directions(*angles) * noisy_m[:, None]
     return noisy
 
 
