@@ -72,7 +72,7 @@ class MapParts(ABC):
 
     @abstractmethod
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
-        """What views from a position (3,), world, m, need of the map within a range. It is held for the next view."""
+        """What views from a position (3,) need of the map within a range. It is held for the next view."""
 
     def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
         """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
@@ -196,18 +196,12 @@ class Map(MapParts):
             Probability, in [0, 1], that a true surface is within the edge of a leaf cell. 0 where there are no returns near `x`,
             or `x` is not finite.
 
-        Raises
-        ------
-        ValueError, TypeError
-            As for :meth:`sdf`.
-
         Notes
         -----
         A logistic function of the precision of the returns (:meth:`uncertainty` without its floor), of how many returns are
-        missing, in standard deviations, given the scans that reached the place, of the map's clutter ratio, and of its number
-        of returns in a cell. It is at most the share of position errors within a leaf cell's edge, for a surface that bends
-        little. It was fitted to simulated places of twelve kinds and to five real drives; on kinds that had no part in it, the
-        worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
+        missing given the scans that reached the place, of the map's clutter ratio, and of its number of returns in a cell. It
+        was fitted to simulated places of twelve kinds and to five real drives; on kinds that had no part in it, the worst tenth
+        is mostly within 0.1 to 0.3 of the share of true surface.
         """
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[2])
@@ -224,8 +218,7 @@ class Map(MapParts):
         sensor_positions : (N, 3) or (3,) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to predict where nothing was observed, too, for instance to compare with all returns of a
-            held-out scan.
+            As for :meth:`sdf`.
 
         Returns
         -------

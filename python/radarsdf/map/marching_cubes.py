@@ -37,12 +37,10 @@ def marching_cubes(
 
     A sample is positive if it is greater than `level`. The normals of the triangles point to the positive side. The mesh is
     closed and manifold except where the cells in use end: at the border of the volume or of the mask, and at NaN samples. No
-    triangle has zero area, because vertices stay 0.1 % of an edge's length away from samples. Beyond about 10^12 times `spacing`
-    from the world's origin, float64 does not resolve this length, and vertices may coincide.
+    triangle has zero area: vertices stay 0.1 % of an edge's length away from samples.
 
-    For a tensor, the vertices can be differentiated by the samples, once. A vertex moves along its edge with the two samples at
-    the edge's ends. Its gradient is zero where it is kept away from a sample, and where a sample is infinite. The gradient does
-    not know that a sample could change its sign. For a gradient by the level, subtract the level from the samples.
+    For a tensor, the vertices can be differentiated by the samples, once; the gradient is zero where a vertex is kept away from
+    a sample, and where a sample is infinite. For a gradient by the level, subtract the level from the samples.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -33,7 +33,6 @@ _MAX_VOXELS = 2**30  # with repeated ones. Lattice coordinates, and rows of corn
 # same side. Measured on four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the
 # cells are left.
 _CLEARLY = 0.25
-_PART = 1 << 21  # numbers that NumPy gets at a time
 # Share of the distance to the voxel's centre by which a corner on the map's border is moved to be evaluated.
 _INWARD = 1e-3
 
@@ -60,10 +59,8 @@ class Surface:
     ) -> Surface:
         """The surface in voxels of this edge, m, in the whole map or in a `box` (2, 3), local frame, m."""
         corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
-        spacing, threads = [voxel_size] * 3, torch.get_num_threads()
-        vertices, faces = extract_cells(
-            corners, distances_m, voxel_corners, spacing=spacing, num_threads=threads
-        )
+        options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": torch.get_num_threads()}
+        vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
         return cls.told_by(contents, vertices, faces, evidence, searched)
@@ -80,22 +77,11 @@ class Surface:
     ) -> Surface:
         """From triangles and the evidence at their vertices. `areas_m2` (V,): of :func:`areas_round`, if known."""
         found = queries.probabilities(scene, evidence)
-        confidence = found.confidence.float()
-        return cls(
-            vertices,
-            faces,
-            evidence,
-            confidence.numpy(),
-            queries.uncertainty(scene, evidence).numpy(),
-            Tally.of(
-                areas_round(vertices, faces) if areas_m2 is None else areas_m2,
-                confidence.double().numpy(),
-                found.covering.numpy(),
-                found.reach.numpy(),
-                evidence.detections.double().numpy(),
-            ),
-            cells_searched,
-        )
+        confidence, uncertainty = found.confidence.float(), queries.uncertainty(scene, evidence).numpy()
+        areas_m2 = areas_round(vertices, faces) if areas_m2 is None else areas_m2
+        columns = confidence.double(), found.covering, found.reach, evidence.detections.double()
+        tally = Tally.of(areas_m2, *(column.numpy() for column in columns))
+        return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)
 
     def allowed(self, max_uncertainty: float, min_confidence: float = 0.0) -> NDArray[np.bool_]:
         """(F,) faces whose three vertices are within these limits."""
@@ -118,15 +104,10 @@ class Surface:
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """What the limits leave, in the world. `leaf_cells`: of the whole map."""
         used, faces = renumbered(len(self.vertices), self.faces[self.kept(limits)])
-        return described_mesh(
-            self.vertices[used] + origin,
-            faces,
-            self.confidence[used],
-            self.uncertainty_m[used],
-            leaf_cells=leaf_cells,
-            leaf_cells_searched=self.cells_searched,
-            **self.threshold(limits).metadata,
-        )
+        counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
+        columns = self.confidence[used], self.uncertainty_m[used]
+        metadata = counts | self.threshold(limits).metadata
+        return described_mesh(self.vertices[used] + origin, faces, *columns, **metadata)
 
 
 def extract_mesh(
@@ -261,13 +242,9 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
     steps = np.arange(parts, dtype=np.int32) if even else ends
     inside = np.stack(np.meshgrid(*[steps] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    voxels = np.zeros((len(cells), *inside.shape[1:]), np.int32)
-    for some in _parts(len(cells), inside.size):
-        if even:
-            voxels[some] = cells[some, None, :] * np.int32(parts) + inside
-        else:
-            voxels[some] = np.floor((cells[some, None, :] + inside) * (leaf_size_m / voxel_size))
-    return voxels.reshape(-1, 3)
+    if even:
+        return (cells[:, None] * np.int32(parts) + inside).reshape(-1, 3)
+    return np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32).reshape(-1, 3)
 
 
 def _corner_distances(
@@ -290,28 +267,17 @@ def _corner_distances(
     # The last voxel of each corner is the one that it is moved into: of repeated indices, NumPy keeps the
     # last.
     owners = np.zeros(len(corners), np.int32)
-    for part in _parts(len(voxels)):
-        rows = np.arange(part.start, part.stop, dtype=np.int32)
-        owners[voxel_corners[part].reshape(-1)] = np.repeat(rows, 8)
+    owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
     moved = np.flatnonzero(outside)
-    moved_m = np.zeros(len(moved), np.float32)
-    for part in _parts(len(moved)):
-        corner = points[moved[part]]
-        centres = (voxels[owners[moved[part]]].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-        place, left = corner.copy(), np.arange(len(corner))
-        for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
-            place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
-            left = left[~_occupied(contents, place[left])]
-        points[moved[part]] = place
-        moved_m[part] = np.linalg.norm(place - corner, axis=1)
+    corner = points[moved]
+    centres = (voxels[owners[moved]].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+    place, left = corner.copy(), np.arange(len(corner))
+    for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
+        place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
+        left = left[~_occupied(contents, place[left])]
+    points[moved] = place
     values: NDArray[np.float32] = queries.signed_distance(
         contents, torch.from_numpy(points), description="mesh", progress=progress
     ).numpy()
-    values[moved] += np.copysign(moved_m, values[moved])
+    values[moved] += np.copysign(np.linalg.norm(place - corner, axis=1), values[moved])
     return values
-
-
-def _parts(count: int, numbers: int = 8) -> Iterator[slice]:
-    """Slices of [0, count), for `numbers` numbers each. Ctrl-C has to wait for at most one slice."""
-    step = max(1, _PART // numbers)
-    return (slice(first, min(first + step, count)) for first in range(0, count, step))

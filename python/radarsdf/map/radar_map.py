@@ -128,7 +128,7 @@ class RadarMap(Map):
 
 
 def load_file(path: str | PathLike[str]) -> RadarMap:
-    """Read the file of a map; see :func:`radarsdf.load`. Nothing in it is executed."""
+    """:func:`radarsdf.load` of a file. Nothing in it is executed."""
     return RadarMap(storage.load_contents(path))
 
 

@@ -252,9 +252,7 @@ def _check(fits: Any, text: str) -> None:
 
 
 def _damaged(path: str | PathLike[str]) -> ValueError:
-    return ValueError(
-        f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind; radarsdf fit writes maps"
-    )
+    return ValueError(f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind")
 
 
 class _Report(TypedDict, total=False):
