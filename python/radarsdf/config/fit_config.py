@@ -208,24 +208,15 @@ class FitConfig:
         >>> FitConfig.paper().override(seed=1, training={"sdf_iterations": 200}).training.batch_size
         8192
         """
-        merged: dict[str, Any] = {name: getattr(self, name) for name in _names(self)}
+        merged: dict[str, Any] = dict(vars(self))
         for name, value in changes.items():
             group = merged.get(name)
-            if dataclasses.is_dataclass(group) and isinstance(value, Mapping):
-                own = {inner: getattr(group, inner) for inner in _names(group)}
-                merged[name] = own | by_name(value, name)
-            else:
-                merged[name] = value
+            inside = dataclasses.is_dataclass(group) and isinstance(value, Mapping)
+            merged[name] = vars(group) | by_name(value, name) if inside else value
         return FitConfig(**merged)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings as nested dicts of plain values, as JSON and TOML store them.
-
-        Returns
-        -------
-        dict
-            Values by name; a dict for each group. :meth:`from_dict` is the inverse.
-        """
+        """Return the settings as plain values by name, with a dict for each group, as JSON and TOML store them."""
         return dataclasses.asdict(self)
 
     @classmethod
@@ -245,10 +236,6 @@ class FitConfig:
         return cls().override(**by_name(values, "the settings"))
 
 
-def _names(group: Any) -> list[str]:
-    return [field.name for field in dataclasses.fields(group)]
-
-
 def settings_of_results(config: FitConfig) -> dict[str, Any]:
     """As :meth:`FitConfig.to_dict`, without what changes no result: two fits of the same scans that agree in these are one."""
     settings = config.to_dict()
@@ -261,9 +248,6 @@ def flat_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings, or changes of some, by names such as training.learning_rate."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
-        flat |= (
-            {f"{name}.{own}": inner for own, inner in value.items()}
-            if isinstance(value, dict)
-            else {name: value}
-        )
+        group = value if isinstance(value, dict) else {"": value}
+        flat |= {f"{name}.{own}".rstrip("."): inner for own, inner in group.items()}
     return flat

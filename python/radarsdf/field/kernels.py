@@ -69,10 +69,7 @@ def _interpolate(
 def scatter(
     table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
 ) -> Tensor:
-    """Gradient of the sum of interpolated · out_grad with respect to the features, (num_rows, 8).
-
-    With `directions` (N, 3), the interpolated features are replaced by their derivatives along these.
-    """
+    """Gradient of Σ interpolated · out_grad by the features, (num_rows, 8); with `directions` of their derivatives along these."""
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     places = _places(points, located, directions)
     table.scatter(*places, rows_view(out_grad), features_grad.numpy(), threads())
@@ -200,10 +197,7 @@ def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:
-    """Row of the occupied cell that holds each point (N, 3), local frame, m, at each level.
-
-    (N, num_levels) int32, finest level first. -1: the point is in no occupied cell.
-    """
+    """Rows (N, num_levels) int32, finest level first, of the occupied cells that hold points (N, 3), local, m; -1: none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
     table.locate(view(points), located.numpy(), threads())
     return located

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS
+from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.encodings import Fourier, Octree, TriQuadtree
 from radarsdf.field.field import Field
-from radarsdf.field.kernels import mlp, spherical_harmonics
+from radarsdf.field.kernels import fourier, interpolate, large_zeros, mlp, spherical_harmonics
 
 NUM_LEVELS = 3  # of cells (3QFP)
+_FEATURE_STD = 0.05  # standard deviation of the features at the start (3QFP)
 SDF_HIDDEN = (32, 32)  # widths of the hidden layers of the SDF network (3QFP)
 # Half of the longest Fourier wavelength, leaf cells (3QFP: 409.6 m).
 FOURIER_HALF_WIDTH_CELLS = 2048.0
@@ -34,9 +34,7 @@ class Geometry:
     encoding: tuple[Tensor, ...]  # (N, width) each: by the cells, then the Fourier encoding if there is one
     logit: Tensor  # (N,) signed distance / sigma, positive in free space
     feature: Tensor  # (N, geometry_feature_dim), an input of the intensity network
-    normals: (
-        Tensor | None
-    )  # (N, 3) unit vectors towards free space. None: the intensity network does not use them
+    normals: Tensor | None  # (N, 3) unit vectors towards free space, if the intensity network uses them
 
     def first(self, count: int, factors: Sequence[Tensor] | None) -> Geometry:
         """The part for the first `count` points; `factors`: dropout, what each part of the encoding is multiplied by."""
@@ -45,6 +43,36 @@ class Geometry:
         if factors is not None:
             encoding = tuple(part * kept for part, kept in zip(encoding, factors, strict=True))
         return Geometry(encoding, self.logit[:count], self.feature[:count], normals)
+
+
+class VertexFeatures(nn.Module):
+    """A learnable feature, 8 floats, at each vertex of the occupied cells, interpolated inside the cells.
+
+    On quadtrees in the planes xy, xz and yz, summed over the planes (3QFP, ICRA 2024), or at the corners of an octree's cells
+    (SHINE-Mapping, ICRA 2023). The cells of each level are twice as large as those of the level before.
+    """
+
+    def __init__(
+        self,
+        leaf_keys: NDArray[np.uint64],
+        leaf_size_m: float,
+        num_levels: int,
+        encoding: Encoding,
+        num_threads: int = 0,
+    ) -> None:
+        super().__init__()
+        self._summed = encoding == Encoding.OCTREE
+        self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, encoding, num_threads)
+        self.features = nn.Parameter(large_zeros(self.table.num_rows, FEATURE_DIM))
+        self.interpolated_dim = FEATURE_DIM * num_levels
+
+    def initialise(self, generator: torch.Generator) -> None:
+        nn.init.normal_(self.features, std=_FEATURE_STD, generator=generator)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Encoding of points (N, 3), local frame, m: levels side by side, (N, 8 · num_levels), of an octree their sum, (N, 8)."""
+        found = interpolate(self.features, points, self.table)
+        return found.view(len(points), -1, FEATURE_DIM).sum(1) if self._summed else found
 
 
 class NeuralField(Field):
@@ -57,12 +85,12 @@ class NeuralField(Field):
         self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool, num_threads: int = 0
     ) -> None:
         super().__init__()
-        encoding = TriQuadtree if config.encoding.kind == "tri-quadtree" else Octree
+        encoding = Encoding.TRI_QUADTREE if config.encoding.kind == "tri-quadtree" else Encoding.OCTREE
         self.sigma_m = config.sigma_m
-        self.cells = encoding(leaf_keys, config.leaf_size_m, NUM_LEVELS, num_threads)
+        self.cells = VertexFeatures(leaf_keys, config.leaf_size_m, NUM_LEVELS, encoding, num_threads)
         self.table = self.cells.table
-        half_width_m = config.metres(FOURIER_HALF_WIDTH_CELLS)
-        self.fourier = Fourier(half_width_m, config.encoding.fourier_count)
+        self.half_width_m = config.metres(FOURIER_HALF_WIDTH_CELLS)
+        self.num_frequencies = config.encoding.fourier_count
         self.sdf_network = SDFNetwork(config)
         self.intensity_network = IntensityNetwork(config) if with_intensity else None
 
@@ -76,13 +104,15 @@ class NeuralField(Field):
     @property
     def smooth_in_cells(self) -> bool:
         # No wavelength of the encoding is shorter than two leaf cells.
-        shortest_m = 2 * self.fourier.half_width_m / 2 ** (self.fourier.num_frequencies - 1)
-        return self.fourier.num_frequencies == 0 or shortest_m >= 2 * self.table.leaf_size_m
+        shortest_m = 2 * self.half_width_m / 2 ** (self.num_frequencies - 1)
+        return self.num_frequencies == 0 or shortest_m >= 2 * self.table.leaf_size_m
 
     def encode(self, points: Tensor) -> tuple[Tensor, ...]:
         """The inputs of the SDF network, (N, width) each, at points (N, 3), local frame, m."""
         cells = self.cells(points)
-        return (cells, self.fourier(points)) if self.fourier.num_frequencies else (cells,)
+        if self.num_frequencies == 0:
+            return (cells,)
+        return cells, fourier(points, self.half_width_m, 0, self.num_frequencies)
 
     def logit(self, points: Tensor) -> Tensor:
         """Signed distance / sigma (N,), positive in free space, at points (N, 3), local frame, m."""

@@ -181,12 +181,8 @@ def seconds_of(
     shared = _S_PER_INPUT * sdf_widths(config)[0] * of_field + _S_PER_MULTIPLICATION * multiplications
     moved = 0 if config.moves_rows(with_network) else rows * iterations
     seconds += _S_PER_ITERATION * (iterations + later) + _S_PER_MOVED_ROW * moved
-    return seconds + shared / min(resolve_num_threads(config.num_threads), processors())
-
-
-def processors() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return seconds + shared / min(resolve_num_threads(config.num_threads), processors)
 
 
 def skipped_parts(
@@ -205,9 +201,7 @@ def skipped_parts(
     now_s = seconds(network)
     skipped = []
     if not config.train:
-        skipped.append(
-            ("training of the surface: it is averaged", seconds(False, train=True) - now_s),
-        )
+        skipped.append(("training of the surface: it is averaged", seconds(False, train=True) - now_s))
     if not config.returns.passages:
         words = "free space and mean intensities by view, which grids and comparisons need: returns.passages is off"
         skipped.append((words, _S_PER_RETURN_OF_FREE_SPACE * returns))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Losses and gradients of a batch, by the compiled core or by PyTorch's autograd.
 
-:class:`AutogradGradients` is the reference: it differentiates the losses of :mod:`~radarsdf.field.losses` by PyTorch. Only it
+:class:`AutogradGradients` is the reference: it differentiates the losses of this module by PyTorch. Only it
 has normals, which are gradients themselves. :class:`CoreGradients` calls the core once a batch and takes a half to a third of
 the time. Tests check that the two are equal up to rounding.
 """
@@ -18,11 +18,11 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from radarsdf import _core
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field import kernels
-from radarsdf.field.losses import intensity_loss, sdf_loss
 from radarsdf.field.neural_field import Geometry, NeuralField, cells_width, fourier_width
 from radarsdf.fitting.sampling import Batch, Dropout, Samples
 from radarsdf.threads import Workers
@@ -38,6 +38,19 @@ _Result = TypeVar("_Result")
 
 Losses = Literal["sdf", "joint", "intensity"]
 """The sdf loss, by features and SDF network; both losses, by all; the intensity loss, by the intensity network alone."""
+
+
+def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
+    """Binary cross-entropy of sigmoid(logit) against sigmoid(sdf / sigma), (B,) each (SHINE-Mapping).
+
+    The sigmoid gives errors near the surface the most weight.
+    """
+    return functional.binary_cross_entropy_with_logits(logit, torch.sigmoid(sdf_m / sigma_m))
+
+
+def intensity_loss(predicted: Tensor, label: Tensor) -> Tensor:
+    """Mean absolute error of scaled intensities (B,), 0 where the label is NaN. It gives outliers little weight (3QFPI)."""
+    return functional.l1_loss(predicted, torch.where(label.isnan(), predicted.detach(), label))
 
 
 @dataclass(frozen=True)
@@ -62,14 +75,6 @@ class Gradients:
     )  # if only the touched features move: the gradient for these, perhaps in parts
 
 
-@dataclass(frozen=True)
-class RandomDropout:
-    """Factor on the usual dropout, and the random numbers that it is drawn from."""
-
-    scale: float
-    generator: torch.Generator
-
-
 class GradientBackend(ABC):
     """Losses and gradients of batches.
 
@@ -78,9 +83,15 @@ class GradientBackend(ABC):
     """
 
     def __init__(
-        self, field: NeuralField, config: FitConfig, dropout: RandomDropout, workers: Workers
+        self,
+        field: NeuralField,
+        config: FitConfig,
+        dropout_scale: float,
+        generator: torch.Generator,
+        workers: Workers,
     ) -> None:
-        self._field, self._config, self._dropout, self._workers = field, config, dropout, workers
+        self._field, self._config, self._workers = field, config, workers
+        self._dropout_scale, self._generator = dropout_scale, generator
         self._moves_rows = config.moves_rows(field.intensity_network is not None)
 
     @abstractmethod
@@ -92,35 +103,31 @@ class GradientBackend(ABC):
         """Gradients of these losses, and the result of `meanwhile`, which the calling thread runs while others work."""
 
     def state(self) -> dict[str, Tensor]:
-        return {"generator": self._dropout.generator.get_state()}
+        return {"generator": self._generator.get_state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        self._dropout.generator.set_state(state["generator"])
+        self._generator.set_state(state["generator"])
 
     def _draw_dropouts(self) -> list[tuple[int, Dropout]]:
         """Columns and dropout of each part of the encoding, for the intensity network alone."""
-        if not self._config.networks.dropout or self._dropout.scale == 0:
+        if not self._config.networks.dropout or self._dropout_scale == 0:
             return []
-        parts = (
-            (cells_width(self._config), FEATURE_DROPOUT),
-            (fourier_width(self._config), FOURIER_DROPOUT),
-        )
-        scale, generator = self._dropout.scale, self._dropout.generator
+        scale, generator = self._dropout_scale, self._generator
+        widths = (cells_width(self._config), fourier_width(self._config))
+        parts = zip(widths, (FEATURE_DROPOUT, FOURIER_DROPOUT), strict=True)
         return [(width, Dropout.draw(scale * share, generator)) for width, share in parts if width]
 
 
 class CoreGradients(GradientBackend):
     """Losses and gradients by the core's ``FieldLoss``, which checks the field's arrays once and reads them in each call."""
 
-    def __init__(
-        self, field: NeuralField, config: FitConfig, dropout: RandomDropout, workers: Workers
-    ) -> None:
-        super().__init__(field, config, dropout, workers)
-        fourier, network, networks = field.fourier, field.intensity_network, config.networks
+    def __init__(self, field: NeuralField, config: FitConfig, *others: Any) -> None:
+        super().__init__(field, config, *others)
+        network, networks = field.intensity_network, config.networks
         self._loss = _core.FieldLoss(
             table=field.cells.table,
             features=kernels.view(field.cells.features),
-            frequencies=(fourier.half_width_m, 0, fourier.num_frequencies),
+            frequencies=(field.half_width_m, 0, field.num_frequencies),
             sdf=_layers(field.sdf_network),
             intensity=None if network is None else _layers(network),
             sees=(True, networks.view_direction, networks.log_range),

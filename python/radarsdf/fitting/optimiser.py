@@ -12,8 +12,8 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf._core import FEATURE_DIM
-from radarsdf.field.encodings import VertexFeatures
 from radarsdf.field.kernels import large_zeros, rows_view, view
+from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import Workers
 
@@ -93,9 +93,8 @@ class Soap(Optimiser):
         super().__init__(parameters, learning_rate)
         self.step_count = 0
         # A layer with one output has one vector of weights: nothing to turn.
-        is_matrix = [p.ndim == 2 and min(p.shape) > 1 for p in self.parameters]
-        self._matrices = [i for i, yes in enumerate(is_matrix) if yes]
-        self._others = [i for i, yes in enumerate(is_matrix) if not yes]
+        self._matrices = [i for i, p in enumerate(self.parameters) if p.ndim == 2 and min(p.shape) > 1]
+        self._others = [i for i in range(len(self.parameters)) if i not in self._matrices]
         self._adam = Adam(_at(self._others, self.parameters), learning_rate)
         matrices = _at(self._matrices, self.parameters)
         self._weights = [view(p) for p in matrices]

@@ -57,10 +57,9 @@ class Samples:
 
     points: Tensor  # (B, 3) float32, local frame, m
     sdf_m: Tensor  # (B,) label: distance along the ray to the return, m, positive in front of it
-    num_near: int  # the first ones are near the surface, the others in free space
     num_labelled: int  # of the first ones, the intensities are labels
     of_ray: (
-        Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; scaled intensity if there are any
+        Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; scaled intensity if there is one
     )
     share: float = 1.0  # of a part of a batch: what its mean counts in that of the whole; 0 without samples
     labelled_share: float = 1.0  # the same of the samples with labels
@@ -86,7 +85,6 @@ class Batch:
     sdf_m: Tensor  # (B,)
     of_ray: Tensor  # (B, 7 or 8)
     parts: list[tuple[int, int]]  # number of samples of each part, and how many of the first ones have labels
-    near: list[int]  # of each part: how many of its samples, the first ones, are near the surface
 
     def split(self) -> list[Samples]:
         """The samples of each part."""
@@ -95,10 +93,8 @@ class Batch:
         # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
         shares = ([count / max(sum(counts), 1) for count in counts] for counts in (sizes, labelled))
         return [
-            Samples(x, sdf, num_near, num_labelled, of_ray, *shares_of_part)
-            for x, sdf, of_ray, num_near, num_labelled, *shares_of_part in zip(
-                *columns, self.near, labelled, *shares, strict=True
-            )
+            Samples(x, sdf, num_labelled, of_ray, *shares_of_part)
+            for x, sdf, of_ray, num_labelled, *shares_of_part in zip(*columns, labelled, *shares, strict=True)
         ]
 
 
@@ -186,7 +182,7 @@ class RaySampler:
             noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
             points += noise * (noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
-        return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)), near)
+        return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)))
 
     def batch(self, parts: int = 1) -> Batch:
         """`batch_size` samples, in `parts`, each with its share of near and free samples."""
@@ -202,7 +198,7 @@ class RaySampler:
         # Random numbers are drawn for the whole batch and then divided, so samples do not depend on `parts`.
         sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
         points = torch.addcmul(_returns(ray), sdf_m[:, None], _directions(ray), value=-1)
-        return Batch(points, sdf_m, ray, layout.parts, layout.near)
+        return Batch(points, sdf_m, ray, layout.parts)
 
 
 def _in_morton_order(
@@ -241,7 +237,6 @@ class _Layout:
     start: tuple[Tensor, Tensor]  # (B,) c and d: the segment starts c + d · range in front of the return, m,
     length: tuple[Tensor, Tensor]  # (B,) and has the length c + d · range, m, towards the sensor
     parts: list[tuple[int, int]]  # see :class:`Batch`
-    near: list[int]
 
     @classmethod
     def of(cls, counts: tuple[int, int, int], parts: int, config: FitConfig) -> _Layout:
@@ -263,10 +258,8 @@ class _Layout:
         segments = [[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]]
         ends = torch.tensor(segments, dtype=torch.float32, device="cpu")[(kinds == 2).long()]
         start, of_range, length, length_of_range = ends.T.contiguous()
-        of_parts = list(zip(*shares, strict=True))
-        sizes_and_labels = [(sum(part), part[0]) for part in of_parts]
-        near = [labelled + others for labelled, others, _ in of_parts]
-        return cls(index, order, (start, of_range), (length, length_of_range), sizes_and_labels, near)
+        sizes_and_labels = [(sum(part), part[0]) for part in zip(*shares, strict=True)]
+        return cls(index, order, (start, of_range), (length, length_of_range), sizes_and_labels)
 
 
 def _spread(count: int, of: int) -> NDArray[np.int64]:

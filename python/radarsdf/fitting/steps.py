@@ -86,16 +86,22 @@ def _fit(
     workers: Workers,
 ) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
     """The contents of the map, and why the training ended early, if it did."""
-    clock, num_threads = Clock(), workers.num_threads
+    num_threads, clock = workers.num_threads, [time.perf_counter()]
+    seconds: dict[str, float] = {}
+
+    def lap(step: str) -> None:
+        clock.append(time.perf_counter())
+        seconds[step] = clock[-1] - clock[-2]
+
     given = read()
     check_extent(given.rays, config)
     check_fit(given.rays, config, given.inside)
     saved = None if checkpoint is None else Checkpoint(checkpoint, given.rays, given.scale, config)
-    clock.lap("prepare_s")
+    lap("prepare_s")
 
     surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
     learnt = given.rays if given.inside is None else given.rays.select(given.inside)
-    clock.lap("ghosts_s")
+    lap("ghosts_s")
 
     leaf_keys, returns = occupied_cells(surface, config, num_threads)
     with_network = config.trains_intensity and learnt.intensities is not None
@@ -105,18 +111,13 @@ def _fit(
         field.initialise(torch.Generator("cpu").manual_seed(config.seed))
     else:
         field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
-    clock.lap("occupied_cells_s")
+    lap("occupied_cells_s")
 
-    schedule = Schedule.of(
-        config,
-        surface_returns=len(surface.rays),
-        returns=len(learnt),
-        vertices=field.table.num_rows,
-        with_intensity=with_network,
-    )
+    sizes = {"surface_returns": len(surface.rays), "returns": len(learnt), "vertices": field.table.num_rows}
+    schedule = Schedule.of(config, with_intensity=with_network, **sizes)
     report = _report(given, learnt, surface, field, schedule, config)
     contents = _contents(given, learnt, surface, leaf_keys, returns, field, report, config, num_threads)
-    clock.lap("start_s")
+    lap("start_s")
 
     scale = given.scale if config.trains_intensity else None
     closes = learnt.intensities is not None and config.closes_intensity
@@ -139,8 +140,8 @@ def _fit(
     if of_intensity is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
         field.reflectance = closed_form(contents, *of_intensity, num_threads)
     field.requires_grad_(False)
-    clock.lap("training_s")
-    report.update(clock.laps)
+    lap("training_s")
+    report.update(seconds)
     return contents, stop
 
 
@@ -218,16 +219,3 @@ def _report(
         "losses": {},
         "loss_history": {},
     }
-
-
-class Clock:
-    """Wall-clock seconds of each step."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self.laps: dict[str, float] = {}
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = now - self._last
-        self._last = now

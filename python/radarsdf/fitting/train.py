@@ -20,13 +20,7 @@ from tqdm import tqdm
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.gradients import (
-    AutogradGradients,
-    CoreGradients,
-    Gradients,
-    Losses,
-    RandomDropout,
-)
+from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, Losses
 from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.schedule import Schedule
@@ -37,7 +31,6 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
-_OPTIMISERS: dict[str, type[Optimiser]] = {"adam": Adam, "soap": Soap}
 _GENERATORS = 2  # random generators of a fit: for samples, for dropout
 _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
 _MOST_SPANS = 200  # of the history of each loss: enough for a plot, little in the file of a map
@@ -110,7 +103,7 @@ class LossHistory:
                 span[2] = now_s
 
     def fault(self) -> str | None:
-        """A loss that is worse than any answer of the right size over about a hundred iterations: trainings get over a few."""
+        """A loss that is worse than any answer of the right size over about a hundred iterations."""
         for (count, loss, worst), (name, words) in zip(self._recent, _WORST.items(), strict=True):
             if loss > worst:
                 return f"the {name} loss is {loss / count:.3g}, {words},"
@@ -174,10 +167,9 @@ class Training:
         self.history = LossHistory(self.iterations, config)
         network, training = field.intensity_network, config.training
         kind = AutogradGradients if network is not None and config.networks.normals else CoreGradients
-        of_dropout, self._generator = (
-            torch.Generator("cpu").manual_seed(config.seed * _GENERATORS + i) for i in (1, 0)
-        )
-        self._backend = kind(field, config, RandomDropout(schedule.dropout_scale, of_dropout), workers)
+        seeds = (config.seed * _GENERATORS + i for i in range(_GENERATORS))
+        self._generator, of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
+        self._backend = kind(field, config, schedule.dropout_scale, of_dropout, workers)
         self._scale = None if network is None else scale
         # A sampler has its own copy of the rays: there is one at a time.
         self._sampler = self._sampler_of(surface)
@@ -185,7 +177,7 @@ class Training:
         self._later = None if returns is surface or self._scale is None else returns
         self._rows: RowAdam | None = None
         self._optimisers: dict[str, Optimiser] = {}
-        of_network = _OPTIMISERS[training.optimiser]
+        of_network = Soap if training.optimiser == "soap" else Adam
         if config.moves_rows(network is not None):
             self._rows = RowAdam(field.cells, training.learning_rate)
         else:
@@ -321,16 +313,14 @@ class Training:
 
         ahead: Batch | None = None
         for i in range(self._done(stage), iterations):
-            # Each stage starts at the full learning rate, also for an optimiser that an earlier stage has
-            # used.
+            # Each stage starts at the full learning rate, also for an optimiser that an earlier stage used.
             cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
             share = cosine if self._config.training.optimiser == "soap" else 1.0
             stop = interrupted()
             write = checkpoint is not None and (stop or checkpoint.due())
             judge = i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
             look = stop or write or judge
-            # No samples are drawn ahead before the state is written: it would contain the draw after the
-            # next.
+            # No samples are drawn ahead before the state is written: it would contain the draw after the next.
             batch = ahead or stage.draw()
             found, ahead = self._backend.of(stage.losses, batch, _nothing if look else stage.draw)
             loss = sum(found.losses.values())

@@ -29,69 +29,7 @@ if TYPE_CHECKING:
     from radarsdf.map.view import View, ViewedMap
 
 
-class MapParts(ABC):
-    """What each kind of map implements, at positions (N, 3), world, m, and what grids and comparisons read."""
-
-    @abstractmethod
-    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
-        """Free space and returns in the leaf cells that overlap a box of two corners (3,), world, m."""
-
-    @abstractmethod
-    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
-        """The evidence of a surface at positions (N, 3), world, m."""
-
-    @abstractmethod
-    def echoes(self) -> EchoesAt:
-        """View statistics of intensity. Empty without intensities, or without ``returns.passages``."""
-
-    @property
-    @abstractmethod
-    def _contents_of_any(self) -> MapContents:
-        """The parts of the map, or of one of its tiles, for what all have in common."""
-
-    @cached_property
-    def passage_odds(self) -> NDArray[np.float64]:
-        """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
-        return queries.passage_odds(self._contents_of_any)
-
-    @abstractmethod
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor: ...
-
-    @abstractmethod
-    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor: ...
-
-    @abstractmethod
-    def _observed(self, world: Tensor) -> Tensor: ...
-
-    @abstractmethod
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor: ...
-
-    @abstractmethod
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
-        """:meth:`Map.mesh` without intensities. `wanted`: its arguments but for the viewpoint."""
-
-    @abstractmethod
-    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
-        """What views from a position (3,) need of the map within a range. It is held for the next view."""
-
-    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
-        """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
-        return self._sdf(world, False), self._gradient(world, False)
-
-    def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The surface near positions (N, 3), world, m, as planes: signed distances (N,), m, and unit normals (N, 3)."""
-        sdf, gradient = (values.double().numpy() for values in self.plane_at(torch.from_numpy(x)))
-        length = np.linalg.norm(gradient, axis=1)
-        # Along grazing rays the field is longer than the distance, and its gradient is as much longer than 1.
-        return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
-
-    def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
-        """:meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
-        evidence, contents = self.evidence_at(world), self._contents_of_any
-        return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
-
-
-class Map(MapParts):
+class Map(ABC):
     """A surface and its reflectance: the interface of :class:`RadarMap` and :class:`TiledMap`.
 
     Queries take world coordinates, m, as array_like or CPU tensors of shape (N, 3), and return the same kind: float64 for
@@ -430,6 +368,66 @@ class Map(MapParts):
     @abstractmethod
     def file_bytes(self) -> int:
         """Size of the file that :meth:`save` writes, but for the up to 4 kB of its header: int, bytes."""
+
+    # What grids, comparisons and views read of a map, and what each kind of map implements, at positions (N, 3), world, m.
+
+    @abstractmethod
+    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
+        """Free space and returns in the leaf cells that overlap a box of two corners (3,), world, m."""
+
+    @abstractmethod
+    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+        """The evidence of a surface at positions (N, 3), world, m."""
+
+    @abstractmethod
+    def echoes(self) -> EchoesAt:
+        """View statistics of intensity. Empty without intensities, or without ``returns.passages``."""
+
+    @property
+    @abstractmethod
+    def _contents_of_any(self) -> MapContents:
+        """The parts of the map, or of one of its tiles, for what all have in common."""
+
+    @cached_property
+    def passage_odds(self) -> NDArray[np.float64]:
+        """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
+        return queries.passage_odds(self._contents_of_any)
+
+    @abstractmethod
+    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor: ...
+
+    @abstractmethod
+    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor: ...
+
+    @abstractmethod
+    def _observed(self, world: Tensor) -> Tensor: ...
+
+    @abstractmethod
+    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor: ...
+
+    @abstractmethod
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+        """:meth:`Map.mesh` without intensities. `wanted`: its arguments but for the viewpoint."""
+
+    @abstractmethod
+    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
+        """What views from a position (3,) need of the map within a range. It is held for the next view."""
+
+    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
+        return self._sdf(world, False), self._gradient(world, False)
+
+    def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The surface near positions (N, 3), world, m, as planes: signed distances (N,), m, and unit normals (N, 3)."""
+        sdf, gradient = (values.double().numpy() for values in self.plane_at(torch.from_numpy(x)))
+        length = np.linalg.norm(gradient, axis=1)
+        # Along grazing rays the field is longer than the distance, and its gradient is as much longer than 1.
+        return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
+
+    def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
+        """:meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
+        evidence, contents = self.evidence_at(world), self._contents_of_any
+        return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
 
 
 def _as_positions(x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:

@@ -124,11 +124,7 @@ def extract_cells(
     origin: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
     num_threads: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """:func:`marching_cubes` in some cells of a lattice, with time and memory proportional to their number.
-
-    `corners` (K, 3): lattice coordinates, without repetitions. `values` (K,): the field there. `cells` (M, 8): rows of corners,
-    as of :func:`sparse_lattice`; those with a NaN corner are left out.
-    """
+    """:func:`marching_cubes` of values (K,) at lattice coordinates (K, 3), in cells (M, 8) as of :func:`sparse_lattice`."""
     return _core.marching_cubes_sparse(
         _as_int32(corners), values, _as_int32(cells), list(spacing), list(origin), level, num_threads
     )
@@ -201,7 +197,6 @@ def _as_samples(volume: ArrayLike) -> NDArray[Any]:
 
 
 def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    refuse_masked(mask, "mask")
     array = np.asarray(mask)
     if array.dtype != np.bool_:
         msg = f"mask must be boolean, not {array.dtype}"

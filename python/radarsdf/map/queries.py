@@ -211,8 +211,7 @@ def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 def roughness(contents: WholeMap) -> float:
     """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
-    share: float = contents.rough_share / _ROUGH_SHARE
-    return min(share, 1.0)
+    return min(contents.rough_share / _ROUGH_SHARE, 1.0)
 
 
 def _floor_m(contents: WholeMap) -> float:
@@ -229,8 +228,9 @@ class Probabilities(NamedTuple):
     """Probabilities of a surface at N points, float64. 0, or next to it, where there are no returns."""
 
     confidence: Tensor  # (N,) see :func:`confidence`
-    covering: Tensor
-    """(N,) true surface that is newly covered there over its area, if surface is taken as its confidence falls. Only ratios count."""
+    covering: (
+        Tensor  # (N,) true surface newly covered over its area, as the confidence falls. Only ratios count
+    )
     reach: Tensor  # (N,) share of a normal distribution of the position's error within a leaf cell's edge
 
 
@@ -247,10 +247,8 @@ def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
 
 def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     """(N, 5) float64 regressors: 1, the logarithm of the error in leaf cells, how many returns of a surface are missing
-    there, in standard deviations, how rough the map is, and how crowded its returns are. Infinite without returns.
-
-    The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
-    """
+    there, in standard deviations, how rough the map is, and how crowded its returns are. Infinite without returns."""
+    # The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
     error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
     expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.looks.double()
     deviations = (expected - evidence.detections.double()) / (expected + 1).sqrt()
@@ -299,11 +297,9 @@ def dense_cells(
 
 
 def passage_odds(contents: MapContents) -> NDArray[np.float64]:
-    """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it.
-
-    Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
-    on the way to false returns.
-    """
+    """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
+    # Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
+    # on the way to false returns.
     keys = contents.field.table.leaf_keys()
     keys = keys[:: max(1, len(keys) // _ODDS_CELLS)]
     leaf_m = contents.config.leaf_size_m
@@ -314,12 +310,9 @@ def passage_odds(contents: MapContents) -> NDArray[np.float64]:
     weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
     passed = contents.passages.at(keys)
 
-    def shares(side: NDArray[np.bool_]) -> NDArray[np.float64]:
-        counts = np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1
-        found: NDArray[np.float64] = counts / counts.sum()
-        return found
-
-    odds = shares(distances_m < -edge) / shares(distances_m > edge)
+    sides = (distances_m < -edge, distances_m > edge)
+    behind, before = (np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1 for side in sides)
+    odds = (behind / behind.sum()) / (before / before.sum())
     # More crossings never make a cell less free: chance is smoothed away from the end on.
     falling: NDArray[np.float64] = np.minimum.accumulate(odds)
     return falling

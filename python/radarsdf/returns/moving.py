@@ -47,9 +47,7 @@ class SensorVelocity:
     """What the Doppler of one scan says."""
 
     velocity_mps: FloatArray  # (3,) of the sensor in its own frame. NaN if the returns do not agree on one
-    covariance: (
-        FloatArray  # (3, 3) m²/s², large in directions that no return measures. NaN without a velocity
-    )
+    covariance: FloatArray  # (3, 3) m²/s², large in directions that no return measures
     static: NDArray[np.bool_]  # (N,) whether each return agrees with it. All False without a velocity
 
     @property
