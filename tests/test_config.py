@@ -33,7 +33,6 @@ WHOLE = {
     "num_threads": (0, 1024, -1, 1025),
     "max_memory_bytes": (1, 2**63 - 1, 0, 2**63),
     "returns.accumulate_scans": (1, MAX_COUNT, 0, MAX_COUNT + 1),
-    "encoding.num_levels": (1, 12, 0, 13),
     "encoding.bridge_cells": (0, 8, -1, 9),
     "encoding.fourier_count": (0, 24, -1, 25),
     "networks.geometry_feature_dim": (0, MAX_WIDTH, -1, MAX_WIDTH + 1),
@@ -54,7 +53,6 @@ REAL = {
     "returns.pose_sigma_rad": (0.0, 1.0, -0.1, 1.1),
     "training.cross_range_noise_rad": (0.0, LARGE, -0.1, None),
     "training.sigma_cells": (TINY, LARGE, 0.0, None),
-    "training.sdf_loss_weight": (0.0, LARGE, -0.1, None),
     "training.learning_rate": (TINY, LARGE, 0.0, None),
     "training.intensity_learning_rate": (TINY, LARGE, 0.0, None),
 }
@@ -66,13 +64,9 @@ TRUTH = [
     "returns.onto_planes",
     "networks.dropout",
     "networks.normals",
-    "networks.sdf_input",
     "networks.view_direction",
     "networks.log_range",
     "training.intensity_in_free_space",
-    "training.joint",
-    "training.cosine_schedule",
-    "training.row_updates",
 ]
 WORDS = {
     "encoding.kind": ["tri-quadtree", "octree"],
@@ -92,7 +86,7 @@ NONE = [
 
 
 def nested(name, value):
-    """A setting such as "training.joint" as arguments of FitConfig."""
+    """A setting such as "training.batch_size" as arguments of FitConfig."""
     group, dot, own = name.partition(".")
     return {group: {own: value}} if dot else {group: value}
 
@@ -192,7 +186,6 @@ def test_widths(name):
 
 
 def test_limits_are_those_of_the_core():
-    assert groups.MAX_LEVELS == _core.MAX_LEVELS
     assert groups.MAX_FREQUENCIES == _core.MAX_FREQUENCIES
 
 
@@ -205,6 +198,7 @@ def test_limits_are_those_of_the_core():
         ),
         ({"leaf_size_m": 0}, "leaf_size_m must be greater than 0, not 0"),
         ({"training": {"bar": 1}}, "unknown setting training.bar"),
+        ({"training": {"joint": True}}, "unknown setting training.joint"),  # of older versions
         ({"bar": 1}, "unknown setting bar"),
         ({"sdf_iterations": 1}, "unknown setting sdf_iterations"),
         ({"returns": {"max_range_m": 1.0}}, "returns.max_range_m must exceed min_range_m, 2.5, not 1.0"),
@@ -290,16 +284,16 @@ def test_there_and_back(config):
 
 def test_from_dict_fills_what_is_missing():
     assert FitConfig.from_dict({}) == FitConfig()
-    found = FitConfig.from_dict({"seed": 2, "training": {"joint": False}})
-    assert found == FitConfig(seed=2, training={"joint": False})
+    found = FitConfig.from_dict({"seed": 2, "networks": {"dropout": False}})
+    assert found == FitConfig(seed=2, networks={"dropout": False})
 
 
 def test_configurations_are_values():
-    one, same, other = FitConfig(), FitConfig(seed=0), FitConfig(training={"joint": False})
+    one, same, other = FitConfig(), FitConfig(seed=0), FitConfig(networks={"dropout": False})
     assert one == same
     assert one != other
     assert {one: 1, other: 2}[same] == 1
-    for thing, name in ((one, "seed"), (one.training, "joint"), (one, "training")):
+    for thing, name in ((one, "seed"), (one.networks, "dropout"), (one, "training")):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(thing, name, 1)
 
@@ -332,7 +326,6 @@ PUBLISHED = {
     },
     "encoding": {
         "kind": "tri-quadtree",
-        "num_levels": 3,
         "bridge_cells": 0,
         "fourier_count": 16,
     },
@@ -341,7 +334,6 @@ PUBLISHED = {
         "geometry_feature_dim": 15,
         "reflectance": "network",
         "normals": True,
-        "sdf_input": True,
         "view_direction": True,
         "log_range": False,
         "dropout": False,
@@ -349,9 +341,7 @@ PUBLISHED = {
     "training": {
         "cross_range_noise_rad": 0.0,
         "sigma_cells": 0.1375,
-        "sdf_loss_weight": 1.0,
         "intensity_in_free_space": True,
-        "joint": True,
         "batch_size": 8192,
         "intensity_batch_size": 8192,
         "sdf_iterations": 1000,
@@ -359,8 +349,6 @@ PUBLISHED = {
         "optimiser": "adam",
         "learning_rate": 1e-3,
         "intensity_learning_rate": 1e-3,
-        "cosine_schedule": False,
-        "row_updates": False,
     },
 }
 
@@ -383,11 +371,10 @@ def test_what_is_told_to_prepare():
 
 def test_rows_move_unless_normals_are_learnt_with_the_geometry():
     assert FitConfig().moves_rows(with_intensity=True)
-    assert not FitConfig(training={"row_updates": False}).moves_rows(with_intensity=False)
+    assert not FitConfig(training={"optimiser": "adam"}).moves_rows(with_intensity=False)
     normals = FitConfig(networks={"normals": True})
     assert normals.moves_rows(with_intensity=False)
     assert not normals.moves_rows(with_intensity=True)
-    assert normals.override(training={"joint": False}).moves_rows(with_intensity=True)
 
 
 def test_every_setting_says_what_it_is():

@@ -17,7 +17,7 @@ CASES: dict[str, Changes] = {
     **{f"learning rates {r:g}": {"training": {"learning_rate": r, "intensity_learning_rate": r}} for r in
        (1e-4, 1e-3, 1e-1, 1.0)},
     "learning rates 1, constant": {
-        "training": {"learning_rate": 1.0, "intensity_learning_rate": 1.0, "cosine_schedule": False}
+        "training": {"learning_rate": 1.0, "intensity_learning_rate": 1.0, "optimiser": "adam"}
     },
     # Of 1 mm, 1 cm, 1 m and 10 m.
     **{f"sigma of {s:g} cells": {"training": {"sigma_cells": s}} for s in (0.005, 0.05, 5.0, 50.0)},

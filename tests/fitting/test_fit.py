@@ -169,9 +169,7 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     monkeypatch.setattr(
         RaySampler, "spread", lambda self, *args: (drawn_from.append(len(self._rays)), spread(self, *args))[1]
     )
-    config = QUICK.override(
-        num_threads=1, training={"joint": False}, returns={"drop_ghosts": True, "onto_planes": False}
-    )
+    config = QUICK.override(num_threads=1, returns={"drop_ghosts": True, "onto_planes": False})
     with_ghosts = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert 0.1 < is_ghost.mean() < 0.9
     assert with_ghosts.report["ghosts"] == is_ghost.sum()

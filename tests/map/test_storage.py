@@ -60,7 +60,6 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
         normals=True,
         geometry_feature_dim=4,
         intensity_hidden=(16,),
-        num_levels=2,
         max_range_m=70.0,
     )
     path = tmp_path / "map.safetensors"
@@ -92,7 +91,7 @@ def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity)
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "12"
+    assert metadata["format_version"] == "13"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -117,7 +116,7 @@ def test_files_of_other_programs_and_versions(saved, tmp_path):
         save_file({"weight": torch.zeros(3)}, path, foreign)
         with pytest.raises(ValueError, match="is not a radarsdf map"):
             radarsdf.load(path)
-    for version in ("10", "11", "", "1.5", "one"):
+    for version in ("12", "", "1.5", "one"):
         write(path, tensors, metadata | {"format_version": version})
         with pytest.raises(ValueError, match="format version"):
             radarsdf.load(path)
@@ -198,7 +197,7 @@ DAMAGE = {
     "a group a list": lambda d: d["config"].update(training=[1, 2]),
     "setting out of range": lambda d: d["config"].update(leaf_size_m=-0.2),
     "number beyond floats": lambda d: d["config"]["training"].update(sigma_cells=10**400),
-    "other levels": lambda d: d["config"]["encoding"].update(num_levels=5),
+    "other encoding": lambda d: d["config"]["encoding"].update(kind="octree", fourier_count=3),
     "other width": lambda d: d["config"]["networks"].update(sdf_hidden=[33, 32]),
     "config a list": lambda d: d.update(config=[1, 2]),
     "no report": lambda d: d.pop("report"),

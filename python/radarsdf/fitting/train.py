@@ -328,9 +328,10 @@ class Training:
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
             move_networks = functools.partial(_move_networks, found, stage.optimisers, share)
-            if rows is None or found.touched is None:
+            if rows is None:
                 move_networks()
             else:
+                assert found.touched is not None
                 rows.learning_rate = share * rows.full_rate
                 rows.step([found.touched], self._workers, meanwhile=move_networks)
             self.losses[stage.name] = loss
