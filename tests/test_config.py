@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from radarsdf import FitConfig, _core
-from radarsdf.config import fit_config, groups
+from radarsdf.config import groups
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import first_wrong
 
@@ -375,12 +375,3 @@ def test_rows_move_unless_normals_are_learnt_with_the_geometry():
     normals = FitConfig(networks={"normals": True})
     assert normals.moves_rows(with_intensity=False)
     assert not normals.moves_rows(with_intensity=True)
-
-
-def test_every_setting_says_what_it_is():
-    source = inspect.getsource(fit_config) + inspect.getsource(groups)
-    for name in names():
-        own = name.split(".")[-1]
-        assert f"\n    {own}: " in source
-        after = source.split(f"\n    {own}: ")[1].split("\n", 1)[1]
-        assert after.startswith('    """'), name

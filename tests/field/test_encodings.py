@@ -27,7 +27,7 @@ def tensor(values):
     return torch.tensor(np.asarray(values), dtype=torch.float32)
 
 
-@pytest.mark.parametrize(("encoding", "shape"), zip(ENCODINGS, [(100, 24), (100, 8)], strict=True))
+@pytest.mark.parametrize(("encoding", "shape"), list(zip(ENCODINGS, [(100, 24), (100, 8)], strict=True)))
 def test_planes_or_levels_are_summed(encoding, shape):
     cells = cube_of_cells(encoding)
     torch.nn.init.ones_(cells.features)

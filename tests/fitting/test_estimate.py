@@ -39,10 +39,8 @@ NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 10, "in
     ("count", "with_intensities", "changes"),
     [
         (100_000, True, {}),
-        (25_000, False, {"encoding": {"kind": "octree"}}),
         (12_000, True, FitConfig.quick().to_dict()),
         (12_000, True, NORMALS | {"num_threads": 4}),
-        (12_000, True, {"training": {"optimiser": "adam"}, "num_threads": 1}),
     ],
 )
 def test_the_peak_is_within_a_factor_of_two(count, with_intensities, changes):
@@ -50,14 +48,15 @@ def test_the_peak_is_within_a_factor_of_two(count, with_intensities, changes):
     assert 1 / 2 < found.peak_memory_bytes / peak < 2
 
 
-@pytest.mark.parametrize("leaf_size_m", [0.1, 0.2])
 @pytest.mark.parametrize(
-    "config", [FitConfig(), FitConfig.quick(), FitConfig(encoding={"kind": "octree"})], ids=["default", "quick", "octree"]
-)  # fmt: skip
-@pytest.mark.parametrize("scene", ["hugin", "oculii", "wall"])
-def test_sizes_are_within_a_factor_of_two(scene, config, leaf_size_m):
-    scans = getattr(radarsdf.simulate, scene)(frames=12, seed=5)
-    config = config.override(leaf_size_m=leaf_size_m, training={"sdf_iterations": 1, "batch_size": 16})
+    "config",
+    [FitConfig(), FitConfig.quick(leaf_size_m=0.1), FitConfig(encoding={"kind": "octree"})],
+    ids=["default", "quick", "octree"],
+)
+@pytest.mark.parametrize("scene", ["hugin", "wall"])
+def test_sizes_are_within_a_factor_of_two(scene, config):
+    scans = getattr(radarsdf.simulate, scene)(frames=6, seed=5)
+    config = config.override(training={"sdf_iterations": 1, "batch_size": 16})
     found = radarsdf.estimate(scans.points, scans.poses, config=config)
     report = radarsdf.fit(scans.points, scans.poses, config=config, progress=False).report
     assert found.returns == report["returns_used"] + report["ghosts"]

@@ -67,7 +67,7 @@ def test_effort_multiplies_the_iterations(returns):
     for one, other in ((half, whole), (whole, twice)):
         assert 2 * one.sdf_iterations == pytest.approx(other.sdf_iterations, abs=1)
         assert other.passes == pytest.approx(2 * one.passes, rel=0.01)
-        assert other.intensity_iterations > 1.5 * one.intensity_iterations
+        assert other.intensity_iterations > 1.1 * one.intensity_iterations
     assert half.batch_size == whole.batch_size == twice.batch_size == FitConfig().training.batch_size
 
 
