@@ -197,6 +197,7 @@ def _as_samples(volume: ArrayLike) -> NDArray[Any]:
 
 
 def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    refuse_masked(mask, "mask")
     array = np.asarray(mask)
     if array.dtype != np.bool_:
         msg = f"mask must be boolean, not {array.dtype}"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors.torch import load, save
 from torch import Tensor
 
 from radarsdf.field.field import Field
@@ -38,7 +39,8 @@ class RadarMap(Map):
         return f"RadarMap({kind}, {self.num_cells} cells, {self.file_bytes / 1e6:.1f} MB)"
 
     def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
-        return _from_pickle, storage.to_pickle(self._contents)
+        tensors, description = storage.parts_of(self._contents)
+        return _from_pickle, (save(tensors), description)  # as bytes: a pickle without classes of PyTorch
 
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
         return self._where_observed(queries.signed_distance, world, extrapolate=extrapolate)
@@ -133,4 +135,4 @@ def load_file(path: str | PathLike[str]) -> RadarMap:
 
 
 def _from_pickle(data: bytes, description: dict[str, Any]) -> RadarMap:
-    return RadarMap(storage.from_pickle(data, description))
+    return RadarMap(storage.contents_of(load(data), description))

@@ -14,8 +14,6 @@ import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load as from_bytes
-from safetensors.torch import save as to_bytes
 from torch import Tensor
 from typing_extensions import TypedDict
 
@@ -77,7 +75,6 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     write_whole(path, tensor_bytes(tensors, metadata))
 
 
-@torch.inference_mode(mode=False)  # or the map could not give gradients
 def load_contents(path: str | PathLike[str]) -> MapContents:
     """Read the file of a map. A ValueError if it is damaged, of another program or of another version."""
     check_regular_file(path)
@@ -93,7 +90,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
             else:
                 # Copied, because the tensors are views of the file, which may be changed or removed.
                 tensors = {name: file.array(name).clone() for name in file.names}
-                return _build(tensors, json.loads(metadata["description"]))
+                return contents_of(tensors, json.loads(metadata["description"]))
     except OSError:
         raise
     except SafetensorError as error:
@@ -123,18 +120,6 @@ def file_bytes(contents: MapContents) -> int:
     return sum(tensor.nbytes for tensor in tensors.values()) + len(quoted)
 
 
-def to_pickle(contents: MapContents) -> tuple[bytes, dict[str, Any]]:
-    """The contents of a map's pickle: tensors as bytes, so that it does not contain classes of PyTorch."""
-    tensors, description = parts_of(contents)
-    return to_bytes(tensors), description
-
-
-@torch.inference_mode(mode=False)
-def from_pickle(data: bytes, description: dict[str, Any]) -> MapContents:
-    """The inverse of :func:`to_pickle`."""
-    return _build(from_bytes(data), description)
-
-
 def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """All tensors of a map, and a description that JSON can store."""
     field, scale, reflectance = contents.field, contents.intensity_scale, contents.field.reflectance
@@ -161,7 +146,8 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
 
 
-def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
+@torch.inference_mode(mode=False)  # or the map could not give gradients
+def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
     """The inverse of :func:`parts_of`. Raises an error of some kind if parts do not fit together."""
     config = FitConfig.from_dict(description["config"])
     origin = _taken(tensors, "origin", torch.float64, (3,))

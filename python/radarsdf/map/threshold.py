@@ -40,10 +40,9 @@ class Limits(NamedTuple):
         min_component_triangles: int | None = None,
     ) -> Limits:
         """The arguments of :meth:`Map.mesh`, checked, with defaults filled in."""
-        if (
-            min_confidence is not None
-            and not 0 <= (min_confidence := number(min_confidence, "min_confidence")) <= 1
-        ):
+        if min_confidence is not None:
+            min_confidence = number(min_confidence, "min_confidence")
+        if not 0 <= (min_confidence or 0) <= 1:
             msg = f"min_confidence must be in [0, 1], not {min_confidence}"
             raise ValueError(msg)
         max_uncertainty = number(math.inf if max_uncertainty is None else max_uncertainty, "max_uncertainty")
@@ -106,17 +105,10 @@ class Tally:
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
         scans = np.round(detections)
 
-        def by_confidence(values: Floats) -> Floats:
-            return np.bincount(bins, values, _BINS).astype(np.float64)
-
-        return cls(
-            by_confidence(area_m2),
-            by_confidence(true_m2),
-            by_confidence(covering * area_m2),
-            float(np.minimum(existing_m2, area_m2).sum()),
-            float(true_m2[scans == 1].sum()),
-            float(true_m2[scans == 2].sum()),
-        )
+        columns = (area_m2, true_m2, covering * area_m2)
+        by_confidence = (np.bincount(bins, values, _BINS).astype(np.float64) for values in columns)
+        scalars = (np.minimum(existing_m2, area_m2), true_m2[scans == 1], true_m2[scans == 2])
+        return cls(*by_confidence, *(float(values.sum()) for values in scalars))
 
     def sums(self) -> Floats:
         """(TALLY_NUMBERS,)."""
