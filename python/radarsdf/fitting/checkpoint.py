@@ -55,7 +55,6 @@ class Checkpoint:
             raise FileNotFoundError(msg)
 
     def due(self) -> bool:
-        """Whether it is time to write the next file."""
         return time.monotonic() >= self._next_s
 
     def write(self, state: dict[str, Tensor]) -> None:

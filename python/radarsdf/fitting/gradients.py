@@ -67,12 +67,8 @@ class Gradients:
     """Losses and gradients of a batch. The next batch overwrites the arrays."""
 
     losses: dict[str, float]  # "sdf", "intensity"
-    by_parameters: list[
-        Tensor
-    ]  # that are trained: all features (without `touched`), SDF network, intensity network
-    touched: (
-        list[Touched] | None
-    )  # if only the touched features move: the gradient for these, perhaps in parts
+    by_parameters: list[Tensor]  # all features (without `touched`), SDF network, intensity network
+    touched: Touched | None  # the gradient for touched features, if only these move
 
 
 class GradientBackend(ABC):

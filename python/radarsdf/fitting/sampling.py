@@ -58,9 +58,7 @@ class Samples:
     points: Tensor  # (B, 3) float32, local frame, m
     sdf_m: Tensor  # (B,) label: distance along the ray to the return, m, positive in front of it
     num_labelled: int  # of the first ones, the intensities are labels
-    of_ray: (
-        Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; scaled intensity if there is one
-    )
+    of_ray: Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; perhaps scaled intensity
     share: float = 1.0  # of a part of a batch: what its mean counts in that of the whole; 0 without samples
     labelled_share: float = 1.0  # the same of the samples with labels
 
@@ -87,7 +85,6 @@ class Batch:
     parts: list[tuple[int, int]]  # number of samples of each part, and how many of the first ones have labels
 
     def split(self) -> list[Samples]:
-        """The samples of each part."""
         sizes, labelled = map(list, zip(*self.parts, strict=True))
         columns = [torch.split_with_sizes(column, sizes) for column in (self.points, self.sdf_m, self.of_ray)]
         # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
@@ -136,7 +133,6 @@ class RaySampler:
         return {"order_from": self._order_from, "next": following_ray}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of a sampler of the same rays gave. Changes the generator's state."""
         following = int(state["next"])
         if not -1 <= following <= len(self._rays):
             msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"

@@ -80,12 +80,10 @@ class Schedule:
 
     @property
     def iterations(self) -> dict[str, int]:
-        """Iterations of both stages by name, for reports."""
         return {"sdf": self.sdf_iterations, "intensity": self.intensity_iterations}
 
 
 def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, int]:
-    """Samples in a batch, and iterations, of the sdf stage."""
     # Few returns: what is learnt from more samples than those of a pass is the same again. Measured on 20 to 300 returns
     # of four simulated scenes: errors are as small, and 20 take a quarter of the time.
     batch_size = min(config.training.batch_size, samples)

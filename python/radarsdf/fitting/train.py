@@ -83,7 +83,6 @@ class LossHistory:
         self._started_s = time.perf_counter()
 
     def start(self) -> None:
-        """The training begins, or goes on."""
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
         self._started_s = time.perf_counter() - before_s
 
@@ -241,7 +240,6 @@ class Training:
         self._generator.set_state(state["generator"])  # last, because the sampler changes it
 
     def report(self) -> dict[str, Any]:
-        """What the map's report says of the training."""
         names = ("iterations", "iterations_done", "losses")
         return {name: getattr(self, name) for name in names} | {"loss_history": self.history.to_report()}
 

@@ -82,9 +82,7 @@ class Map(ABC):
         return answer(self._gradient(world, extrapolate))
 
     def observed(self, x: Any) -> Any:
-        """Whether positions lie in a leaf cell of the map, or on its border.
-
-        Leaf cells are those near returns, and those that bridge a small gap between two of them.
+        """Whether positions lie in a leaf cell, near returns or in a small gap between them, or on its border.
 
         Parameters
         ----------
@@ -136,10 +134,9 @@ class Map(ABC):
 
         Notes
         -----
-        A logistic function of the precision of the returns (:meth:`uncertainty` without its floor), of how many returns are
-        missing given the scans that reached the place, of the map's clutter ratio, and of its number of returns in a cell. It
-        was fitted to simulated places of twelve kinds and to five real drives; on kinds that had no part in it, the worst tenth
-        is mostly within 0.1 to 0.3 of the share of true surface.
+        A logistic function of the precision of the returns, of how many are missing given the scans that reached the place, of
+        the map's clutter ratio, and of its returns per cell. It was fitted to simulated places and five real drives; on other
+        kinds, the worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
         """
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[2])
@@ -236,7 +233,6 @@ class Map(ABC):
     def _mesh_seen_from(
         self, viewpoint: ArrayLike | None, voxel_size: float, **wanted: Any
     ) -> trimesh.Trimesh:
-        """:meth:`mesh`; `wanted`: arguments of `_surface_mesh`."""
         from radarsdf.map.mesh import with_intensities  # noqa: PLC0415 - trimesh is slow to import
 
         if viewpoint is None:
@@ -264,9 +260,8 @@ class Map(ABC):
     ) -> View:
         """Predict the scan that a radar would get from a pose, and what each of its beams first meets.
 
-        Beams are traced to the surface that :meth:`mesh` keeps by default. Returns come from patches of the field's
-        surface: most from those that often had returns in the scans that reached them, few from hidden ones. They are the
-        likeliest scan, not a random one: spread evenly, and on the surface.
+        Beams are traced to the surface that :meth:`mesh` keeps by default. Returns come from patches of the field's surface, most
+        from those that often had returns in the scans that reached them: the likeliest scan, not a random one.
 
         Parameters
         ----------

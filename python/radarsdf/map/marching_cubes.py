@@ -21,8 +21,6 @@ from torch.autograd.function import once_differentiable
 from radarsdf import _core
 from radarsdf.checks import real_array, refuse_masked
 
-_SMALL_INTEGERS = 2  # bytes: float32 holds all of them
-
 
 def marching_cubes(
     volume: ArrayLike | Tensor,
@@ -125,21 +123,21 @@ def extract_cells(
     num_threads: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """:func:`marching_cubes` of values (K,) at lattice coordinates (K, 3), in cells (M, 8) as of :func:`sparse_lattice`."""
-    return _core.marching_cubes_sparse(
-        _as_int32(corners), values, _as_int32(cells), list(spacing), list(origin), level, num_threads
-    )
+    corners, cells = (np.ascontiguousarray(a, np.int32) for a in (corners, cells))
+    placement = list(spacing), list(origin), level
+    return _core.marching_cubes_sparse(corners, values, cells, *placement, num_threads)
 
 
 def sparse_lattice(
     cells: NDArray[Any], *, num_threads: int = 0
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Different cells (M', 3) of those with lower corners (M, 3), sorted; their corners (K, 3), sorted; rows of these (M', 8)."""
-    return _core.sparse_lattice(_as_int32(cells), num_threads)
+    return _core.sparse_lattice(np.ascontiguousarray(cells, np.int32), num_threads)
 
 
 def mesh_components(faces: NDArray[Any], num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Component (F,) of each of the faces (F, 3), which share vertices, numbered by their first faces; and their sizes (C,)."""
-    return _core.mesh_components(_as_int32(faces), num_vertices)
+    return _core.mesh_components(np.ascontiguousarray(faces, np.int32), num_vertices)
 
 
 class _MarchingCubes(torch.autograd.Function):
@@ -183,7 +181,7 @@ def _as_tensor(volume: Tensor) -> Tensor:
     if kind.is_complex:
         msg = f"volume must be real numbers, not {kind}"
         raise TypeError(msg)
-    small = kind.is_floating_point or kind.itemsize <= _SMALL_INTEGERS
+    small = kind.is_floating_point or kind.itemsize <= 2  # bytes: float32 holds all integers of these
     return volume.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
 
 
@@ -206,10 +204,6 @@ def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         msg = f"mask must have the shape of volume, {shape}, not {array.shape}"
         raise ValueError(msg)
     return np.ascontiguousarray(array)
-
-
-def _as_int32(values: NDArray[Any]) -> NDArray[np.int32]:
-    return np.ascontiguousarray(values, np.int32)
 
 
 def _as_placement(

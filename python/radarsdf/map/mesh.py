@@ -89,7 +89,6 @@ class Surface:
         return with_all(certain & (self.confidence >= min_confidence), self.faces)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
-        """(F,) faces that a mesh keeps."""
         kept = self.allowed(limits.max_uncertainty, self.threshold(limits).min_confidence)
         rows = np.flatnonzero(kept)
         if len(rows):
@@ -103,10 +102,15 @@ class Surface:
 
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """What the limits leave, in the world. `leaf_cells`: of the whole map."""
-        used, faces = renumbered(len(self.vertices), self.faces[self.kept(limits)])
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
+        return self.part(origin, self.kept(limits), **counts, **self.threshold(limits).metadata)
+
+    def part(
+        self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
+    ) -> trimesh.Trimesh:
+        """The faces that are `kept` (F,), in the world."""
+        used, faces = renumbered(len(self.vertices), self.faces[kept])
         columns = self.confidence[used], self.uncertainty_m[used]
-        metadata = counts | self.threshold(limits).metadata
         return described_mesh(self.vertices[used] + origin, faces, *columns, **metadata)
 
 
@@ -151,7 +155,6 @@ def with_intensities(
 
 
 def local(contents: WholeMap, world: NDArray[np.float64]) -> torch.Tensor:
-    """Positions (N, 3) in the world, m, in the local frame, float32."""
     return queries.to_local(contents, torch.from_numpy(world))
 
 
@@ -243,8 +246,10 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
     steps = np.arange(parts, dtype=np.int32) if even else ends
     inside = np.stack(np.meshgrid(*[steps] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     if even:
-        return (cells[:, None] * np.int32(parts) + inside).reshape(-1, 3)
-    return np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32).reshape(-1, 3)
+        voxels: NDArray[np.int32] = cells[:, None] * np.int32(parts) + inside
+    else:
+        voxels = np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32)
+    return voxels.reshape(-1, 3)
 
 
 def _corner_distances(

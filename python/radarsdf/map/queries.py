@@ -66,12 +66,10 @@ def to_local(contents: WholeMap, world: Tensor) -> Tensor:
 def signed_distance(
     contents: MapContents, points: Tensor, *, description: str = "", progress: bool | None = False
 ) -> Tensor:
-    """(N,) signed distance, m, positive in free space."""
     return evaluate(contents.field.sdf, points, description=description, progress=progress)
 
 
 def gradient(contents: MapContents, points: Tensor) -> Tensor:
-    """(N, 3) gradient of the signed distance, towards free space."""
     return evaluate(contents.field.gradient, points)
 
 
@@ -93,7 +91,6 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
 
 
 def occupied(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) bool, whether each point lies in an occupied leaf cell."""
     return evaluate(contents.field.occupied, points)
 
 
@@ -185,7 +182,6 @@ class EvidenceAt(NamedTuple):
 
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
-    """The evidence at each point."""
     keys = contents.field.table.leaf_keys()
     return interpolated(contents.evidence, keys, contents.config.leaf_size_m, points)
 
@@ -228,9 +224,7 @@ class Probabilities(NamedTuple):
     """Probabilities of a surface at N points, float64. 0, or next to it, where there are no returns."""
 
     confidence: Tensor  # (N,) see :func:`confidence`
-    covering: (
-        Tensor  # (N,) true surface newly covered over its area, as the confidence falls. Only ratios count
-    )
+    covering: Tensor  # (N,) true surface newly covered over its area; only ratios count
     reach: Tensor  # (N,) share of a normal distribution of the position's error within a leaf cell's edge
 
 

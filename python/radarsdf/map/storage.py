@@ -207,7 +207,6 @@ def _field_of(
 
 
 def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """Takes the arrays of a part from the tensors."""
     arrays = {}
     for name, (dtype, dimensions) in _PARTS[part].items():
         array = _taken(tensors, f"{part}.{name}", dtype, (None,) * dimensions)

@@ -106,17 +106,15 @@ class Tally:
         scans = np.round(detections)
 
         columns = (area_m2, true_m2, covering * area_m2)
-        by_confidence = (np.bincount(bins, values, _BINS).astype(np.float64) for values in columns)
+        sums = [np.bincount(bins, values, _BINS) for values in columns]
         scalars = (np.minimum(existing_m2, area_m2), true_m2[scans == 1], true_m2[scans == 2])
-        return cls(*by_confidence, *(float(values.sum()) for values in scalars))
+        return cls.of_sums(np.concatenate([*sums, [values.sum() for values in scalars]]))
 
     def sums(self) -> Floats:
-        """(TALLY_NUMBERS,)."""
         return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
 
     @classmethod
     def of_sums(cls, sums: Floats) -> Tally:
-        """The inverse of :meth:`sums`."""
         area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _BINS)
         existing_m2, once_m2, twice_m2 = sums[-_SCALARS:].tolist()
         return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)

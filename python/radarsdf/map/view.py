@@ -227,7 +227,6 @@ def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
 
     def rows_of(places: int) -> NDArray[np.int64]:
-        """They are not listed: there can be many more than rows."""
         up_to = np.minimum(np.floor(sums * (places / sums[-1]) + 0.5), places)
         return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
 
@@ -260,8 +259,9 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
     while counts[0] * counts[1] > _MAX_BEAMS:
         counts = [max(1, count // 2) for count in counts]
     (first, last), (lowest, highest) = limits
-    azimuth = first + (np.arange(counts[0]) + 0.5) * ((last - first) / counts[0])
-    return azimuth, lowest + (np.arange(counts[1]) + 0.5) * ((highest - lowest) / counts[1])
+    azimuth: _Floats = first + (np.arange(counts[0]) + 0.5) * ((last - first) / counts[0])
+    elevation: _Floats = lowest + (np.arange(counts[1]) + 0.5) * ((highest - lowest) / counts[1])
+    return azimuth, elevation
 
 
 def _first_surface(

@@ -112,7 +112,6 @@ def unpacked(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
 
 
 def _morton_table() -> NDArray[np.int64]:
-    """(8, 8, 8) place of each leaf cell of a block in Morton order."""
     table = np.zeros((BLOCK_CELLS,) * 3, np.int64)
     cells = lattice_of(_INSIDE) % BLOCK_CELLS
     table[tuple(cells.T)] = _INSIDE

@@ -38,7 +38,6 @@ class Plausible:
         return known.plausible()
 
     def holds(self, intensities: NDArray[Any]) -> NDArray[np.bool_]:
-        """Mask (N,) of the intensities within the limits. NaN is not."""
         return (intensities >= np.float64(self.low)) & (intensities <= np.float64(self.high))
 
     def kept(self, intensities: NDArray[Any]) -> NDArray[Any]:

@@ -219,7 +219,6 @@ class Movers:
         return sum(int(mask.sum()) for mask in self.masks)
 
     def without(self, arrays: Sequence[ArrayLike]) -> list[NDArray[Any]]:
-        """F arrays (N_i, ...) without the rows of what moves."""
         return [np.asarray(array)[~mask] for array, mask in zip(arrays, self.masks, strict=True)]
 
 
@@ -264,5 +263,8 @@ def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike])
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
     """The static returns within the ranges of a fit, each seen from where its scan was taken. Intensity outliers are NaN."""
     standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
-    limits = {"min_range_m": config.returns.min_range_m, "max_range_m": config.returns.max_range_m}
+    limits: dict[str, Any] = {
+        "min_range_m": config.returns.min_range_m,
+        "max_range_m": config.returns.max_range_m,
+    }
     return prepare(standing.points, scans.poses, standing.intensities, **limits)

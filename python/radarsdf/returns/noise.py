@@ -41,7 +41,6 @@ class SensorNoise:
 
     @classmethod
     def median(cls, noises: Sequence[SensorNoise]) -> SensorNoise:
-        """Of several, number by number."""
         return cls(*np.median([dataclasses.astuple(noise) for noise in noises], axis=0).tolist())
 
     @property

@@ -58,9 +58,8 @@ class Surfels:
         planes = (cell_of_plane, centres, normals, variances, widest)
         return cls(cell_size_m, keys, blocks, counts, support, *planes)
 
-    def is_flat(self, max_flatness: float = MAX_FLATNESS) -> NDArray[np.bool_]:
-        """(P,) bool, whether each surfel is thin compared with its extent."""
-        flat: NDArray[np.bool_] = self.variances[:, 0] < max_flatness * self.variances[:, 1]
+    def is_flat(self) -> NDArray[np.bool_]:
+        flat: NDArray[np.bool_] = self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]
         return flat
 
     def rough_share(self) -> float:
@@ -74,12 +73,6 @@ class Surfels:
     def returns_per_cell(self) -> float:
         """Mean number of returns in a cell, to which false returns are proportional. 0 without cells."""
         return float(self.counts.sum()) / len(self.keys) if len(self.keys) else 0.0
-
-    def plane_of_cell(self, planes: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(C,) row of the surfel of each cell, -1 if it is none of the rows `planes`."""
-        plane_of_cell = np.full(len(self.keys), -1, np.int32)
-        plane_of_cell[self.cell_of_plane[planes]] = planes
-        return plane_of_cell
 
     def cells_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
         """(N,) row of the cell of each of the `points` (N, 3), local, m. -1: it holds no return."""
@@ -99,8 +92,10 @@ class Surfels:
         return self._flat_planes(self.cells_of_leaves(leaf_keys, num_threads))
 
     def _flat_planes(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        planes = self.plane_of_cell(np.flatnonzero(self.is_flat()))
-        return np.append(planes, np.int32(-1))[cells]  # the row -1, of no cell, is that of the last number
+        flat = np.flatnonzero(self.is_flat())
+        planes = np.full(len(self.keys) + 1, -1, np.int32)  # the last one is for the row -1, of no cell
+        planes[self.cell_of_plane[flat]] = flat
+        return planes[cells]
 
 
 def support_round(

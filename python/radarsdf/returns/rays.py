@@ -79,7 +79,6 @@ class Rays:
         )
 
     def in_c_order(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """`points`, `directions` and `ranges_m` as the core takes them."""
         points, directions = np.ascontiguousarray(self.points), np.ascontiguousarray(self.directions)
         return points, directions, np.ascontiguousarray(self.ranges_m)
 
@@ -114,7 +113,6 @@ class LeftOut:
 
     @property
     def notes(self) -> list[str]:
-        """A sentence if anything is left out."""
         parts = []
         if self.rows:
             parts.append(f"{self.rows} of {self.given} returns (not finite, at the sensor, or padding)")

@@ -190,11 +190,11 @@ class _Groups:
             return cls(None, points, directions, np.ones(len(points)))
         rows, count = cell_rows(_in_metres(_GROUPS, leaf_size_m), points, directions, incidence_rad)
         counts = np.bincount(rows, minlength=count).astype(np.float64)
-        sums = (
-            np.stack([np.bincount(rows, column, count) for column in columns.T], 1)
+        means = [
+            _divided(np.stack([np.bincount(rows, column, count) for column in columns.T], 1), counts)
             for columns in (points, directions)
-        )
-        return cls(rows, *(_divided(of_groups, counts) for of_groups in sums), counts)
+        ]
+        return cls(rows, means[0], means[1], counts)
 
     @property
     def weights(self) -> Float32:

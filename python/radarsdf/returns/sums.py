@@ -215,7 +215,14 @@ class MeanRays:
         )
 
     def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
-        columns = (self.keys, self.points, self.directions, self.counts, self.scans, self.ranges_m)
+        columns: tuple[NDArray[Any], ...] = (
+            self.keys,
+            self.points,
+            self.directions,
+            self.counts,
+            self.scans,
+            self.ranges_m,
+        )
         return MeanRays(*(column[part] for column in columns))
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,14 +51,14 @@ class EchoesAt:
     sigma: float  # standard deviation of single returns from the mean of those that are close and seen alike
 
     def select(self, chosen: NDArray[np.bool_]) -> EchoesAt:
-        return EchoesAt(*(getattr(self, name)[chosen] for name in _COLUMNS), self.sigma)
+        return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @classmethod
     def together(cls, parts: Sequence[EchoesAt]) -> EchoesAt:
         weights = np.array([max(float(part.counts.sum()), 1.0) for part in parts])
         variances = np.array([part.sigma**2 for part in parts])
-        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS)
-        return cls(*columns, float(np.sqrt((weights * variances).sum() / weights.sum())))
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
+        return cls(**columns, sigma=float(np.sqrt((weights * variances).sum() / weights.sum())))
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,6 @@ class Echoes:
 
     @classmethod
     def of(cls, rays: Rays, unit: Float32, leaf_size_m: float) -> Echoes:
-        """Of `rays` with intensities (N,) in [0, 1]."""
         rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, leaf_size_m)
         counts = np.bincount(rows, minlength=count)
         of_returns = unit.astype(np.float64)
@@ -98,8 +98,8 @@ class Echoes:
     @classmethod
     def none(cls) -> Echoes:
         empty = np.zeros((0, 3), np.float32)
-        none = (np.zeros(0, dtype) for dtype in (np.float16, np.float32, np.int16))
-        return cls(empty, empty.astype(np.int8), *none, 0.0)
+        none = empty[:, 0]
+        return cls(empty, empty.astype(np.int8), none.astype(np.float16), none, none.astype(np.int16), 0.0)
 
     def check(self, leaf_size_m: float) -> None:
         """Raises a ValueError unless arrays of a file are what they should be."""
