@@ -21,7 +21,7 @@ from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.threshold import Limits, Tally, Threshold, areas_round
+from radarsdf.map.threshold import Limits, Tally, areas_round
 from radarsdf.memory import check_mesh
 from radarsdf.returns.intensities import IntensityScale
 
@@ -89,29 +89,29 @@ class Surface:
         return with_all(certain & (self.confidence >= min_confidence), self.faces)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
-        kept = self.allowed(limits.max_uncertainty, self.threshold(limits).min_confidence)
+        kept = self.allowed(
+            limits.max_uncertainty, self.tally.threshold(limits.min_confidence).min_confidence
+        )
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
             kept[rows] = sizes[labels] >= limits.min_component_triangles
         return kept
 
-    def threshold(self, limits: Limits) -> Threshold:
-        """The confidence from which a mesh keeps the surface, and what is expected of it."""
-        return self.tally.threshold(limits.min_confidence)
-
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """What the limits leave, in the world. `leaf_cells`: of the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
-        return self.part(origin, self.kept(limits), **counts, **self.threshold(limits).metadata)
+        return self.part(
+            origin, self.kept(limits), **counts, **self.tally.threshold(limits.min_confidence).metadata
+        )
 
     def part(
         self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
     ) -> trimesh.Trimesh:
         """The faces that are `kept` (F,), in the world."""
         used, faces = renumbered(len(self.vertices), self.faces[kept])
-        columns = self.confidence[used], self.uncertainty_m[used]
-        return described_mesh(self.vertices[used] + origin, faces, *columns, **metadata)
+        vertices, confidence = self.vertices[used] + origin, self.confidence[used]
+        return described_mesh(vertices, faces, confidence, self.uncertainty_m[used], **metadata)
 
 
 def extract_mesh(

@@ -259,9 +259,9 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
     while counts[0] * counts[1] > _MAX_BEAMS:
         counts = [max(1, count // 2) for count in counts]
     (first, last), (lowest, highest) = limits
-    azimuth: _Floats = first + (np.arange(counts[0]) + 0.5) * ((last - first) / counts[0])
-    elevation: _Floats = lowest + (np.arange(counts[1]) + 0.5) * ((highest - lowest) / counts[1])
-    return azimuth, elevation
+    azimuth = first + (np.arange(counts[0]) + 0.5) * ((last - first) / counts[0])
+    elevation = lowest + (np.arange(counts[1]) + 0.5) * ((highest - lowest) / counts[1])
+    return np.asarray(azimuth, np.float64), np.asarray(elevation, np.float64)
 
 
 def _first_surface(

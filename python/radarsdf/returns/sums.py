@@ -108,7 +108,6 @@ class ScanSums:
         return self._with(other, 1)
 
     def __sub__(self, other: ScanSums) -> ScanSums:
-        """Without scans that were added. Cells without returns go."""
         return self._with(other, -1)
 
     def _with(self, other: ScanSums, sign: int) -> ScanSums:
