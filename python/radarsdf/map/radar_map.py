@@ -10,6 +10,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from safetensors.torch import load, save
 from torch import Tensor
@@ -134,5 +135,6 @@ def load_file(path: str | PathLike[str]) -> RadarMap:
     return RadarMap(storage.load_contents(path))
 
 
+@torch.inference_mode(mode=False)
 def _from_pickle(data: bytes, description: dict[str, Any]) -> RadarMap:
     return RadarMap(storage.contents_of(load(data), description))

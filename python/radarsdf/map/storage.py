@@ -75,6 +75,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     write_whole(path, tensor_bytes(tensors, metadata))
 
 
+@torch.inference_mode(mode=False)  # or the map could not give gradients
 def load_contents(path: str | PathLike[str]) -> MapContents:
     """Read the file of a map. A ValueError if it is damaged, of another program or of another version."""
     check_regular_file(path)
@@ -146,7 +147,6 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
 
 
-@torch.inference_mode(mode=False)  # or the map could not give gradients
 def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
     """The inverse of :func:`parts_of`. Raises an error of some kind if parts do not fit together."""
     config = FitConfig.from_dict(description["config"])
