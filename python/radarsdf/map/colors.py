@@ -10,12 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import real_array
 
 # From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal steps.
-_ANCHORS = np.array(
-    [
-        [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
-        [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
-    ]
-)  # fmt: skip
+_ANCHORS = np.array([
+    [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
+    [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
+])  # fmt: skip
 NEUTRAL = (190, 196, 204)  # light grey, for surfaces without a value
 
 

@@ -92,8 +92,7 @@ class Map(ABC):
         Returns
         -------
         (N,) ndarray of bool or Tensor
-            Where it is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN. False for positions that are not
-            finite.
+            Where it is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
         """
         world, answer = _as_positions(x)
         return answer(self._observed(world))
@@ -158,8 +157,7 @@ class Map(ABC):
         Returns
         -------
         (N,) ndarray or Tensor
-            Intensity, sensor units, as given to the fit. NaN where `x` was not :meth:`observed`, and where a position is
-            not finite.
+            Intensity, sensor units. NaN where `x` was not :meth:`observed`, or a position is not finite.
 
         Raises
         ------
@@ -385,7 +383,7 @@ class Map(ABC):
 
     @cached_property
     def passage_odds(self) -> NDArray[np.float64]:
-        """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
+        """See :func:`radarsdf.map.queries.passage_odds`."""
         return queries.passage_odds(self._contents_of_any)
 
     @abstractmethod

@@ -29,9 +29,8 @@ with whole_import():
     import trimesh
 
 _MAX_VOXELS = 2**30  # with repeated ones. Lattice coordinates, and rows of corners, are int32
-# Edges of a leaf cell. A cell is left out if its corners are all farther than this from the surface, on the
-# same side. Measured on four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the
-# cells are left.
+# Edges of a leaf cell. A cell is left out if its corners are all farther than this from the surface, on the same side.
+# Measured on four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the cells are left.
 _CLEARLY = 0.25
 # Share of the distance to the voxel's centre by which a corner on the map's border is moved to be evaluated.
 _INWARD = 1e-3
@@ -240,8 +239,7 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
         msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
         raise ValueError(msg)
     check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
-    # If voxels do not divide the cell: points from one end of the cell to the other, at most a voxel apart,
-    # find every voxel that overlaps it.
+    # If voxels do not divide the cell: points from end to end, at most a voxel apart, find every voxel that overlaps it.
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
     steps = np.arange(parts, dtype=np.int32) if even else ends
     inside = np.stack(np.meshgrid(*[steps] * 3, indexing="ij"), -1).reshape(1, -1, 3)
@@ -262,15 +260,12 @@ def _corner_distances(
 ) -> NDArray[np.float32]:
     """Signed distances (K,) at lattice corners (K, 3), m.
 
-    A corner on the border of the map may be in a cell beyond it, which has no features, so its value would be
-    wrong. It is moved a little towards the centre of one of its voxels and evaluated there. If voxels do not
-    divide the cells, a corner can be farther outside. Then it is moved until it is in an occupied cell, and
-    the distance moved is added to its value.
+    A corner on the border of the map may be in a cell beyond it, which has no features. It is moved towards the centre of one of
+    its voxels until it is in an occupied cell, and the distance moved is added to its value.
     """
     points = corners.astype(np.float32) * np.float32(voxel_size)
     outside = ~_occupied(contents, points)
-    # The last voxel of each corner is the one that it is moved into: of repeated indices, NumPy keeps the
-    # last.
+    # The last voxel of each corner is the one that it is moved into: of repeated indices, NumPy keeps the last.
     owners = np.zeros(len(corners), np.int32)
     owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
     moved = np.flatnonzero(outside)

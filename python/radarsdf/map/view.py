@@ -28,8 +28,8 @@ _Floats = NDArray[np.float64]
 _Intensity = Callable[[_Floats, _Floats], NDArray[np.float32]]  # (N,) of points (N, 3) and a sensor (3,), m
 
 # The density of returns on the surface is rate^a · cosine^b / range^c, times d where the patch is hidden: (a, b, c, d) in
-# smooth scenes and in rough ones. Beams are spread by angle, so in smooth scenes a patch gets as many as it is wide. A
-# real radar sees much behind surfaces, and returns come from few places. Chosen with `python -m bench.paper novel-views`.
+# smooth scenes, where beams are spread by angle, and in rough ones, where a radar sees much behind surfaces. Chosen with
+# `python -m bench.paper novel-views`.
 _SMOOTH = np.array([1.0, 1.0, 2.0, 0.01])
 _ROUGH = np.array([2.2, 0.3, 1.0, 0.65])
 _HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden

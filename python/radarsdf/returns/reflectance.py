@@ -201,13 +201,11 @@ class _Groups:
         return (self.counts / (1 + _CORRELATION * (self.counts - 1))).astype(np.float32)
 
     def means(self, values: Float32) -> Float32:
-        """(G,) of values (N,) of the returns."""
         if self.rows is None:
             return np.ascontiguousarray(values)
         return _divided(np.bincount(self.rows, values, len(self.counts)), self.counts)
 
     def of_returns(self, values: Float32) -> Float32:
-        """(N,) of values (G,) of the groups."""
         return values if self.rows is None else values[self.rows]
 
 
