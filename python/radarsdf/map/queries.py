@@ -60,9 +60,6 @@ def to_local(contents: WholeMap, world: Tensor) -> Tensor:
     return (world.double() - torch.from_numpy(contents.origin)).float()
 
 
-# The field
-
-
 def signed_distance(
     contents: MapContents, points: Tensor, *, description: str = "", progress: bool | None = False
 ) -> Tensor:
