@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Memory and time of fits against their estimates: `python -m bench.estimates memory|durations`, on Linux.
-
-`durations` ends with the constants of `radarsdf.fitting.estimate`, calibrated on this machine.
-"""
+"""Memory and time of fits against their estimates: `python -m bench.estimates memory|durations`, on Linux."""
 
 from __future__ import annotations
 
@@ -15,9 +12,6 @@ import numpy as np
 import radarsdf
 import radarsdf.fitting.fit  # else the first fit would import it, in what is measured
 from radarsdf import Estimate, FitConfig
-from radarsdf.fitting import estimate as model
-from radarsdf.fitting.schedule import Schedule
-from scipy.optimize import nnls
 
 from bench.growth.street import street
 from bench.measure import in_new_process, measured, memory_bytes, timed
@@ -92,10 +86,9 @@ DURATION_CASES: list[tuple[int, bool, str, Changes]] = [
     (10_000, True, "default", {}),
     (30_000, False, "default", {}),
     (30_000, True, "default", {"num_threads": 1}),
-    (30_000, True, "default", {"training": {"joint": False}}),
     (30_000, True, "default", _SHORT | {"encoding": {"kind": "octree"}}),
     (30_000, True, "default", _SHORT | _WIDE),
-    (30_000, True, "default", _SHORT | {"encoding": {"num_levels": 6, "fourier_count": 16}}),
+    (30_000, True, "default", _SHORT | {"encoding": {"fourier_count": 16}}),
     (30_000, True, "default", merged(_SHORT, _LARGE)),
     (10_000, True, "paper", _SHORT),
     (100_000, False, "paper", _SHORT | {"num_threads": 1}),
@@ -103,7 +96,7 @@ DURATION_CASES: list[tuple[int, bool, str, Changes]] = [
     (100_000, False, "default", {"num_threads": 1}),
     (100_000, False, "quick", {}),
     (300_000, False, "default", {"training": {"sdf_iterations": 300}}),
-    (300_000, False, "default", {"training": {"sdf_iterations": 50, "row_updates": False}}),
+    (300_000, False, "default", {"training": {"sdf_iterations": 50, "optimiser": "adam"}}),
     (300_000, False, "quick", {"num_threads": 1}),
     (1_000_000, False, "quick", {}),
     (1_000_000, False, "default", {"training": {"sdf_iterations": 100}, "returns": {"drop_ghosts": False}}),
@@ -114,45 +107,28 @@ DURATION_CASES: list[tuple[int, bool, str, Changes]] = [
 
 
 def durations(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each case: time of a fit, and its estimate; then a row for each constant, calibrated anew."""
-    shares = []
+    """A row for each case: time of a fit, and its estimate."""
     for count, with_intensities, preset, changes in DURATION_CASES[: 1 if options.quick else None]:
         fits = [
             in_new_process("bench.estimates:measured_duration", count, with_intensities, preset, changes)
             for _ in range(options.repetitions)
         ]
-        wall_s, cpu_s = (min(fit[key] for fit in fits) for key in ("wall_s", "cpu_s"))
-        row: Row = {
-            "returns": count,
-            "intensities": with_intensities,
-            "settings": f"{preset} {words_of(changes)}",
-        }
-        yield row | {
-            "measured": wall_s,
-            "estimated": fits[0]["estimated_s"],
-            "ratio": fits[0]["estimated_s"] / wall_s,
-        }
-        shares.append([fits[0]["work"][kind] / cpu_s for kind in model.SECONDS])
-    # Non-negative least squares of the relative errors.
-    scale = np.max(shares, axis=0).clip(1e-30)
-    found, _ = nnls(np.array(shares) / scale, np.ones(len(shares)))
-    for kind, seconds in zip(model.SECONDS, (found / scale).tolist(), strict=True):
-        yield {"part": "constants", "constant": kind, "now": model.SECONDS[kind], "anew": seconds}
+        estimated_s, wall_s = fits[0]["estimated_s"], min(fit["wall_s"] for fit in fits)
+        row: Row = {"returns": count, "intensities": with_intensities}
+        row |= {"settings": f"{preset} {words_of(changes)}", "measured": wall_s, "estimated": estimated_s}
+        yield row | {"ratio": estimated_s / wall_s}
 
 
 def measured_duration(count: int, with_intensities: bool, preset: str, changes: Changes) -> Row:
-    """Estimated time of a fit, amounts of work as of `durations.work_of`, and times of this process."""
+    """Estimated and measured time of a fit."""
     returns, config = _street(count, with_intensities), PRESETS[preset].override(**changes)
     estimate = radarsdf.estimate(*returns, config=config)
-    of_scene: dict[str, Any] = {"returns": estimate.returns, "with_intensity": with_intensities}
-    schedule = Schedule.of(config, surface_returns=estimate.returns, vertices=estimate.vertices, **of_scene)
-    work = model.work_of(config, schedule, cells=estimate.leaf_cells, rows=estimate.vertices, **of_scene)
     # A small fit first: the estimate does not include what PyTorch sets up in its first steps.
     tiny = FitConfig().override(training={"sdf_iterations": 5, "intensity_iterations": 10})
     radarsdf.fit(*_street(2000, True), config=tiny, progress=False)
     with timed() as taken:
         radarsdf.fit(*returns, config=config, progress=False)
-    return {"estimated_s": estimate.seconds, "work": work, "wall_s": taken.wall_s, "cpu_s": taken.cpu_s}
+    return {"estimated_s": estimate.seconds, "wall_s": taken.wall_s}
 
 
 _LINES = ("returns", "intensities", "settings")
@@ -170,10 +146,8 @@ EXPERIMENTS = {
         durations,
         options=("repetitions",),
         defaults={"repetitions": 2},
-        columns={"measured": Column("s"), "estimated": Column("estimated, s"), **_RATIO}
-        | {"now": Column("now, ns", 1e9, 3), "anew": Column("calibrated, ns", 1e9, 3)},
-        tables=("part",),
-        lines=(*_LINES, "constant"),
+        columns={"measured": Column("s"), "estimated": Column("estimated, s")} | _RATIO,
+        lines=_LINES,
     ),
 }
 

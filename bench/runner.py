@@ -88,7 +88,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "set": {
         "nargs": "+", "action": "append", "default": [], "metavar": "NAME=VALUE",
-        "help": "one more fit with these settings, such as training.joint=False or mesh.min_confidence=0; repeatable",
+        "help": "one more fit with these settings, such as training.optimiser=adam or mesh.min_confidence=0; repeatable",
     },
     "meshes": {"type": Path, "metavar": "FOLDER", "help": "write each mesh, and a picture of it"},
     "threads": {"type": int, "nargs": "+", "default": [1], "help": "numbers of threads"},

@@ -28,7 +28,7 @@ def merged(*changes: Changes) -> Changes:
 
 
 def parsed(words: Iterable[str]) -> Changes:
-    """Changes from words such as ``training.joint=False``. Those of ``mesh.`` are arguments of a mesh.
+    """Changes from words such as ``training.batch_size=8192``. Those of ``mesh.`` are arguments of a mesh.
 
     Raises
     ------

@@ -25,7 +25,7 @@ from .conftest import surface_points
 
 STEPS = 100  # after this many steps, a training checks its parameters and keeps a copy
 STAGES = ("geometry", "joint", "intensity")
-CONFIG = FitConfig(num_threads=1, returns={"drop_ghosts": False}, training={"cosine_schedule": False})
+CONFIG = FitConfig(num_threads=1, returns={"drop_ghosts": False})
 SHARE = 2  # a fit divides its batches among two threads
 
 
@@ -66,8 +66,7 @@ def test_whole(benchmark, stage, rays, leaf_keys):
             "batch_size": CONFIG.training.batch_size // SHARE,
             "intensity_batch_size": CONFIG.training.intensity_batch_size // SHARE,
             "sdf_iterations": 1 if stage == "intensity" else STEPS,
-            "intensity_iterations": 1 if stage == "joint" else STEPS,
-            "joint": stage == "joint",
+            "intensity_iterations": {"geometry": 1, "joint": 1, "intensity": STEPS + 1}[stage],
         }
     )
     count, vertices = len(rays), field.cells.table.num_rows

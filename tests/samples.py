@@ -31,7 +31,7 @@ from radarsdf.threads import Workers
 _CONFIG = FitConfig(num_threads=1).override(
     training={"sdf_iterations": 2, "intensity_iterations": 2, "batch_size": 64, "intensity_batch_size": 64},
     networks={"intensity_hidden": (4, 3)},
-    encoding={"num_levels": 2, "fourier_count": 2},
+    encoding={"fourier_count": 2},
 )
 _VALUES: list[Any] = [
     None, True, -1, 0, 1, 12, 13, 2**31, 2**63, 10**400, 1e308, -0.0, float("nan"), float("inf"), "", "x" * 10_000, [],

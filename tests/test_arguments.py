@@ -188,7 +188,7 @@ TINY = FitConfig(
     num_threads=1,
     max_memory_bytes=10**9,
     returns={"min_range_m": 0.0},
-    encoding={"num_levels": 2, "fourier_count": 2},
+    encoding={"fourier_count": 2},
     networks={"intensity_hidden": (4,)},
     training={"sdf_iterations": 1, "intensity_iterations": 1, "batch_size": 16, "intensity_batch_size": 16},
 )

@@ -59,17 +59,9 @@ def errors_of(radar_map: RadarMap, test: Scene) -> Row:
 
 
 # All inputs of the paper, also those that the default configuration does not use.
-_FULL: Changes = {
-    "networks": {"normals": True, "geometry_feature_dim": 15, "sdf_input": True, "view_direction": True}
-}
+_FULL: Changes = {"networks": {"normals": True, "geometry_feature_dim": 15}}
 _VARIANTS: dict[str, Changes] = {
     "full": {},
-    # Without the SDF loss, features and intensity network learn from the intensities alone: our reading of the paper's
-    # "training only the intensity network".
-    "w/o SDF": {
-        "networks": {"sdf_input": False, "normals": False, "geometry_feature_dim": 0},
-        "training": {"sdf_loss_weight": 0.0},
-    },
     "w/o SDF normals": {"networks": {"normals": False}},
     "w/o geometry feature": {"networks": {"geometry_feature_dim": 0}},
     "w/o viewing direction": {"networks": {"view_direction": False}},

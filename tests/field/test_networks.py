@@ -4,34 +4,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from radarsdf import FitConfig
 from radarsdf._core import CellSet
-from radarsdf.field.losses import sdf_loss
-from radarsdf.field.neural_field import IntensityNetwork, NeuralField, cells_width, fourier_width
+from radarsdf.field.neural_field import Geometry, IntensityNetwork, NeuralField, cells_width, fourier_width
+from radarsdf.fitting.gradients import sdf_loss
 
-BARE = FitConfig(networks={"sdf_input": False, "view_direction": False, "log_range": False})
-SMALL = {"num_levels": 1, "fourier_count": 1}  # 8 and 6 numbers
+BARE = FitConfig(networks={"view_direction": False, "log_range": False})
 
 
-def inputs(config, count=20):
+def geometry_of(config, count=20):
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape):
         return torch.randn(*shape, generator=generator)
 
-    return {
-        "encoding": [normal(count, cells_width(config)), normal(count, fourier_width(config))],
-        "logit": normal(count),
-        "geometry_feature": normal(count, config.networks.geometry_feature_dim),
-        "normals": torch.nn.functional.normalize(normal(count, 3), dim=1)
-        if config.networks.normals
-        else None,
-        "directions": torch.nn.functional.normalize(normal(count, 3), dim=1),
-        "ranges_m": 5 + 10 * torch.rand(count, generator=generator),
-    }
+    encoding = (normal(count, cells_width(config)), normal(count, fourier_width(config)))
+    feature = normal(count, config.networks.geometry_feature_dim)
+    normals = torch.nn.functional.normalize(normal(count, 3), dim=1) if config.networks.normals else None
+    return Geometry(encoding, normal(count), feature, normals)
 
 
 def make_field(config, seed=0):
@@ -45,53 +40,46 @@ def make_field(config, seed=0):
     return field, torch.from_numpy(points[:200])
 
 
-def initialised(network):
-    network.initialise(torch.Generator().manual_seed(0))
-    return network
-
-
 def views(points):
     rays = points - torch.tensor([0.0, 0.0, 8.0])
     return rays / rays.norm(dim=1, keepdim=True), rays.norm(dim=1)
 
 
 @pytest.mark.parametrize(
-    ("setting", "arguments", "width"),
+    ("setting", "seen", "width"),
     [
-        ({"sdf_input": True}, {"logit"}, 1),
-        ({"geometry_feature_dim": 15}, {"geometry_feature"}, 15),
-        ({"normals": True}, {"normals"}, 3),
-        ({"view_direction": True}, {"directions"}, 16),
-        ({"log_range": True}, {"ranges_m"}, 1),
+        ({"geometry_feature_dim": 15}, "feature", 15),
+        ({"normals": True}, "normals", 3),
+        ({"view_direction": True}, "directions", 16),
+        ({"log_range": True}, "ranges_m", 1),
     ],
 )
-def test_the_intensity_network_sees_what_it_is_told_to(setting, arguments, width):
-    config = BARE.override(encoding=SMALL, networks=setting)
-    network = initialised(IntensityNetwork(config))
-    assert network.layers[0].in_features == 14 + width
-    given = inputs(config)
-    before = network(**given)
+def test_the_intensity_network_sees_what_it_is_told_to(setting, seen, width):
+    config = BARE.override(encoding={"fourier_count": 1}, networks=setting)
+    network = IntensityNetwork(config)
+    network.initialise(torch.Generator().manual_seed(0))
+    assert network.layers[0].in_features == 24 + 6 + 1 + width
+    geometry, (directions, ranges_m) = geometry_of(config), views(torch.rand(20, 3))
+    before = network(geometry, directions, ranges_m)
     assert before.shape == (20,)
-    for name, value in given.items():
-        if value is None or (name != "encoding" and value.numel() == 0):
-            continue
-        changed = given | {
-            name: [part.roll(1, 0) for part in value] if name == "encoding" else value.roll(1, 0)
-        }
-        seen = name in arguments | {"encoding"}
-        assert torch.equal(network(**changed), before) != seen, name
+    for name in ("logit", "feature", "normals"):
+        value = getattr(geometry, name)
+        if value is not None and value.numel():
+            changed = dataclasses.replace(geometry, **{name: value.roll(1, 0)})
+            assert not torch.equal(network(changed, directions, ranges_m), before), name
+    assert torch.equal(network(geometry, directions.roll(1, 0), ranges_m), before) != (seen == "directions")
+    assert torch.equal(network(geometry, directions, ranges_m.roll(1, 0)), before) != (seen == "ranges_m")
 
 
-def intensity(field, points, *, frozen=True, encoding_factors=None):
-    geometry = field.geometry(points, frozen=frozen)
-    return field.intensity_of(geometry, *views(points), encoding_factors=encoding_factors)
+def intensity(field, points, *, frozen=True):
+    return field.intensity_network(field.geometry(points, frozen=frozen), *views(points))
 
 
 def test_normals_are_the_normalised_gradient():
     config = FitConfig(networks={"normals": True, "intensity_hidden": (8,)})
     field, points = make_field(config)
     seen = []
-    field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[3]))
+    field.intensity_network.register_forward_pre_hook(lambda _, given: seen.append(given[0].normals))
     intensity(field, points)
     x = points.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(field.logit(x).sum(), x)
@@ -109,7 +97,7 @@ def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geom
 
 
 def test_the_second_derivative_through_the_normals_is_right():
-    # Double precision and smooth: no input but the normal depends on the features.
+    # Double precision: the networks bend at few places.
     config = BARE.override(
         networks={"normals": True, "intensity_hidden": (6,)},
         encoding={"fourier_count": 2},

@@ -54,7 +54,7 @@ def test_the_number_of_threads_changes_no_bit(scene, config):
     config = config.override(training={"batch_size": 2200, "intensity_batch_size": 1100})
     maps = [
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config.override(num_threads=n))
-        for n in (1, 2, 3, 7)
+        for n in (1, 3)
     ]
     for other in maps[1:]:
         for name, value in maps[0].field.state_dict().items():
@@ -169,9 +169,8 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     monkeypatch.setattr(
         RaySampler, "spread", lambda self, *args: (drawn_from.append(len(self._rays)), spread(self, *args))[1]
     )
-    config = QUICK.override(
-        num_threads=1, training={"joint": False}, returns={"drop_ghosts": True, "onto_planes": False}
-    )
+    returns = {"drop_ghosts": True, "onto_planes": False}
+    config = QUICK.override(num_threads=1, returns=returns, training={"intensity_iterations": 25})
     with_ghosts = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
     assert 0.1 < is_ghost.mean() < 0.9
     assert with_ghosts.report["ghosts"] == is_ghost.sum()

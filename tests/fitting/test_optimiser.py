@@ -10,9 +10,9 @@ import sys
 import numpy as np
 import pytest
 import torch
-from radarsdf._core import CellSet
+from radarsdf._core import CellSet, Encoding
 from radarsdf.field import kernels
-from radarsdf.field.encodings import Octree, TriQuadtree
+from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
 from radarsdf.threads import Workers
 
@@ -75,7 +75,7 @@ def cells_and_points(encoding, half_m=1.0, count=500):
     points = (2 * torch.rand(count, 3, generator=generator) - 1) * half_m
     occupied = CellSet(0.2)
     occupied.insert(points.numpy())
-    cells = encoding(occupied.sorted_keys(), 0.2, 3)
+    cells = VertexFeatures(occupied.sorted_keys(), 0.2, 3, encoding)
     with torch.no_grad():
         cells.features.copy_(torch.randn(cells.features.shape, generator=generator))
     return cells, points, generator
@@ -94,7 +94,7 @@ def steps(cells, batches, threads, learning_rate=1e-2):
     return cells.features.detach().clone()
 
 
-@pytest.mark.parametrize("encoding", [TriQuadtree, Octree])
+@pytest.mark.parametrize("encoding", [Encoding.TRI_QUADTREE, Encoding.OCTREE])
 def test_by_rows_it_is_the_same_where_all_are_touched(encoding):
     cells, points, generator = cells_and_points(encoding)
     weights = torch.randn(10, len(points), cells.table.num_levels * 8, generator=generator)
@@ -114,7 +114,7 @@ def test_by_rows_it_is_the_same_where_all_are_touched(encoding):
 
 
 def test_what_a_batch_does_not_touch_stays_and_its_momentum_fades():
-    cells, points, _ = cells_and_points(TriQuadtree)
+    cells, points, _ = cells_and_points(Encoding.TRI_QUADTREE)
     left, right = points[points[:, 0] < -0.6], points[points[:, 0] > 0.6]
     one = torch.ones(1, 24)
     start = cells.features.detach().clone()

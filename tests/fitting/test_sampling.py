@@ -65,9 +65,9 @@ def test_ranges_of_the_samples(rays):
     near, free, lowest_share = [], [], []
     for _ in range(40):
         samples = draw.batch().split()[0]
-        range_m = torch.from_numpy(rays.ranges_m)[rows_of(rays.points, samples)][samples.num_near :]
-        near.append(samples.sdf_m[: samples.num_near])
-        from_sensor = range_m - samples.sdf_m[samples.num_near :]
+        range_m = torch.from_numpy(rays.ranges_m)[rows_of(rays.points, samples)][256:]
+        near.append(samples.sdf_m[:256])
+        from_sensor = range_m - samples.sdf_m[256:]
         free.append((from_sensor - 0.3 * range_m) / (0.7 * range_m + 0.8))
         lowest_share.append((from_sensor / range_m).min())
     # Uniform over the whole of each interval, and not beyond.
@@ -89,7 +89,7 @@ def test_each_ray_is_seen_equally_often(rays, batch_size):
     for _ in range(batches):
         samples = draw.batch().split()[0]
         rows = rows_of(rays.points, samples)
-        for kind, part in enumerate((rows[: samples.num_near], rows[samples.num_near :])):
+        for kind, part in enumerate((rows[: batch_size // 2], rows[batch_size // 2 :])):
             np.add.at(seen[kind], part.numpy(), 1)
     assert seen.sum() == batches * batch_size
     # Whole passes, and the begun one.
@@ -127,11 +127,11 @@ def test_only_so_many_intensities_are_labels(rays, parts):
     draw = RaySampler(rays, config, 288, generator, 6, unit)
     batches = [draw.batch(parts).split() for _ in range(NUM_RAYS // 24 * 12)]
     assert {sum(part.num_labelled for part in batch) for batch in batches} == {24}
-    assert {sum(part.num_near for part in batch) for batch in batches} == {144}
     for batch in batches[:5]:
         for part in batch:
-            assert (part.sdf_m[: part.num_near].abs() <= NEAR_M).all()
-            assert (part.sdf_m[part.num_near :].abs() > NEAR_M).float().mean() > 0.8
+            near = 144 // parts
+            assert (part.sdf_m[:near].abs() <= NEAR_M).all()
+            assert (part.sdf_m[near:].abs() > NEAR_M).float().mean() > 0.8
             assert 0 <= part.num_labelled - 24 // parts <= 1
     labelled = torch.cat([part.intensities[: part.num_labelled] for batch in batches for part in batch])
     assert len(torch.unique(labelled)) > 0.9 * NUM_RAYS
@@ -145,20 +145,18 @@ def test_only_so_many_intensities_are_labels(rays, parts):
 def test_parts_are_the_batch_each_with_its_share(rays, parts):
     (whole,) = sampler(rays, 250).batch().split()
     found = sampler(rays, 250).batch(parts).split()
-    for sizes, total in (
-        ([len(part.points) for part in found], 250),
-        ([part.num_near for part in found], 125),
-    ):
-        assert sum(sizes) == total
-        assert max(sizes) - min(sizes) <= 2
+    sizes, near = [len(part.points) for part in found], [part.num_labelled for part in found]
+    for counts, total in ((sizes, 250), (near, 125)):  # without intensities, all near samples have labels
+        assert sum(counts) == total
+        assert max(counts) - min(counts) <= 2
     # The same rays, each kind in the same order.
-    near = torch.cat([part.of_ray[: part.num_near] for part in found])
-    free = torch.cat([part.of_ray[part.num_near :] for part in found])
+    near = torch.cat([part.of_ray[: part.num_labelled] for part in found])
+    free = torch.cat([part.of_ray[part.num_labelled :] for part in found])
     assert torch.equal(torch.cat([near, free]), whole.of_ray)
     for part in found:
         rows = rows_of(rays.points, part)
         assert torch.equal(part.ranges_m, torch.from_numpy(rays.ranges_m)[rows])
-        assert (part.sdf_m[: part.num_near].abs() <= NEAR_M).all()
+        assert (part.sdf_m[: part.num_labelled].abs() <= NEAR_M).all()
         gap = part.points + part.sdf_m[:, None] * part.directions - torch.from_numpy(rays.points)[rows]
         assert gap.abs().max() < 2e-5
 

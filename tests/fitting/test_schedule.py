@@ -62,14 +62,12 @@ def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():
 
 
 @pytest.mark.parametrize("returns", [2000, 10**5, 5 * 10**5])
-@pytest.mark.parametrize("joint", [False, True])
-def test_effort_multiplies_the_iterations(returns, joint):
-    half, whole, twice = (schedule(returns, joint=joint, effort=effort) for effort in (0.5, 1.0, 2.0))
+def test_effort_multiplies_the_iterations(returns):
+    half, whole, twice = (schedule(returns, effort=effort) for effort in (0.5, 1.0, 2.0))
     for one, other in ((half, whole), (whole, twice)):
         assert 2 * one.sdf_iterations == pytest.approx(other.sdf_iterations, abs=1)
         assert other.passes == pytest.approx(2 * one.passes, rel=0.01)
-        if not joint:
-            assert 2 * one.intensity_iterations == pytest.approx(other.intensity_iterations, abs=1)
+        assert other.intensity_iterations > 1.1 * one.intensity_iterations
     assert half.batch_size == whole.batch_size == twice.batch_size == FitConfig().training.batch_size
 
 

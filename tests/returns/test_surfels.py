@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
@@ -98,11 +97,3 @@ def test_crossings_of_one_surfel():
     assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.0, 0.5)) == [
         0
     ]  # across the beam: no depth
-
-
-def test_returns_per_cell_are_those_of_cells_that_hold_any():
-    # Three cells of 0.4 m, with 4, 1 and 1 returns.
-    places = np.array([[5.0, 0.1, 0.1]] * 4 + [[5.0, 0.5, 0.1], [9.0, 0.1, 0.1]])
-    surfels = Surfels.of(prepare([places[:2], places[2:]], np.tile(np.eye(4), (2, 1, 1))), LEAF_M)
-    assert surfels.returns_per_cell() == pytest.approx(2)
-    assert Surfels.of(prepare([places[:1]], np.eye(4)[None]), LEAF_M).returns_per_cell() == 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The configuration of a fit: what is changed most often, the groups, and the presets."""
+"""The configuration of a fit: the settings changed most often, the groups, and the presets."""
 
 from __future__ import annotations
 
@@ -17,16 +17,48 @@ from radarsdf.config.groups import (
     ReturnsConfig,
     TrainingConfig,
 )
-from radarsdf.config.presets import PAPER, QUICK
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
 
-# Edge of a block, leaf cells: a multiple of that of the cubes of visibility counts.
+# Edge of a block, leaf cells: a multiple of that of the cubes of visibility counts, and of the coarsest cells.
 LATTICE_BLOCK_CELLS = 32
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
 
-_Group = ReturnsConfig | EncodingConfig | NetworksConfig | TrainingConfig
+QUICK: dict[str, Any] = {"train": False, "returns": {"passages": False}}
+"""What :meth:`FitConfig.quick` changes: stage 1 only, and nothing kept for grids and comparisons."""
+
+PAPER: dict[str, Any] = {
+    "returns": {
+        "accumulate_scans": 5,
+        "drop_movers": False,
+        "drop_ghosts": False,
+        "onto_planes": False,
+        "passages": False,
+    },
+    "encoding": {"bridge_cells": 0, "fourier_count": 16},
+    "networks": {
+        "intensity_hidden": (64, 64),
+        "geometry_feature_dim": 15,
+        "normals": True,
+        "log_range": False,
+        "dropout": False,
+        "reflectance": "network",
+    },
+    "training": {
+        "sigma_cells": 0.1375,  # 0.55 · 0.05 m
+        "intensity_in_free_space": True,
+        "cross_range_noise_rad": 0.0,
+        "batch_size": 8192,
+        "intensity_batch_size": 8192,
+        "sdf_iterations": 1000,
+        "intensity_iterations": 4000,
+        "optimiser": "adam",
+        "learning_rate": 1e-3,
+        "intensity_learning_rate": 1e-3,
+    },
+}
+"""What :meth:`FitConfig.paper` changes: 3QFP (ICRA 2024) and 3QFPI as published."""
 
 
 def _from_mapping(group: Any) -> Callable[[Any], Any]:
@@ -105,7 +137,7 @@ class FitConfig:
     @property
     def lattice(self) -> WorldLattice:
         """Where cells lie in the world, from leaf cells to the coarsest."""
-        return WorldLattice(self.leaf_size_m, max(LATTICE_BLOCK_CELLS, 2 ** (self.encoding.num_levels - 1)))
+        return WorldLattice(self.leaf_size_m, LATTICE_BLOCK_CELLS)
 
     @property
     def preparation(self) -> dict[str, Any]:
@@ -124,62 +156,83 @@ class FitConfig:
         return not self.train or self.networks.reflectance != "network"
 
     def moves_rows(self, with_intensity: bool) -> bool:
-        """Whether an iteration changes only the features that its samples use: see `training.row_updates`."""
+        """Whether an iteration changes only the features that its samples use."""
         # Normals are gradients of the features, which only autograd differentiates again, for all features at
         # once.
-        through_normals = with_intensity and self.training.joint and self.networks.normals
-        return self.training.row_updates and not through_normals
+        through_normals = with_intensity and self.networks.normals
+        return self.training.optimiser == "soap" and not through_normals
 
     @classmethod
     def quick(cls, **changes: Any) -> FitConfig:
-        """Settings for stage 1 only: a surface that is averaged over the rays and smoothed, instead of trained.
+        """Return the settings for stage 1 only: distances averaged over the rays and smoothed, not trained.
 
-        The fit takes a fraction of the time; the map is larger. Mesh it with voxels of the size of its leaf cells, since
-        smaller ones show no more detail. Intensities are in closed form, and take a quarter to a half of the time
-        without them. Free space is not kept: for that, change ``returns.passages``.
-        `changes`: as for :meth:`override`.
+        The fit takes a fraction of the time; the file of the map is larger. Intensities are in closed form. Mesh the map with
+        voxels of a leaf cell's size: smaller ones show no more detail.
+
+        Parameters
+        ----------
+        **changes
+            Further settings, and errors, as for :meth:`override`. ``returns={"passages": True}`` keeps what
+            :func:`radarsdf.grid` and :func:`radarsdf.compare` need.
         """
         return cls().override(**QUICK).override(**changes)
 
     @classmethod
     def paper(cls, **changes: Any) -> FitConfig:
-        """The settings of 3QFPI as published. `changes`: as for :meth:`override`.
+        """Return the settings of 3QFPI as published, for comparisons.
 
         For a mesh as published, call ``mesh(min_confidence=0, max_uncertainty=math.inf, min_component_triangles=300)``.
+
+        Parameters
+        ----------
+        **changes
+            Further settings, and errors, as for :meth:`override`.
         """
         return cls().override(**PAPER).override(**changes)
 
     def override(self, /, **changes: Any) -> FitConfig:
-        """This configuration with some settings changed.
+        """Return a copy with some settings changed.
 
         Parameters
         ----------
         **changes
             Settings by name. For a group: a dict of the settings that change, or the whole group.
 
+        Raises
+        ------
+        ValueError
+            For an unknown setting, or a value of the wrong type or out of range.
+
         Examples
         --------
         >>> FitConfig.paper().override(seed=1, training={"sdf_iterations": 200}).training.batch_size
         8192
         """
-        merged: dict[str, Any] = {}
+        merged: dict[str, Any] = dict(vars(self))
         for name, value in changes.items():
-            group = getattr(self, name, None)
-            if isinstance(group, _Group) and isinstance(value, Mapping):
-                own = {field.name: getattr(group, field.name) for field in dataclasses.fields(group)}
-                merged[name] = own | by_name(value, name)
-            else:
-                merged[name] = value
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return FitConfig(**(own | merged))
+            group = merged.get(name)
+            inside = dataclasses.is_dataclass(group) and isinstance(value, Mapping)
+            merged[name] = vars(group) | by_name(value, name) if inside else value
+        return FitConfig(**merged)
 
     def to_dict(self) -> dict[str, Any]:
-        """The settings as nested dicts of plain values, for JSON and TOML."""
+        """Return the settings as plain values by name, with a dict for each group, as JSON and TOML store them."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> FitConfig:
-        """The inverse of :meth:`to_dict`. Missing settings have defaults; unknown ones raise a ValueError."""
+        """Build a configuration from nested dicts, such as those of :meth:`to_dict` or a TOML file.
+
+        Parameters
+        ----------
+        values : mapping
+            Settings by name; a mapping for each group. Those that are missing have their defaults.
+
+        Raises
+        ------
+        ValueError
+            If `values` is no mapping of names; for an unknown setting, or a value of the wrong type or out of range.
+        """
         return cls().override(**by_name(values, "the settings"))
 
 
@@ -195,9 +248,6 @@ def flat_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings, or changes of some, by names such as training.learning_rate."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
-        flat |= (
-            {f"{name}.{own}": inner for own, inner in value.items()}
-            if isinstance(value, dict)
-            else {name: value}
-        )
+        group = value if isinstance(value, dict) else {"": value}
+        flat |= {f"{name}.{own}".rstrip("."): inner for own, inner in group.items()}
     return flat

@@ -16,8 +16,7 @@ from pydantic import Field
 
 from radarsdf.settings import settings
 
-MAX_LEVELS = 12  # levels of cells that the compiled core allows; a test compares the two numbers
-MAX_FREQUENCIES = 24  # Fourier frequencies that the compiled core allows; likewise
+MAX_FREQUENCIES = 24  # Fourier frequencies that the compiled core allows; a test compares the two numbers
 MAX_THREADS = 1024
 MAX_LAYERS = 32  # hidden layers of a network
 MAX_SAMPLES = 2**24  # samples in a batch, and samples for a return
@@ -60,9 +59,9 @@ class ReturnsConfig:
     """Standard deviation of a return along the beam, m. None: estimated from the returns; see
     :func:`radarsdf.returns.noise.sensor_noise`."""
     azimuth_noise_rad: _NoiseRad | None = None
-    """The same in azimuth, rad. None: likewise."""
+    """The same in azimuth, rad."""
     elevation_noise_rad: _NoiseRad | None = None
-    """The same in elevation, rad. None: likewise."""
+    """The same in elevation, rad."""
     pose_sigma_m: Annotated[float, Field(ge=0, le=_MAX_NOISE_M)] = 0.0
     """Standard deviation of the position of a scan, m. It only makes the map's uncertainty larger: all returns
     of a scan share the error, so that only more scans make it smaller."""
@@ -72,7 +71,6 @@ class ReturnsConfig:
     """Whether each return is moved towards the surfel of its cell, a plane through the returns there, if there
     is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
     up to 1 % more error of intensities."""
-
     passages: bool = True
     """Whether the map keeps which cells rays crossed, and mean intensities by place and view, for :func:`radarsdf.grid`
     and :func:`radarsdf.compare`. It takes about 1 µs of a processor for each return, and 0.3 kB for each block of
@@ -90,8 +88,6 @@ class EncodingConfig:
 
     kind: Literal["tri-quadtree", "octree"] = "tri-quadtree"
     """Where the features are: on quadtrees in three planes (3QFP) or on an octree (SHINE-Mapping)."""
-    num_levels: Annotated[int, Field(ge=1, le=MAX_LEVELS)] = 3
-    """Levels of cells. The cells of each level are twice as large as those of the level before (3QFP: 3)."""
     bridge_cells: Annotated[int, Field(ge=0, le=_MAX_BRIDGE_CELLS)] = 4
     """A gap of at most so many empty leaf cells between two cells with returns becomes part of the map (3QFP:
     0). Four are as wide as a cell of the third level, so its features interpolate across the gap. Measured:
@@ -120,8 +116,6 @@ class NetworksConfig:
     and mostly 1 to 10 % more on simulated scenes."""
     normals: bool = False
     """Whether the intensity network sees the surface normal (3QFPI: yes; its own ablation shows no gain)."""
-    sdf_input: bool = True
-    """Whether the intensity network sees the signed distance (3QFPI)."""
     view_direction: bool = True
     """Whether the intensity network sees the viewing direction (3QFPI)."""
     dropout: bool = True
@@ -140,41 +134,31 @@ class TrainingConfig:
     """Scale of the sigmoid from signed distance to occupancy, in leaf cells (3QFP: 0.0275 m). Measured: 0.4
     to 0.75 differ by 0.2 points of F-score on simulated scenes; on real ones 0.4 to 0.5 are 0.4 to 2 points
     better."""
-    sdf_loss_weight: _NotNegative = 1.0
-    """Weight of the sdf loss in the joint iterations, where that of the intensity loss is 1 (3QFPI: 1). 0 is
-    for ablations: features and networks then learn from intensities alone, and there is no surface."""
     intensity_in_free_space: bool = False
     """Whether the intensity network also trains on samples in free space, with the lowest intensity as their
     label (3QFPI: yes). Measured: 10 to 25 % more error."""
-    joint: bool = True
-    """Whether the intensity network trains during the sdf stage too, and its loss also trains the features
-    and the SDF network (3QFPI: yes). These are joint iterations. Otherwise it trains only afterwards, on a
-    frozen field. Measured: 1 to 3 % less error in equal time."""
     batch_size: Annotated[int, Field(ge=1, le=MAX_SAMPLES)] = 4096
     """Samples in an iteration of the sdf stage (3QFP: 8192). Measured: more and smaller steps are better."""
     intensity_batch_size: Annotated[int, Field(ge=1, le=MAX_SAMPLES)] = 1024
-    """Samples that the intensity network sees in an iteration, unless it sees free space in joint ones (3QFPI:
+    """Samples that the intensity network sees in an iteration, unless it sees free space in the sdf stage (3QFPI:
     8192). Measured: likewise; 2048 take 1.5 to 1.8 times as long, and have 0.3 to 0.7 % less error on simulated
     scenes."""
     sdf_iterations: _Count | None = None
     """Iterations of the sdf stage. It trains features and SDF network, which are then frozen (3QFPI: 1000).
     None: from the size of the data and `effort`."""
     intensity_iterations: _Count | None = None
-    """Iterations that train the intensity network, joint ones included (3QFPI: 4000). None: likewise."""
+    """Iterations that train the intensity network, those of the sdf stage included, which train both (3QFPI: 4000).
+    None: likewise."""
     cross_range_noise_rad: _NotNegative = 0.005
     """Noise across the beam that is added to the samples of the intensity stage, as the sensor's noise displaces
     returns: standard deviation, rad (3QFPI: 0)."""
     optimiser: Literal["soap", "adam"] = "soap"
-    """What moves the weights of the networks: SOAP (Vyas et al., ICLR 2025) or Adam (3QFPI). Features always have Adam.
-    Measured: with SOAP, the networks learn as much in a quarter to a half of the iterations."""
+    """`"soap"`: SOAP (Vyas et al., ICLR 2025) for the networks, Adam for those features that a batch uses, and learning rates
+    that fall to zero along a cosine in each stage. `"adam"`: Adam for all, with constant learning rates (3QFPI). Measured: with
+    SOAP, the networks learn as much in a quarter to a half of the iterations."""
     learning_rate: _Positive = 2e-2
     """Learning rate for features and SDF network (3QFPI: 1e-3; 3QFP for radar: 1e-2). Measured with
-    `row_updates`: 2e-2 gives 0.0 to 0.8 points of F-score more than 1e-2 on real scans, and 0.1 more or less
+    SOAP: 2e-2 gives 0.0 to 0.8 points of F-score more than 1e-2 on real scans, and 0.1 more or less
     on simulated ones."""
     intensity_learning_rate: _Positive = 1e-2
     """Learning rate for the intensity network (3QFPI: 1e-3). Measured: with Adam, 6e-3 is better."""
-    cosine_schedule: bool = True
-    """Whether the learning rates fall to zero along a cosine in each stage (3QFPI: no, they are constant)."""
-    row_updates: bool = True
-    """Whether an iteration changes only the features that its samples use. Otherwise Adam's momentum changes
-    the others too (3QFP). Joint iterations with `normals` always change all features."""

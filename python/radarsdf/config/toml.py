@@ -34,10 +34,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # invalid TOML or invalid UTF-8, or lists in lists without end
+    except (ValueError, RecursionError) as error:  # RecursionError: lists in lists without end
         msg = f"{path} is not a TOML file: {error}"
         raise ValueError(msg) from error
 
@@ -47,34 +44,29 @@ def to_toml(config: FitConfig) -> str:
 
     A setting that is None is written as a comment, because TOML has no null.
     """
-    groups = [
-        field.name
-        for field in dataclasses.fields(config)
-        if dataclasses.is_dataclass(getattr(config, field.name))
-    ]
-    lines = _settings(config, leave_out=groups)
-    for name in groups:
-        group = getattr(config, name)
-        lines += ["", f"[{name}]", *_comment(_descriptions(config)[name]), "", *_settings(group)]
-    return "\n".join(lines) + "\n"
-
-
-def _settings(group: Any, leave_out: list[str] | None = None) -> list[str]:
-    lines = []
-    for field in dataclasses.fields(group):
-        if field.name in (leave_out or []):
+    top, tables = [], []
+    for name, value, description in _settings(config):
+        if not dataclasses.is_dataclass(value):
+            top += _lines(name, value, description)
             continue
-        value = getattr(group, field.name)
-        lines += _comment(_descriptions(group)[field.name])
-        # TOML writes numbers, strings, booleans and lists as JSON does.
-        lines.append(f"# {field.name} =" if value is None else f"{field.name} = {json.dumps(value)}")
-    return lines
+        tables += ["", f"[{name}]", *_comment(description), ""]
+        for setting in _settings(value):
+            tables += _lines(*setting)
+    return "\n".join(top + tables) + "\n"
 
 
-def _descriptions(group: Any) -> dict[str, str]:
-    return {
-        name: " ".join((field.description or "").split()) for name, field in group.__pydantic_fields__.items()
-    }
+def _settings(group: Any) -> list[tuple[str, Any, str]]:
+    """Name, value and description of each setting."""
+    fields = group.__pydantic_fields__.items()
+    return [
+        (name, getattr(group, name), " ".join((field.description or "").split())) for name, field in fields
+    ]
+
+
+def _lines(name: str, value: Any, description: str) -> list[str]:
+    # TOML writes numbers, strings, booleans and lists as JSON does.
+    written = f"# {name} =" if value is None else f"{name} = {json.dumps(value)}"
+    return [*_comment(description), written]
 
 
 def _comment(text: str) -> list[str]:

@@ -20,12 +20,9 @@ from radarsdf.returns.reflectance import Reflectance
 class LeafCorners(NamedTuple):
     """Signed distances at the corners of all leaf cells."""
 
-    corners: NDArray[np.int32]
-    """(V, 3) lattice coordinates: so many leaf cells from the origin."""
-    of_cells: NDArray[np.int32]
-    """(C, 8) rows of `corners` for each leaf cell, in C order."""
-    distances_m: NDArray[np.float32]
-    """(V,)."""
+    corners: NDArray[np.int32]  # (V, 3) lattice coordinates: so many leaf cells from the origin
+    of_cells: NDArray[np.int32]  # (C, 8) rows of `corners` for each leaf cell, in C order
+    distances_m: NDArray[np.float32]  # (V,)
 
 
 class Field(nn.Module, ABC):

@@ -17,21 +17,9 @@ from radarsdf.field.field import Field, LeafCorners
 
 
 class GridField(Field):
-    """Signed distances at the corners of leaf cells, interpolated trilinearly. 0 outside the cells.
+    """Signed distances `distances_m` (V,) at the corners of leaf cells, interpolated trilinearly. 0 outside the cells.
 
-    Parameters
-    ----------
-    leaf_keys : ndarray
-        (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
-    leaf_size_m : float
-        Edge of a leaf cell, m.
-    num_threads : int
-        Threads that build the table of corners. 0: as many as OpenMP uses.
-
-    Attributes
-    ----------
-    distances_m : Parameter
-        (V,) float32, at the corners of the cells, in the order of `table`. It is not initialised.
+    `leaf_keys` (C,): Morton keys of the occupied leaf cells, ascending. The distances are not initialised.
     """
 
     def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_threads: int = 0) -> None:

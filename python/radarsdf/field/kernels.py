@@ -54,37 +54,25 @@ def threads() -> int:
     return torch.get_num_threads()
 
 
+def _places(points: Tensor, located: Tensor, directions: Tensor | None) -> tuple[Any, Any, Any]:
+    return view(points), located.numpy(), None if directions is None else view(directions)
+
+
 def _interpolate(
     table: VertexTable, features: Tensor, points: Tensor, located: Tensor, directions: Tensor | None
 ) -> Tensor:
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
-    table.interpolate(
-        view(features),
-        view(points),
-        located.numpy(),
-        None if directions is None else view(directions),
-        out.numpy(),
-        threads(),
-    )
+    table.interpolate(view(features), *_places(points, located, directions), out.numpy(), threads())
     return out
 
 
 def scatter(
     table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
 ) -> Tensor:
-    """Gradient of the sum of interpolated · out_grad with respect to the features, (num_rows, 8).
-
-    With `directions` (N, 3), the interpolated features are replaced by their derivatives along these.
-    """
+    """Gradient of Σ interpolated · out_grad by the features, (num_rows, 8); with `directions` of their derivatives along these."""
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
-    table.scatter(
-        view(points),
-        located.numpy(),
-        None if directions is None else view(directions),
-        rows_view(out_grad),
-        features_grad.numpy(),
-        threads(),
-    )
+    places = _places(points, located, directions)
+    table.scatter(*places, rows_view(out_grad), features_grad.numpy(), threads())
     return features_grad
 
 
@@ -97,15 +85,8 @@ def _coordinate_gradient(
     out_grad: Tensor,
 ) -> Tensor:
     points_grad = torch.empty_like(points, memory_format=torch.contiguous_format)
-    table.coordinate_gradient(
-        view(features),
-        view(points),
-        located.numpy(),
-        None if directions is None else view(directions),
-        rows_view(out_grad),
-        points_grad.numpy(),
-        threads(),
-    )
+    places = _places(points, located, directions)
+    table.coordinate_gradient(view(features), *places, rows_view(out_grad), points_grad.numpy(), threads())
     return points_grad
 
 
@@ -123,18 +104,9 @@ class _Interpolate(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, out_grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         features, points, located = ctx.saved_tensors
-        return (
-            *_InterpolateBackward.apply(  # type: ignore[no-untyped-call]
-                out_grad,
-                features,
-                points,
-                located,
-                ctx.table,
-                ctx.needs_input_grad[0],
-                ctx.needs_input_grad[1],
-            ),
-            None,
-        )
+        wanted = ctx.needs_input_grad[:2]
+        found = _InterpolateBackward.apply(out_grad, features, points, located, ctx.table, *wanted)  # type: ignore[no-untyped-call]
+        return *found, None
 
 
 class _InterpolateBackward(torch.autograd.Function):
@@ -199,11 +171,8 @@ class _Fourier(torch.autograd.Function):
         # PyTorch operations on the saved output, so that autograd can differentiate them again.
         (out,) = ctx.saved_tensors
         half_width_m, first, count = ctx.frequencies
-        scale = torch.tensor(
-            [math.pi * 2**k / half_width_m for k in range(first, first + count)],
-            dtype=out.dtype,
-            device="cpu",
-        )
+        wave_numbers = [math.pi * 2**k / half_width_m for k in range(first, first + count)]
+        scale = torch.tensor(wave_numbers, dtype=out.dtype, device="cpu")
         sine, cosine = out.view(-1, 2, count, 3).unbind(1)
         sine_grad, cosine_grad = out_grad.reshape(-1, 2, count, 3).unbind(1)
         return ((sine_grad * cosine - cosine_grad * sine) * scale[:, None]).sum(1), None, None, None
@@ -212,21 +181,9 @@ class _Fourier(torch.autograd.Function):
 def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
     """Features at points: bilinear in each plane of a tri-quadtree, then summed (3QFP); trilinear in an octree.
 
-    Parameters
-    ----------
-    features : Tensor
-        (table.num_rows, 8), float32 or float64.
-    points : Tensor
-        (N, 3), the dtype of `features`, local frame, m.
-    table : VertexTable
-        The rows of `features` at the vertices of each cell.
-
-    Returns
-    -------
-    Tensor
-        (N, 8 · num_levels), finest level first. Zero at a level at which the point is in no occupied cell. It
-        can be differentiated twice, with respect to features and points. The gradient at points is the one
-        inside their cell.
+    From features (table.num_rows, 8), float32 or float64, at points (N, 3) of the same type, local frame, m, to
+    (N, 8 · num_levels), finest level first. Zero at a level at which the point is in no occupied cell. It can be
+    differentiated twice, by features and points; the gradient by points is the one inside their cell.
     """
     return _Interpolate.apply(features, points, table)  # type: ignore[no-any-return, no-untyped-call]
 
@@ -240,10 +197,7 @@ def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:
-    """Row of the occupied cell that holds each point (N, 3), local frame, m, at each level.
-
-    (N, num_levels) int32, finest level first. -1: the point is in no occupied cell.
-    """
+    """Rows (N, num_levels) int32, finest level first, of the occupied cells that hold points (N, 3), local, m; -1: none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
     table.locate(view(points), located.numpy(), threads())
     return located
@@ -265,25 +219,14 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 def mlp(inputs: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Linear layers with ReLU between them.
+    """Linear layers with ReLU between them, which can be differentiated any number of times: (N, outputs of the last layer).
 
-    The core takes a few rows at a time through all layers. PyTorch, which takes all rows through one layer
-    after the other, needs 1.5 times as long. It also makes a dozen calls, each of which waits for the
-    interpreter's lock, so two threads would train hardly faster than one.
-
-    Parameters
-    ----------
-    inputs : sequence of Tensor
-        (N, width) each. Side by side they are the input of the first layer.
-    layers : sequence of (weight, bias)
-        (outputs, inputs) and (outputs,) of each layer, like those of ``torch.nn.Linear``.
-
-    Returns
-    -------
-    Tensor
-        (N, outputs of the last layer). It can be differentiated any number of times. The bits of a row do not
-        depend on the other rows. Gradients have the same bits with any number of threads.
+    `inputs`: (N, width) each, side by side the input of the first layer. `layers`: weights (outputs, inputs) and biases
+    (outputs,), like those of ``torch.nn.Linear``. The bits of a row do not depend on the other rows.
     """
+    # The core takes a few rows at a time through all layers. PyTorch, which takes all rows through one layer
+    # after the other, needs 1.5 times as long. It also makes a dozen calls, each of which waits for the
+    # interpreter's lock, so two threads would train hardly faster than one.
     return _MLP.apply(len(layers), *(t for layer in layers for t in layer), *inputs)  # type: ignore[no-any-return, no-untyped-call]
 
 
@@ -307,28 +250,21 @@ class _MLP(torch.autograd.Function):
         wanted: tuple[bool, ...] = ctx.needs_input_grad[1:]
         if torch.is_grad_enabled():  # the gradient may be differentiated again, which the core cannot do
             chosen = [t for t, w in zip(tensors, wanted, strict=True) if w]
-            found = iter(
-                torch.autograd.grad(_plain(ctx.num_layers, tensors), chosen, out_grad, create_graph=True)
-            )
+            out = _plain(ctx.num_layers, tensors)
+            found = iter(torch.autograd.grad(out, chosen, out_grad, create_graph=True))
             return None, *(next(found) if w else None for w in wanted)
         split = 2 * ctx.num_layers
         by_layers = any(wanted[:split])  # the core computes all of them: that takes little longer than one
+        computed = [w or (by_layers and i < split) for i, w in enumerate(wanted)]
         grads = [
-            torch.empty_like(t, memory_format=torch.contiguous_format)
-            if w or (by_layers and i < split)
-            else None
-            for i, (t, w) in enumerate(zip(tensors, wanted, strict=True))
+            torch.empty_like(t, memory_format=torch.contiguous_format) if c else None
+            for t, c in zip(tensors, computed, strict=True)
         ]
         views: list[Any] = [None if g is None else g.numpy() for g in grads]
+        by_weights, by_biases = (views[:split:2], views[1:split:2]) if by_layers else (None, None)
         given: tuple[list[Any], list[Any], list[Any]] = ctx.views
         _core.mlp_backward(
-            *given,
-            ctx.hidden,
-            rows_view(out_grad),
-            views[:split:2] if by_layers else None,
-            views[1:split:2] if by_layers else None,
-            views[split:],
-            threads(),
+            *given, ctx.hidden, rows_view(out_grad), by_weights, by_biases, views[split:], threads()
         )
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
 

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS
+from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.encodings import Fourier, Octree, SphericalHarmonics, TriQuadtree
 from radarsdf.field.field import Field
-from radarsdf.field.kernels import mlp
+from radarsdf.field.kernels import fourier, interpolate, large_zeros, mlp, spherical_harmonics
 
+NUM_LEVELS = 3  # of cells (3QFP)
+_FEATURE_STD = 0.05  # standard deviation of the features at the start (3QFP)
 SDF_HIDDEN = (32, 32)  # widths of the hidden layers of the SDF network (3QFP)
 # Half of the longest Fourier wavelength, leaf cells (3QFP: 409.6 m).
 FOURIER_HALF_WIDTH_CELLS = 2048.0
@@ -30,47 +31,66 @@ FOURIER_HALF_WIDTH_CELLS = 2048.0
 class Geometry:
     """Inputs and outputs of the SDF network at N points."""
 
-    encoding: tuple[Tensor, ...]
-    """Inputs, (N, width) each: the encoding by the cells, then the Fourier encoding if there is one."""
-    logit: Tensor
-    """(N,) signed distance / sigma, positive in free space."""
-    feature: Tensor
-    """(N, geometry_feature_dim), an input of the intensity network."""
-    normals: Tensor | None
-    """(N, 3) unit vectors towards free space. None if the intensity network does not use them."""
+    encoding: tuple[Tensor, ...]  # (N, width) each: by the cells, then the Fourier encoding if there is one
+    logit: Tensor  # (N,) signed distance / sigma, positive in free space
+    feature: Tensor  # (N, geometry_feature_dim), an input of the intensity network
+    normals: Tensor | None  # (N, 3) unit vectors towards free space, if the intensity network uses them
 
-    def first(self, count: int) -> Geometry:
-        """The part for the first `count` points."""
+    def first(self, count: int, factors: Sequence[Tensor] | None) -> Geometry:
+        """The part for the first `count` points; `factors`: dropout, what each part of the encoding is multiplied by."""
         normals = None if self.normals is None else self.normals[:count]
         encoding = tuple(part[:count] for part in self.encoding)
+        if factors is not None:
+            encoding = tuple(part * kept for part, kept in zip(encoding, factors, strict=True))
         return Geometry(encoding, self.logit[:count], self.feature[:count], normals)
+
+
+class VertexFeatures(nn.Module):
+    """A learnable feature, 8 floats, at each vertex of the occupied cells, interpolated inside the cells.
+
+    On quadtrees in the planes xy, xz and yz, summed over the planes (3QFP, ICRA 2024), or at the corners of an octree's cells
+    (SHINE-Mapping, ICRA 2023). The cells of each level are twice as large as those of the level before.
+    """
+
+    def __init__(
+        self,
+        leaf_keys: NDArray[np.uint64],
+        leaf_size_m: float,
+        num_levels: int,
+        encoding: Encoding,
+        num_threads: int = 0,
+    ) -> None:
+        super().__init__()
+        self._summed = encoding == Encoding.OCTREE
+        self.table = VertexTable(leaf_keys, leaf_size_m, num_levels, encoding, num_threads)
+        self.features = nn.Parameter(large_zeros(self.table.num_rows, FEATURE_DIM))
+        self.interpolated_dim = FEATURE_DIM * num_levels
+
+    def initialise(self, generator: torch.Generator) -> None:
+        nn.init.normal_(self.features, std=_FEATURE_STD, generator=generator)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Encoding of points (N, 3), local frame, m: levels side by side, (N, 8 · num_levels), of an octree their sum, (N, 8)."""
+        found = interpolate(self.features, points, self.table)
+        return found.view(len(points), -1, FEATURE_DIM).sum(1) if self._summed else found
 
 
 class NeuralField(Field):
     """Features of cells and a Fourier encoding, from which two networks compute signed distance and intensity.
 
-    Parameters
-    ----------
-    leaf_keys : ndarray
-        (C,) uint64, Morton keys of the occupied leaf cells, ascending (``CellSet.sorted_keys``).
-    config : FitConfig
-        Its encoding, its networks and its lengths are used.
-    with_intensity : bool
-        Whether the field has an intensity network.
-    num_threads : int
-        Threads that build the table of vertices. 0: as many as OpenMP uses.
+    `leaf_keys` (C,): Morton keys of the occupied leaf cells, ascending. `with_intensity`: whether there is a second network.
     """
 
     def __init__(
         self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool, num_threads: int = 0
     ) -> None:
         super().__init__()
-        encoding = TriQuadtree if config.encoding.kind == "tri-quadtree" else Octree
+        encoding = Encoding.TRI_QUADTREE if config.encoding.kind == "tri-quadtree" else Encoding.OCTREE
         self.sigma_m = config.sigma_m
-        self.cells = encoding(leaf_keys, config.leaf_size_m, config.encoding.num_levels, num_threads)
+        self.cells = VertexFeatures(leaf_keys, config.leaf_size_m, NUM_LEVELS, encoding, num_threads)
         self.table = self.cells.table
-        half_width_m = config.metres(FOURIER_HALF_WIDTH_CELLS)
-        self.fourier = Fourier(half_width_m, config.encoding.fourier_count)
+        self.half_width_m = config.metres(FOURIER_HALF_WIDTH_CELLS)
+        self.num_frequencies = config.encoding.fourier_count
         self.sdf_network = SDFNetwork(config)
         self.intensity_network = IntensityNetwork(config) if with_intensity else None
 
@@ -84,38 +104,31 @@ class NeuralField(Field):
     @property
     def smooth_in_cells(self) -> bool:
         # No wavelength of the encoding is shorter than two leaf cells.
-        shortest_m = 2 * self.fourier.half_width_m / 2 ** (self.fourier.num_frequencies - 1)
-        return self.fourier.num_frequencies == 0 or shortest_m >= 2 * self.table.leaf_size_m
+        shortest_m = 2 * self.half_width_m / 2 ** (self.num_frequencies - 1)
+        return self.num_frequencies == 0 or shortest_m >= 2 * self.table.leaf_size_m
 
-    def encode(self, points: Tensor, interpolated: Tensor | None = None) -> tuple[Tensor, ...]:
-        """The inputs of the SDF network, (N, width) each, at points (N, 3), local frame, m.
+    def encode(self, points: Tensor) -> tuple[Tensor, ...]:
+        """The inputs of the SDF network, (N, width) each, at points (N, 3), local frame, m."""
+        cells = self.cells(points)
+        if self.num_frequencies == 0:
+            return (cells,)
+        return cells, fourier(points, self.half_width_m, 0, self.num_frequencies)
 
-        `interpolated`: the features of the cells at the points, (N, interpolated_dim), if they are known
-        already.
-        """
-        cells = self.cells(points) if interpolated is None else self.cells.combine(interpolated)
-        return (cells, self.fourier(points)) if self.fourier.num_frequencies else (cells,)
-
-    def logit(self, points: Tensor, interpolated: Tensor | None = None) -> Tensor:
-        """Signed distance / sigma (N,), positive in free space. `interpolated`: see :meth:`encode`."""
-        return self.sdf_network(self.encode(points, interpolated))[0]  # type: ignore[no-any-return]
+    def logit(self, points: Tensor) -> Tensor:
+        """Signed distance / sigma (N,), positive in free space, at points (N, 3), local frame, m."""
+        return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
 
     def sdf(self, points: Tensor) -> Tensor:
         return self.logit(points) * self.sigma_m
 
-    def geometry(
-        self, points: Tensor, *, frozen: bool = True, interpolated: Tensor | None = None
-    ) -> Geometry:
-        """The inputs of the intensity network at points (N, 3), local frame, m.
-
-        `frozen`: no gradient reaches features and SDF network. `interpolated`: see :meth:`encode`.
-        """
+    def geometry(self, points: Tensor, *, frozen: bool = True) -> Geometry:
+        """Inputs of the intensity network at points (N, 3), local, m. `frozen`: no gradient reaches features and SDF network."""
         wants_normals = self.intensity_network is not None and self.intensity_network.normals
         # A normal is the gradient of the logit, so it needs an autograd graph even if the field is frozen.
         with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
             if wants_normals:
                 points = points.detach().requires_grad_()
-            encoding = self.encode(points, interpolated)
+            encoding = self.encode(points)
             logit, feature = self.sdf_network(encoding)
             normals = None
             if wants_normals:
@@ -126,33 +139,13 @@ class NeuralField(Field):
             logit, feature = logit.detach(), feature.detach()
         return Geometry(encoding, logit, feature, normals)
 
-    def intensity_of(
-        self,
-        geometry: Geometry,
-        directions: Tensor,
-        ranges_m: Tensor,
-        *,
-        encoding_factors: Sequence[Tensor] | None = None,
-    ) -> Tensor:
-        """What the intensity network answers (N,) for the result of :meth:`geometry`.
-
-        `directions`, `ranges_m`: see :meth:`intensity`. `encoding_factors`: dropout, what each part of the encoding is
-        multiplied by.
-        """
-        assert self.intensity_network is not None
-        encoding = geometry.encoding
-        if encoding_factors is not None:
-            encoding = tuple(part * kept for part, kept in zip(encoding, encoding_factors, strict=True))
-        return self.intensity_network(  # type: ignore[no-any-return]
-            encoding, geometry.logit, geometry.feature, geometry.normals, directions, ranges_m
-        )
-
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
         unit = self._closed_form(points, directions, ranges_m)
         closed = self.reflectance
         share = 1.0 if closed is None else closed.network_share
         if share > 0:
-            unit += share * self.intensity_of(self.geometry(points), directions, ranges_m)
+            assert self.intensity_network is not None
+            unit += share * self.intensity_network(self.geometry(points), directions, ranges_m)
         # The closed form knows no limits, and what is beyond those of the training was never measured.
         return unit if closed is None else unit.clamp(0, 1)
 
@@ -215,30 +208,18 @@ class IntensityNetwork(Network):
     def __init__(self, config: FitConfig) -> None:
         super().__init__(intensity_widths(config))
         networks = config.networks
-        self.sdf_input = networks.sdf_input
         self.view_direction = networks.view_direction
         self.log_range = networks.log_range
         self.normals = networks.normals
-        self.harmonics = SphericalHarmonics()
 
-    def forward(
-        self,
-        encoding: Sequence[Tensor],
-        logit: Tensor,
-        geometry_feature: Tensor,
-        normals: Tensor | None,
-        directions: Tensor,
-        ranges_m: Tensor,
-    ) -> Tensor:
-        """Scaled intensity (N,). Inputs are those of :class:`Geometry` and :meth:`Field.intensity`."""
-        inputs = [*encoding, geometry_feature]
-        if self.sdf_input:
-            inputs.append(logit[:, None])
+    def forward(self, geometry: Geometry, directions: Tensor, ranges_m: Tensor) -> Tensor:
+        """Scaled intensity (N,), seen along unit vectors (N, 3) from ranges (N,), m."""
+        inputs = [*geometry.encoding, geometry.feature, geometry.logit[:, None]]
         if self.normals:
-            assert normals is not None
-            inputs.append(normals)
+            assert geometry.normals is not None
+            inputs.append(geometry.normals)
         if self.view_direction:
-            inputs.append(self.harmonics(directions))
+            inputs.append(spherical_harmonics(directions))
         if self.log_range:
             inputs.append(torch.log10(ranges_m.clamp_min(1e-3) / 10.0)[:, None])
         return self._run(inputs).squeeze(1)
@@ -246,7 +227,7 @@ class IntensityNetwork(Network):
 
 def cells_width(config: FitConfig) -> int:
     """Width of the encoding by the cells. A tri-quadtree puts levels side by side, an octree adds them."""
-    return FEATURE_DIM * (config.encoding.num_levels if config.encoding.kind == "tri-quadtree" else 1)
+    return FEATURE_DIM * (NUM_LEVELS if config.encoding.kind == "tri-quadtree" else 1)
 
 
 def fourier_width(config: FitConfig) -> int:
@@ -267,7 +248,7 @@ def intensity_widths(config: FitConfig) -> tuple[int, ...]:
         cells_width(config)
         + fourier_width(config)
         + networks.geometry_feature_dim
-        + networks.sdf_input
+        + 1  # the logit
         + 3 * networks.normals
         + NUM_SPHERICAL_HARMONICS * networks.view_direction
         + networks.log_range
@@ -278,8 +259,3 @@ def intensity_widths(config: FitConfig) -> tuple[int, ...]:
 def weights_of(widths: tuple[int, ...]) -> int:
     """Number of weights of a network without its biases. So many multiplications it takes for one point."""
     return sum(inputs * outputs for inputs, outputs in itertools.pairwise(widths))
-
-
-def parameters_of(widths: tuple[int, ...]) -> int:
-    """Number of weights and biases of a network."""
-    return weights_of(widths) + sum(widths[1:])

@@ -42,16 +42,11 @@ CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
 class SurfaceReturns:
     """The returns that the surface is made of, and what is known of them."""
 
-    rays: Rays
-    """Without ghosts. If a field is trained on them, they are moved towards the flat surfel of their cell."""
-    surfels: Surfels
-    """Surfels of all returns."""
+    rays: Rays  # without ghosts; if a field is trained on them, moved towards the flat surfel of their cell
+    surfels: Surfels  # of all returns
     noise: SensorNoise
-    """Noise of the returns."""
-    means: MeanRays | None
-    """Mean rays of the leaf cells, without ghosts, which are averaged. None: a field is trained on `rays`."""
-    true: NDArray[np.bool_] | None
-    """(N,) which of all rays end at no ghost. None: ghosts were not looked for."""
+    means: MeanRays | None  # of the leaf cells, without ghosts, to average. None: a field is trained
+    true: NDArray[np.bool_] | None  # (N,) which of all rays end at no ghost. None: ghosts were not looked for
 
     @classmethod
     def of(
@@ -62,10 +57,7 @@ class SurfaceReturns:
         inside: NDArray[np.bool_] | None = None,
         sums: ScanSums | None = None,
     ) -> SurfaceReturns:
-        """Cleans `rays` as ``config.returns`` says, and keeps those that are `inside`, (N,). None: all.
-
-        `sums`: of the same rays, if they are known.
-        """
+        """Cleans `rays`, of which there may be `sums`, by ``config.returns``, and keeps those `inside`, (N,). None: all."""
         sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if sums is None else sums
         surfels = Surfels.of_sums(sums, num_threads)
         means = None if config.train else MeanRays.of_sums(sums)
@@ -89,10 +81,7 @@ class SurfaceReturns:
 def occupied_cells(
     surface: SurfaceReturns, config: FitConfig, num_threads: int
 ) -> tuple[NDArray[np.uint64], ReturnsOfCells]:
-    """Keys (C,), ascending, of the leaf cells in which a surface can lie, and what the returns of cells tell.
-
-    These are the cells that rays cross near their returns, and those that bridge gaps between them.
-    """
+    """Keys (C,), ascending, of the leaf cells that rays cross near their returns or that bridge gaps; and what returns tell."""
     if surface.means is None:
         keys = near_leaf_keys(surface.rays, config, num_threads)
         returns = _returns_of_rays(surface, config, num_threads)
@@ -104,11 +93,8 @@ def occupied_cells(
 
 
 def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
-    """(C,) uint64, Morton keys of the leaf cells that a sample near the surface can fall into, ascending.
-
-    Points every half cell along the near band of each ray find the cells. Random samples would make the map's
-    cells depend on the seed.
-    """
+    """(C,) uint64, Morton keys of the leaf cells that a sample near the surface can fall into, ascending."""
+    # By points every half cell along the near band of each ray: random samples would make cells depend on the seed.
     band_m = config.metres(NEAR_BAND_CELLS)
     steps = math.ceil(2 * band_m / (config.leaf_size_m / 2))
     cells = CellSet(config.leaf_size_m)
@@ -123,12 +109,9 @@ def _returns_of_rays(surface: SurfaceReturns, config: FitConfig, num_threads: in
     rays = surface.rays
     cells = ReturnCells.of(rays, config.leaf_size_m, num_threads)
     information = 1 / surface.noise.variances_m2(rays.ranges_m)
-    found = ReturnsOfCells(
-        keys=cells.keys,
-        information=np.bincount(cells.cell_of_ray, information, len(cells.keys)).astype(np.float32),
-        scans=count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads),
-        counts=cells.counts,
-    )
+    of_cells = np.bincount(cells.cell_of_ray, information, len(cells.keys)).astype(np.float32)
+    scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
+    found = ReturnsOfCells(cells.keys, of_cells, scans, cells.counts)
     ranges_m = np.zeros(len(cells.keys), np.float32)
     ranges_m[cells.cell_of_ray] = rays.ranges_m  # any return of the cell
     return found.with_uncertain_poses(ranges_m, config.returns)
@@ -154,14 +137,7 @@ def average_surface(
 ) -> GridField:
     """The average of the rays' truncated signed distances (Curless and Levoy, 1996), smoothed.
 
-    Parameters
-    ----------
-    leaf_keys : ndarray
-        (C,) uint64, Morton keys of the leaf cells of the field, ascending.
-    means, returns : MeanRays, ReturnsOfCells
-        The mean ray of each cell with returns, and what these tell, in the same order.
-    surfels : Surfels
-        Planes of the returns.
+    `leaf_keys` (C,): of the field, ascending. `means`, `returns`: of each cell with returns, in the same order.
     """
     field = GridField(leaf_keys, config.leaf_size_m, num_threads)
     normals = normals_at(means, surfels, num_threads)
@@ -208,17 +184,7 @@ def average_at_corners(
 
 
 def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads: int) -> Reflectance:
-    """Intensities in closed form, or what the network of a map leaves of them.
-
-    Parameters
-    ----------
-    contents : MapContents
-        The map, with what its field answers for intensities so far.
-    rays : Rays
-        Returns that the map is made of, with ghosts.
-    surfels : Surfels
-        Of all returns.
-    """
+    """Intensities of `rays` in closed form, ghosts included, or what the network of the map leaves of them."""
     scale = contents.intensity_scale
     assert scale is not None
     known = rays.with_intensity

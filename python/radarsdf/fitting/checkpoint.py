@@ -9,7 +9,7 @@ import json
 import time
 import warnings
 from os import PathLike
-from typing import Any, Protocol
+from typing import Any
 
 from safetensors import SafetensorError
 from torch import Tensor
@@ -28,35 +28,12 @@ _NONE = object()  # where one of two configurations lacks a setting
 _SHARE = 0.02  # largest share of the time that is spent on writing
 
 
-class Resumable(Protocol):
-    """A training."""
-
-    def state(self) -> dict[str, Tensor]: ...
-
-    def restore(self, state: dict[str, Tensor]) -> None: ...
-
-
 class Checkpoint:
     """A file that the training writes its state to, every half minute or less often if writing takes long.
 
-    Parameters
-    ----------
-    path : path-like
-        An existing file must be a checkpoint of the same fit. It is replaced only once the new one is
-        complete.
-    rays : Rays
-        All returns of the fit. The file holds a digest of them, and of the `scale`.
-    scale : IntensityScale or None
-        Of their intensities.
-    config : FitConfig
-        Settings of the fit. The file holds a copy.
-
-    Raises
-    ------
-    ValueError
-        If the file is not a checkpoint, or one of other scans, another configuration or another version.
-    OSError
-        If the file cannot be read, or its folder does not exist.
+    An existing file must be a checkpoint of the same fit: it holds the settings, and a digest of all returns and the scale of
+    their intensities. A ValueError if it is none, or of other scans, settings or version; an OSError if it cannot be read, or
+    its folder does not exist.
     """
 
     def __init__(
@@ -78,7 +55,6 @@ class Checkpoint:
             raise FileNotFoundError(msg)
 
     def due(self) -> bool:
-        """Whether it is time to write the next file."""
         return time.monotonic() >= self._next_s
 
     def write(self, state: dict[str, Tensor]) -> None:
@@ -92,17 +68,11 @@ class Checkpoint:
         now_s = time.monotonic()
         self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _SHARE)
 
-    def resume(self, training: Resumable) -> None:
-        """Sets a training to the state in the file. Does nothing if there is no file.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged.
-        """
+    def resume(self, training: Any) -> None:
+        """Restores a `Training` from the file, if there is one. A ValueError if it is damaged."""
         if not self._path.exists():
             return
-        expected = training.state()
+        expected: dict[str, Tensor] = training.state()
         try:
             with open_tensors(self._path) as file:
                 if (names := set(file.names)) != set(expected):
@@ -110,11 +80,9 @@ class Checkpoint:
                     raise ValueError(msg)
                 state = {name: file.array(name).clone() for name in expected}
             for name, value in state.items():
-                if value.shape != expected[name].shape:
-                    msg = f"{name} has shape {tuple(value.shape)} instead of {tuple(expected[name].shape)}"
-                    raise ValueError(msg)
-                if value.dtype != expected[name].dtype or not value.isfinite().all():
-                    msg = f"{name} holds something other than finite {expected[name].dtype}"
+                wanted = expected[name]
+                if value.shape != wanted.shape or value.dtype != wanted.dtype or not value.isfinite().all():
+                    msg = f"{name} is not {tuple(wanted.shape)} finite numbers, {wanted.dtype}"
                     raise ValueError(msg)
             training.restore(state)
         except OSError:
@@ -124,31 +92,26 @@ class Checkpoint:
             raise ValueError(msg) from error
 
     def _check_identity(self) -> None:
-        ours, found = self._identity, self._identity_of_file()
-        if found is None:
-            msg = f"{self._path} is not a checkpoint of a fit: it is left as it is"
-            raise ValueError(msg)
-        mine, other = flat_settings(ours["config"]), flat_settings(found["config"])
-        changed = sorted(k for k in mine.keys() | other.keys() if mine.get(k, _NONE) != other.get(k, _NONE))
-        for name, what in (
-            ("version", f"was written by radarsdf {found['version']!r:.50}: remove it to begin again"),
-            ("config", f"is a checkpoint of another configuration: {', '.join(changed)!s:.200} differ"),
-            ("scans", "is a checkpoint of other scans, poses or intensities"),
-        ):
-            if found[name] != ours[name]:
-                msg = f"{self._path} {what}"
-                raise ValueError(msg)
-
-    def _identity_of_file(self) -> dict[str, Any] | None:
-        """None: it is no checkpoint."""
+        ours = self._identity
         try:
             with open_tensors(self._path) as file:
                 metadata = file.metadata
             found: Any = json.loads(metadata["identity"]) if metadata.get("format") == FORMAT else None
-        except (SafetensorError, KeyError, ValueError, RecursionError):
-            return None
-        whole = isinstance(found, dict) and found.keys() == self._identity.keys()
-        return found if whole and isinstance(found["config"], dict) else None
+            mine, other = flat_settings(ours["config"]), flat_settings(found["config"])
+            differing = [name for name in ours if found[name] != ours[name]]
+        except (SafetensorError, AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+            msg = f"{self._path} is not a checkpoint of a fit: it is left as it is"
+            raise ValueError(msg) from error
+        changed = sorted(k for k in mine.keys() | other.keys() if mine.get(k, _NONE) != other.get(k, _NONE))
+        words = {
+            "version": f"was written by radarsdf {found['version']!r:.50}: remove it to begin again",
+            "config": f"is a checkpoint of another configuration: {', '.join(changed)!s:.200} differ",
+            "scans": "is a checkpoint of other scans, poses or intensities",
+        }
+        for name, what in words.items():
+            if name in differing:
+                msg = f"{self._path} {what}"
+                raise ValueError(msg)
 
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:

@@ -8,22 +8,15 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import FEATURE_DIM, CellSet
 from radarsdf.checks import instance
-from radarsdf.config.fit_config import FitConfig
-from radarsdf.config.presets import PAPER
-from radarsdf.field.neural_field import (
-    SDF_HIDDEN,
-    fourier_width,
-    intensity_widths,
-    parameters_of,
-    sdf_widths,
-    weights_of,
-)
+from radarsdf.config.fit_config import PAPER, FitConfig
+from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
 from radarsdf.fitting.average import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS, seen_jointly
 from radarsdf.fitting.schedule import Schedule
@@ -32,44 +25,24 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import resolve_num_threads
 
-# Seconds on one thread, measured on the machine that BENCHMARK.md names: `python -m bench.estimates durations`
-# measures fits and prints them. The estimates of twenty fits were 0.65 to 1.24 times their processor time.
-SECONDS = {
-    "return": 1.7e-06,
-    "cell": 9.4e-07,
-    "moved row": 7.5e-09,
-    "iteration": 9.3e-4,
-    "encoded number": 2.2e-9,
-    "multiplication": 2.6e-11,
-}
-_SECONDS_OF_FREE_SPACE = 1e-6  # a return
-_SHARED = ("encoded number", "multiplication")  # done by all threads; one thread does the other kinds
+# Seconds of one thread, measured on the machine that BENCHMARK.md names. The estimates of twenty fits were 0.65 to 1.24
+# times their processor time: `python -m bench.estimates durations` repeats it.
+_S_PER_RETURN, _S_PER_RETURN_OF_FREE_SPACE, _S_PER_CELL = 1.7e-6, 1e-6, 9.4e-7
+_S_PER_ITERATION, _S_PER_MOVED_ROW = 9.3e-4, 7.5e-9
+_S_PER_INPUT, _S_PER_MULTIPLICATION = 2.2e-9, 2.6e-11  # of a network, which all threads share
 
-# Bytes. Measured as peaks of fits of 1e4 to 3e6 returns of a street, over the memory of the process before
-# the fit; `python -m bench.estimates memory` repeats it.
+# Bytes, measured as peaks of fits of 1e4 to 3e6 returns of a street: `python -m bench.estimates memory` repeats it.
 _ALWAYS = 35e6  # code that the fit loads, stacks and arenas of the threads
-_PER_RETURN = 30.0
-_PER_INTENSITY = 20.0
-_PER_RETURN_AGAIN = 110.0  # if the intensity stage uses other returns than the sdf stage
-_PER_RETURN_OF_CLOSED_FORM = 150.0  # cells of intensities in closed form
-_PER_RETURN_CLEANED = (
-    200.0  # rays with and without ghosts, and the training's copy, for which the others make room
-)
-_PER_CELL = 215.0
-_PER_CELL_AVERAGED = 30.0  # corners of the cell, and distances there
-_PER_BLOCK = 300.0  # of 8 × 8 × 8 leaf cells that rays crossed
-_COPIES = 4  # of each parameter that learns: value, two moments of Adam, last finite value
-_PER_ROW = 8.0  # if only the touched rows move: marks of Adam
+_PER_RETURN, _PER_RETURN_CLEANED = 30.0, 200.0
+_PER_RETURN_OF_NETWORK, _PER_RETURN_OF_CLOSED_FORM = 130.0, 150.0
+_PER_CELL = 230.0
+_COPIES = 4  # of each feature: value, two moments of Adam, last finite value
 
-# Cells of a map for each cell with returns, where these have many returns each, and more where they have few: cells of
-# dense surfaces share what is near. Measured on `hugin`, `oculii` and `wall`, of 4 to all scans, with cells of 0.1 to 0.5 m:
-# within a factor of 1.5.
-_CELLS, _CELLS_SPARSE = 1.4, 3.6
-_AVERAGED = 1.35  # times as many in stage 1, whose band is wider
-# Rows for each of these cells, likewise: within a factor of 2.
-_ROWS = {"tri-quadtree": (0.7, 1.3), "octree": (2.3, 2.5)}
-_ROWS_AVERAGED = (1.7, 1.5)
-_BLOCKS = 0.05
+# Leaf cells for each one with returns, and rows of features for each leaf cell: where cells hold many returns each, and what
+# is added where they hold one. Measured on `hugin`, `oculii` and `wall`, of 4 to all scans, with cells of 0.1 to 0.5 m: within
+# a factor of 2.
+_CELLS, _CELLS_AVERAGED = (1.4, 3.6), (1.9, 4.9)
+_ROWS, _ROWS_AVERAGED = {"tri-quadtree": (0.7, 1.3), "octree": (2.3, 2.5)}, (1.7, 1.5)
 
 
 @dataclass(frozen=True)
@@ -106,12 +79,18 @@ def estimate(
     *,
     config: FitConfig | None = None,
 ) -> Estimate:
-    """Estimates memory and time of :func:`radarsdf.fit` with the same arguments, much faster than a fit.
+    """Estimate memory and time of :func:`radarsdf.fit` from the numbers of returns and of cells that hold them.
 
     Parameters
     ----------
-    points, poses, intensities, config
-        As for :func:`radarsdf.fit`.
+    points : sequence of F arrays
+        (N_i, 3) each: the returns of one scan, sensor frame, m.
+    poses : array_like
+        (F, 4, 4) T_world_sensor, m.
+    intensities : sequence of F arrays, optional
+        (N_i,) each, sensor units.
+    config : FitConfig, optional
+        Settings of the fit.
 
     Returns
     -------
@@ -121,7 +100,7 @@ def estimate(
     Raises
     ------
     ValueError
-        If scans or poses are invalid, see :func:`radarsdf.returns.rays.prepare`.
+        If scans or poses are invalid, or a return is too far away, as for :func:`radarsdf.fit`.
 
     Examples
     --------
@@ -139,185 +118,118 @@ def estimate(
 
 def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> Estimate:
     """:func:`estimate` for rays, of which a map is made of those `inside`, (N,). None: all."""
-    learnt, threads = rays if inside is None else rays.select(inside), resolve_num_threads(config.num_threads)
-    occupied = CellSet(config.leaf_size_m)
-    occupied.insert(np.ascontiguousarray(learnt.points), threads)
-    return _estimate(learnt, len(rays), len(occupied.sorted_keys(threads)), config)
-
-
-def _estimate(learnt: Rays, num_rays: int, with_returns: int, config: FitConfig) -> Estimate:
-    """Of a map that is made of the returns `learnt`, of so many rays. `with_returns`: leaf cells that hold them."""
     threads = resolve_num_threads(config.num_threads)
-    cells, rows = _sizes(len(learnt), with_returns, config)
-    with_network = learnt.intensities is not None and config.trains_intensity
+    points = rays.points if inside is None else rays.points[inside]
+    occupied = CellSet(config.leaf_size_m)
+    occupied.insert(np.ascontiguousarray(points), threads)
+    return _estimate(rays, config, len(points), len(occupied.sorted_keys(threads)))
+
+
+def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) -> Estimate:
+    """Of a map of so many `returns` of the rays, which lie in `with_returns` leaf cells."""
+    sparse = with_returns / returns
+    of_dense, of_sparse = _CELLS if config.train else _CELLS_AVERAGED
+    cells = with_returns * (of_dense + of_sparse * sparse**3)
+    of_dense, of_sparse = _ROWS[config.encoding.kind] if config.train else _ROWS_AVERAGED
+    rows = round(cells * (of_dense + of_sparse * sparse**6))
+    with_network = rays.intensities is not None and config.trains_intensity
     schedule = Schedule.of(
-        config, surface_returns=len(learnt), returns=len(learnt), vertices=rows, with_intensity=with_network
+        config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=with_network
     )
+    memory = _ALWAYS + returns * _PER_RETURN + cells * _PER_CELL
+    if config.train:
+        # Gradients of all rows, unless only those of a batch move; through normals two for each thread, and their sum.
+        normals = with_network and config.networks.normals
+        all_rows = 3 * resolve_num_threads(config.num_threads) if normals else 1
+        gradients = 0 if config.moves_rows(with_network) else all_rows
+        memory += 4 * rows * FEATURE_DIM * (_COPIES + gradients)
+        memory += 4 * schedule.batch_size * sum(sdf_widths(config)) * (3 if normals else 1)
+    if with_network:
+        memory += returns * _PER_RETURN_OF_NETWORK
+    if rays.intensities is not None and config.closes_intensity:
+        memory += returns * _PER_RETURN_OF_CLOSED_FORM
     return Estimate(
-        peak_memory_bytes=_fit_bytes(learnt, num_rays, cells, rows, schedule, config),
-        seconds=seconds_of(config, schedule, num_rays, cells, rows, with_network, threads),
-        returns=len(learnt),
-        leaf_cells=cells,
+        peak_memory_bytes=int(max(memory, len(rays) * _PER_RETURN_CLEANED)),
+        seconds=seconds_of(config, schedule, len(rays), round(cells), rows, with_network),
+        returns=returns,
+        leaf_cells=round(cells),
         vertices=rows,
         iterations=schedule.iterations,
     )
 
 
-def _sizes(returns: int, with_returns: int, config: FitConfig) -> tuple[int, int]:
-    """Numbers of leaf cells and of rows of features, or of corners, of a map. `with_returns`: leaf cells that hold returns."""
-    sparse = with_returns / returns
-    cells = with_returns * (_CELLS + _CELLS_SPARSE * sparse**3) * (1 if config.train else _AVERAGED)
-    of_cell, of_sparse = _ROWS[config.encoding.kind] if config.train else _ROWS_AVERAGED
-    return round(cells), round(cells * (of_cell + of_sparse * sparse**6))
-
-
-def _fit_bytes(
-    learnt: Rays, num_rays: int, cells: int, rows: int, schedule: Schedule, config: FitConfig
-) -> int:
-    count, with_intensity = len(learnt), learnt.intensities is not None
-    memory = _ALWAYS + count * _PER_RETURN + cells * _PER_CELL
-    if config.returns.passages:
-        memory += cells * _BLOCKS * _PER_BLOCK
-    if with_intensity and config.closes_intensity:
-        memory += count * _PER_RETURN_OF_CLOSED_FORM
-    memory += _training_bytes(count, rows, schedule, config) if config.train else cells * _PER_CELL_AVERAGED
-    return int(max(memory, num_rays * _PER_RETURN_CLEANED))
-
-
-def _training_bytes(count: int, rows: int, schedule: Schedule, config: FitConfig) -> float:
-    threads = resolve_num_threads(config.num_threads)
-    networks, with_intensity = parameters_of(sdf_widths(config)), schedule.intensity_iterations > 0
-    memory = 0.0
-    if with_intensity:
-        networks += parameters_of(intensity_widths(config))
-        memory += count * (_PER_INTENSITY + config.returns.drop_ghosts * _PER_RETURN_AGAIN)
-    memory += 4 * networks * (_COPIES + threads)
-    normals = with_intensity and config.networks.normals
-    gradients = 0  # of all rows, in a batch
-    if not config.moves_rows(with_intensity):
-        # Each thread has one. Through normals the loss sees the features twice: two gradients, and their sum.
-        gradients = 3 * threads if normals else 1
-    memory += 4 * rows * FEATURE_DIM * (_COPIES + gradients) + rows * _PER_ROW
-    # A batch in encodings, hidden layers and their gradients; normals need gradients of gradients.
-    encoding = config.encoding.num_levels * FEATURE_DIM + fourier_width(config)
-    numbers = schedule.batch_size * (encoding + sum(SDF_HIDDEN))
-    numbers += schedule.intensity_batch_size * (encoding + sum(config.networks.intensity_hidden))
-    return memory + 4 * numbers * (3 if normals else 1)
-
-
 def seconds_of(
-    config: FitConfig,
-    schedule: Schedule,
-    returns: int,
-    cells: int,
-    rows: int,
-    with_intensity: bool,
-    threads: int,
+    config: FitConfig, schedule: Schedule, returns: int, cells: int, rows: int, with_network: bool
 ) -> float:
-    """Wall-clock seconds of a fit. `with_intensity`: with an intensity network."""
-    work = work_of(config, schedule, returns=returns, cells=cells, rows=rows, with_intensity=with_intensity)
-    threads = min(threads, processors())  # more threads than processors do not help
-    return sum(SECONDS[kind] * amount / (threads if kind in _SHARED else 1) for kind, amount in work.items())
-
-
-def work_of(
-    config: FitConfig, schedule: Schedule, *, returns: int, cells: int, rows: int, with_intensity: bool
-) -> dict[str, float]:
-    """Amount of each kind of work in :data:`SECONDS` for a fit, all threads together.
-
-    `returns`, `cells`, `rows`: numbers of returns, leaf cells and rows of features.
-    """
-    work = dict.fromkeys(SECONDS, 0.0) | {"return": float(returns), "cell": float(cells)}
+    """Wall-clock seconds of a fit with so many returns, leaf cells and rows of features."""
+    seconds = _S_PER_RETURN * returns + _S_PER_CELL * cells
     if not config.train:
-        return work
-    training, normals = config.training, config.networks.normals
+        return seconds
     iterations = schedule.sdf_iterations
-    joint = iterations if with_intensity and training.joint else 0
+    joint = iterations if with_network else 0
     later = max(0, schedule.intensity_iterations - joint)
-    of_both = seen_jointly(config, schedule.batch_size)
-    # Units: a forward pass of a sample. Forward and backward take 3. Normals take a backward pass of their
-    # own, and their gradient two more: 9 in all, or 3 if the field is frozen.
-    passes, frozen_passes = (9, 3) if normals and with_intensity else (3, 1)
-    evaluations = passes * iterations * schedule.batch_size
-    evaluations += frozen_passes * later * schedule.intensity_batch_size
-    sdf, intensity = weights_of(sdf_widths(config)), weights_of(intensity_widths(config))
-    multiplied = sdf * evaluations + intensity * 3 * (joint * of_both + later * schedule.intensity_batch_size)
-    return work | {
-        "moved row": float(rows * iterations * (not config.moves_rows(with_intensity))),
-        "iteration": float(iterations + later),
-        "encoded number": float(sdf_widths(config)[0] * evaluations),
-        "multiplication": float(multiplied),
-    }
-
-
-def processors() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    # In forward passes of a sample: forward and backward take 3. Normals take a backward pass of their own, and their
+    # gradient two more: 9 in all, or 3 if the field is frozen.
+    passes, frozen_passes = (9, 3) if config.networks.normals and with_network else (3, 1)
+    of_field = passes * iterations * schedule.batch_size
+    of_field += frozen_passes * later * schedule.intensity_batch_size
+    of_network = 3 * joint * seen_jointly(config, schedule.batch_size)
+    of_network += 3 * later * schedule.intensity_batch_size
+    multiplications = (
+        weights_of(sdf_widths(config)) * of_field + weights_of(intensity_widths(config)) * of_network
+    )
+    shared = _S_PER_INPUT * sdf_widths(config)[0] * of_field + _S_PER_MULTIPLICATION * multiplications
+    moved = 0 if config.moves_rows(with_network) else rows * iterations
+    seconds += _S_PER_ITERATION * (iterations + later) + _S_PER_MOVED_ROW * moved
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return seconds + shared / min(resolve_num_threads(config.num_threads), processors)
 
 
 def skipped_parts(
-    config: FitConfig,
-    schedule: Schedule,
-    *,
-    returns: int,
-    cells: int,
-    rows: int,
-    with_intensity: bool,
-    threads: int,
-) -> list[tuple[str, float | None]]:
-    """Parts of the method that a fit does not run, with the reason, and the seconds that this saves by :data:`SECONDS`."""
+    config: FitConfig, schedule: Schedule, *, returns: int, cells: int, rows: int, with_intensity: bool
+) -> list[tuple[str, float]]:
+    """Parts of the method that a fit does not run, with the reason, and the seconds that this saves."""
 
-    def seconds(config: FitConfig, schedule: Schedule, with_network: bool) -> float:
-        return seconds_of(config, schedule, returns, cells, rows, with_network, threads)
-
-    def scheduled(config: FitConfig, with_network: bool) -> Schedule:
-        return Schedule.of(
-            config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=with_network
+    def seconds(network: bool, **changes: Any) -> float:
+        changed = config.override(**changes)
+        scheduled = Schedule.of(
+            changed, surface_returns=returns, returns=returns, vertices=rows, with_intensity=network
         )
+        return seconds_of(changed, scheduled, returns, cells, rows, network)
 
-    with_network = with_intensity and config.trains_intensity
-    ours_s = seconds(config, schedule, with_network)
-    skipped: list[tuple[str, float | None]] = []
+    network = with_intensity and config.trains_intensity
+    now_s = seconds(network)
+    skipped = []
     if not config.train:
-        trained = config.override(train=True)
-        s = seconds(trained, scheduled(trained, False), False) - ours_s
-        skipped.append(("training of the surface: it is averaged", s))
+        skipped.append(("training of the surface: it is averaged", seconds(False, train=True) - now_s))
     if not config.returns.passages:
         words = "free space and mean intensities by view, which grids and comparisons need: returns.passages is off"
-        skipped.append((words, _SECONDS_OF_FREE_SPACE * returns))
-    if not with_network:
+        skipped.append((words, _S_PER_RETURN_OF_FREE_SPACE * returns))
+    if not network:
         why = "intensities are in closed form" if with_intensity else "there are no intensities"
-        trained = config.override(train=True)
-        surface_s, both_s = (
-            seconds(trained, scheduled(trained, with_it), with_it) for with_it in (False, True)
-        )
-        skipped.append((f"the intensity network: {why}", both_s - surface_s))
-    else:
-        for name, setting in (("normals", "normals"), ("geometry feature", "geometry_feature_dim")):
-            if not getattr(config.networks, setting):
-                used = config.override(networks={setting: PAPER["networks"][setting]})
-                words = f"the {name}, which the intensity network does not use"
-                skipped.append((words, seconds(used, schedule, with_network) - ours_s))
+        trained_s = seconds(True, train=True) - seconds(False, train=True)
+        skipped.append((f"the intensity network: {why}", trained_s))
+    for name, setting in (("normals", "normals"), ("geometry feature", "geometry_feature_dim")):
+        if network and not getattr(config.networks, setting):
+            used = {setting: PAPER["networks"][setting]}
+            words = f"the {name}, which the intensity network does not use"
+            skipped.append((words, seconds(network, networks=used) - now_s))
     if config.train and schedule.passes < 1 and config.training.sdf_iterations is None:
         why = "the others were enough" if config.effort >= 1 else f"effort is {config.effort:g}"
         whole = math.ceil(schedule.sdf_iterations / schedule.passes)
-        used = config.override(training={"sdf_iterations": whole})
         words = f"{1 - schedule.passes:.0%} of the samples: {why}"
-        skipped.append((words, seconds(used, scheduled(used, with_network), with_network) - ours_s))
-    if config.train and config.moves_rows(with_network):
+        skipped.append((words, seconds(network, training={"sdf_iterations": whole}) - now_s))
+    if config.train and config.moves_rows(network):
         words = "in each iteration, updates of features that its samples did not use"
-        skipped.append((words, SECONDS["moved row"] * rows * schedule.sdf_iterations))
+        skipped.append((words, _S_PER_MOVED_ROW * rows * schedule.sdf_iterations))
     return skipped
 
 
 def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> None:
-    """Raises a MemoryError if a fit needs more than `max_memory_bytes`, or than the system has left.
-
-    `inside`: as of :func:`estimate_rays`.
-    """
+    """Raises a MemoryError if a fit needs more than `max_memory_bytes`, or than the system has left."""
     available = limit_bytes(config.max_memory_bytes)
     # No more cells hold returns than there are returns. If so many are small enough, they need not be counted.
-    if available is None or _estimate(rays, len(rays), len(rays), config).peak_memory_bytes <= available:
+    if available is None or _estimate(rays, config, len(rays), len(rays)).peak_memory_bytes <= available:
         return
     expected = estimate_rays(rays, config, inside)
     if expected.peak_memory_bytes > available:

@@ -31,13 +31,12 @@ def fit(
     origin: ArrayLike | None = None,
     intensity_range: tuple[float, float] | None = None,
 ) -> RadarMap:
-    """Fits a signed distance field, and with intensities a reflectance map, to radar returns.
+    """Fit a signed distance field, and with intensities a reflectance map, to radar returns.
 
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. An iterator is asked for one after another, and they
-        are not kept, unless Doppler is given. Of :class:`radarsdf.io.Scans`, as they are, their poses, intensities and
+        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, their poses, intensities and
         Doppler are used where none are given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf._core import FEATURE_DIM
-from radarsdf.field.encodings import VertexFeatures
 from radarsdf.field.kernels import large_zeros, rows_view, view
+from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import Workers
 
@@ -30,11 +30,11 @@ class Optimiser(ABC):
 
     @abstractmethod
     def state(self) -> dict[str, Tensor]:
-        """All that the next steps depend on, except the parameters. The tensors are not copied."""
+        """All that the next steps depend on, except the parameters. Not copied."""
 
     @abstractmethod
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of an optimiser of the same parameters returned. ValueError: none can have that state."""
+        """Restores a :meth:`state`. ValueError: no optimiser of these parameters can have it."""
 
     @abstractmethod
     def step(self, gradients: Sequence[Tensor]) -> None:
@@ -93,9 +93,8 @@ class Soap(Optimiser):
         super().__init__(parameters, learning_rate)
         self.step_count = 0
         # A layer with one output has one vector of weights: nothing to turn.
-        is_matrix = [p.ndim == 2 and min(p.shape) > 1 for p in self.parameters]
-        self._matrices = [i for i, yes in enumerate(is_matrix) if yes]
-        self._others = [i for i, yes in enumerate(is_matrix) if not yes]
+        self._matrices = [i for i, p in enumerate(self.parameters) if p.ndim == 2 and min(p.shape) > 1]
+        self._others = [i for i in range(len(self.parameters)) if i not in self._matrices]
         self._adam = Adam(_at(self._others, self.parameters), learning_rate)
         matrices = _at(self._matrices, self.parameters)
         self._weights = [view(p) for p in matrices]
@@ -139,13 +138,6 @@ class RowAdam:
     The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
     change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.
     Measured: the surface is as good without that, and a fit of `hugin` takes 4.2 s instead of 5.2.
-
-    Attributes
-    ----------
-    learning_rate : float
-        Learning rate of the next step.
-    full_rate : float
-        Learning rate at the start.
     """
 
     def __init__(self, cells: VertexFeatures, learning_rate: float) -> None:
@@ -160,16 +152,13 @@ class RowAdam:
 
     @property
     def features(self) -> Tensor:
-        """(num_rows, 8), the tensor that is optimised."""
         return self._cells.features
 
     def state(self) -> dict[str, Tensor]:
-        """All that the next steps depend on, except the features. The tensors are not copied."""
         count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
         return {"moments": self._moments, "last_step": self._marks[:, :1], "step_count": count}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` returned. ValueError: a row changed later than the last step."""
         count, last_step = int(state["step_count"]), state["last_step"]
         first, last = (int(last_step.min()), int(last_step.max())) if last_step.numel() else (0, 0)
         if not 0 <= first <= last <= count:

@@ -55,35 +55,23 @@ def seen_jointly(config: FitConfig, batch_size: int) -> int:
 class Samples:
     """Points on rays. Those near the surface come first."""
 
-    points: Tensor
-    """(B, 3) float32, local frame, m."""
-    sdf_m: Tensor
-    """(B,) label: distance along the ray to the return, m, positive in front of it."""
-    num_near: int
-    """The first `num_near` samples are near the surface, the others in free space."""
-    num_labelled: int
-    """The intensities of the first `num_labelled` of them are labels."""
-    of_ray: Tensor
-    """(B, 7 or 8) for the ray of each sample: return (3), local frame, m; direction (3); range, m; and scaled
-    intensity if there are intensities."""
-    share: float = 1.0
-    """Of a part of a batch: what its mean counts in the mean of the whole batch. 0 where it has no samples."""
-    labelled_share: float = 1.0
-    """The same of the samples with labels."""
+    points: Tensor  # (B, 3) float32, local frame, m
+    sdf_m: Tensor  # (B,) label: distance along the ray to the return, m, positive in front of it
+    num_labelled: int  # of the first ones, the intensities are labels
+    of_ray: Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; perhaps scaled intensity
+    share: float = 1.0  # of a part of a batch: what its mean counts in that of the whole; 0 without samples
+    labelled_share: float = 1.0  # the same of the samples with labels
 
     @property
     def directions(self) -> Tensor:
-        """(B, 3) unit vectors from the sensor to the return."""
         return _directions(self.of_ray)
 
     @property
     def ranges_m(self) -> Tensor:
-        """(B,) distances from the sensor to the return, m."""
         return self.of_ray[:, RAY_RANGE]
 
     @property
     def intensities(self) -> Tensor:
-        """(B,) scaled intensities of the returns."""
         return self.of_ray[:, RAY_INTENSITY]
 
 
@@ -91,55 +79,29 @@ class Samples:
 class Batch:
     """Samples in parts, one part after the other. Each part is the work of one thread."""
 
-    points: Tensor
-    """(B, 3), see :class:`Samples`."""
-    sdf_m: Tensor
-    """(B,)."""
-    of_ray: Tensor
-    """(B, 7 or 8)."""
-    parts: list[tuple[int, int]]
-    """Of each part: the number of its samples, and how many of these, the first ones, have labels of intensities."""
-    near: list[int]
-    """Of each part: how many of its samples, the first ones, are near the surface."""
+    points: Tensor  # (B, 3), see :class:`Samples`
+    sdf_m: Tensor  # (B,)
+    of_ray: Tensor  # (B, 7 or 8)
+    parts: list[tuple[int, int]]  # number of samples of each part, and how many of the first ones have labels
 
     def split(self) -> list[Samples]:
-        """The samples of each part."""
         sizes, labelled = map(list, zip(*self.parts, strict=True))
         columns = [torch.split_with_sizes(column, sizes) for column in (self.points, self.sdf_m, self.of_ray)]
         # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
         shares = ([count / max(sum(counts), 1) for count in counts] for counts in (sizes, labelled))
         return [
-            Samples(x, sdf, num_near, num_labelled, of_ray, *shares_of_part)
-            for x, sdf, of_ray, num_near, num_labelled, *shares_of_part in zip(
-                *columns, self.near, labelled, *shares, strict=True
-            )
+            Samples(x, sdf, num_labelled, of_ray, *shares_of_part)
+            for x, sdf, of_ray, num_labelled, *shares_of_part in zip(*columns, labelled, *shares, strict=True)
         ]
 
 
 class RaySampler:
-    """Draws batches of samples from rays.
+    """Draws batches of samples from rays, N of them, with scaled intensities (N,) or none.
 
     Rays are taken in random order without replacement, and positions on them are random. A batch has one sample near the
     surface and one in free space on each of its rays, instead of all twelve on a twelfth of the rays: so its gradient
-    covers more of the scene.
-
-    Parameters
-    ----------
-    rays : Rays
-        N rays.
-    config : FitConfig
-        Settings of the fit.
-    batch_size : int
-        Samples in a batch.
-    generator : torch.Generator
-        Random numbers. The caller saves and restores its state.
-    neighbours : int
-        So many rays that follow each other in Morton order of their returns are taken together. In a large map, the rays
-        of a batch would otherwise share no cache lines.
-    intensities : Tensor, optional
-        (N,) scaled intensities of the rays.
-    num_threads : int
-        Threads that sort the rays. 0: as many as OpenMP uses.
+    covers more of the scene. So many `neighbours` that follow each other in Morton order of their returns are taken together:
+    in a large map, the rays of a batch would otherwise share no cache lines. The caller saves the state of the `generator`.
     """
 
     def __init__(
@@ -167,13 +129,10 @@ class RaySampler:
     def state(self) -> dict[str, Tensor]:
         """The order of the rays, as a state of the generator, and the position in it: -1 before the first batch."""
         following = self._next if len(self._order) else -1
-        return {
-            "order_from": self._order_from,
-            "next": torch.tensor(following, dtype=torch.int64, device="cpu"),
-        }
+        following_ray = torch.tensor(following, dtype=torch.int64, device="cpu")
+        return {"order_from": self._order_from, "next": following_ray}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of a sampler of the same rays gave. Changes the generator's state."""
         following = int(state["next"])
         if not -1 <= following <= len(self._rays):
             msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
@@ -219,7 +178,7 @@ class RaySampler:
             noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
             points += noise * (noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]
-        return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)), near)
+        return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)))
 
     def batch(self, parts: int = 1) -> Batch:
         """`batch_size` samples, in `parts`, each with its share of near and free samples."""
@@ -235,7 +194,7 @@ class RaySampler:
         # Random numbers are drawn for the whole batch and then divided, so samples do not depend on `parts`.
         sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
         points = torch.addcmul(_returns(ray), sdf_m[:, None], _directions(ray), value=-1)
-        return Batch(points, sdf_m, ray, layout.parts, layout.near)
+        return Batch(points, sdf_m, ray, layout.parts)
 
 
 def _in_morton_order(
@@ -269,18 +228,11 @@ def share(count: int, part: int, parts: int) -> int:
 class _Layout:
     """The order of the B samples of a batch, each drawn uniformly from a segment of its ray: part by part, near ones first."""
 
-    index: Tensor
-    """(B,) int64, row of each sample's ray among the rays that were taken."""
-    order: Tensor
-    """(B,) int64, row of each sample if all near samples of the batch came first, then all free ones."""
-    start: tuple[Tensor, Tensor]
-    """(B,) each: c and d. The segment starts c + d · range in front of the return, m."""
-    length: tuple[Tensor, Tensor]
-    """(B,) each: c and d. The segment has the length c + d · range, m, towards the sensor."""
-    parts: list[tuple[int, int]]
-    """See :attr:`Batch.parts`."""
-    near: list[int]
-    """See :attr:`Batch.near`."""
+    index: Tensor  # (B,) int64, row of each sample's ray among the rays that were taken
+    order: Tensor  # (B,) int64, row of each sample if all near samples of the batch came first, then all free ones
+    start: tuple[Tensor, Tensor]  # (B,) c and d: the segment starts c + d · range in front of the return, m,
+    length: tuple[Tensor, Tensor]  # (B,) and has the length c + d · range, m, towards the sensor
+    parts: list[tuple[int, int]]  # see :class:`Batch`
 
     @classmethod
     def of(cls, counts: tuple[int, int, int], parts: int, config: FitConfig) -> _Layout:
@@ -297,20 +249,13 @@ class _Layout:
         kinds = torch.from_numpy(np.repeat(np.tile([0, 1, 2], parts), sizes))
         order = kinds.argsort(stable=True).argsort()
         index = torch.from_numpy(np.concatenate(of_kinds))[order]
-        # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range +
-        # free_beyond].
+        # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range + free_beyond].
         band_m, beyond_m = config.metres(NEAR_BAND_CELLS), config.metres(FREE_BEYOND_CELLS)
-        ends = torch.tensor(
-            [[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]],
-            dtype=torch.float32,
-            device="cpu",
-        )[(kinds == 2).long()]
+        segments = [[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]]
+        ends = torch.tensor(segments, dtype=torch.float32, device="cpu")[(kinds == 2).long()]
         start, of_range, length, length_of_range = ends.T.contiguous()
-        sums = [sum(part) for part in zip(*shares, strict=True)]
-        labelled, others, _ = shares
-        near = [sum(pair) for pair in zip(labelled, others, strict=True)]
-        parts_of_batch = list(zip(sums, labelled, strict=True))
-        return cls(index, order, (start, of_range), (length, length_of_range), parts_of_batch, near)
+        sizes_and_labels = [(sum(part), part[0]) for part in zip(*shares, strict=True)]
+        return cls(index, order, (start, of_range), (length, length_of_range), sizes_and_labels)
 
 
 def _spread(count: int, of: int) -> NDArray[np.int64]:
@@ -325,10 +270,8 @@ def _spread(count: int, of: int) -> NDArray[np.int64]:
 class Dropout:
     """Which numbers of a matrix are kept. PyTorch's own dropout draws from the global generator."""
 
-    seed: int
-    """Of the random bytes, one for each number of the matrix."""
-    keep: int
-    """Numbers whose byte is below this are kept. From 1 to 256."""
+    seed: int  # of the random bytes, one for each number of the matrix
+    keep: int  # numbers whose byte is below this are kept, from 1 to 256
 
     @classmethod
     def draw(cls, dropout: float, generator: torch.Generator) -> Dropout:

@@ -37,72 +37,53 @@ _HALF_DROPOUT_PASSES = 2.5  # a fit that uses each sample so often has half of t
 
 @dataclass(frozen=True)
 class Schedule:
-    """Batch sizes and iterations of the stages sdf and intensity. Joint iterations count for both."""
+    """Batch sizes and iterations of the sdf stage and the intensity stage. Joint iterations count for both."""
 
-    batch_size: int
-    """Samples in an iteration of the sdf stage."""
-    neighbours: int
-    """Neighbouring rays that a batch takes together."""
-    sdf_iterations: int
-    """Iterations of the sdf stage."""
-    intensity_iterations: int
-    """Iterations that train the intensity network."""
-    intensity_batch_size: int
-    """Samples in an iteration of the intensity stage."""
-    dropout_scale: float
-    """Factor on the configured dropout."""
-    passes: float
-    """How often the sdf stage uses each sample."""
+    batch_size: int = 0  # samples in an iteration of the sdf stage
+    neighbours: int = 1  # neighbouring rays that a batch takes together
+    sdf_iterations: int = 0
+    passes: float = 0.0  # how often the sdf stage uses each sample
+    intensity_iterations: int = 0  # that train the intensity network
+    intensity_batch_size: int = 0
+    dropout_scale: float = 0.0  # factor on the dropout
 
     @classmethod
     def of(
         cls, config: FitConfig, *, surface_returns: int, returns: int, vertices: int, with_intensity: bool
     ) -> Schedule:
         """The schedule for `surface_returns` returns without ghosts, `returns` with them."""
-        training = config.training
         if not config.train:
-            return cls(0, 1, 0, 0, 0, 0.0, 0.0)
+            return cls()
+        training = config.training
         samples = surface_returns * (NEAR_SAMPLES + FREE_SAMPLES)
-        batch_size, sdf_iterations = training.batch_size, training.sdf_iterations
-        if sdf_iterations is None:
-            batch_size, sdf_iterations = _sdf_schedule(config, samples, vertices)
+        batch_size, iterations = training.batch_size, training.sdf_iterations
+        if iterations is None:
+            batch_size, iterations = _sdf_schedule(config, samples, vertices)
         # A larger batch takes more rays at as many places: rays at the same place share cache lines.
         neighbours = max(1, batch_size // training.batch_size)
-        passes = sdf_iterations * batch_size / samples
+        surface = (batch_size, neighbours, iterations, iterations * batch_size / samples)
         if not with_intensity:
-            return cls(batch_size, neighbours, sdf_iterations, 0, 0, 0.0, passes)
+            return cls(*surface)
         samples = returns * NEAR_SAMPLES
-        intensity_batch_size, intensity_iterations = (
-            training.intensity_batch_size,
-            training.intensity_iterations,
-        )
+        intensity_batch_size = training.intensity_batch_size
+        intensity_iterations = training.intensity_iterations
         if intensity_iterations is None:
             intensity_batch_size = min(intensity_batch_size, samples)
-            intensity_iterations = _intensity_schedule(config, samples, sdf_iterations)
+            intensity_iterations = _intensity_iterations(config, samples, iterations)
         if training.intensity_in_free_space:  # the samples are those of the sdf stage
             intensity_batch_size = batch_size
         # A sample that is used often is easily memorised. Measured: the same dropout for all scenes (0.7 and
         # 0.2) is as good on sparse ones, but costs 2 % on a dense one, which uses its samples twice.
         times_used = intensity_iterations * intensity_batch_size / samples
         dropout_scale = times_used / (times_used + _HALF_DROPOUT_PASSES)
-        return cls(
-            batch_size,
-            neighbours,
-            sdf_iterations,
-            intensity_iterations,
-            intensity_batch_size,
-            dropout_scale,
-            passes,
-        )
+        return cls(*surface, intensity_iterations, intensity_batch_size, dropout_scale)
 
     @property
     def iterations(self) -> dict[str, int]:
-        """Iterations of both stages by name, for reports."""
         return {"sdf": self.sdf_iterations, "intensity": self.intensity_iterations}
 
 
 def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, int]:
-    """Samples in a batch, and iterations, of the sdf stage."""
     # Few returns: what is learnt from more samples than those of a pass is the same again. Measured on 20 to 300 returns
     # of four simulated scenes: errors are as small, and 20 take a quarter of the time.
     batch_size = min(config.training.batch_size, samples)
@@ -110,17 +91,14 @@ def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, 
     wanted = max(_SDF_PASSES * one_pass, min(_ENOUGH_SDF_ITERATIONS, _MOST_SDF_PASSES * one_pass))
     most = _MOST_SAMPLES_PER_VERTEX * vertices / batch_size
     wanted = min(wanted, max(min(most, _MANY_SDF_ITERATIONS), most / 2))
-    iterations = max(_LEAST_SDF_ITERATIONS, math.ceil(wanted))
-    iterations = max(1, round(config.effort * iterations))
+    iterations = max(1, round(config.effort * max(_LEAST_SDF_ITERATIONS, math.ceil(wanted))))
     if iterations <= _MOST_SDF_ITERATIONS:
         return batch_size, iterations
     return math.ceil(batch_size * iterations / _MOST_SDF_ITERATIONS), _MOST_SDF_ITERATIONS
 
 
-def _intensity_schedule(config: FitConfig, samples: int, sdf_iterations: int) -> int:
-    """Iterations that train the intensity network, joint ones included."""
-    training = config.training
-    joint = sdf_iterations if training.joint else 0
-    wanted = math.ceil(_INTENSITY_PASSES * samples / training.intensity_batch_size)
+def _intensity_iterations(config: FitConfig, samples: int, joint: int) -> int:
+    """Iterations that train the intensity network, the `joint` ones of the sdf stage included."""
+    wanted = math.ceil(_INTENSITY_PASSES * samples / config.training.intensity_batch_size)
     wanted = min(max(wanted, _LEAST_INTENSITY_ITERATIONS), _MOST_INTENSITY_ITERATIONS)
     return max(1, joint + round(config.effort * max(wanted - joint, _LEAST_INTENSITY_STAGE)))

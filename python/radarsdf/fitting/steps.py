@@ -37,32 +37,22 @@ from radarsdf.threads import Workers
 
 @dataclass(frozen=True)
 class FitInput:
-    """What a fit starts from."""
+    """What a fit starts from. Whatever is None follows from these rays."""
 
-    rays: Rays
-    """All rays, scan by scan."""
-    scale: IntensityScale | None
-    """Of their intensities."""
-    poses: ArrayLike | None = None
-    """(F, 4, 4) T_world_sensor of the scans. Only asked if there is no `sensor`."""
-    movers: int = 0
-    """Number of returns that were left out because they move."""
-    why_no_movers: str | None = None
-    """See :class:`radarsdf.returns.moving.Movers`."""
+    rays: Rays  # all, scan by scan
+    scale: IntensityScale | None  # of their intensities
+    poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans; only used without a `sensor`
+    movers: int = 0  # returns that were left out because they move
+    why_no_movers: str | None = None  # see :class:`radarsdf.returns.moving.Movers`
     inside: NDArray[np.bool_] | None = None
     """(N,) returns that the map is made of, whole leaf cells of them. The other rays only show what they crossed. None: all."""
-    rough_share: float | None = None
-    """Share of the returns that lie on no thin surface. None: of these returns."""
-    returns_per_cell: float | None = None
-    """Mean number of returns in the cells of surfels. None: of these returns."""
+    rough_share: float | None = None  # share of the returns that lie on no thin surface
+    returns_per_cell: float | None = None  # mean number in the cells of surfels
     sensor: Sensor | None = None
-    """The radar. None: as these rays and poses show it."""
     box_cells: NDArray[np.int64] | None = None
-    """(2, 3) leaf cells from the origin of the rays; what they crossed outside [lower, upper) is not kept. None: all is."""
-    sums: ScanSums | None = None
-    """Over the scans of the rays, if they were kept up scan by scan. None: made here, of all at once."""
-    looks: Looks | None = None
-    """Visibility counts, likewise."""
+    """(2, 3) leaf cells from the origin; what rays crossed outside [lower, upper) is not kept. None: all is."""
+    sums: ScanSums | None = None  # over the scans of the rays, if they were kept up scan by scan
+    looks: Looks | None = None  # visibility counts, likewise
 
 
 def fit_rays(
@@ -73,11 +63,10 @@ def fit_rays(
     checkpoint: str | PathLike[str] | None = None,
 ) -> RadarMap:
     """Fits a map to what `read` returns. See :func:`radarsdf.fit`, also for errors."""
-    clock = Clock()
     try:
         # A map that is made in inference mode could not give gradients later.
         with torch.inference_mode(mode=False), Workers(config.num_threads) as workers:
-            contents, stop = _fit(read, config, progress, checkpoint, clock, workers)
+            contents, stop = _fit(read, config, progress, checkpoint, workers)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption
     radar_map = RadarMap(contents)
@@ -94,40 +83,41 @@ def _fit(
     config: FitConfig,
     progress: bool | None,
     checkpoint: str | PathLike[str] | None,
-    clock: Clock,
     workers: Workers,
 ) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
     """The contents of the map, and why the training ended early, if it did."""
-    num_threads = workers.num_threads
+    num_threads, clock = workers.num_threads, [time.perf_counter()]
+    seconds: dict[str, float] = {}
+
+    def lap(step: str) -> None:
+        clock.append(time.perf_counter())
+        seconds[step] = clock[-1] - clock[-2]
+
     given = read()
     check_extent(given.rays, config)
     check_fit(given.rays, config, given.inside)
     saved = None if checkpoint is None else Checkpoint(checkpoint, given.rays, given.scale, config)
-    clock.lap("prepare_s")
+    lap("prepare_s")
 
     surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
     learnt = given.rays if given.inside is None else given.rays.select(given.inside)
-    clock.lap("ghosts_s")
+    lap("ghosts_s")
 
     leaf_keys, returns = occupied_cells(surface, config, num_threads)
     with_network = config.trains_intensity and learnt.intensities is not None
     field: Field
     if surface.means is None:
-        field = _untrained(leaf_keys, with_network, config, num_threads)
+        field = NeuralField(leaf_keys, config, with_intensity=with_network, num_threads=num_threads)
+        field.initialise(torch.Generator("cpu").manual_seed(config.seed))
     else:
         field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
-    clock.lap("occupied_cells_s")
+    lap("occupied_cells_s")
 
-    schedule = Schedule.of(
-        config,
-        surface_returns=len(surface.rays),
-        returns=len(learnt),
-        vertices=field.table.num_rows,
-        with_intensity=with_network,
-    )
-    report = _report(given, learnt, surface, field, schedule, config, num_threads)
+    sizes = {"surface_returns": len(surface.rays), "returns": len(learnt), "vertices": field.table.num_rows}
+    schedule = Schedule.of(config, with_intensity=with_network, **sizes)
+    report = _report(given, learnt, surface, field, schedule, config)
     contents = _contents(given, learnt, surface, leaf_keys, returns, field, report, config, num_threads)
-    clock.lap("start_s")
+    lap("start_s")
 
     scale = given.scale if config.trains_intensity else None
     closes = learnt.intensities is not None and config.closes_intensity
@@ -150,18 +140,9 @@ def _fit(
     if of_intensity is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
         field.reflectance = closed_form(contents, *of_intensity, num_threads)
     field.requires_grad_(False)
-    clock.lap("training_s")
-    report.update(clock.laps)
+    lap("training_s")
+    report.update(seconds)
     return contents, stop
-
-
-def _untrained(
-    leaf_keys: NDArray[np.uint64], with_intensity: bool, config: FitConfig, num_threads: int
-) -> NeuralField:
-    """Random networks and features (3QFP)."""
-    field = NeuralField(leaf_keys, config, with_intensity=with_intensity, num_threads=num_threads)
-    field.initialise(torch.Generator("cpu").manual_seed(config.seed))
-    return field
 
 
 def _contents(
@@ -176,41 +157,33 @@ def _contents(
     num_threads: int,
 ) -> MapContents:
     """The map, with the field as it is before the training."""
+    rays, scale, surfels, leaf_m = given.rays, given.scale, surface.surfels, config.leaf_size_m
     sensor, rough_share, returns_per_cell = given.sensor, given.rough_share, given.returns_per_cell
     if sensor is None:
         assert given.poses is not None
-        sensor = Sensor.of_rays(given.rays, given.poses, surface.noise)
+        sensor = Sensor.of_rays(rays, given.poses, surface.noise)
+    passages, echoes = Passages.none(), Echoes.none()
+    if config.returns.passages:
+        to_surface = rays if surface.true is None else rays.select(surface.true)
+        passages = Passages.of(to_surface, surface.noise, leaf_m, given.box_cells, num_threads)
+        known = learnt.with_intensity
+        if scale is not None and known.any():
+            chosen = learnt if known.all() else learnt.select(known)
+            assert chosen.intensities is not None
+            echoes = Echoes.of(chosen, scale.to_unit(chosen.intensities), leaf_m)
     return MapContents(
         field=field,
-        origin=given.rays.origin,
-        intensity_scale=given.scale,
+        origin=rays.origin,
+        intensity_scale=scale,
         config=config,
-        evidence=Evidence.of(returns, given.rays, leaf_keys, config.leaf_size_m, num_threads, given.looks),
-        passages=_passages(given, surface, config, num_threads),
-        echoes=_echoes(learnt, given.scale, config),
-        rough_share=surface.surfels.rough_share() if rough_share is None else rough_share,
-        returns_per_cell=surface.surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
+        evidence=Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.looks),
+        passages=passages,
+        echoes=echoes,
+        rough_share=surfels.rough_share() if rough_share is None else rough_share,
+        returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
         sensor=sensor,
         report=report,
     )
-
-
-def _passages(given: FitInput, surface: SurfaceReturns, config: FitConfig, num_threads: int) -> Passages:
-    """What the rays crossed, of those that end at no ghost."""
-    if not config.returns.passages:
-        return Passages.none()
-    rays = given.rays if surface.true is None else given.rays.select(surface.true)
-    return Passages.of(rays, surface.noise, config.leaf_size_m, given.box_cells, num_threads)
-
-
-def _echoes(rays: Rays, scale: IntensityScale | None, config: FitConfig) -> Echoes:
-    """Mean intensities by place and view, for comparisons, which need free space too."""
-    known = rays.with_intensity
-    if not config.returns.passages or scale is None or not known.any():
-        return Echoes.none()
-    chosen = rays if known.all() else rays.select(known)
-    assert chosen.intensities is not None
-    return Echoes.of(chosen, scale.to_unit(chosen.intensities), config.leaf_size_m)
 
 
 def _report(
@@ -220,21 +193,14 @@ def _report(
     field: Field,
     schedule: Schedule,
     config: FitConfig,
-    num_threads: int,
 ) -> dict[str, Any]:
     """What the map's report says before the training."""
-    cells = len(field.table.leaf_keys())
-    skipped = skipped_parts(
-        config,
-        schedule,
-        returns=len(learnt),
-        cells=cells,
-        rows=field.table.num_rows,
-        with_intensity=given.scale is not None,
-        threads=num_threads,
-    )
+    cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
+    sizes = {"returns": len(learnt), "cells": cells, "rows": rows}
+    skipped: list[tuple[str, float | None]] = []
     if given.why_no_movers is not None:
-        skipped.insert(0, (f"leaving out what moves: {given.why_no_movers}", None))
+        skipped.append((f"leaving out what moves: {given.why_no_movers}", None))
+    skipped += skipped_parts(config, schedule, with_intensity=with_intensity, **sizes)
     outliers = 0 if learnt.intensities is None else len(learnt) - int(learnt.with_intensity.sum())
     return {
         "scans": len(given.rays.up_of_scan),
@@ -245,7 +211,7 @@ def _report(
         "wild_intensities": outliers,
         "noise": dataclasses.asdict(surface.noise),
         "leaf_cells": cells,
-        "vertices": field.table.num_rows,
+        "vertices": rows,
         "skipped": [words for words, _ in skipped],
         "skipped_s": [seconds for _, seconds in skipped],
         "iterations": schedule.iterations,
@@ -253,16 +219,3 @@ def _report(
         "losses": {},
         "loss_history": {},
     }
-
-
-class Clock:
-    """Wall-clock seconds of each step."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self.laps: dict[str, float] = {}
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = now - self._last
-        self._last = now

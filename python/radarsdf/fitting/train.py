@@ -14,14 +14,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
-from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, RandomDropout
+from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, Gradients, Losses
 from radarsdf.fitting.optimiser import Adam, Optimiser, RowAdam, Soap
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.schedule import Schedule
@@ -32,7 +31,6 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers
 
-_OPTIMISERS: dict[str, type[Optimiser]] = {"adam": Adam, "soap": Soap}
 _GENERATORS = 2  # random generators of a fit: for samples, for dropout
 _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
 _MOST_SPANS = 200  # of the history of each loss: enough for a plot, little in the file of a map
@@ -77,17 +75,14 @@ class LossHistory:
 
     def __init__(self, iterations: Mapping[str, int], config: FitConfig) -> None:
         self._iterations = dict(iterations)
-        self._sigma_m, self._joint_weight = config.sigma_m, config.training.sdf_loss_weight
+        self._sigma_m = config.sigma_m
         # A row for each span: iterations done, sum of their losses, seconds of training at their end.
-        self._spans: dict[str, NDArray[np.float64]] = {
-            name: np.zeros((min(count, _MOST_SPANS), 3)) for name, count in iterations.items()
-        }
+        self._spans = {name: np.zeros((min(n, _MOST_SPANS), 3)) for name, n in iterations.items()}
         # A row for each loss: iterations, their losses, and those of the worst answers, fading.
         self._recent = np.zeros((len(_WORST), 3))
         self._started_s = time.perf_counter()
 
     def start(self) -> None:
-        """The training begins, or goes on."""
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
         self._started_s = time.perf_counter() - before_s
 
@@ -96,8 +91,7 @@ class LossHistory:
         now_s = time.perf_counter() - self._started_s
         # Distances with the wrong sign have a cross-entropy of less than 1 + distance / sigma, and intensities from 0 to
         # 1 an absolute error of at most 1.
-        weight = self._joint_weight if len(losses) > 1 else 1
-        worst = {"sdf": (1 + float(sdf_m.abs().mean()) / self._sigma_m) * weight, "intensity": 1.0}
+        worst = {"sdf": 1 + float(sdf_m.abs().mean()) / self._sigma_m, "intensity": 1.0}
         self._recent *= _KEPT
         for row, name in enumerate(_WORST):
             if name in losses:
@@ -108,7 +102,7 @@ class LossHistory:
                 span[2] = now_s
 
     def fault(self) -> str | None:
-        """A loss that is worse than any answer of the right size over about a hundred iterations: trainings get over a few."""
+        """A loss that is worse than any answer of the right size over about a hundred iterations."""
         for (count, loss, worst), (name, words) in zip(self._recent, _WORST.items(), strict=True):
             if loss > worst:
                 return f"the {name} loss is {loss / count:.3g}, {words},"
@@ -128,11 +122,9 @@ class LossHistory:
         return found
 
     def state(self) -> dict[str, Tensor]:
-        """For a checkpoint. Not copied."""
         return {name: torch.from_numpy(a) for name, a in (*self._spans.items(), ("recent", self._recent))}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of the same fit returned."""
         for name, tensor in self.state().items():
             tensor.copy_(state[name])
 
@@ -142,25 +134,19 @@ class _Stage:
     """A stage of the training."""
 
     name: str
+    losses: Losses
     iterations: int
-    iterations_before: int
-    """Joint iterations of the sdf stage that count as iterations of this stage too."""
-    counts: tuple[str, ...]
-    """The stages that an iteration counts for. Joint iterations count for both."""
-    optimisers: list[Optimiser]
-    """Of the parameters that are trained, in the order of their gradients."""
-    rows: RowAdam | None
-    """Optimiser of the features if only the touched ones move."""
+    done_before: int  # iterations of the sdf stage that count for this stage too
+    optimisers: list[Optimiser]  # of the parameters that are trained, in the order of their gradients
+    rows: RowAdam | None  # optimiser of the features if only the touched ones move
     draw: Callable[[], Batch]
-    gradients_of: Callable[[Batch, Callable[[], Batch | None]], tuple[Gradients, Batch | None]]
-    """Computes losses and gradients of a batch, and the result of what it runs meanwhile."""
 
 
 class Training:
     """Trains `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
 
-    Ghosts are not part of the surface, but the sensor will see them again, so their intensities are learnt. Without a `scale`
-    there are no intensities.
+    In the sdf stage the intensity network, if there is one, trains too: its iterations are joint ones. Ghosts are not part of
+    the surface, but the sensor will see them again, so their intensities are learnt. Without a `scale` there are none.
     """
 
     def __init__(
@@ -178,45 +164,35 @@ class Training:
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
         self.history = LossHistory(self.iterations, config)
-        with_normals = field.intensity_network is not None and config.networks.normals
-        kind = AutogradGradients if with_normals else CoreGradients
-        of_dropout, self._generator = (
-            torch.Generator("cpu").manual_seed(config.seed * _GENERATORS + i) for i in (1, 0)
-        )
-        self._backend = kind(field, config, RandomDropout(schedule.dropout_scale, of_dropout), workers)
-        self._scale = None if field.intensity_network is None else scale
+        network, training = field.intensity_network, config.training
+        kind = AutogradGradients if network is not None and config.networks.normals else CoreGradients
+        seeds = (config.seed * _GENERATORS + i for i in range(_GENERATORS))
+        self._generator, of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
+        self._backend = kind(field, config, schedule.dropout_scale, of_dropout, workers)
+        self._scale = None if network is None else scale
         # A sampler has its own copy of the rays: there is one at a time.
         self._sampler = self._sampler_of(surface)
+        # Returns from which the intensity stage draws. None: those of the sampler.
         self._later = None if returns is surface or self._scale is None else returns
-        """Returns from which the intensity stage draws. None: those of the sampler."""
         self._rows: RowAdam | None = None
         self._optimisers: dict[str, Optimiser] = {}
-        training = config.training
-        of_network = _OPTIMISERS[training.optimiser]
-        if config.moves_rows(field.intensity_network is not None):
+        of_network = Soap if training.optimiser == "soap" else Adam
+        if config.moves_rows(network is not None):
             self._rows = RowAdam(field.cells, training.learning_rate)
         else:
             self._optimisers["features"] = Adam(field.cells.parameters(), training.learning_rate)
         self._optimisers["sdf"] = of_network(field.sdf_network.parameters(), training.learning_rate)
-        if field.intensity_network is not None:
-            self._optimisers["intensity"] = of_network(
-                field.intensity_network.parameters(), training.intensity_learning_rate
-            )
+        if network is not None:
+            rate = training.intensity_learning_rate
+            self._optimisers["intensity"] = of_network(network.parameters(), rate)
 
     def _sampler_of(self, rays: Rays) -> RaySampler:
         unit = None
         if self._scale is not None and rays.intensities is not None:
             unit = torch.from_numpy(self._scale.to_unit(rays.intensities))
-        schedule = self._schedule
-        return RaySampler(
-            rays,
-            self._config,
-            schedule.batch_size,
-            self._generator,
-            schedule.neighbours,
-            unit,
-            self._workers.num_threads,
-        )
+        size, neighbours = self._schedule.batch_size, self._schedule.neighbours
+        threads = self._workers.num_threads
+        return RaySampler(rays, self._config, size, self._generator, neighbours, unit, threads)
 
     def _draw_from_all_returns(self) -> None:
         if self._later is not None:
@@ -239,9 +215,7 @@ class Training:
 
     def _parts(self) -> Iterable[tuple[str, Any]]:
         """What has a state of its own, by name."""
-        yield "history", self.history
-        yield "backend", self._backend
-        yield "sampler", self._sampler
+        yield from (("history", self.history), ("backend", self._backend), ("sampler", self._sampler))
         if self._rows is not None:
             yield "rows", self._rows
         for name, optimiser in self._optimisers.items():
@@ -266,35 +240,20 @@ class Training:
         self._generator.set_state(state["generator"])  # last, because the sampler changes it
 
     def report(self) -> dict[str, Any]:
-        """What the map's report says of the training."""
-        return {
-            "iterations": self.iterations,
-            "iterations_done": self.iterations_done,
-            "losses": self.losses,
-            "loss_history": self.history.to_report(),
-        }
+        names = ("iterations", "iterations_done", "losses")
+        return {name: getattr(self, name) for name in names} | {"loss_history": self.history.to_report()}
 
     def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
         """Runs all iterations that are left.
 
-        Raises
-        ------
-        Diverged
-            If a loss or a parameter is not finite, or a loss is worse than any answer of the right size. The
-            field then has the last parameters that were checked and good.
-        KeyboardInterrupt
-            After Ctrl-C, between two iterations.
+        Raises :class:`Diverged`, and the field then has the last parameters that were checked and good; or after Ctrl-C a
+        KeyboardInterrupt, between two iterations.
         """
         stages = self._stages()
         self.history.start()
+        total, done = sum(stage.iterations for stage in stages), sum(map(self._done, stages))
         with (
-            tqdm(
-                total=sum(stage.iterations for stage in stages),
-                initial=sum(self._done(stage) for stage in stages),
-                desc="fit",
-                unit="it",
-                disable=hides_bar(progress),
-            ) as bar,
+            tqdm(total=total, initial=done, desc="fit", unit="it", disable=hides_bar(progress)) as bar,
             deferred_interrupts() as interrupted,
         ):
             for stage in stages:
@@ -309,33 +268,15 @@ class Training:
 
     def _stages(self) -> list[_Stage]:
         """The sdf stage, then the intensity stage if it has iterations."""
-        sdf_iterations, intensity_iterations = self.iterations["sdf"], self.iterations["intensity"]
-        of_surface = [o for name, o in self._optimisers.items() if name != "intensity"]
-        of_intensity = [o for name, o in self._optimisers.items() if name == "intensity"]
-        joint = sdf_iterations if of_intensity and self._config.training.joint else 0
-        surface = _Stage(
-            name="sdf",
-            iterations=sdf_iterations,
-            iterations_before=0,
-            counts=("sdf", "intensity") if joint else ("sdf",),
-            optimisers=of_surface + of_intensity if joint else of_surface,
-            rows=self._rows,
-            draw=self._batch,
-            gradients_of=self._backend.joint if joint else self._backend.sdf,
-        )
-        if not of_intensity or intensity_iterations <= joint:
-            return [surface]
-        intensity = _Stage(
-            name="intensity",
-            iterations=intensity_iterations - joint,
-            iterations_before=joint,
-            counts=("intensity",),
-            optimisers=of_intensity,
-            rows=None,
-            draw=self._labelled_batch,
-            gradients_of=self._backend.intensity,
-        )
-        return [surface, intensity]
+        joint = "intensity" in self._optimisers
+        iterations, optimisers = self.iterations["sdf"], list(self._optimisers.values())
+        losses: Losses = "joint" if joint else "sdf"
+        stages = [_Stage("sdf", losses, iterations, 0, optimisers, self._rows, self._batch)]
+        left = self.iterations["intensity"] - iterations
+        if joint and left > 0:
+            draw = self._labelled_batch
+            stages.append(_Stage("intensity", "intensity", left, iterations, optimisers[-1:], None, draw))
+        return stages
 
     def _batch(self) -> Batch:
         """A batch of the sdf stage."""
@@ -350,13 +291,13 @@ class Training:
         return self._sampler.spread(count, self._backend.num_parts(count))
 
     def _done(self, stage: _Stage) -> int:
-        """Iterations of this stage that are done, without joint ones of an earlier stage."""
-        return max(0, self.iterations_done[stage.name] - stage.iterations_before)
+        return max(0, self.iterations_done[stage.name] - stage.done_before)
 
     def _run_stage(
         self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
     ) -> None:
         rows, iterations = stage.rows, stage.iterations
+        counts = ("sdf", "intensity") if stage.losses == "joint" else (stage.name,)
         changing = [p for optimiser in stage.optimisers for p in optimiser.parameters]
         if rows is not None:
             changing.append(rows.features)
@@ -370,18 +311,16 @@ class Training:
 
         ahead: Batch | None = None
         for i in range(self._done(stage), iterations):
-            # Each stage starts at the full learning rate, also for an optimiser that an earlier stage has
-            # used.
+            # Each stage starts at the full learning rate, also for an optimiser that an earlier stage used.
             cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
-            share = cosine if self._config.training.cosine_schedule else 1.0
+            share = cosine if self._config.training.optimiser == "soap" else 1.0
             stop = interrupted()
             write = checkpoint is not None and (stop or checkpoint.due())
             judge = i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
             look = stop or write or judge
-            # No samples are drawn ahead before the state is written: it would contain the draw after the
-            # next.
+            # No samples are drawn ahead before the state is written: it would contain the draw after the next.
             batch = ahead or stage.draw()
-            found, ahead = stage.gradients_of(batch, _nothing if look else stage.draw)
+            found, ahead = self._backend.of(stage.losses, batch, _nothing if look else stage.draw)
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
@@ -390,12 +329,12 @@ class Training:
             if rows is None:
                 move_networks()
             else:
+                assert found.touched is not None
                 rows.learning_rate = share * rows.full_rate
-                rows.step(found.touched or [], self._workers, meanwhile=move_networks)
+                rows.step([found.touched], self._workers, meanwhile=move_networks)
             self.losses[stage.name] = loss
-            for name in stage.counts:
-                before = stage.iterations_before if name == stage.name else 0
-                self.iterations_done[name] = min(before + i + 1, self.iterations[name])
+            for name in counts:
+                self.iterations_done[name] = min(stage.done_before + i + 1, self.iterations[name])
             self.history.add(found.losses, self.iterations_done, batch.sdf_m)
             # Gradients of all features are as large as these: not two at once.
             del batch, found, move_networks

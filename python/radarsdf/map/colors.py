@@ -9,37 +9,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import real_array
 
-# From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal
-# steps.
-_ANCHORS = np.array(
-    [
-        [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
-        [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
-    ]
-)  # fmt: skip
+# From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal steps.
+_ANCHORS = np.array([
+    [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
+    [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
+])  # fmt: skip
 NEUTRAL = (190, 196, 204)  # light grey, for surfaces without a value
 
 
 def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
-    """Colours of a perceptually uniform map, from dark indigo at `low` to bright yellow at `high`.
+    """Colours (N, 4) uint8, RGBA, of values (N,): from dark indigo at `low` to bright yellow at `high`, NaN grey.
 
-    Parameters
-    ----------
-    values : (N,) array_like
-        Scalars. Values outside the limits have the colour of the nearer limit. NaN is grey, such as the
-        intensity of a vertex that was not observed.
-    low, high : float
-        Limits, low ≤ high. If they are equal, all values have the middle colour.
-
-    Returns
-    -------
-    (N, 4) uint8
-        Red, green, blue, and alpha, which is 255.
-
-    Raises
-    ------
-    ValueError
-        If low > high or one of them is not finite.
+    Values outside the limits have the colour of the nearer one; if these are equal, all values have the middle colour.
     """
     if not (np.isfinite([low, high]).all() and low <= high):
         msg = f"limits must be finite and ascending, not {low} and {high}"

@@ -26,26 +26,18 @@ class WholeMap:
 
     origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
-    rough_share: float  # Clutter ratio: share of the returns that lie on no thin surface, in [0, 1]
-    returns_per_cell: float
-    """Mean number of returns in the cells of surfels that hold any; see :meth:`Surfels.returns_per_cell`."""
+    rough_share: float  # clutter ratio: share of the returns that lie on no thin surface, in [0, 1]
+    returns_per_cell: float  # mean number of returns in the cells of surfels that hold any
 
 
 @dataclass(frozen=True)
 class MapContents(WholeMap):
     """The parts of a map."""
 
-    field: Field
-    """Signed distance and intensity, in the local frame."""
-    intensity_scale: IntensityScale | None
-    """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
-    evidence: Evidence
-    """What the returns tell of each leaf cell."""
-    sensor: Sensor
-    """The radar, as the scans of the fit show it."""
-    report: dict[str, Any]
-    """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
-    passages: Passages = dataclasses.field(default_factory=Passages.none)
-    """Free-space crossings. Empty if the map keeps none."""
-    echoes: Echoes = dataclasses.field(default_factory=Echoes.none)
-    """View statistics of intensity. Empty if the map keeps no passages, or was fitted without intensities."""
+    field: Field  # signed distance and intensity, in the local frame
+    intensity_scale: IntensityScale | None  # range of the training intensities. None: it has no intensities
+    evidence: Evidence  # what the returns tell of each leaf cell
+    sensor: Sensor  # the radar, as the scans of the fit show it
+    report: dict[str, Any]  # counts, losses, noise of the sensor and seconds of the fit
+    passages: Passages = dataclasses.field(default_factory=Passages.none)  # free-space crossings, or none
+    echoes: Echoes = dataclasses.field(default_factory=Echoes.none)  # view statistics of intensity, or none

@@ -29,73 +29,7 @@ if TYPE_CHECKING:
     from radarsdf.map.view import View, ViewedMap
 
 
-class MapParts(ABC):
-    """What each kind of map implements, at positions that were checked, and what grids and comparisons read."""
-
-    @abstractmethod
-    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
-        """Free space and returns in the leaf cells that overlap a box of two corners (3,), world, m."""
-
-    @abstractmethod
-    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
-        """The evidence of a surface at positions (N, 3), world, m."""
-
-    @abstractmethod
-    def echoes(self) -> EchoesAt:
-        """View statistics of intensity. Empty without intensities, or without ``returns.passages``."""
-
-    @property
-    @abstractmethod
-    def _contents_of_any(self) -> MapContents:
-        """The parts of the map, or of one of its tiles, for what all have in common."""
-
-    @cached_property
-    def passage_odds(self) -> NDArray[np.float64]:
-        """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
-        return queries.passage_odds(self._contents_of_any)
-
-    @abstractmethod
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`Map.sdf` at positions (N, 3), world, m: (N,)."""
-
-    @abstractmethod
-    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`Map.gradient` there, (N, 3)."""
-
-    @abstractmethod
-    def _observed(self, world: Tensor) -> Tensor:
-        """:meth:`Map.observed` there, (N,) bool."""
-
-    @abstractmethod
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        """:meth:`Map.intensity` there, (N,), for sensors at (N, 3)."""
-
-    @abstractmethod
-    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
-        """:meth:`Map.mesh` without intensities. `wanted`: its arguments but for the viewpoint."""
-
-    @abstractmethod
-    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
-        """What views from a position (3,), world, m, need of the map within a range. It is held for the next view."""
-
-    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
-        """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
-        return self._sdf(world, False), self._gradient(world, False)
-
-    def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The surface near positions (N, 3), world, m, as planes: signed distances (N,), m, and unit normals (N, 3)."""
-        sdf, gradient = (values.double().numpy() for values in self.plane_at(torch.from_numpy(x)))
-        length = np.linalg.norm(gradient, axis=1)
-        # Along grazing rays the field is longer than the distance, and its gradient is as much longer than 1.
-        return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
-
-    def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
-        """:meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
-        evidence, contents = self.evidence_at(world), self._contents_of_any
-        return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
-
-
-class Map(MapParts):
+class Map(ABC):
     """A surface and its reflectance: the interface of :class:`RadarMap` and :class:`TiledMap`.
 
     Queries take world coordinates, m, as array_like or CPU tensors of shape (N, 3), and return the same kind: float64 for
@@ -148,9 +82,7 @@ class Map(MapParts):
         return answer(self._gradient(world, extrapolate))
 
     def observed(self, x: Any) -> Any:
-        """Whether positions lie in a leaf cell of the map, or on its border.
-
-        Leaf cells are those near returns, and those that bridge a small gap between two of them.
+        """Whether positions lie in a leaf cell, near returns or in a small gap between them, or on its border.
 
         Parameters
         ----------
@@ -160,8 +92,7 @@ class Map(MapParts):
         Returns
         -------
         (N,) ndarray of bool or Tensor
-            Where it is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN. False for positions that are not
-            finite.
+            Where it is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
         """
         world, answer = _as_positions(x)
         return answer(self._observed(world))
@@ -200,18 +131,11 @@ class Map(MapParts):
             Probability, in [0, 1], that a true surface is within the edge of a leaf cell. 0 where there are no returns near `x`,
             or `x` is not finite.
 
-        Raises
-        ------
-        ValueError, TypeError
-            As for :meth:`sdf`.
-
         Notes
         -----
-        A logistic function of the precision of the returns (:meth:`uncertainty` without its floor), of how many returns are
-        missing, in standard deviations, given the scans that reached the place, of the map's clutter ratio, and of its number
-        of returns in a cell. It is at most the share of position errors within a leaf cell's edge, for a surface that bends
-        little. It was fitted to simulated places of twelve kinds and to five real drives; on kinds that had no part in it, the
-        worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
+        A logistic function of the precision of the returns, of how many are missing given the scans that reached the place, of
+        the map's clutter ratio, and of its returns per cell. It was fitted to simulated places and five real drives; on other
+        kinds, the worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
         """
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[2])
@@ -228,14 +152,12 @@ class Map(MapParts):
         sensor_positions : (N, 3) or (3,) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to predict where nothing was observed, too, for instance to compare with all returns of a
-            held-out scan.
+            As for :meth:`sdf`.
 
         Returns
         -------
         (N,) ndarray or Tensor
-            Intensity, sensor units, as given to the fit. NaN where `x` was not :meth:`observed`, and where a position is
-            not finite.
+            Intensity, sensor units. NaN where `x` was not :meth:`observed`, or a position is not finite.
 
         Raises
         ------
@@ -302,20 +224,13 @@ class Map(MapParts):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
-        return self._mesh_seen_from(
-            viewpoint,
-            voxel_size,
-            box=box,
-            min_confidence=min_confidence,
-            max_uncertainty=max_uncertainty,
-            min_component_triangles=min_component_triangles,
-            progress=progress,
-        )
+        limits = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
+        limits |= {"min_component_triangles": min_component_triangles}
+        return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
 
     def _mesh_seen_from(
         self, viewpoint: ArrayLike | None, voxel_size: float, **wanted: Any
     ) -> trimesh.Trimesh:
-        """:meth:`mesh`; `wanted`: arguments of `_surface_mesh`."""
         from radarsdf.map.mesh import with_intensities  # noqa: PLC0415 - trimesh is slow to import
 
         if viewpoint is None:
@@ -343,9 +258,8 @@ class Map(MapParts):
     ) -> View:
         """Predict the scan that a radar would get from a pose, and what each of its beams first meets.
 
-        Beams are traced to the surface that :meth:`mesh` keeps by default. Returns come from patches of the field's
-        surface: most from those that often had returns in the scans that reached them, few from hidden ones. They are the
-        likeliest scan, not a random one: spread evenly, and on the surface.
+        Beams are traced to the surface that :meth:`mesh` keeps by default. Returns come from patches of the field's surface, most
+        from those that often had returns in the scans that reached them: the likeliest scan, not a random one.
 
         Parameters
         ----------
@@ -431,22 +345,82 @@ class Map(MapParts):
     @property
     @abstractmethod
     def origin(self) -> NDArray[np.float64]:
-        """(3,) float64, origin of the local frame in world coordinates, m."""
+        """Origin of the local frame, (3,) float64, world, m. Queries subtract it in float64."""
 
     @property
     @abstractmethod
     def extent(self) -> NDArray[np.float64]:
-        """(2, 3) lower and upper corner of all leaf cells, world, m."""
+        """Lower and upper corner of the box that encloses all leaf cells, (2, 3) float64, world, m."""
 
     @property
     @abstractmethod
     def num_cells(self) -> int:
-        """Number of leaf cells."""
+        """Number of leaf cells, in which the map was observed: int."""
 
     @property
     @abstractmethod
     def file_bytes(self) -> int:
-        """Size of the file that :meth:`save` writes, without the names of its arrays: less than 4 kB; bytes."""
+        """Size of the file that :meth:`save` writes, but for the up to 4 kB of its header: int, bytes."""
+
+    # What grids, comparisons and views read of a map, and what each kind of map implements, at positions (N, 3), world, m.
+
+    @abstractmethod
+    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
+        """Free space and returns in the leaf cells that overlap a box of two corners (3,), world, m."""
+
+    @abstractmethod
+    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+        """The evidence of a surface at positions (N, 3), world, m."""
+
+    @abstractmethod
+    def echoes(self) -> EchoesAt:
+        """View statistics of intensity. Empty without intensities, or without ``returns.passages``."""
+
+    @property
+    @abstractmethod
+    def _contents_of_any(self) -> MapContents:
+        """The parts of the map, or of one of its tiles, for what all have in common."""
+
+    @cached_property
+    def passage_odds(self) -> NDArray[np.float64]:
+        """See :func:`radarsdf.map.queries.passage_odds`."""
+        return queries.passage_odds(self._contents_of_any)
+
+    @abstractmethod
+    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor: ...
+
+    @abstractmethod
+    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor: ...
+
+    @abstractmethod
+    def _observed(self, world: Tensor) -> Tensor: ...
+
+    @abstractmethod
+    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor: ...
+
+    @abstractmethod
+    def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
+        """:meth:`Map.mesh` without intensities. `wanted`: its arguments but for the viewpoint."""
+
+    @abstractmethod
+    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
+        """What views from a position (3,) need of the map within a range. It is held for the next view."""
+
+    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
+        return self._sdf(world, False), self._gradient(world, False)
+
+    def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The surface near positions (N, 3), world, m, as planes: signed distances (N,), m, and unit normals (N, 3)."""
+        sdf, gradient = (values.double().numpy() for values in self.plane_at(torch.from_numpy(x)))
+        length = np.linalg.norm(gradient, axis=1)
+        # Along grazing rays the field is longer than the distance, and its gradient is as much longer than 1.
+        return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
+
+    def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
+        """:meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
+        evidence, contents = self.evidence_at(world), self._contents_of_any
+        return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
 
 
 def _as_positions(x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:

@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: MIT
 """Triangle meshes of the level sets of sampled fields, by marching cubes; of tensors with gradients.
 
-A cell here is a cube of eight neighbouring samples: a voxel of marching cubes. Its corners are in C order:
-corner ``4 * dx + 2 * dy + dz`` is at ``(dx, dy, dz)`` from the lower one. Results do not depend on the number
-of threads.
-
-A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length.
-It moves along this edge when a or b changes, and depends on no other sample. Triangles have no gradient: they
-change only where a sample changes its sign.
+A cell here is a cube of eight neighbouring samples, corner ``4 * dx + 2 * dy + dz`` of which is at ``(dx, dy, dz)`` from the
+lower one. A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length: it
+depends on no other sample. Triangles have no gradient: they change only where a sample changes its sign.
 """
 
 from __future__ import annotations
@@ -25,8 +21,6 @@ from torch.autograd.function import once_differentiable
 from radarsdf import _core
 from radarsdf.checks import real_array, refuse_masked
 
-_SMALL_INTEGERS = 2  # bytes: float32 holds all of them
-
 
 def marching_cubes(
     volume: ArrayLike | Tensor,
@@ -41,12 +35,10 @@ def marching_cubes(
 
     A sample is positive if it is greater than `level`. The normals of the triangles point to the positive side. The mesh is
     closed and manifold except where the cells in use end: at the border of the volume or of the mask, and at NaN samples. No
-    triangle has zero area, because vertices stay 0.1 % of an edge's length away from samples. Beyond about 10^12 times `spacing`
-    from the world's origin, float64 does not resolve this length, and vertices may coincide.
+    triangle has zero area: vertices stay 0.1 % of an edge's length away from samples.
 
-    For a tensor, the vertices can be differentiated by the samples, once. A vertex moves along its edge with the two samples at
-    the edge's ends. Its gradient is zero where it is kept away from a sample, and where a sample is infinite. The gradient does
-    not know that a sample could change its sign. For a gradient by the level, subtract the level from the samples.
+    For a tensor, the vertices can be differentiated by the samples, once; the gradient is zero where a vertex is kept away from
+    a sample, and where a sample is infinite. For a gradient by the level, subtract the level from the samples.
 
     Parameters
     ----------
@@ -130,30 +122,22 @@ def extract_cells(
     origin: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
     num_threads: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """:func:`marching_cubes` in some cells of a lattice, with time and memory proportional to their number.
-
-    `corners` (K, 3): lattice coordinates, without repetitions. `values` (K,): the field there. `cells` (M, 8): rows of corners,
-    as of :func:`sparse_lattice`; those with a NaN corner are left out.
-    """
-    return _core.marching_cubes_sparse(
-        _as_int32(corners), values, _as_int32(cells), list(spacing), list(origin), level, num_threads
-    )
+    """:func:`marching_cubes` of values (K,) at lattice coordinates (K, 3), in cells (M, 8) as of :func:`sparse_lattice`."""
+    corners, cells = (np.ascontiguousarray(a, np.int32) for a in (corners, cells))
+    placement = list(spacing), list(origin), level
+    return _core.marching_cubes_sparse(corners, values, cells, *placement, num_threads)
 
 
 def sparse_lattice(
     cells: NDArray[Any], *, num_threads: int = 0
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Number the corners that cells (M, 3) share, given by the lattice coordinates of their lower corners.
-
-    Returns the different cells (M', 3), sorted by x, then y, then z; their corners (K, 3), sorted likewise; and rows (M', 8)
-    of the corners for each cell, in C order.
-    """
-    return _core.sparse_lattice(_as_int32(cells), num_threads)
+    """Different cells (M', 3) of those with lower corners (M, 3), sorted; their corners (K, 3), sorted; rows of these (M', 8)."""
+    return _core.sparse_lattice(np.ascontiguousarray(cells, np.int32), num_threads)
 
 
 def mesh_components(faces: NDArray[Any], num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Component (F,) of each of the faces (F, 3), which share vertices, numbered by their first faces; and their sizes (C,)."""
-    return _core.mesh_components(_as_int32(faces), num_vertices)
+    return _core.mesh_components(np.ascontiguousarray(faces, np.int32), num_vertices)
 
 
 class _MarchingCubes(torch.autograd.Function):
@@ -167,12 +151,10 @@ class _MarchingCubes(torch.autograd.Function):
         level: float,
         num_threads: int,
     ) -> tuple[Tensor, Tensor]:
-        vertices, faces, edges = map(
-            torch.from_numpy,
-            _core.marching_cubes_dense_with_edges(
-                samples.detach().numpy(), mask, spacing, origin, level, num_threads
-            ),
+        found = _core.marching_cubes_dense_with_edges(
+            samples.detach().numpy(), mask, spacing, origin, level, num_threads
         )
+        vertices, faces, edges = map(torch.from_numpy, found)
         ctx.save_for_backward(samples, edges)
         ctx.placement = spacing, level, num_threads
         ctx.mark_non_differentiable(faces)
@@ -199,7 +181,7 @@ def _as_tensor(volume: Tensor) -> Tensor:
     if kind.is_complex:
         msg = f"volume must be real numbers, not {kind}"
         raise TypeError(msg)
-    small = kind.is_floating_point or kind.itemsize <= _SMALL_INTEGERS
+    small = kind.is_floating_point or kind.itemsize <= 2  # bytes: float32 holds all integers of these
     return volume.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
 
 
@@ -222,10 +204,6 @@ def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         msg = f"mask must have the shape of volume, {shape}, not {array.shape}"
         raise ValueError(msg)
     return np.ascontiguousarray(array)
-
-
-def _as_int32(values: NDArray[Any]) -> NDArray[np.int32]:
-    return np.ascontiguousarray(values, np.int32)
 
 
 def _as_placement(

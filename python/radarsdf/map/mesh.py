@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.threshold import Limits, Tally, Threshold, areas_round
+from radarsdf.map.threshold import Limits, Tally, areas_round
 from radarsdf.memory import check_mesh
 from radarsdf.returns.intensities import IntensityScale
 
@@ -29,11 +29,9 @@ with whole_import():
     import trimesh
 
 _MAX_VOXELS = 2**30  # with repeated ones. Lattice coordinates, and rows of corners, are int32
-# Edges of a leaf cell. A cell is left out if its corners are all farther than this from the surface, on the
-# same side. Measured on four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the
-# cells are left.
+# Edges of a leaf cell. A cell is left out if its corners are all farther than this from the surface, on the same side.
+# Measured on four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the cells are left.
 _CLEARLY = 0.25
-_PART = 1 << 21  # numbers that NumPy gets at a time
 # Share of the distance to the voxel's centre by which a corner on the map's border is moved to be evaluated.
 _INWARD = 1e-3
 
@@ -59,17 +57,12 @@ class Surface:
         progress: bool | None = False,
     ) -> Surface:
         """The surface in voxels of this edge, m, in the whole map or in a `box` (2, 3), local frame, m."""
-        lattice = sample_lattice(contents, voxel_size, box, progress)
-        vertices, faces = extract_cells(
-            lattice.corners,
-            lattice.distances_m,
-            lattice.voxel_corners,
-            spacing=[voxel_size] * 3,
-            num_threads=torch.get_num_threads(),
-        )
+        corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
+        options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": torch.get_num_threads()}
+        vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
-        return cls.told_by(contents, vertices, faces, evidence, lattice.cells_searched)
+        return cls.told_by(contents, vertices, faces, evidence, searched)
 
     @classmethod
     def told_by(
@@ -83,22 +76,11 @@ class Surface:
     ) -> Surface:
         """From triangles and the evidence at their vertices. `areas_m2` (V,): of :func:`areas_round`, if known."""
         found = queries.probabilities(scene, evidence)
-        confidence = found.confidence.float()
-        return cls(
-            vertices,
-            faces,
-            evidence,
-            confidence.numpy(),
-            queries.uncertainty(scene, evidence).numpy(),
-            Tally.of(
-                areas_round(vertices, faces) if areas_m2 is None else areas_m2,
-                confidence.double().numpy(),
-                found.covering.numpy(),
-                found.reach.numpy(),
-                evidence.detections.double().numpy(),
-            ),
-            cells_searched,
-        )
+        confidence, uncertainty = found.confidence.float(), queries.uncertainty(scene, evidence).numpy()
+        areas_m2 = areas_round(vertices, faces) if areas_m2 is None else areas_m2
+        columns = confidence.double(), found.covering, found.reach, evidence.detections.double()
+        tally = Tally.of(areas_m2, *(column.numpy() for column in columns))
+        return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)
 
     def allowed(self, max_uncertainty: float, min_confidence: float = 0.0) -> NDArray[np.bool_]:
         """(F,) faces whose three vertices are within these limits."""
@@ -106,26 +88,20 @@ class Surface:
         return with_all(certain & (self.confidence >= min_confidence), self.faces)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
-        """(F,) faces that a mesh keeps."""
-        kept = self.allowed(limits.max_uncertainty, self.threshold(limits).min_confidence)
+        kept = self.allowed(
+            limits.max_uncertainty, self.tally.threshold(limits.min_confidence).min_confidence
+        )
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
             kept[rows] = sizes[labels] >= limits.min_component_triangles
         return kept
 
-    def threshold(self, limits: Limits) -> Threshold:
-        """The confidence from which a mesh keeps the surface, and what is expected of it."""
-        return self.tally.threshold(limits.min_confidence)
-
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """What the limits leave, in the world. `leaf_cells`: of the whole map."""
+        counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         return self.part(
-            origin,
-            self.kept(limits),
-            leaf_cells=leaf_cells,
-            leaf_cells_searched=self.cells_searched,
-            **self.threshold(limits).metadata,
+            origin, self.kept(limits), **counts, **self.tally.threshold(limits.min_confidence).metadata
         )
 
     def part(
@@ -133,18 +109,12 @@ class Surface:
     ) -> trimesh.Trimesh:
         """The faces that are `kept` (F,), in the world."""
         used, faces = renumbered(len(self.vertices), self.faces[kept])
-        return described_mesh(
-            self.vertices[used] + origin, faces, self.confidence[used], self.uncertainty_m[used], **metadata
-        )
+        vertices, confidence = self.vertices[used] + origin, self.confidence[used]
+        return described_mesh(vertices, faces, confidence, self.uncertainty_m[used], **metadata)
 
 
 def extract_mesh(
-    contents: MapContents,
-    voxel_size: float,
-    *,
-    box: ArrayLike | None,
-    progress: bool | None,
-    **wanted: Any,
+    contents: MapContents, voxel_size: float, *, box: ArrayLike | None, progress: bool | None, **wanted: Any
 ) -> trimesh.Trimesh:
     """The mesh of one map; `wanted`: the limits of :meth:`Map.mesh`."""
     voxel_size = positive(voxel_size, "voxel_size")
@@ -184,7 +154,6 @@ def with_intensities(
 
 
 def local(contents: WholeMap, world: NDArray[np.float64]) -> torch.Tensor:
-    """Positions (N, 3) in the world, m, in the local frame, float32."""
     return queries.to_local(contents, torch.from_numpy(world))
 
 
@@ -214,29 +183,24 @@ def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDA
 # Voxels
 
 
-class SampledLattice(NamedTuple):
-    """Signed distances at the corners of voxels."""
-
-    corners: NDArray[np.int32]  # (K, 3) lattice coordinates
-    voxel_corners: NDArray[np.int32]  # (M, 8) rows of `corners` for each voxel
-    distances_m: NDArray[np.float32]  # (K,) signed distance at each corner, m
-    cells_searched: int  # number of leaf cells in which the surface can be
-
-
 def sample_lattice(
     contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
-) -> SampledLattice:
-    """The voxels of leaf cells in which the surface can be. `box` (2, 3), local frame, m, limits their centres."""
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], int]:
+    """The voxels of leaf cells in which the surface can be. `box` (2, 3), local frame, m, limits their centres.
+
+    Returns lattice coordinates of corners (K, 3), rows of these for each voxel (M, 8), signed distances at the corners (K,), m,
+    and the number of leaf cells that were searched.
+    """
     config, num_threads = contents.config, torch.get_num_threads()
     leaf_size_m = config.leaf_size_m
-    cells = queries.leaf_cells(contents)
+    cells = contents.field.table.leaf_cells()
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
     parts, even = _per_cell(voxel_size, leaf_size_m)
     stored = contents.field.leaf_corners() if box is None else None
     if stored is not None and even and parts == 1:
-        return SampledLattice(*stored, len(cells))
+        return *stored, len(cells)
     if stored is not None and voxel_size < leaf_size_m:
         cells = cells[_near_surface(stored.distances_m[stored.of_cells], leaf_size_m)]
     elif voxel_size < leaf_size_m and contents.field.smooth_in_cells:
@@ -246,13 +210,15 @@ def sample_lattice(
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     if voxel_size < leaf_size_m and not even:
-        voxels = _in_map(contents, voxels, voxel_size)
+        # Only those with their centre in an occupied cell: others would continue the surface beyond the map.
+        centre = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+        voxels = voxels[_occupied(contents, centre)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     if stored is not None and even:
         distances_m = contents.field.table.distances_at(stored.distances_m, corners, parts, num_threads)
     else:
         distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
-    return SampledLattice(corners, voxel_corners, distances_m, len(cells))
+    return corners, voxel_corners, distances_m, len(cells)
 
 
 def crossed(
@@ -260,10 +226,7 @@ def crossed(
     leaf_size_m: float,
     distances_at: Callable[[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]], NDArray[Any]],
 ) -> NDArray[np.int32]:
-    """Those of the leaf cells (M, 3) whose corners are not all clearly on one side of the surface.
-
-    `distances_at`: signed distances (K,), m, of what :func:`sparse_lattice` gives.
-    """
+    """Those of the leaf cells (M, 3) whose corners, by `distances_at`, are not all clearly on one side of the surface."""
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
     found: NDArray[np.int32] = unique[
         _near_surface(distances_at(unique, corners, cell_corners)[cell_corners], leaf_size_m)
@@ -285,7 +248,6 @@ def _per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
 
 
 def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(N,) whether each of the points (N, 3), local frame, m, is in an occupied leaf cell."""
     inside: NDArray[np.bool_] = queries.occupied(contents, torch.from_numpy(points)).numpy()
     return inside
 
@@ -298,24 +260,15 @@ def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -
         msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
         raise ValueError(msg)
     check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
-    # If voxels do not divide the cell: points from one end of the cell to the other, at most a voxel apart,
-    # find every voxel that overlaps it.
+    # If voxels do not divide the cell: points from end to end, at most a voxel apart, find every voxel that overlaps it.
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
     steps = np.arange(parts, dtype=np.int32) if even else ends
     inside = np.stack(np.meshgrid(*[steps] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    voxels = np.zeros((len(cells), *inside.shape[1:]), np.int32)
-    for some in _parts(len(cells), inside.size):
-        if even:
-            voxels[some] = cells[some, None, :] * np.int32(parts) + inside
-        else:
-            voxels[some] = np.floor((cells[some, None, :] + inside) * (leaf_size_m / voxel_size))
+    if even:
+        voxels: NDArray[np.int32] = cells[:, None] * np.int32(parts) + inside
+    else:
+        voxels = np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32)
     return voxels.reshape(-1, 3)
-
-
-def _in_map(contents: MapContents, voxels: NDArray[np.int32], voxel_size: float) -> NDArray[np.int32]:
-    """The voxels with their centre in an occupied cell. Others would continue the surface beyond the map."""
-    centres = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-    return voxels[_occupied(contents, centres)]
 
 
 def _corner_distances(
@@ -328,39 +281,24 @@ def _corner_distances(
 ) -> NDArray[np.float32]:
     """Signed distances (K,) at lattice corners (K, 3), m.
 
-    A corner on the border of the map may be in a cell beyond it, which has no features, so its value would be
-    wrong. It is moved a little towards the centre of one of its voxels and evaluated there. If voxels do not
-    divide the cells, a corner can be farther outside. Then it is moved until it is in an occupied cell, and
-    the distance moved is added to its value.
+    A corner on the border of the map may be in a cell beyond it, which has no features. It is moved towards the centre of one of
+    its voxels until it is in an occupied cell, and the distance moved is added to its value.
     """
     points = corners.astype(np.float32) * np.float32(voxel_size)
     outside = ~_occupied(contents, points)
-    # The last voxel of each corner is the one that it is moved into: of repeated indices, NumPy keeps the
-    # last.
+    # The last voxel of each corner is the one that it is moved into: of repeated indices, NumPy keeps the last.
     owners = np.zeros(len(corners), np.int32)
-    for part in _parts(len(voxels)):
-        owners[voxel_corners[part].reshape(-1)] = np.repeat(
-            np.arange(part.start, part.stop, dtype=np.int32), 8
-        )
+    owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
     moved = np.flatnonzero(outside)
-    moved_m = np.zeros(len(moved), np.float32)
-    for part in _parts(len(moved)):
-        corner = points[moved[part]]
-        centres = (voxels[owners[moved[part]]].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-        place, left = corner.copy(), np.arange(len(corner))
-        for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
-            place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
-            left = left[~_occupied(contents, place[left])]
-        points[moved[part]] = place
-        moved_m[part] = np.linalg.norm(place - corner, axis=1)
+    corner = points[moved]
+    centres = (voxels[owners[moved]].astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+    place, left = corner.copy(), np.arange(len(corner))
+    for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
+        place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
+        left = left[~_occupied(contents, place[left])]
+    points[moved] = place
     values: NDArray[np.float32] = queries.signed_distance(
         contents, torch.from_numpy(points), description="mesh", progress=progress
     ).numpy()
-    values[moved] += np.copysign(moved_m, values[moved])
+    values[moved] += np.copysign(np.linalg.norm(place - corner, axis=1), values[moved])
     return values
-
-
-def _parts(count: int, numbers: int = 8) -> Iterator[slice]:
-    """Slices of [0, count), for `numbers` numbers each. Ctrl-C has to wait for at most one slice."""
-    step = max(1, _PART // numbers)
-    return (slice(first, min(first + step, count)) for first in range(0, count, step))

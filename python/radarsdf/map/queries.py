@@ -60,18 +60,13 @@ def to_local(contents: WholeMap, world: Tensor) -> Tensor:
     return (world.double() - torch.from_numpy(contents.origin)).float()
 
 
-# The field
-
-
 def signed_distance(
     contents: MapContents, points: Tensor, *, description: str = "", progress: bool | None = False
 ) -> Tensor:
-    """(N,) signed distance, m, positive in free space."""
     return evaluate(contents.field.sdf, points, description=description, progress=progress)
 
 
 def gradient(contents: MapContents, points: Tensor) -> Tensor:
-    """(N, 3) gradient of the signed distance, towards free space."""
     return evaluate(contents.field.gradient, points)
 
 
@@ -93,18 +88,7 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
 
 
 def occupied(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) bool, whether each point lies in an occupied leaf cell."""
     return evaluate(contents.field.occupied, points)
-
-
-def leaf_keys(contents: MapContents) -> NDArray[np.uint64]:
-    """(C,) Morton keys of the leaf cells, ascending."""
-    return contents.field.table.leaf_keys()
-
-
-def leaf_cells(contents: MapContents) -> NDArray[np.int32]:
-    """(C, 3) leaf cells, counted from the origin."""
-    return contents.field.table.leaf_cells()
 
 
 @torch.inference_mode(mode=False)
@@ -116,28 +100,18 @@ def evaluate(
     progress: bool | None = False,
 ) -> Tensor:
     """function(points) without gradients, in chunks, on as many threads as PyTorch uses."""
-
-    def without_gradients(chunk: Tensor) -> Tensor:
-        with torch.no_grad():
-            return function(chunk)
-
-    chunks = torch.split(points, _CHUNK) if len(points) > _CHUNK else (points,)
-    if len(chunks) == 1:
+    without_gradients = torch.no_grad()(function)
+    chunks = torch.split(points, _CHUNK)
+    if len(chunks) <= 1:
         start_vector_library()  # the first queries may come from several threads at once
         return without_gradients(points)
     with Workers() as workers:
         results = workers.map(without_gradients, chunks)
-        return torch.cat(
-            list(tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress)))
-        )
+        bar = tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress))
+        return torch.cat(list(bar))
 
 
 # Where the map was observed
-
-
-def observed(contents: MapContents, points: Tensor) -> Tensor:
-    """(N,) bool, whether each point lies in an occupied leaf cell, or on its border."""
-    return into_cells(contents, points)[1]
 
 
 @torch.inference_mode(mode=False)
@@ -149,8 +123,8 @@ def into_cells(
 ) -> tuple[Tensor, Tensor]:
     """Points, of which those on the border of the occupied leaf cells are moved a little into one, and which are inside.
 
-    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features. It is moved by
-    a thousandth of `size_m`, by default of a leaf cell. `among`: which points are in a cell that counts.
+    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features. `among`: which
+    points are in a cell that counts.
     """
     leaf_m = contents.config.leaf_size_m
     step_m = INWARD * (leaf_m if size_m is None else size_m)
@@ -173,10 +147,7 @@ def into_cells(
 def where_observed(
     contents: MapContents, function: Callable[..., Tensor], points: Tensor, *others: Tensor, extrapolate: bool
 ) -> Tensor:
-    """function(contents, points, *others) where the points (N, 3) were observed and the others are finite; NaN elsewhere.
-
-    `extrapolate`: points that are finite are enough.
-    """
+    """function(contents, points, *others) where points (N, 3) were observed, or are finite, and others are finite; else NaN."""
     points, known = into_cells(contents, points)
     if extrapolate:
         known = points.isfinite().all(dim=1)
@@ -187,7 +158,7 @@ def where_observed(
 
 @torch.inference_mode(mode=False)
 def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Tensor:
-    """function(*inputs) of the rows that are `known` (N,), NaN in others, which the function does not get."""
+    """function(*inputs) of the rows that are `known` (N,); NaN in the others."""
     if bool(known.all()):
         return function(*inputs)
     found = function(*(rows[known] for rows in inputs))
@@ -208,8 +179,8 @@ class EvidenceAt(NamedTuple):
 
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
-    """The evidence at each point."""
-    return interpolated(contents.evidence, leaf_keys(contents), contents.config.leaf_size_m, points)
+    keys = contents.field.table.leaf_keys()
+    return interpolated(contents.evidence, keys, contents.config.leaf_size_m, points)
 
 
 def interpolated(
@@ -233,8 +204,7 @@ def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 def roughness(contents: WholeMap) -> float:
     """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
-    share: float = contents.rough_share / _ROUGH_SHARE
-    return min(share, 1.0)
+    return min(contents.rough_share / _ROUGH_SHARE, 1.0)
 
 
 def _floor_m(contents: WholeMap) -> float:
@@ -251,8 +221,7 @@ class Probabilities(NamedTuple):
     """Probabilities of a surface at N points, float64. 0, or next to it, where there are no returns."""
 
     confidence: Tensor  # (N,) see :func:`confidence`
-    covering: Tensor
-    """(N,) true surface that is newly covered there over its area, if surface is taken as its confidence falls. Only ratios count."""
+    covering: Tensor  # (N,) true surface newly covered over its area; only ratios count
     reach: Tensor  # (N,) share of a normal distribution of the position's error within a leaf cell's edge
 
 
@@ -260,13 +229,8 @@ def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
     """Logistic functions of :func:`terms`."""
     start_vector_library()
     columns = terms(contents, evidence)
-    true, covering = (
-        (columns * torch.tensor(logit, dtype=torch.float64, device="cpu"))
-        .sum(1)
-        .clamp(min=_LEAST_LOGIT)
-        .sigmoid()
-        for logit in (_CONFIDENCE, _COVERING)
-    )
+    logits = torch.tensor([_CONFIDENCE, _COVERING], dtype=torch.float64, device="cpu")
+    true, covering = ((columns * logit).sum(1).clamp(min=_LEAST_LOGIT).sigmoid() for logit in logits)
     reach = torch.erf(math.sqrt(0.5) / _smoothed(columns[:, 1].exp()))
     # A surface is no nearer than its position is known.
     return Probabilities(true.minimum(reach), covering, reach)
@@ -274,10 +238,8 @@ def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
 
 def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     """(N, 5) float64 regressors: 1, the logarithm of the error in leaf cells, how many returns of a surface are missing
-    there, in standard deviations, how rough the map is, and how crowded its returns are. Infinite without returns.
-
-    The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
-    """
+    there, in standard deviations, how rough the map is, and how crowded its returns are. Infinite without returns."""
+    # The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
     error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
     expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.looks.double()
     deviations = (expected - evidence.detections.double()) / (expected + 1).sqrt()
@@ -318,7 +280,7 @@ def dense_cells(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
     """`passed`, `returns` and `observed` of the leaf cells from `lower` (3,) on, counted from the origin of a map."""
     passed, returns = contents.passages.dense(lower, shape)
-    cells = lattice_of(leaf_keys(contents)) - lower
+    cells = lattice_of(contents.field.table.leaf_keys()) - lower
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     observed = np.zeros(shape, bool)
     observed[tuple(cells[inside].T)] = True
@@ -326,27 +288,22 @@ def dense_cells(
 
 
 def passage_odds(contents: MapContents) -> NDArray[np.float64]:
-    """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it.
-
-    Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
-    on the way to false returns.
-    """
-    cells = lattice_of(leaf_keys(contents))
-    cells = cells[:: max(1, len(cells) // _ODDS_CELLS)]
+    """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
+    # Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
+    # on the way to false returns.
+    keys = contents.field.table.leaf_keys()
+    keys = keys[:: max(1, len(keys) // _ODDS_CELLS)]
     leaf_m = contents.config.leaf_size_m
-    centres = torch.from_numpy(((cells + 0.5) * leaf_m).astype(np.float32))
+    centres = torch.from_numpy(((lattice_of(keys) + 0.5) * leaf_m).astype(np.float32))
     distances_m = signed_distance(contents, centres).numpy()
     # Along grazing rays the field is longer than the distance, and where returns are noisy shorter; so is its gradient.
     edge = leaf_m * np.linalg.norm(gradient(contents, centres).numpy(), axis=1)
     weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
-    passed = contents.passages.at(cells)
+    passed = contents.passages.at(keys)
 
-    def shares(side: NDArray[np.bool_]) -> NDArray[np.float64]:
-        counts = np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1
-        found: NDArray[np.float64] = counts / counts.sum()
-        return found
-
-    odds = shares(distances_m < -edge) / shares(distances_m > edge)
+    sides = (distances_m < -edge, distances_m > edge)
+    behind, before = (np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1 for side in sides)
+    odds = (behind / behind.sum()) / (before / before.sum())
     # More crossings never make a cell less free: chance is smoothed away from the end on.
     falling: NDArray[np.float64] = np.minimum.accumulate(odds)
     return falling

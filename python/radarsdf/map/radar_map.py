@@ -10,7 +10,9 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from safetensors.torch import load, save
 from torch import Tensor
 
 from radarsdf.field.field import Field
@@ -38,7 +40,8 @@ class RadarMap(Map):
         return f"RadarMap({kind}, {self.num_cells} cells, {self.file_bytes / 1e6:.1f} MB)"
 
     def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
-        return _from_pickle, storage.to_pickle(self._contents)
+        tensors, description = storage.parts_of(self._contents)
+        return _from_pickle, (save(tensors), description)  # as bytes: a pickle without classes of PyTorch
 
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
         return self._where_observed(queries.signed_distance, world, extrapolate=extrapolate)
@@ -47,7 +50,7 @@ class RadarMap(Map):
         return self._where_observed(queries.gradient, world, extrapolate=extrapolate)
 
     def _observed(self, world: Tensor) -> Tensor:
-        return queries.observed(self._contents, queries.to_local(self._contents, world))
+        return queries.into_cells(self._contents, queries.to_local(self._contents, world))[1]
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         return self._where_observed(queries.intensity, world, sensors, extrapolate=extrapolate)
@@ -78,9 +81,8 @@ class RadarMap(Map):
 
     def echoes(self) -> EchoesAt:
         scale = self.intensity_scale
-        return self._contents.echoes.in_world(
-            self.origin, *((0, 1) if scale is None else (scale.low, scale.high))
-        )
+        low, high = (0, 1) if scale is None else (scale.low, scale.high)
+        return self._contents.echoes.in_world(self.origin, low, high)
 
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
         return self._viewed
@@ -129,9 +131,10 @@ class RadarMap(Map):
 
 
 def load_file(path: str | PathLike[str]) -> RadarMap:
-    """Read the file of a map; see :func:`radarsdf.load`. Nothing in it is executed."""
+    """:func:`radarsdf.load` of a file. Nothing in it is executed."""
     return RadarMap(storage.load_contents(path))
 
 
+@torch.inference_mode(mode=False)
 def _from_pickle(data: bytes, description: dict[str, Any]) -> RadarMap:
-    return RadarMap(storage.from_pickle(data, description))
+    return RadarMap(storage.contents_of(load(data), description))

@@ -14,8 +14,6 @@ import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load as from_bytes
-from safetensors.torch import save as to_bytes
 from torch import Tensor
 from typing_extensions import TypedDict
 
@@ -26,7 +24,6 @@ from radarsdf.field.neural_field import NeuralField
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
-from radarsdf.map.queries import leaf_keys
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.free_space import Passages
 from radarsdf.returns.intensities import IntensityScale
@@ -36,7 +33,7 @@ from radarsdf.returns.view_statistics import Echoes
 from radarsdf.settings import by_name, first_wrong
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 12
+FORMAT_VERSION = 13
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
@@ -62,10 +59,6 @@ _PARTS = {
 }
 
 
-class _OtherFileError(ValueError):
-    """The file is of another program, or of another version of the format."""
-
-
 def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     """Write a map to one file, whole or not at all. A ValueError if a number is not finite: it could not be loaded."""
     tensors, description = parts_of(contents)
@@ -86,20 +79,27 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
 def load_contents(path: str | PathLike[str]) -> MapContents:
     """Read the file of a map. A ValueError if it is damaged, of another program or of another version."""
     check_regular_file(path)
+    foreign = None
     try:
         with open_tensors(path) as file:
             metadata = file.metadata
-            _check_format(metadata, path)
-            # Copied, because the tensors are views of the file, which may be changed or removed.
-            tensors = {name: file.array(name).clone() for name in file.names}
-        return _build(tensors, json.loads(metadata["description"]))
-    except (OSError, _OtherFileError):
+            version = metadata.get("format_version", "")
+            if metadata.get("format") != FORMAT:
+                foreign = f"{path} is not a radarsdf map"
+            elif version != str(FORMAT_VERSION):
+                foreign = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}: fit it again"
+            else:
+                # Copied, because the tensors are views of the file, which may be changed or removed.
+                tensors = {name: file.array(name).clone() for name in file.names}
+                return contents_of(tensors, json.loads(metadata["description"]))
+    except OSError:
         raise
     except SafetensorError as error:
         raise _damaged(path) from error
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} is not a whole radarsdf map: {error}"
         raise ValueError(msg) from error
+    raise ValueError(foreign)
 
 
 def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
@@ -121,32 +121,19 @@ def file_bytes(contents: MapContents) -> int:
     return sum(tensor.nbytes for tensor in tensors.values()) + len(quoted)
 
 
-def to_pickle(contents: MapContents) -> tuple[bytes, dict[str, Any]]:
-    """The contents of a map's pickle: tensors as bytes, so that it does not contain classes of PyTorch."""
-    tensors, description = parts_of(contents)
-    return to_bytes(tensors), description
-
-
-@torch.inference_mode(mode=False)
-def from_pickle(data: bytes, description: dict[str, Any]) -> MapContents:
-    """The inverse of :func:`to_pickle`."""
-    return _build(from_bytes(data), description)
-
-
 def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """All tensors of a map, and a description that JSON can store."""
-    tensors: dict[str, Tensor] = {
-        f"field.{name}": value for name, value in contents.field.state_dict().items()
-    }
+    field, scale, reflectance = contents.field, contents.intensity_scale, contents.field.reflectance
+    tensors: dict[str, Tensor] = {f"field.{name}": value for name, value in field.state_dict().items()}
     tensors["origin"] = torch.from_numpy(contents.origin)
-    tensors["leaf_keys"] = torch.from_numpy(leaf_keys(contents).astype(np.int64))
+    tensors["leaf_keys"] = torch.from_numpy(field.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
-    tensors |= _tensors_of("passages", contents.passages)
-    tensors |= _tensors_of("echoes", contents.echoes)
-    reflectance = contents.field.reflectance
-    if reflectance is not None:
-        tensors |= _tensors_of("reflectance", reflectance)
-    scale = contents.intensity_scale
+    parts = {"passages": contents.passages, "echoes": contents.echoes, "reflectance": reflectance}
+    for part, owner in parts.items():
+        for name in _PARTS[part] if owner is not None else ():
+            array = getattr(owner, name)
+            stored = array.view(np.int64) if array.dtype == np.uint64 else array
+            tensors[f"{part}.{name}"] = torch.from_numpy(stored)
     description = {
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
@@ -160,12 +147,11 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {name: tensor.contiguous() for name, tensor in tensors.items()}, description
 
 
-def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
+def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
     """The inverse of :func:`parts_of`. Raises an error of some kind if parts do not fit together."""
     config = FitConfig.from_dict(description["config"])
     origin = _taken(tensors, "origin", torch.float64, (3,))
-    keys = tensors.pop("leaf_keys")
-    _check(keys.ndim == 1 and keys.dtype == torch.int64, "leaf_keys is not one key for each leaf cell")
+    keys = _taken(tensors, "leaf_keys", torch.int64, (None,))
     evidence = {name: _taken(tensors, name, dtype, keys.shape) for name, dtype in _EVIDENCE.items()}
     _check((evidence["information"] >= 0).all(), "information is negative")
     passages = Passages(**_arrays_of("passages", tensors))
@@ -182,19 +168,17 @@ def _build(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapConten
         reflectance.check()
     # One of the two must answer for intensities, and without them neither can.
     trained = scale is not None and config.trains_intensity
-    _check(
-        (trained or reflectance is not None) == (scale is not None),
-        "what answers for intensities is missing, or there are none",
-    )
-    field = _field_of(tensors, keys.numpy().astype(np.uint64), config, trained)
+    answered = trained or reflectance is not None
+    _check(answered == (scale is not None), "what answers for intensities is missing, or there are none")
+    field = _field_of(tensors, keys.astype(np.uint64), config, trained)
     field.reflectance = reflectance
     return MapContents(
         field=field,
-        origin=origin.numpy(),
+        origin=origin,
         intensity_scale=scale,
         config=config,
         report=checked_report(description["report"]),
-        evidence=Evidence(**{name: tensor.numpy().copy() for name, tensor in evidence.items()}),
+        evidence=Evidence(**evidence),
         passages=passages,
         echoes=echoes,
         rough_share=_in_range("rough_share", description["rough_share"], 1),
@@ -222,35 +206,23 @@ def _field_of(
     return field
 
 
-def _tensors_of(part: str, owner: Passages | Echoes | Reflectance) -> dict[str, Tensor]:
-    arrays = {f"{part}.{name}": getattr(owner, name) for name in _PARTS[part]}
-    return {
-        name: torch.from_numpy(array.view(np.int64) if array.dtype == np.uint64 else array)
-        for name, array in arrays.items()
-    }
-
-
 def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """Takes the arrays of a part from the tensors."""
     arrays = {}
     for name, (dtype, dimensions) in _PARTS[part].items():
-        tensor = tensors.pop(f"{part}.{name}")
-        if tensor.dtype != dtype or tensor.ndim != dimensions or not tensor.isfinite().all():
-            msg = f"{name} of the {part} is not {dimensions}-dimensional, finite and {dtype}"
-            raise ValueError(msg)
-        array = tensor.numpy().copy()
+        array = _taken(tensors, f"{part}.{name}", dtype, (None,) * dimensions)
         arrays[name] = array.view(np.uint64) if dtype == torch.int64 else array
     return arrays
 
 
 def _taken(
-    tensors: dict[str, Tensor], name: str, dtype: torch.dtype, shape: torch.Size | tuple[int, ...]
-) -> Tensor:
-    """Takes a tensor of this type and shape, of finite numbers."""
+    tensors: dict[str, Tensor], name: str, dtype: torch.dtype, shape: tuple[int | None, ...]
+) -> NDArray[Any]:
+    """Takes a tensor of finite numbers of this type and shape. None: any length."""
     tensor = tensors.pop(name)
-    fits = tensor.shape == shape and tensor.dtype == dtype and tensor.isfinite().all()
-    _check(fits, f"{name} is not {tuple(shape)} finite numbers, {dtype}")
-    return tensor
+    fits = tensor.dtype == dtype and tensor.ndim == len(shape) and bool(tensor.isfinite().all())
+    fits &= all(wanted in (None, length) for wanted, length in zip(shape, tensor.shape, strict=False))
+    _check(fits, f"{name} is not {shape} finite numbers, {dtype}")
+    return tensor.numpy().copy()
 
 
 def _in_range(name: str, value: Any, highest: float) -> float:
@@ -264,20 +236,8 @@ def _check(fits: Any, text: str) -> None:
         raise ValueError(text)
 
 
-def _check_format(metadata: dict[str, str], path: str | PathLike[str]) -> None:
-    if metadata.get("format") != FORMAT:
-        msg = f"{path} is not a radarsdf map"
-        raise _OtherFileError(msg)
-    version = metadata.get("format_version", "")
-    if version != str(FORMAT_VERSION):
-        msg = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}: fit it again (CHANGELOG, 0.2.0)"
-        raise _OtherFileError(msg)
-
-
 def _damaged(path: str | PathLike[str]) -> ValueError:
-    return ValueError(
-        f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind; radarsdf fit writes maps"
-    )
+    return ValueError(f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind")
 
 
 class _Report(TypedDict, total=False):

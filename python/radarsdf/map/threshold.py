@@ -41,10 +41,9 @@ class Limits(NamedTuple):
         min_component_triangles: int | None = None,
     ) -> Limits:
         """The arguments of :meth:`Map.mesh`, checked, with defaults filled in."""
-        if (
-            min_confidence is not None
-            and not 0 <= (min_confidence := number(min_confidence, "min_confidence")) <= 1
-        ):
+        if min_confidence is not None:
+            min_confidence = number(min_confidence, "min_confidence")
+        if not 0 <= (min_confidence or 0) <= 1:
             msg = f"min_confidence must be in [0, 1], not {min_confidence}"
             raise ValueError(msg)
         max_uncertainty = number(math.inf if max_uncertainty is None else max_uncertainty, "max_uncertainty")
@@ -62,26 +61,20 @@ class Limits(NamedTuple):
 class Threshold:
     """The least confidence of a mesh, and what is expected of it. The names are those in the ``metadata`` of a mesh."""
 
-    min_confidence: float
-    """In [0, 1]. Surface of less is left out."""
-    expected_precision: float
-    """Share of the area kept that is expected to be true; 0 if nothing is kept."""
+    min_confidence: float  # in [0, 1]; surface of less is left out
+    expected_precision: float  # share of the area kept that is expected to be true; 0 if nothing is kept
+    # Share of the observed surface, that which returns lie on, that it is expected to cover; 0 if none is expected. Surface
+    # that no ray reached does not count: the share of all that is there may be far smaller.
     coverage_of_observed: float
-    """Share of the observed surface, that which returns lie on, that it is expected to cover; 0 if none is expected. Surface that
-    no ray reached does not count: the share of all that is there may be far smaller."""
-    whole_precision: float
-    """`expected_precision` if all surface were kept, whatever its confidence."""
+    whole_precision: float  # the same two if all surface were kept, whatever its confidence
     whole_coverage_of_observed: float
-    """`coverage_of_observed` if all surface were kept."""
 
     @classmethod
     def of_mesh(cls, metadata: Mapping[str, Any]) -> Threshold:
-        """That of a mesh with this ``metadata``."""
         return cls(**{name: metadata[name] for name in cls.__dataclass_fields__})
 
     @property
     def metadata(self) -> dict[str, float]:
-        """For the ``metadata`` of a mesh."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -98,11 +91,9 @@ class Tally:
 
     area_m2: Floats  # (B,) of the surface in each of B equal bins of the confidence from 0 to 1
     true_m2: Floats  # (B,) expected true area of it
-    covering: Floats
-    """(B,) true surface that is newly covered, if surface is taken as its confidence falls. Only ratios count: what one
-    place covers is learnt up to a factor."""
-    existing_m2: float  # Expected true surface, whether or not its position is known well enough
-    once_m2: float  # Expected true surface that has a return of one scan in one cell
+    covering: Floats  # (B,) true surface that is newly covered as the confidence falls. Only ratios count
+    existing_m2: float  # expected true surface, whether or not its position is known well enough
+    once_m2: float  # expected true surface that has a return of one scan in one cell
     twice_m2: float  # … of two
 
     @classmethod
@@ -115,25 +106,16 @@ class Tally:
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
         scans = np.round(detections)
 
-        def by_confidence(values: Floats) -> Floats:
-            return np.bincount(bins, values, _BINS).astype(np.float64)
-
-        return cls(
-            by_confidence(area_m2),
-            by_confidence(true_m2),
-            by_confidence(covering * area_m2),
-            float(np.minimum(existing_m2, area_m2).sum()),
-            float(true_m2[scans == 1].sum()),
-            float(true_m2[scans == 2].sum()),
-        )
+        columns = (area_m2, true_m2, covering * area_m2)
+        sums = [np.bincount(bins, values, _BINS) for values in columns]
+        scalars = (np.minimum(existing_m2, area_m2), true_m2[scans == 1], true_m2[scans == 2])
+        return cls.of_sums(np.concatenate([*sums, [values.sum() for values in scalars]]))
 
     def sums(self) -> Floats:
-        """(TALLY_NUMBERS,) all numbers: those of parts of a map add up."""
         return np.concatenate([np.atleast_1d(values) for values in astuple(self)])
 
     @classmethod
     def of_sums(cls, sums: Floats) -> Tally:
-        """The inverse of :meth:`sums`."""
         area_m2, true_m2, covering = sums[:-_SCALARS].reshape(-1, _BINS)
         existing_m2, once_m2, twice_m2 = sums[-_SCALARS:].tolist()
         return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)
@@ -159,11 +141,9 @@ class Tally:
 
     @property
     def reachable(self) -> float:
-        """Share of the observed surface that can be covered: it has returns, and lies near enough to where it was found.
-
-        Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: Chao's estimate of
-        species that no sample has. Surface that no ray reaches leaves no trace in these counts.
-        """
+        """Share of the observed surface that can be covered: it has returns, and lies near enough to where it was found."""
+        # Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: Chao's estimate of
+        # species that no sample has. Surface that no ray reaches leaves no trace in these counts.
         true_m2 = float(self.true_m2.sum())
         if true_m2 == 0 or (self.once_m2 > 0 and self.twice_m2 == 0):
             return 0.0

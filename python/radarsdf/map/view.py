@@ -25,10 +25,11 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.threads import resolve_num_threads
 
 _Floats = NDArray[np.float64]
+_Intensity = Callable[[_Floats, _Floats], NDArray[np.float32]]  # (N,) of points (N, 3) and a sensor (3,), m
 
 # The density of returns on the surface is rate^a · cosine^b / range^c, times d where the patch is hidden: (a, b, c, d) in
-# smooth scenes and in rough ones. Beams are spread by angle, so in smooth scenes a patch gets as many as it is wide. A
-# real radar sees much behind surfaces, and returns come from few places. Chosen with `python -m bench.paper novel-views`.
+# smooth scenes, where beams are spread by angle, and in rough ones, where a radar sees much behind surfaces. Chosen with
+# `python -m bench.paper novel-views`.
 _SMOOTH = np.array([1.0, 1.0, 2.0, 0.01])
 _ROUGH = np.array([2.2, 0.3, 1.0, 0.65])
 _HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
@@ -36,7 +37,6 @@ _MIN_COSINE = 0.05
 _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
 _MOST_PLACES = 1 << 40
-_BLOCK = 1 << 20  # patches that are tested at a time
 _ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
 # Prior of the detection rate, in scans: with few scans that reached a patch, it is uncertain.
 _LOOKS_BEFORE = 2.0
@@ -107,9 +107,8 @@ class ViewedMap:
     rates: _Floats  # (P,) detection rate: share of the scans that reached a patch that have a return there
     origin: _Floats  # (3,) of the local frame, world, m
     roughness: float  # See :func:`radarsdf.map.queries.roughness`
-    intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None
-    """Intensities (N,) of returns from points (N, 3) to a sensor (3,), m. None: the map has none."""
-    max_memory_bytes: int | None  # what views may take. None: what the system has left.
+    intensity: _Intensity | None
+    max_memory_bytes: int | None  # what views may take. None: what the system has left
 
     @classmethod
     def of(cls, contents: MapContents) -> ViewedMap:
@@ -138,7 +137,7 @@ class ViewedMap:
         scene: WholeMap,
         origin: _Floats,
         evidence_at: Callable[[_Floats], queries.EvidenceAt],
-        intensity: Callable[[_Floats, _Floats], NDArray[np.float32]] | None,
+        intensity: _Intensity | None,
     ) -> ViewedMap:
         """All triangles are patches; rays meet those that the mesh keeps by default. `evidence_at`: of points (N, 3), m."""
         across, twice_m2 = across_triangles(surface.vertices, surface.faces)
@@ -146,17 +145,11 @@ class ViewedMap:
         evidence = evidence_at(centres)
         rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
         faces = np.ascontiguousarray(surface.faces[surface.kept(Limits.of(scene.config.leaf_size_m))])
-        return cls(
-            SurfaceTracer(surface.vertices, faces, resolve_num_threads(0)),
-            centres,
-            across / np.maximum(twice_m2, 1e-12)[:, None],
-            twice_m2 / 2,
-            rates.astype(np.float64),
-            origin,
-            queries.roughness(scene),
-            intensity,
-            scene.config.max_memory_bytes,
-        )
+        tracer = SurfaceTracer(surface.vertices, faces, resolve_num_threads(0))
+        normals = across / np.maximum(twice_m2, 1e-12)[:, None]
+        patches = centres, normals, twice_m2 / 2, rates.astype(np.float64)
+        of_scene = queries.roughness(scene), intensity, scene.config.max_memory_bytes
+        return cls(tracer, *patches, origin, *of_scene)
 
     def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:
         """(N,) where rays from `origin` (3,) in unit `directions` (N, 3) first meet the mesh, m; inf: nowhere."""
@@ -204,18 +197,17 @@ def _patches(
     surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, count: int
 ) -> NDArray[np.int64]:
     """Rows of the patches that have a return: `count`, spread evenly by the number that is expected of each."""
-    rows = np.concatenate(
-        [
-            first + _in_view(surface.centres[first : first + _BLOCK], R, position, sensor)
-            for first in range(0, len(surface.centres), _BLOCK)
-        ]
-        or [np.zeros(0, np.int64)]
-    )
+    centres = surface.centres
+    seen = np.ones(len(centres), bool)
+    limits = (sensor.range_m, sensor.azimuth_rad, sensor.elevation_rad)
+    for values, (low, high) in zip(_polar(turned(centres - position, R.T)), limits, strict=True):
+        seen &= (values >= low) & (values <= high)
+    rows = np.flatnonzero(seen)
     if len(rows) == 0 or count == 0:
         return rows[:0]
-    order = cell_keys(surface.centres[rows].astype(np.float32), _ORDER_M, 1)
+    order = cell_keys(centres[rows].astype(np.float32), _ORDER_M, 1)
     rows = rows[np.argsort(order, kind="stable")]
-    to_patch = surface.centres[rows] - position
+    to_patch = centres[rows] - position
     ranges_m = np.sqrt(np.einsum("ni,ni->n", to_patch, to_patch))
     to_patch /= ranges_m[:, None]
     first_m = surface.ranges(position, to_patch, float(sensor.range_m[1]))
@@ -227,30 +219,18 @@ def _patches(
     return rows[_spread(expected, count)]
 
 
-def _in_view(centres: _Floats, R: _Floats, position: _Floats, sensor: Sensor) -> NDArray[np.int64]:
-    """Rows of the patches (N, 3) that lie in the sensor's field of view and ranges."""
-    seen = np.ones(len(centres), bool)
-    limits = (sensor.range_m, sensor.azimuth_rad, sensor.elevation_rad)
-    for values, (low, high) in zip(_polar(turned(centres - position, R.T)), limits, strict=True):
-        seen &= (values >= low) & (values <= high)
-    return np.flatnonzero(seen)
-
-
 def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
-    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums.
-
-    Where a row expects more than one place, others get more of them, until there are `count` rows.
-    """
+    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums."""
     sums = np.cumsum(expected)
     count = min(count, int(np.count_nonzero(expected)))
     if count == 0:
         return np.zeros(0, np.int64)
 
     def rows_of(places: int) -> NDArray[np.int64]:
-        """They are not listed: there can be many more than rows."""
         up_to = np.minimum(np.floor(sums * (places / sums[-1]) + 0.5), places)
         return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
 
+    # Where a row expects more than one place, others get more of them, until there are `count` rows.
     chosen, places, step, grows = rows_of(count), count, count, True
     while 0 < step < _MOST_PLACES and len(chosen) < count:
         more = rows_of(places + step)
@@ -264,11 +244,10 @@ def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
 
 def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
     ranges_m, azimuth, elevation = _polar(points)
-    errors = rng.standard_normal((3, len(points)))
-    directions = sensor.directions(
-        azimuth + sensor.noise.azimuth_rad * errors[1], elevation + sensor.noise.elevation_rad * errors[2]
-    )
-    noisy: _Floats = directions * np.maximum(ranges_m + sensor.noise.range_m * errors[0], 0.0)[:, None]
+    errors, noise = rng.standard_normal((3, len(points))), sensor.noise
+    angles = azimuth + noise.azimuth_rad * errors[1], elevation + noise.elevation_rad * errors[2]
+    noisy_m = np.maximum(ranges_m + noise.range_m * errors[0], 0.0)
+    noisy: _Floats = sensor.directions(*angles) * noisy_m[:, None]
     return noisy
 
 
@@ -279,11 +258,10 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
     counts = [int((high - low) / step) + 1 for (low, high), step in zip(limits, steps, strict=True)]
     while counts[0] * counts[1] > _MAX_BEAMS:
         counts = [max(1, count // 2) for count in counts]
-    azimuth, elevation = (
-        np.asarray(low + (np.arange(count) + 0.5) * ((high - low) / count), np.float64)
-        for (low, high), count in zip(limits, counts, strict=True)
-    )
-    return azimuth, elevation
+    (first, last), (lowest, highest) = limits
+    azimuth = first + (np.arange(counts[0]) + 0.5) * ((last - first) / counts[0])
+    elevation = lowest + (np.arange(counts[1]) + 0.5) * ((highest - lowest) / counts[1])
+    return np.asarray(azimuth, np.float64), np.asarray(elevation, np.float64)
 
 
 def _first_surface(

@@ -31,13 +31,12 @@ class Evidence:
     `information` and `detections` are sums over a leaf cell and the 26 cells round it.
     """
 
-    information: NDArray[np.float32]
-    """(C,) 1 / variance of the position that the returns give together, m⁻²."""
+    information: NDArray[np.float32]  # (C,) 1 / variance of the position that the returns give together, m⁻²
+    # (C,) number of scans with returns, added up over the cells. A scan of many returns in a cell counts once there: their
+    # errors have causes in common.
     detections: NDArray[np.uint32]
-    """(C,) number of scans with returns, added up over the cells. A scan of many returns in a cell counts once
-    there: their errors have causes in common."""
+    # (C,) number of scans with a ray through the cube of 8 × 8 × 8 leaf cells that the cell is in, or to there
     looks: NDArray[np.uint32]
-    """(C,) number of scans with a ray through the cube of 8 × 8 × 8 leaf cells that the cell is in, or to there."""
 
     @classmethod
     def of(
@@ -49,22 +48,12 @@ class Evidence:
         num_threads: int = 0,
         looks: Looks | None = None,
     ) -> Evidence:
-        """Evidence in the leaf cells with these keys (C,), ascending.
-
-        `returns` are those that are not known to be false; `rays` are all, scan by scan, since a ray to a false return also
-        looked. `looks`: visibility counts, if they were kept up scan by scan.
-        """
+        """Evidence in the leaf cells with these keys (C,), ascending. `rays` are all: those to false returns also looked."""
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         information, detections = sums_round(returns.select(near), leaf_keys, num_threads)
         if looks is not None:
             return cls(information, detections, looks.at(leaf_keys))
-        counted = count_looks(
-            leaf_keys,
-            leaf_size_m,
-            *rays.in_c_order(),
-            rays.scans,
-            num_threads,
-        )
+        counted = count_looks(leaf_keys, leaf_size_m, *rays.in_c_order(), rays.scans, num_threads)
         return cls(information, detections, counted)
 
 
@@ -72,27 +61,22 @@ class Evidence:
 class ReturnsOfCells:
     """What the returns in each leaf cell tell, in the order of their keys."""
 
-    keys: NDArray[np.uint64]
-    """(M,) Morton keys of the leaf cells with returns, ascending."""
-    information: NDArray[np.float32]
-    """(M,) 1 / variance of the position that the returns of a cell give together, m⁻²."""
-    scans: NDArray[np.uint32]
-    """(M,) number of different scans with returns."""
-    counts: NDArray[np.float64]
-    """(M,) number of returns."""
+    keys: NDArray[np.uint64]  # (M,) Morton keys of the leaf cells with returns, ascending
+    information: NDArray[
+        np.float32
+    ]  # (M,) 1 / variance of the position that the returns of a cell give together, m⁻²
+    scans: NDArray[np.uint32]  # (M,) number of different scans with returns
+    counts: NDArray[np.float64]  # (M,) number of returns
 
     def select(self, part: NDArray[np.bool_]) -> ReturnsOfCells:
-        """The cells of a mask (M,)."""
         return ReturnsOfCells(self.keys[part], self.information[part], self.scans[part], self.counts[part])
 
     def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
-        """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m.
-
-        The error of a pose is common to the returns of a scan. So the variance of a cell gets that of a pose over the number
-        of scans, as many times as a surface has cells among 27.
-        """
+        """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m."""
         if config.pose_sigma_m == 0 and config.pose_sigma_rad == 0:
             return self
+        # The error of a pose is common to the returns of a scan. So the variance of a cell gets that of a pose over the
+        # number of scans, as many times as a surface has cells among 27.
         pose_m2 = config.pose_sigma_m**2 + np.square(np.float32(config.pose_sigma_rad) * ranges_m)
         variances_m2 = 1 / self.information + CELLS_OF_SURFACE * pose_m2 / self.scans
         return dataclasses.replace(self, information=(1 / variances_m2).astype(np.float32))
@@ -102,10 +86,8 @@ class ReturnsOfCells:
 class Looks:
     """How many scans looked at each block of 8 × 8 × 8 leaf cells."""
 
-    keys: NDArray[np.uint64]
-    """(B,) Morton keys of leaf cells without their last nine bits, ascending."""
-    scans: NDArray[np.uint32]
-    """(B,) number of scans with a ray through each block, or to there."""
+    keys: NDArray[np.uint64]  # (B,) Morton keys of leaf cells without their last nine bits, ascending
+    scans: NDArray[np.uint32]  # (B,) number of scans with a ray through each block, or to there
 
     def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint32]:
         """(C,) of the blocks that leaf cells with these Morton keys (C,), ascending, are in."""
@@ -157,10 +139,9 @@ def bridged(
     max_cells: int,
     num_threads: int = 0,
 ) -> NDArray[np.uint64]:
-    """Adds to `leaf_keys` (C,), ascending, the cells on the line between two cells with returns.
+    """Adds to `leaf_keys` (C,), ascending, at most `max_cells` on a line between two cells with returns, in 13 directions.
 
-    Lines run along the axes and the diagonals, in 13 directions, over at most `max_cells`. `counts` (M,): returns in the cells
-    with `keys` (M,), ascending.
+    `counts` (M,): returns in the cells with `keys` (M,), ascending.
     """
     if max_cells == 0:
         return leaf_keys

@@ -29,11 +29,10 @@ _INSIDE = np.arange(BLOCK_CELLS**3, dtype=np.uint64)
 class Passages:
     """The leaf cells that rays passed, in blocks of 8 × 8 × 8."""
 
-    keys: NDArray[np.uint64]
-    """(B,) Morton keys of the blocks' leaf cells without the last 9 bits, ascending."""
+    keys: NDArray[np.uint64]  # (B,) Morton keys of the blocks' leaf cells without the last 9 bits, ascending
+    # (B, 4, 8) a bit for each of the 512 leaf cells of a block, in Morton order. Planes 0 to 2: the bits of the number of
+    # scans with a ray through the cell, up to 7. Plane 3: whether there are returns in it.
     planes: NDArray[np.uint64]
-    """(B, 4, 8) a bit for each of the 512 leaf cells of a block, in Morton order. Planes 0 to 2: the bits of the number of
-    scans with a ray through the cell, up to 7. Plane 3: whether there are returns in it."""
 
     @classmethod
     def of(
@@ -44,29 +43,20 @@ class Passages:
         box_cells: NDArray[np.int64] | None = None,
         num_threads: int = 0,
     ) -> Passages:
-        """What `rays`, without those to false returns, crossed in the box [lower, upper), (2, 3) leaf cells. None: anywhere.
-
-        A ray tells of cells up to two standard deviations of its return before it, and only where the angles of a return
-        are known to one cell: beyond that it cannot be said which cell a ray crossed.
-        """
+        """What `rays`, without those to false returns, crossed in the box [lower, upper), (2, 3) leaf cells. None: anywhere."""
+        # Up to two standard deviations before the return, and where its angles are known to one cell: beyond that, it
+        # cannot be said which cell a ray crossed.
         before_m = rays.ranges_m - np.float32(_SIGMAS) * np.sqrt(noise.variances_m2(rays.ranges_m))
         known_m = np.float32(leaf_size_m / noise.angle_rad)
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
-        lower, upper = (limit if box_cells is None else np.asarray(box_cells)).__iter__()
-        keys, planes = find_passages(
-            *rays.in_c_order(),
-            np.minimum(before_m, known_m),
-            np.ascontiguousarray(rays.scans),
-            leaf_size_m,
-            [int(cell) for cell in lower],
-            [int(cell) for cell in upper],
-            num_threads,
+        lower, upper = limit if box_cells is None else box_cells.tolist()
+        crossed_m, scans = np.minimum(before_m, known_m), np.ascontiguousarray(rays.scans)
+        return cls(
+            *find_passages(*rays.in_c_order(), crossed_m, scans, leaf_size_m, lower, upper, num_threads)
         )
-        return cls(keys, planes)
 
     @classmethod
     def none(cls) -> Passages:
-        """Those of a map that keeps none."""
         return cls(np.zeros(0, np.uint64), np.zeros((0, _PLANES, _WORDS), np.uint64))
 
     def check(self) -> None:
@@ -96,25 +86,15 @@ class Passages:
         inside = cells[tuple(slice(o, o + n) for o, n in zip(offset, shape, strict=True))]
         return inside & np.uint8(MOST_SCANS), inside > MOST_SCANS
 
-    def at(self, cells: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """(N,) number of scans that passed leaf cells (N, 3), up to 7."""
-        if len(self.keys) == 0 or len(cells) == 0:
-            return np.zeros(len(cells), np.uint8)
-        blocks = block_numbers(self.keys)
-        begin = blocks.min(axis=0)
-        span = blocks.max(axis=0) - begin + 1
-        wanted = cells // BLOCK_CELLS - begin
-        inside = ((wanted >= 0) & (wanted < span)).all(axis=1)
-        numbers = np.ravel_multi_index(tuple((blocks - begin).T), tuple(span))
-        order = np.argsort(numbers)
-        asked = np.ravel_multi_index(tuple(np.where(inside[:, None], wanted, 0).T), tuple(span))
-        place = np.minimum(np.searchsorted(numbers[order], asked), len(order) - 1)
-        rows = order[place]
-        inside &= numbers[rows] == asked
-        bit = _MORTON[tuple((cells % BLOCK_CELLS).T)].astype(np.uint64)
+    def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint8]:
+        """(N,) number of scans that crossed the leaf cells with these Morton keys (N,), up to 7."""
+        if len(self.keys) == 0:
+            return np.zeros(len(leaf_keys), np.uint8)
+        blocks, bit = leaf_keys >> np.uint64(3 * _LEVELS), leaf_keys & _INSIDE[-1]
+        rows = np.minimum(np.searchsorted(self.keys, blocks), len(self.keys) - 1)
         words = self.planes[rows, :, bit >> np.uint64(6)] >> (bit & np.uint64(63))[:, None] & np.uint64(1)
         scans = (words[:, 0] + 2 * words[:, 1] + 4 * words[:, 2]).astype(np.uint8)
-        return np.where(inside, scans, np.uint8(0))
+        return np.where(self.keys[rows] == blocks, scans, np.uint8(0))
 
 
 def block_numbers(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
@@ -132,7 +112,6 @@ def unpacked(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
 
 
 def _morton_table() -> NDArray[np.int64]:
-    """(8, 8, 8) place of each leaf cell of a block in Morton order."""
     table = np.zeros((BLOCK_CELLS,) * 3, np.int64)
     cells = lattice_of(_INSIDE) % BLOCK_CELLS
     table[tuple(cells.T)] = _INSIDE

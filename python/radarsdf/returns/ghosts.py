@@ -36,11 +36,10 @@ def find_ghosts(
     surfels: Surfels, rays: Rays | MeanRays, noise: SensorNoise, num_threads: int = 0
 ) -> NDArray[np.bool_]:
     """(C,) bool, which cells of `surfels` hold ghosts. `rays`: all, or the mean rays of leaf cells, which are fewer."""
-    cell_of_ray, weights = (
-        (surfels.cells_of_leaves(rays.keys, num_threads), rays.counts)
-        if isinstance(rays, MeanRays)
-        else (surfels.cells_at(rays.points, num_threads), None)
-    )
+    if isinstance(rays, MeanRays):
+        cell_of_ray, weights = surfels.cells_of_leaves(rays.keys, num_threads), rays.counts
+    else:
+        cell_of_ray, weights = surfels.cells_at(rays.points, num_threads), None
 
     def count(rows: NDArray[np.int32], of: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
         counted = np.bincount(rows[of], None if weights is None else weights[of], size)
@@ -110,11 +109,8 @@ def are_behind(
     num_threads: int = 0,
 ) -> NDArray[np.bool_]:
     """(N,) which rays end behind one of `planes`, rows of opaque surfels. `crosses` (N,): which cross any flat one."""
-    behind = crosses.copy()
-    behind[crosses] = (
-        first_crossed(surfels, planes, rays.select(np.flatnonzero(crosses)), noise, num_threads, beside=False)
-        >= 0
-    )
+    behind, chosen = crosses.copy(), rays.select(np.flatnonzero(crosses))
+    behind[crosses] = first_crossed(surfels, planes, chosen, noise, num_threads, beside=False) >= 0
     return behind
 
 

@@ -33,13 +33,11 @@ class Plausible:
 
     @classmethod
     def of(cls, intensities: NDArray[Any]) -> Plausible:
-        """The limits of intensities (N,), sensor units. NaN stands for none."""
         known = Intensities()
         known.add(intensities)
         return known.plausible()
 
     def holds(self, intensities: NDArray[Any]) -> NDArray[np.bool_]:
-        """Mask (N,) of the intensities within the limits. NaN is not."""
         return (intensities >= np.float64(self.low)) & (intensities <= np.float64(self.high))
 
     def kept(self, intensities: NDArray[Any]) -> NDArray[Any]:
@@ -56,7 +54,7 @@ class Intensities:
         self.low, self.high = math.inf, -math.inf
 
     def add(self, intensities: NDArray[Any]) -> None:
-        """The next ones (N,), sensor units. NaN stands for none."""
+        """The next ones (N,), sensor units; NaN for none."""
         none = np.isnan(intensities)
         known = intensities[~none] if none.any() else intensities
         if len(known) == 0:
@@ -68,7 +66,6 @@ class Intensities:
         self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
 
     def plausible(self) -> Plausible:
-        """The limits of all so far."""
         if len(self._some) < _FEWEST:
             return Plausible(-math.inf, math.inf)
         values = self._some
@@ -117,17 +114,15 @@ def _reach(distances: NDArray[Any], share: float) -> float:
 class IntensityScale:
     """The range of the training intensities, which becomes [0, 1]."""
 
-    low: float
-    """Lowest training intensity, sensor units."""
-    high: float
-    """Highest training intensity, sensor units."""
+    low: float  # lowest training intensity, sensor units
+    high: float  # highest training intensity, sensor units
 
     @classmethod
     def of(cls, intensities: NDArray[np.float32] | None) -> IntensityScale | None:
         """The range of `intensities` (N,), sensor units, NaN where there is none. None if there are none at all."""
-        return (
-            None if intensities is None else cls(float(np.nanmin(intensities)), float(np.nanmax(intensities)))
-        )
+        if intensities is None:
+            return None
+        return cls(float(np.nanmin(intensities)), float(np.nanmax(intensities)))
 
     @classmethod
     def between(cls, intensity_range: ArrayLike) -> IntensityScale:

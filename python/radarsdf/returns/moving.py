@@ -46,16 +46,12 @@ _FOLDS = (-1.0, 0.0, 1.0)  # intervals by which all three returns of a draw may 
 class SensorVelocity:
     """What the Doppler of one scan says."""
 
-    velocity_mps: FloatArray
-    """(3,) velocity of the sensor in its own frame, m/s. NaN if the returns do not agree on one."""
-    covariance: FloatArray
-    """(3, 3) its covariance, m²/s², large in directions that no return measures. NaN if there is no velocity."""
-    static: NDArray[np.bool_]
-    """(N,) whether each return agrees with it, so that it stands still. All False if there is no velocity."""
+    velocity_mps: FloatArray  # (3,) of the sensor in its own frame. NaN if the returns do not agree on one
+    covariance: FloatArray  # (3, 3) m²/s², large in directions that no return measures
+    static: NDArray[np.bool_]  # (N,) whether each return agrees with it. All False without a velocity
 
     @property
     def found(self) -> bool:
-        """Whether the returns agree on a velocity."""
         return bool(np.isfinite(self.velocity_mps).all())
 
 
@@ -64,9 +60,8 @@ def sensor_velocity(
 ) -> SensorVelocity:
     """The velocity of the sensor in one scan of returns (N, 3) with `doppler_mps` (N,), positive away from the sensor.
 
-    None if there are fewer than 10 returns, or if less than 40 % of them agree. A component that no return measures is 0 m/s,
-    with a deviation of 100 m/s. `interval_mps`: width of the interval into which the sensor folds speeds. The same scan gives
-    the same bits.
+    NaN with fewer than 10 returns, or if less than 40 % of them agree. A component that no return measures is 0 m/s, with a
+    deviation of 100 m/s. `interval_mps`: width of the interval into which the sensor folds speeds.
     """
     x, speeds = np.asarray(points, np.float64), np.asarray(doppler_mps, np.float64)
     ranges = np.linalg.norm(x, axis=1)
@@ -135,11 +130,9 @@ def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
         return None
     # Folded speeds reach both ends of the interval, which lie about as far from 0.
     low, high = float(speeds.min()), float(speeds.max())
-    if not 0 < -low < 1.25 * high or not high < -1.25 * low:
-        return None
     edge = 0.05 * (high - low)
-    ends = ((speeds < low + edge).mean(), (speeds > high - edge).mean())
-    if min(ends) < 0.002:
+    symmetric = 0 < -low < 1.25 * high and high < -1.25 * low
+    if not symmetric or min((speeds < low + edge).mean(), (speeds > high - edge).mean()) < 0.002:
         return None
     values = np.unique(np.abs(np.diff(np.unique(speeds))))
     step = float(values[values > 1e-6].min(initial=np.inf))
@@ -165,11 +158,9 @@ def sensor_velocities(
 def without_filler(
     points: Sequence[NDArray[Any]], doppler_mps: Sequence[NDArray[Any]]
 ) -> tuple[list[FloatArray], str | None]:
-    """Doppler of K scans with NaN where a driver wrote a fixed value because it measured none, and a note on that.
-
-    Many equal speeds are a filler if the other returns show a velocity of the sensor that contradicts them, or if there are
-    hardly any others. A sensor that stands still and resolves speeds coarsely has many equal ones, too.
-    """
+    """Doppler of K scans with NaN where a driver wrote a fixed value because it measured none, and a note on that."""
+    # Many equal speeds are a filler if the other returns show a velocity that contradicts them, or if there are hardly any
+    # others: a sensor that stands still and resolves speeds coarsely has many equal ones, too.
     speeds = [np.asarray(values, np.float64) for values in doppler_mps]
     values, counts = np.unique(np.concatenate([v[np.isfinite(v)] for v in speeds]), return_counts=True)
     if len(values) == 0 or counts.max() < _FILLER * counts.sum():
@@ -185,10 +176,10 @@ def without_filler(
             contradicting += int((np.abs(expected - filler) > 3 * _SIGMA_MPS).sum())
             asked += int(filled.sum())
     if 2 * contradicting > asked or (asked == 0 and share > _ONLY_FILLER):
-        return (
-            others,
-            f"{share:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out",
+        note = (
+            f"{share:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out"
         )
+        return others, note
     return speeds, None
 
 
@@ -200,18 +191,12 @@ _MAX_MOVING = 0.4  # share of the returns; if more disagree, it is the Doppler t
 class Movers:
     """Which returns of F scans move."""
 
-    masks: list[NDArray[np.bool_]]
-    """F arrays (N_i,). All False where a scan tells no velocity of the sensor, or a return has no Doppler."""
-    why_none: str | None
-    """Why none are named although there is Doppler, in words. None: they were looked for in all scans that tell."""
+    masks: list[NDArray[np.bool_]]  # F arrays (N_i,). All False where a scan gives no velocity of the sensor
+    why_none: str | None  # why none are named although there is Doppler, in words
 
     @classmethod
     def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> Movers:
-        """Finds the returns whose Doppler disagrees with a world that stands still.
-
-        `points`, `doppler_mps`: F arrays (N_i, 3), sensor frame, m, and (N_i,), m/s, of either sign, folded or not; NaN where it
-        was not measured. TypeError or ValueError: they are no numbers, or do not fit together.
-        """
+        """The returns (N_i, 3), sensor frame, m, whose Doppler (N_i,), m/s or NaN, of either sign, disagrees with a static world."""
         scans, _, _ = check_scans(points)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
         none = [np.zeros(len(scan), bool) for scan in scans]
@@ -219,9 +204,8 @@ class Movers:
         found = sensor_velocities([scans[i] for i in tried], [speeds[i] for i in tried])
         telling = [(i, velocity) for i, velocity in zip(tried, found, strict=True) if velocity.found]
         if len(telling) < max(1, _MIN_SHARE_WITH_VELOCITY * len(tried)):
-            return cls(
-                none, filler or f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor"
-            )
+            few = f"only {len(telling)} of {len(scans)} scans agree on a velocity of the sensor"
+            return cls(none, filler or few)
         masks = list(none)
         for i, velocity in telling:
             masks[i] = ~velocity.static & np.isfinite(speeds[i]) & scans[i].any(axis=1)
@@ -232,11 +216,9 @@ class Movers:
 
     @property
     def count(self) -> int:
-        """Number of returns that move."""
         return sum(int(mask.sum()) for mask in self.masks)
 
     def without(self, arrays: Sequence[ArrayLike]) -> list[NDArray[Any]]:
-        """F arrays (N_i, ...) without the rows of what moves."""
         return [np.asarray(array)[~mask] for array, mask in zip(arrays, self.masks, strict=True)]
 
 
@@ -244,14 +226,10 @@ class Movers:
 class Standing:
     """The returns of F scans without those that move, as far as Doppler tells them."""
 
-    points: Iterable[ArrayLike]
-    """F arrays (N_i, 3), sensor frame, m."""
-    intensities: Iterable[ArrayLike] | None
-    """F arrays (N_i,), sensor units."""
-    movers: int
-    """Number of returns that were left out."""
-    why_none: str | None
-    """As of :class:`Movers`."""
+    points: Iterable[ArrayLike]  # F arrays (N_i, 3), sensor frame, m
+    intensities: Iterable[ArrayLike] | None  # F arrays (N_i,), sensor units
+    movers: int  # number of returns that were left out
+    why_none: str | None  # as of :class:`Movers`
 
     @classmethod
     def of(
@@ -266,8 +244,7 @@ class Standing:
             return cls(points, intensities, 0, None)
         points = list(one_for_each_scan(points, "points"))
         intensities = None if intensities is None else list(one_for_each_scan(intensities, "intensities"))
-        if intensities is not None:
-            check_scans(points, intensities)
+        check_scans(points, intensities)
         movers = Movers.of(points, doppler_mps)
         values = None if intensities is None else movers.without(intensities)
         return cls(movers.without(points), values, movers.count, movers.why_none)
@@ -284,15 +261,10 @@ def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike])
 
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
-    """The returns that a fit with this configuration accepts, of a range and of what does not move, each seen from where its scan was taken.
-
-    An intensity that cannot belong to the others of these scans is NaN.
-    """
+    """The static returns within the ranges of a fit, each seen from where its scan was taken. Intensity outliers are NaN."""
     standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
-    return prepare(
-        standing.points,
-        scans.poses,
-        standing.intensities,
-        min_range_m=config.returns.min_range_m,
-        max_range_m=config.returns.max_range_m,
-    )
+    limits: dict[str, Any] = {
+        "min_range_m": config.returns.min_range_m,
+        "max_range_m": config.returns.max_range_m,
+    }
+    return prepare(standing.points, scans.poses, standing.intensities, **limits)

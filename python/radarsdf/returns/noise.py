@@ -33,26 +33,19 @@ _MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Standard deviations of the position of a return.
+    """Standard deviations of the position of a return. The three errors are independent."""
 
-    The errors along the beam, in azimuth and in elevation are independent.
-    """
-
-    range_m: float
-    """Along the beam, m."""
-    azimuth_rad: float
-    """In azimuth, rad."""
-    elevation_rad: float
-    """In elevation, rad."""
+    range_m: float  # along the beam, m
+    azimuth_rad: float  # in azimuth, rad
+    elevation_rad: float  # in elevation, rad
 
     @classmethod
     def median(cls, noises: Sequence[SensorNoise]) -> SensorNoise:
-        """Of several, number by number."""
         return cls(*np.median([dataclasses.astuple(noise) for noise in noises], axis=0).tolist())
 
     @property
     def variances(self) -> list[float]:
-        """Along the beam, m², in azimuth and in elevation, rad²: what the core takes."""
+        """Along the beam, m², in azimuth and in elevation, rad²."""
         squares: list[float] = np.square(dataclasses.astuple(self)).tolist()
         return squares
 
@@ -68,18 +61,15 @@ class SensorNoise:
 
     def variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N,) variance of returns at these ranges (N,), along the beam and across it together, m²."""
-        variances: NDArray[np.float32] = np.float32(self.range_m**2) + np.square(
-            np.float32(self.angle_rad) * ranges_m
-        )
+        across_m = np.float32(self.angle_rad) * ranges_m
+        variances: NDArray[np.float32] = np.float32(self.range_m**2) + np.square(across_m)
         return variances
 
     def mean_variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float64]:
         """(N,) mean of the variances along the three axes, of returns at these ranges (N,), m²."""
         across_rad2 = self.azimuth_rad**2 + self.elevation_rad**2
-        variances: NDArray[np.float64] = (
-            self.range_m**2 + across_rad2 * np.square(ranges_m, dtype=np.float64)
-        ) / 3
-        return variances
+        sums: NDArray[np.float64] = self.range_m**2 + across_rad2 * np.square(ranges_m, dtype=np.float64)
+        return sums / 3
 
 
 def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> SensorNoise:
@@ -124,14 +114,13 @@ def variances_across(
     rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64], noise: SensorNoise
 ) -> NDArray[np.float64]:
     """(M,) variances of the returns in these `rows` (M,) across planes with `normals` (M, 3), m²."""
-    variances: NDArray[np.float64] = np.einsum(
-        "k,kn->n", np.array(noise.variances), _shares(rays, rows, normals)
-    )
+    shares = _shares(rays, rows, normals)
+    variances: NDArray[np.float64] = np.einsum("k,kn->n", np.array(noise.variances), shares)
     return variances
 
 
 def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes. Above the sensor, 0 of angles."""
+    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes."""
     ranges2 = np.square(rays.ranges_m[rows].astype(np.float64))
     up, normal = rays.up_of_scan[rays.scans[rows]].T, normals.T
     along = rays.directions[rows].T.astype(np.float64)

@@ -26,36 +26,25 @@ MIN_SUPPORT = 12.0  # weighted returns in the 27 cells of a surfel
 class Surfels:
     """Cells twice as large as leaf cells, and surfels of those with enough returns in and round them."""
 
-    cell_size_m: float
-    """Edge of a cell, m."""
-    keys: NDArray[np.uint64]
-    """(C,) Morton keys of the cells that hold returns, ascending."""
-    blocks: CellBlocks
-    """Finds the row of a cell from its key."""
-    counts: NDArray[np.float64]
-    """(C,) number of returns in each cell."""
-    support: NDArray[np.float64]
-    """(C,) weighted number of returns in a cell and the 26 cells round it. Neighbours have less weight."""
-    cell_of_plane: NDArray[np.int64]
-    """(P,) row of the cell of each surfel, ascending."""
-    centres: NDArray[np.float64]
-    """(P, 3) weighted mean of the returns, local, m."""
-    normals: NDArray[np.float64]
-    """(P, 3) unit vectors towards the sensors."""
-    variances: NDArray[np.float64]
-    """(P, 3) variances of the returns along the principal axes, ascending, m². The first is across the
-    plane."""
-    widest: NDArray[np.float32] | None = None
-    """(P, 3) unit vectors in the planes, along which the returns spread most. None: not kept, in maps that grow."""
+    cell_size_m: float  # edge of a cell, m
+    keys: NDArray[np.uint64]  # (C,) Morton keys of the cells that hold returns, ascending
+    blocks: CellBlocks  # finds the row of a cell from its key
+    counts: NDArray[np.float64]  # (C,) number of returns in each cell
+    support: NDArray[
+        np.float64
+    ]  # (C,) weighted number of returns in a cell and, with less weight, the 26 around it
+    cell_of_plane: NDArray[np.int64]  # (P,) row of the cell of each surfel, ascending
+    centres: NDArray[np.float64]  # (P, 3) weighted mean of the returns, local, m
+    normals: NDArray[np.float64]  # (P, 3) unit vectors towards the sensors
+    variances: NDArray[np.float64]  # (P, 3) of the returns along the principal axes, ascending, m²
+    widest: NDArray[np.float32] | None = None  # (P, 3) unit vectors along which they spread most, in a batch
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
-        """Surfels of the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         return cls.of_sums(ScanSums.of(rays, leaf_size_m, num_threads), num_threads)
 
     @classmethod
     def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> Surfels:
-        """Surfels of the returns of scans that are known by their `sums`."""
         cell_size_m = LEAVES_PER_SURFEL * sums.leaf_size_m
         keys, of_cells = sums.merged_moments()
         blocks = CellBlocks(keys)
@@ -65,46 +54,25 @@ class Surfels:
         centres, normals, widest, variances = planes_round(
             blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
         )
-        return cls(
-            cell_size_m=cell_size_m,
-            keys=keys,
-            blocks=blocks,
-            counts=of_cells[:, 0].copy(),
-            support=support,
-            cell_of_plane=cell_of_plane,
-            centres=centres,
-            normals=normals,
-            widest=widest,
-            variances=variances,
-        )
+        counts = of_cells[:, 0].copy()
+        planes = (cell_of_plane, centres, normals, variances, widest)
+        return cls(cell_size_m, keys, blocks, counts, support, *planes)
 
-    def is_flat(self, max_flatness: float = MAX_FLATNESS) -> NDArray[np.bool_]:
-        """(P,) bool, whether each surfel is thin compared with its extent."""
-        flat: NDArray[np.bool_] = self.variances[:, 0] < max_flatness * self.variances[:, 1]
+    def is_flat(self) -> NDArray[np.bool_]:
+        flat: NDArray[np.bool_] = self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]
         return flat
 
     def rough_share(self) -> float:
-        """Share of the returns that lie on no thin surface, of those in a cell with a surfel. 0 without surfels.
-
-        It tells clutter and rough ground from walls, whatever the number of returns. Measured: 0.02 to 0.06 on
-        simulated scenes without clutter, whole or of every tenth scan; 0.27 to 0.44 on five real drives.
-        """
+        """Share of the returns that lie on no thin surface, of those in a cell with a surfel. 0 without surfels."""
+        # Measured: 0.02 to 0.06 on simulated scenes without clutter, whole or of every tenth scan; 0.27 to 0.44 on five
+        # real drives.
         returns = self.counts[self.cell_of_plane]
         total = float(returns.sum())
         return 1 - float(returns[self.is_flat()].sum()) / total if total else 0.0
 
     def returns_per_cell(self) -> float:
-        """Mean number of returns in a cell. 0 without cells.
-
-        It tells how many false returns to expect in a place: as many times more as there are returns.
-        """
+        """Mean number of returns in a cell, to which false returns are proportional. 0 without cells."""
         return float(self.counts.sum()) / len(self.keys) if len(self.keys) else 0.0
-
-    def plane_of_cell(self, planes: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(C,) row of the surfel of each cell, -1 if it is none of the rows `planes`."""
-        plane_of_cell = np.full(len(self.keys), -1, np.int32)
-        plane_of_cell[self.cell_of_plane[planes]] = planes
-        return plane_of_cell
 
     def cells_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
         """(N,) row of the cell of each of the `points` (N, 3), local, m. -1: it holds no return."""
@@ -124,17 +92,16 @@ class Surfels:
         return self._flat_planes(self.cells_of_leaves(leaf_keys, num_threads))
 
     def _flat_planes(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        planes = self.plane_of_cell(np.flatnonzero(self.is_flat()))
-        return np.append(planes, np.int32(-1))[cells]  # the row -1, of no cell, is that of the last number
+        flat = np.flatnonzero(self.is_flat())
+        planes = np.full(len(self.keys) + 1, -1, np.int32)  # the last one is for the row -1, of no cell
+        planes[self.cell_of_plane[flat]] = flat
+        return planes[cells]
 
 
 def support_round(
     blocks: CellBlocks, keys: NDArray[np.uint64], of_cells: NDArray[np.float64], num_threads: int = 0
 ) -> NDArray[np.float64]:
-    """(K,) weighted number of returns in and round each of the cells with these `keys` (K,).
-
-    `of_cells`: as of :meth:`ScanSums.merged_moments`, of the cells of `blocks`.
-    """
+    """(K,) weighted number of returns in and around cells with these `keys` (K,). `of_cells`: moments of those of `blocks`."""
     counts = np.ascontiguousarray(of_cells[:, :1])
     support: NDArray[np.float64] = blocks.sum_round(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     return support

@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import (
     MAX_POSITION_M,
-    check_equal_numbers,
     check_scan_shape,
     check_scan_shapes,
-    check_values_of_scan,
+    check_values_of_scans,
     one_for_each_scan,
-    pose_matrices,
     real_array,
     usable_poses,
 )
@@ -32,7 +29,6 @@ from radarsdf.returns.intensities import Plausible
 
 _LOG = logging.getLogger("radarsdf.returns")
 _PADDING = 8  # rows that repeat the one before. Sensors with coarse cells repeat some
-_MISSING: Any = object()  # where there are fewer scans of one kind
 
 
 @dataclass(frozen=True)
@@ -44,20 +40,14 @@ class Rays:
 
     origin: NDArray[np.float64]
     """(3,) origin of the local frame in world coordinates, m: by default the mean sensor position."""
-    points: NDArray[np.float32]
-    """(N, 3) returns, m."""
-    directions: NDArray[np.float32]
-    """(N, 3) unit vectors from the sensor to the return."""
-    ranges_m: NDArray[np.float32]
-    """(N,) distance of the return from the sensor."""
+    points: NDArray[np.float32]  # (N, 3) returns, m
+    directions: NDArray[np.float32]  # (N, 3) unit vectors from the sensor to the return
+    ranges_m: NDArray[np.float32]  # (N,) distance of the return from the sensor
     intensities: NDArray[np.float32] | None
     """(N,) sensor units; NaN where it cannot belong to the others. None if there are no intensities."""
-    scans: NDArray[np.int32]
-    """(N,) scan of each return."""
-    up_of_scan: NDArray[np.float64]
-    """(F, 3) z axis of the sensor in each scan, local frame."""
-    num_given: int
-    """Number of returns that the scans hold, with those out of range."""
+    scans: NDArray[np.int32]  # (N,) scan of each return
+    up_of_scan: NDArray[np.float64]  # (F, 3) z axis of the sensor in each scan, local frame
+    num_given: int  # number of returns that the scans hold, with those out of range
 
     def __len__(self) -> int:
         return len(self.points)
@@ -89,11 +79,8 @@ class Rays:
         )
 
     def in_c_order(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """`points`, `directions` and `ranges_m` as the core takes them."""
-        points, directions, ranges_m = map(
-            np.ascontiguousarray, (self.points, self.directions, self.ranges_m)
-        )
-        return points, directions, ranges_m
+        points, directions = np.ascontiguousarray(self.points), np.ascontiguousarray(self.directions)
+        return points, directions, np.ascontiguousarray(self.ranges_m)
 
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns, and for each the sensor position it was seen from: (N, 3) and (N, 3) float64, world, m."""
@@ -119,27 +106,20 @@ def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
 class LeftOut:
     """What of the scans cannot be used."""
 
-    given: int = 0
-    """Number of rows."""
-    rows: int = 0
-    """Number of rows that are no returns: see :func:`measured`."""
-    empty: list[int] = dataclasses.field(default_factory=list)
-    """Scans without returns."""
-    poses: list[int] = dataclasses.field(default_factory=list)
-    """Scans whose pose is not a rigid transform."""
+    given: int = 0  # number of rows
+    rows: int = 0  # number of rows that are no returns: see :func:`measured`
+    empty: list[int] = dataclasses.field(default_factory=list)  # scans without returns
+    poses: list[int] = dataclasses.field(default_factory=list)  # scans whose pose is not a rigid transform
 
     @property
     def notes(self) -> list[str]:
-        """A sentence if anything is left out."""
         parts = []
         if self.rows:
             parts.append(f"{self.rows} of {self.given} returns (not finite, at the sensor, or padding)")
-        for scans, what in (
-            (self.empty, "without returns"),
-            (self.poses, "whose pose is not a rigid transform"),
-        ):
-            if scans:
-                parts.append(f"{len(scans)} scans {what} (the first is scan {scans[0]})")
+        kinds = ((self.empty, "without returns"), (self.poses, "whose pose is not a rigid transform"))
+        parts += [
+            f"{len(scans)} scans {what} (the first is scan {scans[0]})" for scans, what in kinds if scans
+        ]
         return [f"Left out: {', '.join(parts)}."] if parts else []
 
 
@@ -150,48 +130,27 @@ def check_scans(
 
     Rows that are no returns become 0 0 0, and intensities that are not finite NaN: arrays of a scan keep their length.
     """
-    left_out = LeftOut()
-    checked = list(_checked(points, intensities, left_out))
-    values = None if intensities is None else [value for _, value in checked if value is not None]
-    return [scan for scan, _ in checked], values, left_out
-
-
-def _checked(
-    points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None, left_out: LeftOut
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32] | None]]:
-    """:func:`check_scans`, one scan after another: only one is in float64 at a time."""
-    num_scans = num_values = 0
-    both = zip_longest(
-        points,
-        () if intensities is None else one_for_each_scan(intensities, "intensities"),
-        fillvalue=_MISSING,
-    )
-    for i, (given, given_values) in enumerate(both):
-        num_scans += given is not _MISSING
-        num_values += given_values is not _MISSING
-        if intensities is not None and num_scans != num_values:
-            continue  # they are only counted
+    scans, left_out = [], LeftOut()
+    for i, given in enumerate(one_for_each_scan(points, "points")):
         scan = real_array(given, f"scan {i}")
         check_scan_shape(scan, i)
-        values = None
-        if intensities is not None:
-            values = real_array(given_values, f"intensities of scan {i}", np.float32)
-            check_values_of_scan(values, scan, "intensities", i)
-            if not np.isfinite(values).all():
-                values = np.where(np.isfinite(values), values, np.float32(np.nan))
         returns = measured(scan)
         num_rows = len(scan) - int(np.count_nonzero(returns))
-        if num_rows:
-            scan = np.where(returns[:, None], scan, 0.0)
         left_out.given += len(scan)
         left_out.rows += num_rows
         if num_rows == len(scan):
             left_out.empty.append(i)
-        yield scan, values
-    if num_scans == 0:
+        scans.append(np.where(returns[:, None], scan, 0.0) if num_rows else scan)
+    if not scans:
         check_scan_shapes([])
-    if intensities is not None:
-        check_equal_numbers(num_values, num_scans, "intensities")
+    if intensities is None:
+        return scans, None, left_out
+    values = [
+        real_array(of_scan, f"intensities of scan {i}", np.float32)
+        for i, of_scan in enumerate(one_for_each_scan(intensities, "intensities"))
+    ]
+    check_values_of_scans(values, scans, "intensities")
+    return scans, [np.where(np.isfinite(v), v, np.float32(np.nan)) for v in values], left_out
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -210,7 +169,6 @@ def middle_scan(scan: int, scans: int, accumulate_scans: int) -> int:
 def within_ranges(
     scan: NDArray[np.float64], min_range_m: float, max_range_m: float | None
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of the returns of a scan (N, 3) within the ranges."""
     ranges = _lengths(scan)
     keep = (ranges > 0) & (ranges >= min_range_m)  # a return at the sensor itself has no direction
     return keep if max_range_m is None else keep & (ranges <= max_range_m)
@@ -228,43 +186,21 @@ def prepare(
     lattice: WorldLattice | None = None,
     whole: bool = True,
 ) -> Rays:
-    """Checks scans and turns them into rays in the local frame.
+    """Checks scans and turns them into rays in the local frame, scan by scan.
 
-    Parameters
-    ----------
-    points : iterable of F arrays
-        (N_i, 3) each, sensor frame, m. Each is needed only once, while it is its turn.
-    poses : array_like
-        (F, 4, 4) T_world_sensor, m.
-    intensities : iterable of F arrays, optional
-        (N_i,) each, sensor units. Those that are not finite become NaN.
-    min_range_m, max_range_m, accumulate_scans
-        See :class:`~radarsdf.config.groups.ReturnsConfig`.
-    origin : array_like, optional
-        (3,) origin of the local frame, world, m. By default the mean sensor position, moved to the next corner of a block
-        of the `lattice` if there is one, so that different scans share their cells.
-    whole : bool
-        False: these are a part of the scans, of which none need be within the ranges. Of whole scans, intensities that are
-        outliers become NaN.
+    `points`, `intensities`: F arrays (N_i, 3), sensor frame, m, and (N_i,), sensor units; `poses` (F, 4, 4) T_world_sensor, m.
+    The default `origin` is the mean sensor position, moved to the next corner of a block of the `lattice`, so that different
+    scans share their cells. `whole` False: these are a part of the scans, of which none need be within the ranges; of whole
+    scans, intensities that are outliers become NaN.
 
-    Returns
-    -------
-    Rays
-        The returns that are kept, scan by scan. Rows that are no returns (not finite, 0 0 0, padding), and scans whose pose
-        is not rigid, are left out, and counted in a warning of the logger ``radarsdf.returns``.
-
-    Raises
-    ------
-    ValueError
-        If lengths or shapes do not match, half of the poses or more are not rigid, all intensities are equal or are too
-        far apart for float32, or no return is within the ranges.
+    Rows that are no returns (not finite, 0 0 0, padding) and scans whose pose is not rigid are left out, with a warning of the
+    logger ``radarsdf.returns``. A ValueError if lengths or shapes do not match, half of the poses or more are not rigid, all
+    intensities are equal or are too far apart for float32, or no return is within the ranges.
     """
-    # Of an iterator, the number of scans is known only in the end.
-    points = one_for_each_scan(points, "points")
-    num_scans = len(points) if isinstance(points, Sized) else len(np.atleast_1d(real_array(poses, "poses")))
-    if num_scans == 0:
-        check_scan_shapes([])
+    scans, values, left_out = check_scans(points, intensities)
+    num_scans = len(scans)
     T_world_sensor, rigid = usable_poses(poses, num_scans)
+    left_out.poses = np.flatnonzero(~rigid).tolist()
     positions = T_world_sensor[:, :3, 3]
     if origin is not None:
         local_origin = check_positions(real_array(origin, "origin")[None], "origin")[0]
@@ -273,28 +209,27 @@ def prepare(
         if lattice is not None:
             local_origin = lattice.position(lattice.nearest_block(local_origin))
     kept: list[list[Any]] = [[], [], [], []]
-    number_of_scan, left_out = 0, LeftOut(poses=np.flatnonzero(~rigid).tolist())
-    for i, (scan, of_scan) in enumerate(_checked(points, intensities, left_out)):
-        number_of_scan = i + 1
-        if number_of_scan > num_scans:
-            continue  # it is only counted
+    for i, scan in enumerate(scans):
         seen_from = positions[middle_scan(i, num_scans, accumulate_scans)]
         keep = within_ranges(scan, min_range_m, max_range_m) & rigid[i]
-        values = None if of_scan is None else of_scan[keep]
         local = turned(scan if keep.all() else scan[keep], T_world_sensor[i, :3, :3])
         local += positions[i] - local_origin
-        polar = _directions_and_ranges(local - (seen_from - local_origin))
-        for column, part in zip(kept, (local.astype(np.float32), *polar, values), strict=True):
-            if part is not None:
-                column.append(part)
-    pose_matrices(poses, number_of_scan)
+        directions, ranges_m = _directions_and_ranges(local - (seen_from - local_origin))
+        columns = (
+            local.astype(np.float32),
+            directions,
+            ranges_m,
+            None if values is None else values[i][keep],
+        )
+        for column, part in zip(kept, columns, strict=True):
+            column.append(part)
     counts = [len(part) for part in kept[0]]
     if sum(counts) == 0 and whole:
         msg = f"none of {left_out.given} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
         raise ValueError("; ".join([msg, *left_out.notes]))
     for note in left_out.notes if whole else ():
         _LOG.warning(note)
-    intensity = None if intensities is None else _joined(kept[3])
+    intensity = None if values is None else np.concatenate(kept[3])
     if intensity is not None and whole:
         intensity = Plausible.of(intensity).kept(intensity)
         if np.isnan(intensity).all():
@@ -303,9 +238,9 @@ def prepare(
         check_range(float(np.nanmin(intensity)), float(np.nanmax(intensity)))
     return Rays(
         origin=local_origin,
-        points=_joined(kept[0]),
-        directions=_joined(kept[1]),
-        ranges_m=_joined(kept[2]),
+        points=np.concatenate(kept[0]),
+        directions=np.concatenate(kept[1]),
+        ranges_m=np.concatenate(kept[2]),
         intensities=intensity,
         scans=np.repeat(np.arange(num_scans, dtype=np.int32), counts),
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
@@ -347,13 +282,5 @@ def rays_from(
 
 
 def _directions_and_ranges(rays: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Unit vectors (N, 3) and lengths (N,) of rays (N, 3), m."""
     ranges = np.maximum(_lengths(rays), 1e-6)
     return (rays / ranges[:, None]).astype(np.float32), ranges.astype(np.float32)
-
-
-def _joined(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """One array of all, which are forgotten: only one column of the rays needs memory twice."""
-    whole = np.concatenate(parts)
-    parts.clear()
-    return whole

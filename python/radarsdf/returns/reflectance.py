@@ -55,22 +55,18 @@ class Reflectance:
     It is their intensity in [0, 1], or what is added to the answer of a network.
     """
 
-    leaf_size_m: float
-    """Edge of a leaf cell, m."""
-    coefficients: NDArray[np.float64]
-    """(3, 14) of the regressions: see :class:`~radarsdf.returns.response.Response`."""
-    table: Float32
-    """(48, 96) of what the first of them leaves, by range and elevation."""
-    plane_keys: NDArray[np.uint64]
-    """(P,) Morton keys of the surfels' cells with a plane, ascending."""
-    normals: Float32
-    """(P, 3) unit normals of these planes, local frame."""
-    mean_keys: NDArray[np.uint64]
-    """(M,) keys of the cells with means."""
-    means: NDArray[np.float16]
-    """(M,) means in them of what the regression leaves."""
-    network_share: float = 0.0
-    """The answer of the intensity network counts so many times; the quantity is added to that."""
+    leaf_size_m: float  # edge of a leaf cell, m
+    coefficients: NDArray[
+        np.float64
+    ]  # (3, 14) of the regressions: see :class:`~radarsdf.returns.response.Response`
+    table: Float32  # (48, 96) of what the first of them leaves, by range and elevation
+    plane_keys: NDArray[np.uint64]  # (P,) Morton keys of the surfels' cells with a plane, ascending
+    normals: Float32  # (P, 3) unit normals of these planes, local frame
+    mean_keys: NDArray[np.uint64]  # (M,) keys of the cells with means
+    means: NDArray[np.float16]  # (M,) means in them of what the regression leaves
+    network_share: float = (
+        0.0  # factor on the answer of the intensity network, to which the quantity is added
+    )
 
     @cached_property
     def _response(self) -> Response:
@@ -104,10 +100,10 @@ class Reflectance:
         ask: Ask | None = None,
         num_threads: int = 0,
     ) -> Reflectance:
-        """The reflectance of `rays`, with ghosts: a sensor sees these again. The same bits with any number of threads.
+        """The reflectance of `rays`, with ghosts: a sensor sees these again.
 
-        `unit` (N,): their intensities, scaled to [0, 1]. `surfels`: of the same returns, or of more. `ask`: what a network
-        answers, intensities (M,) at points (M, 3) seen along directions (M, 3) from ranges (M,). None: there is no network.
+        `unit` (N,): their intensities, scaled to [0, 1]. `surfels`: of the same returns, or of more. `ask`: intensities (M,)
+        by a network at points (M, 3) seen along directions (M, 3) from ranges (M,). None: there is no network.
         """
         flat = np.flatnonzero(surfels.is_flat())
         normals = surfels.normals.astype(np.float32)
@@ -125,19 +121,12 @@ class Reflectance:
         left = unit - response.at(directions, ranges_m, incidence, kinds)
         incidence = groups.means(incidence)
         del plane, kinds  # of each return
-        keys, means, explained = fit_cell_means(
-            _in_metres(_KINDS, leaf_size_m),
-            _TILINGS,
-            groups.points,
-            groups.directions,
-            incidence,
-            groups.means(left),
-            groups.weights,
-            _SHRINKAGE,
-            _ROUNDS,
-            _LEAST_MEAN,
-            num_threads,
+        kinds_m, columns = _in_metres(_KINDS, leaf_size_m), (groups.points, groups.directions, incidence)
+        values, options = (
+            (groups.means(left), groups.weights),
+            (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads),
         )
+        keys, means, explained = fit_cell_means(kinds_m, _TILINGS, *columns, *values, *options)
         # The cells have means, and the error that counts is the absolute one, whose centre is the median.
         coefficients = response.coefficients.copy()
         coefficients[:, 0] += np.median(left - groups.of_returns(explained))
@@ -188,48 +177,35 @@ def _unit_vectors(directions: Float32) -> Float32:
 class _Groups:
     """Returns that are close and seen alike. A group is one return, unless there are many."""
 
-    rows: NDArray[np.int32] | None
-    """(N,) row of each return's group. None: each is alone."""
-    points: Float32
-    """(G, 3) mean point, local frame, m."""
-    directions: Float32
-    """(G, 3) mean direction."""
-    counts: NDArray[np.float64]
-    """(G,) number of returns."""
+    rows: NDArray[np.int32] | None  # (N,) row of each return's group. None: each is alone
+    points: Float32  # (G, 3) mean point, local frame, m
+    directions: Float32  # (G, 3) mean direction
+    counts: NDArray[np.float64]  # (G,) number of returns
 
     @classmethod
     def of(
-        cls,
-        points: Float32,
-        directions: Float32,
-        incidence_rad: Float32,
-        leaf_size_m: float,
-        most: int,
+        cls, points: Float32, directions: Float32, incidence_rad: Float32, leaf_size_m: float, most: int
     ) -> _Groups:
         if len(points) <= most:
             return cls(None, points, directions, np.ones(len(points)))
         rows, count = cell_rows(_in_metres(_GROUPS, leaf_size_m), points, directions, incidence_rad)
         counts = np.bincount(rows, minlength=count).astype(np.float64)
-
-        def means(columns: Float32) -> Float32:
-            sums = np.stack([np.bincount(rows, column, count) for column in columns.T], 1)
-            return _divided(sums, counts)
-
-        return cls(rows, means(points), means(directions), counts)
+        means = [
+            _divided(np.stack([np.bincount(rows, column, count) for column in columns.T], 1), counts)
+            for columns in (points, directions)
+        ]
+        return cls(rows, means[0], means[1], counts)
 
     @property
     def weights(self) -> Float32:
-        """(G,)."""
         return (self.counts / (1 + _CORRELATION * (self.counts - 1))).astype(np.float32)
 
     def means(self, values: Float32) -> Float32:
-        """(G,) of values (N,) of the returns."""
         if self.rows is None:
             return np.ascontiguousarray(values)
         return _divided(np.bincount(self.rows, values, len(self.counts)), self.counts)
 
     def of_returns(self, values: Float32) -> Float32:
-        """(N,) of values (G,) of the groups."""
         return values if self.rows is None else values[self.rows]
 
 

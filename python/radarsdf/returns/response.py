@@ -36,11 +36,8 @@ NUM_COEFFICIENTS = _BASE + 4 + len(_LOBES_RAD)
 # in bins of a table, smoothed with normal kernels, from wide ones to narrow ones.
 TABLE_SHAPE = (48, 96)
 _LOG_RANGES = (np.log10(0.5), np.log10(200.0))  # of the table, m
-_KERNELS = (
-    (0.22, 0.083),
-    (0.11, 0.042),
-    (0.055, 0.021),
-)  # standard deviations in log10(range) and sine of elevation
+# Standard deviations in log10(range) and sine of elevation.
+_KERNELS = ((0.22, 0.083), (0.11, 0.042), (0.055, 0.021))
 _TABLE_SHRINKAGE = 1.0  # 0.5 to 2 differ by up to 2 %
 
 
@@ -48,10 +45,10 @@ _TABLE_SHRINKAGE = 1.0  # 0.5 to 2 differ by up to 2 %
 class Response:
     """A quantity of returns as a function of range, elevation, incidence and the kind of surface."""
 
-    coefficients: NDArray[np.float64]
-    """(3, 14) of the regression, for each kind of surface: `NO_SURFACE`, `LEVEL`, `STEEP`."""
-    table: Float32
-    """(48, 96) by range and elevation, of what the first of them leaves."""
+    coefficients: NDArray[
+        np.float64
+    ]  # (3, 14) of the regression, for each kind: `NO_SURFACE`, `LEVEL`, `STEEP`
+    table: Float32  # (48, 96) by range and elevation, of what the first of them leaves
 
     @classmethod
     @np.errstate(under="ignore")  # of lobes and kernels far from their middle
@@ -88,33 +85,17 @@ class Response:
         tables = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in self.coefficients]
         found = np.empty(len(kinds), np.float32)
         for first in range(0, len(kinds), _ROWS_AT_ONCE):
-            part = slice(first, first + _ROWS_AT_ONCE)
-            found[part] = self._of_block(
-                directions[part], ranges_m[part], incidence_rad[part], kinds[part], tables
-            )
-        return found
-
-    def _of_block(
-        self,
-        directions: Float32,
-        ranges_m: Float32,
-        incidence_rad: Float32,
-        kinds: NDArray[np.int8],
-        tables: list[Float32],
-    ) -> Float32:
-        """Some of :meth:`at`. `tables`: for each kind, the response to `_ANGLES_RAD`."""
-        found = np.empty(len(kinds), np.float32)
-        for kind in range(NUM_KINDS):
-            own = np.flatnonzero(kinds == kind)
-            columns = _of_ray(directions[own], ranges_m[own])
-            values = _weighted_sum(self.coefficients[kind, :_BASE], columns.T)
-            if kind == NO_SURFACE:
-                values += self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
-            else:
-                # The nearest angle of the table: to interpolate would take more time than all else.
-                nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
-                values += tables[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
-            found[own] = values
+            for kind in range(NUM_KINDS):
+                own = first + np.flatnonzero(kinds[first : first + _ROWS_AT_ONCE] == kind)
+                columns = _of_ray(directions[own], ranges_m[own])
+                values = _weighted_sum(self.coefficients[kind, :_BASE], columns.T)
+                if kind == NO_SURFACE:
+                    values += self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
+                else:
+                    # The nearest angle of the table: to interpolate would take more time than all else.
+                    nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
+                    values += tables[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
+                found[own] = values
         return found
 
 
@@ -183,18 +164,11 @@ def _smooth_means(bins: NDArray[np.int32], values: NDArray[np.float64]) -> NDArr
     for _ in range(2):
         error = np.abs(values - means.ravel()[bins])
         weights = 1 / np.hypot(1, error / max(2 * float(np.median(error)), 1e-9)) if means.any() else weights
-        sums, masses = (
-            np.bincount(bins, w, means.size).reshape(TABLE_SHAPE) for w in (weights * values, weights)
-        )
+        tables = [np.bincount(bins, w, means.size).reshape(TABLE_SHAPE) for w in (weights * values, weights)]
         means = np.zeros(TABLE_SHAPE)
         for widths in _KERNELS:
-            by_range, by_elevation = (
-                _kernel(size, width / step)
-                for size, width, step in zip(TABLE_SHAPE, widths, steps, strict=True)
-            )
-            smooth_sums, smooth_masses = (
-                product(product(by_range, table), by_elevation) for table in (sums, masses)
-            )
+            by_range, by_elevation = map(_kernel, TABLE_SHAPE, np.divide(widths, steps).tolist())
+            smooth_sums, smooth_masses = (product(product(by_range, t), by_elevation) for t in tables)
             means = (smooth_sums + _TABLE_SHRINKAGE * means) / (smooth_masses + _TABLE_SHRINKAGE)
     return means
 

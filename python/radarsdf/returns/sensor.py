@@ -62,21 +62,18 @@ class Sensor:
             ("elevation_rad", -math.pi / 2, math.pi / 2),
             ("range_m", 0.0, _MAX_RANGE_M),
         ):
-            first, last = (number(value, name) for value in _pair(getattr(self, name), name))
+            first, last = limits = _pair(getattr(self, name), name)
             if not low <= first < last <= high:
                 msg = f"{name} must be two ascending numbers in [{low:.4g}, {high:.4g}], not {first:.6g} and {last:.6g}"
                 raise ValueError(msg)
-            object.__setattr__(self, name, (first, last))
+            object.__setattr__(self, name, limits)
         if not 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7:
             msg = f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}"
             raise ValueError(msg)
         if any(not 0 <= number(value, "noise") < math.inf for value in dataclasses.astuple(self.noise)):
             msg = f"noise must be finite and at least 0, not {self.noise}"
             raise ValueError(msg)
-        steps = tuple(
-            (number(a, "thresholds"), number(b, "thresholds"))
-            for a, b in (_pair(step, "thresholds") for step in self.thresholds)
-        )
+        steps = tuple(_pair(step, "thresholds") for step in self.thresholds)
         if any(a >= b for (a, _), (b, _) in itertools.pairwise(steps)):
             msg = "thresholds must have ascending ranges"
             raise ValueError(msg)
@@ -88,7 +85,18 @@ class Sensor:
         return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
 
     def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
-        """(N,) the weakest intensity that is detected at ranges (N,), m, sensor units. -inf without `thresholds`."""
+        """Interpolate the weakest intensity that is detected.
+
+        Parameters
+        ----------
+        ranges_m : (N,) ndarray
+            Ranges, m. Beyond the first and the last of `thresholds`, theirs count.
+
+        Returns
+        -------
+        (N,) ndarray of float64
+            Intensities, sensor units. -inf if the sensor has no `thresholds`.
+        """
         if not self.thresholds:
             return np.full(len(ranges_m), -np.inf)
         at_m, weakest = np.transpose(self.thresholds)
@@ -96,20 +104,40 @@ class Sensor:
         return interpolated
 
     def directions(self, azimuth_rad: NDArray[Any], elevation_rad: NDArray[Any]) -> NDArray[np.float64]:
-        """Unit vectors (N, 3), sensor frame, of azimuths and elevations (N,)."""
+        """Convert azimuths and elevations to unit vectors.
+
+        Parameters
+        ----------
+        azimuth_rad, elevation_rad : (N,) ndarray
+            Angles in the sensor frame, rad.
+
+        Returns
+        -------
+        (N, 3) ndarray of float64
+            Unit vectors, sensor frame.
+        """
+        x, y = np.cos(azimuth_rad), np.sin(azimuth_rad)
         cosine = np.cos(elevation_rad)
-        return np.stack(
-            [cosine * np.cos(azimuth_rad), cosine * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=1
-        )
+        return np.stack([cosine * x, cosine * y, np.sin(elevation_rad)], axis=1)
 
     def to_dict(self) -> dict[str, Any]:
-        """What JSON can store. :meth:`from_dict` makes an equal sensor of it."""
-        described = dataclasses.asdict(self)
-        return described | {"thresholds": [list(step) for step in self.thresholds]}
+        """Return the numbers as a dict that JSON can store. :meth:`from_dict` is the inverse."""
+        return dataclasses.asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
 
     @classmethod
     def from_dict(cls, described: dict[str, Any]) -> Sensor:
-        """The inverse of :meth:`to_dict`."""
+        """Build a sensor from the dict of :meth:`to_dict`.
+
+        Parameters
+        ----------
+        described : dict
+            Values by the names of the attributes; `noise` is a dict, too.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a number is out of range, or a name is missing or unknown.
+        """
         return cls(**described | {"noise": SensorNoise(**described["noise"])})
 
     @classmethod
@@ -122,23 +150,9 @@ class Sensor:
         min_range_m: float = 0.0,
         max_range_m: float | None = None,
     ) -> Sensor:
-        """The sensor that took scans.
+        """The sensor that took scans (N_i, 3), sensor frame, m, with intensities (N_i,), sensor units; NaN where there is none.
 
-        Parameters
-        ----------
-        points : sequence of F arrays, or Scans
-            (N_i, 3) each: the returns of one scan, sensor frame, m. `Scans` bring their intensities.
-        intensities : sequence of F arrays, optional
-            (N_i,) each, sensor units; NaN where there is none. Those that cannot belong to the others do not count.
-        noise : SensorNoise, optional
-            See :func:`radarsdf.returns.noise.sensor_noise`. Default: none.
-        min_range_m, max_range_m : float
-            Returns outside these ranges do not count, m. `max_range_m` None: no limit.
-
-        Raises
-        ------
-        ValueError
-            If there is no return within the ranges, or returns are all in one direction.
+        Returns outside the ranges do not count. A ValueError if none is left, or all are in one direction.
         """
         if isinstance(points, Scans):
             intensities = points.intensities if intensities is None else intensities
@@ -169,15 +183,11 @@ class Sensor:
         scans = rays.scans[rows]
         # Coordinate by coordinate: a matrix for each return takes three times as long.
         from_sensor = rays.points[rows].T - (T_world_sensor[:, :3, 3] - rays.origin)[scans].T
-        turned_back = [
-            sum(T_world_sensor[:, j, i][scans] * from_sensor[j] for j in range(3)) for i in range(3)
-        ]
-        return cls._of_returns(
-            np.stack(turned_back, 1),
-            None if rays.intensities is None else rays.intensities[rows].astype(np.float64),
-            np.bincount(rays.scans, minlength=len(T_world_sensor)),
-            noise,
-        )
+        R = T_world_sensor[:, :3, :3]
+        turned_back = [sum(R[:, j, i][scans] * from_sensor[j] for j in range(3)) for i in range(3)]
+        values = None if rays.intensities is None else rays.intensities[rows].astype(np.float64)
+        per_scan = np.bincount(rays.scans, minlength=len(T_world_sensor))
+        return cls._of_returns(np.stack(turned_back, 1), values, per_scan, noise)
 
     @classmethod
     def _of_returns(
@@ -187,7 +197,6 @@ class Sensor:
         per_scan: NDArray[np.int64],
         noise: SensorNoise | None,
     ) -> Sensor:
-        """Of returns (N, 3), sensor frame, m, with their intensities (N,), and the number of returns (F,) in each scan."""
         x, y, z = returns.T
         range_m = np.sqrt(x * x + y * y + z * z)
         known = np.isfinite(range_m if values is None else values)
@@ -201,11 +210,11 @@ class Sensor:
         )
 
 
-def _pair(values: Any, name: str) -> tuple[Any, Any]:
+def _pair(values: Any, name: str) -> tuple[float, float]:
     if not isinstance(values, (tuple, list)) or len(values) != 2:
         msg = f"{name} must be two numbers, not {values!r:.50}"
         raise ValueError(msg)
-    return values[0], values[1]
+    return number(values[0], name), number(values[1], name)
 
 
 def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
@@ -222,7 +231,5 @@ def _thresholds(
     """Middle of each bin of ranges with as many returns, and the weakest intensity there, apart from stray ones."""
     order = np.argsort(ranges_m)
     bins = [part for part in np.array_split(order, _RANGE_BINS) if len(part)]
-    found = {
-        float(np.median(ranges_m[part])): float(np.quantile(intensities[part], _WEAKEST)) for part in bins
-    }
-    return tuple(sorted(found.items()))
+    of_bins = ((np.median(ranges_m[part]), np.quantile(intensities[part], _WEAKEST)) for part in bins)
+    return tuple(sorted({float(range_m): float(weakest) for range_m, weakest in of_bins}.items()))

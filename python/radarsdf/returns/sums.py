@@ -18,9 +18,7 @@ MAX_CELLS_FROM_ORIGIN = 1_000_000
 """Farthest cell along each axis. A Morton key has 21 bits for each axis."""
 
 _AXIS_BITS = 21  # of a key, interleaved with those of the other axes
-_QUARTER = np.uint64(
-    0b111 << (3 * (_AXIS_BITS - 2))
-)  # of the bits of a key: those that say in which quarter of the axes
+_QUARTER = np.uint64(0b111 << (3 * (_AXIS_BITS - 2)))  # bits of a key: in which quarter of the axes
 _COMPACTED = (
     (2, 0x10C30C30C30C30C3),
     (4, 0x100F00F00F00F00F),
@@ -54,16 +52,12 @@ def merged_keys(keys: NDArray[np.uint64]) -> NDArray[np.uint64]:
 class ReturnCells:
     """The cells that hold returns."""
 
-    keys: NDArray[np.uint64]
-    """(C,) Morton keys of the cells, ascending."""
-    blocks: CellBlocks
-    """Finds the row of a cell from its key."""
-    cell_of_ray: NDArray[np.int32]
-    """(N,) row of each return's cell."""
+    keys: NDArray[np.uint64]  # (C,) Morton keys of the cells, ascending
+    blocks: CellBlocks  # finds the row of a cell from its key
+    cell_of_ray: NDArray[np.int32]  # (N,) row of each return's cell
 
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> ReturnCells:
-        """The cells of this size, m, that hold returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         points = np.ascontiguousarray(rays.points)
         occupied = CellSet(cell_size_m)
         occupied.insert(points, num_threads)
@@ -75,7 +69,6 @@ class ReturnCells:
 
     @cached_property
     def counts(self) -> NDArray[np.float64]:
-        """(C,) number of returns in each cell."""
         return np.bincount(self.cell_of_ray, minlength=len(self.keys)).astype(np.float64)
 
 
@@ -96,36 +89,25 @@ class ScanSums:
     and one that a scan was taken out of again, have the same sums to the last bit, in any order.
     """
 
-    leaf_size_m: float
-    """Edge of a leaf cell, m."""
-    keys: NDArray[np.uint64]
-    """(C,) Morton keys of the leaf cells with returns, ascending."""
+    leaf_size_m: float  # edge of a leaf cell, m
+    keys: NDArray[np.uint64]  # (C,) Morton keys of the leaf cells with returns, ascending
+    # (C, 14) of 1, x, y, z, xx, xy, xz, yy, yz, zz, the direction (3) of the ray, and its range. Positions are in quanta from
+    # the corner of the cell, ranges in quanta, directions times DIRECTION_QUANTA.
     sums: NDArray[np.int64]
-    """(C, 14) of 1, x, y, z, xx, xy, xz, yy, yz, zz, the direction (3) of the ray, and its range. Positions are in quanta from
-    the corner of the cell, ranges in quanta, directions times ``DIRECTION_QUANTA``."""
-    scans: NDArray[np.uint32]
-    """(C,) number of different scans with returns."""
+    scans: NDArray[np.uint32]  # (C,) number of different scans with returns
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
-        """Of the returns of `rays`. `num_threads` 0: as many as OpenMP uses."""
         cells = ReturnCells.of(rays, leaf_size_m, num_threads)
-        sums = sum_returns(
-            *rays.in_c_order(),
-            cells.cell_of_ray,
-            _corners(cells.keys),
-            leaf_size_m / QUANTA,
-            num_threads,
-        )
+        corners, quantum_m = _corners(cells.keys), leaf_size_m / QUANTA
+        sums = sum_returns(*rays.in_c_order(), cells.cell_of_ray, corners, quantum_m, num_threads)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         return cls(leaf_size_m, cells.keys, sums, scans)
 
     def __add__(self, other: ScanSums) -> ScanSums:
-        """With other scans, too."""
         return self._with(other, 1)
 
     def __sub__(self, other: ScanSums) -> ScanSums:
-        """Without scans that were added. Cells without returns go."""
         return self._with(other, -1)
 
     def _with(self, other: ScanSums, sign: int) -> ScanSums:
@@ -144,7 +126,6 @@ class ScanSums:
 
     @property
     def counts(self) -> NDArray[np.float64]:
-        """(C,) number of returns in each cell."""
         return self.sums[:, _COUNT].astype(np.float64)
 
     @property
@@ -174,10 +155,8 @@ class ScanSums:
         keys = merged_keys(self.keys)
         first = np.flatnonzero(np.diff(keys, prepend=keys[:1] + np.uint64(1)))
         # Cells, not returns, are moved to the corner that they share: in integers, which is exact.
-        steps = np.stack([self.keys >> np.uint64(axis) & np.uint64(1) for axis in range(3)], 1).astype(
-            np.int64
-        )
-        inner = _moved(self.sums[:, :_RANGE], steps * QUANTA)
+        steps = np.stack([self.keys >> np.uint64(axis) & np.uint64(1) for axis in range(3)], 1)
+        inner = _moved(self.sums[:, :_RANGE], steps.astype(np.int64) * QUANTA)
         merged = np.add.reduceat(inner, first) if len(first) else inner
         keys = keys[first]
         quantum_m = self.leaf_size_m / QUANTA
@@ -208,33 +187,23 @@ _MIN_LENGTH = 1e-6  # of the mean of unit directions. A shorter one has no meani
 
 @dataclass(frozen=True)
 class MeanRays:
-    """The mean ray of each cell.
+    """The mean ray of each cell. Measured: the average over them is as good as over all, two to three times as many."""
 
-    Measured: as a start of the training, the average over mean rays is as good as over all rays, of which
-    there are two to three times as many.
-    """
-
-    keys: NDArray[np.uint64]
-    """(M,) Morton keys of the cells, ascending."""
-    points: NDArray[np.float32]
-    """(M, 3) mean of the returns in each cell, local, m."""
-    directions: NDArray[np.float32]
-    """(M, 3) mean direction of their rays, unit vectors. Downwards where rays from opposite sides leave none."""
-    counts: NDArray[np.float32]
-    """(M,) number of returns in each cell."""
-    scans: NDArray[np.uint32]
-    """(M,) number of different scans that they are of."""
-    ranges_m: NDArray[np.float32]
-    """(M,) mean range of the returns in each cell, m."""
+    keys: NDArray[np.uint64]  # (M,) Morton keys of the cells, ascending
+    points: NDArray[np.float32]  # (M, 3) mean of the returns in each cell, local, m
+    directions: NDArray[
+        np.float32
+    ]  # (M, 3) mean of their rays, unit vectors; downwards where opposite rays leave none
+    counts: NDArray[np.float32]  # (M,) number of returns in each cell
+    scans: NDArray[np.uint32]  # (M,) number of different scans that they are of
+    ranges_m: NDArray[np.float32]  # (M,) mean range of the returns in each cell, m
 
     @classmethod
     def of_sums(cls, sums: ScanSums) -> MeanRays:
-        """The mean rays of scans that are known by their `sums`."""
         directions = sums.mean_directions
         lengths = np.linalg.norm(directions, axis=1)[:, None]
-        directions = np.where(
-            lengths > _MIN_LENGTH, directions / np.maximum(lengths, _MIN_LENGTH), [0.0, 0.0, -1.0]
-        )
+        unit = directions / np.maximum(lengths, _MIN_LENGTH)
+        directions = np.where(lengths > _MIN_LENGTH, unit, [0.0, 0.0, -1.0])
         return cls(
             keys=sums.keys,
             points=sums.mean_points.astype(np.float32),
@@ -245,15 +214,15 @@ class MeanRays:
         )
 
     def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
-        """The mean rays of some of the cells: a mask (M,) bool, or row numbers."""
-        return MeanRays(
-            self.keys[part],
-            self.points[part],
-            self.directions[part],
-            self.counts[part],
-            self.scans[part],
-            self.ranges_m[part],
+        columns: tuple[NDArray[Any], ...] = (
+            self.keys,
+            self.points,
+            self.directions,
+            self.counts,
+            self.scans,
+            self.ranges_m,
         )
+        return MeanRays(*(column[part] for column in columns))
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
         """(C,) uint64, ascending Morton keys of the leaf cells that rays cross within `reach_m` of their returns."""

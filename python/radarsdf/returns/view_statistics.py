@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,72 +29,51 @@ _MOST = 2**16 - 1  # returns of a mean that are counted
 def rows_of_views(
     points: Floating, directions: Floating, ranges_m: Floating, leaf_size_m: float
 ) -> tuple[NDArray[np.int32], int]:
-    """The number (N,) of place and view of returns at points (N, 3), m, seen along directions (N, 3), and how many there are."""
+    """The group (N,) by place and view of returns at points (N, 3), m, seen along directions (N, 3), and how many there are."""
     # The core's third step is of any number.
     kind = np.array([[PLACE_CELLS * leaf_size_m, _DIRECTION_STEP, _LOG_RANGE_STEP]])
     log_ranges = np.log(np.maximum(ranges_m, 1e-6))
     return cell_rows(kind, *(np.ascontiguousarray(a, np.float32) for a in (points, directions, log_ranges)))
 
 
+_COLUMNS = ("points", "directions", "ranges_m", "intensities", "counts")
+
+
 @dataclass(frozen=True)
 class EchoesAt:
     """Means of returns that are close and seen alike, in the world."""
 
-    points: NDArray[np.float64]
-    """(G, 3) mean place, m."""
-    directions: NDArray[np.float64]
-    """(G, 3) unit vectors from the sensor."""
-    ranges_m: NDArray[np.float64]
-    """(G,) mean range."""
-    intensities: NDArray[np.float64]
-    """(G,) mean intensity, sensor units."""
-    counts: NDArray[np.float64]
-    """(G,) returns."""
-    sigma: float
-    """Standard deviation of single returns from the mean of those that are close and seen alike, sensor units."""
+    points: NDArray[np.float64]  # (G, 3) mean place, m
+    directions: NDArray[np.float64]  # (G, 3) unit vectors from the sensor
+    ranges_m: NDArray[np.float64]  # (G,) mean range
+    intensities: NDArray[np.float64]  # (G,) mean intensity, sensor units
+    counts: NDArray[np.float64]  # (G,) returns
+    sigma: float  # standard deviation of single returns from the mean of those that are close and seen alike
 
     def select(self, chosen: NDArray[np.bool_]) -> EchoesAt:
-        """Some (G,) of them."""
-        return EchoesAt(
-            self.points[chosen], self.directions[chosen], self.ranges_m[chosen], self.intensities[chosen],
-            self.counts[chosen], self.sigma,
-        )  # fmt: skip
+        return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @classmethod
     def together(cls, parts: Sequence[EchoesAt]) -> EchoesAt:
-        """All of several, of which there is at least one."""
         weights = np.array([max(float(part.counts.sum()), 1.0) for part in parts])
         variances = np.array([part.sigma**2 for part in parts])
-        return cls(
-            np.concatenate([part.points for part in parts]),
-            np.concatenate([part.directions for part in parts]),
-            np.concatenate([part.ranges_m for part in parts]),
-            np.concatenate([part.intensities for part in parts]),
-            np.concatenate([part.counts for part in parts]),
-            float(np.sqrt((weights * variances).sum() / weights.sum())),
-        )
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
+        return cls(**columns, sigma=float(np.sqrt((weights * variances).sum() / weights.sum())))
 
 
 @dataclass(frozen=True)
 class Echoes:
     """Means of returns that are close and seen alike, as a map keeps them: 23 bytes each."""
 
-    points: Float32
-    """(G, 3) mean place, local frame, m."""
-    directions: NDArray[np.int8]
-    """(G, 3) mean direction from the sensor, a unit vector times 127."""
-    ranges_m: NDArray[np.float16]
-    """(G,) mean range."""
-    intensities: Float32
-    """(G,) mean intensity, of which the range of the training intensities is [0, 1]."""
-    counts: NDArray[np.int16]
-    """(G,) returns, of which the first 65,535 are counted, as a number without a sign."""
-    sigma: float
-    """Standard deviation of single returns from the mean of those that are close and seen alike, likewise."""
+    points: Float32  # (G, 3) mean place, local frame, m
+    directions: NDArray[np.int8]  # (G, 3) mean direction from the sensor, a unit vector times 127
+    ranges_m: NDArray[np.float16]  # (G,) mean range
+    intensities: Float32  # (G,) mean intensity, of which the range of the training intensities is [0, 1]
+    counts: NDArray[np.int16]  # (G,) returns, up to 65,535, as a number without a sign
+    sigma: float  # standard deviation of single returns from the mean of those that are close and seen alike
 
     @classmethod
     def of(cls, rays: Rays, unit: Float32, leaf_size_m: float) -> Echoes:
-        """Of `rays` with intensities (N,) in [0, 1]."""
         rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, leaf_size_m)
         counts = np.bincount(rows, minlength=count)
         of_returns = unit.astype(np.float64)
@@ -117,24 +97,19 @@ class Echoes:
 
     @classmethod
     def none(cls) -> Echoes:
-        """Those of a map that keeps none."""
         empty = np.zeros((0, 3), np.float32)
-        return cls(empty, empty.astype(np.int8), np.zeros(0, np.float16), np.zeros(0, np.float32), np.zeros(0, np.int16), 0.0)  # fmt: skip
+        none = empty[:, 0]
+        return cls(empty, empty.astype(np.int8), none.astype(np.float16), none, none.astype(np.int16), 0.0)
 
     def check(self, leaf_size_m: float) -> None:
         """Raises a ValueError unless arrays of a file are what they should be."""
-        count = len(self.counts)
-        shapes = [self.points.shape, self.directions.shape, self.ranges_m.shape, self.intensities.shape]
-        limit_m = MAX_CELLS_FROM_ORIGIN * leaf_size_m
-        if shapes != [(count, 3), (count, 3), (count,), (count,)] or self.counts.ndim != 1:
+        count, limit_m = len(self.counts), MAX_CELLS_FROM_ORIGIN * leaf_size_m
+        shapes = [getattr(self, name).shape for name in _COLUMNS]
+        if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
             msg = "the echoes have arrays of wrong shapes"
             raise ValueError(msg)
-        if not (
-            (np.abs(self.points) <= limit_m).all()
-            and (self.ranges_m >= 0).all()
-            and (self.counts.view(np.uint16) > 0).all()
-            and 0 <= self.sigma < np.inf
-        ):
+        near = (np.abs(self.points) <= limit_m).all() and (self.ranges_m >= 0).all()
+        if not (near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf):
             msg = "the echoes hold numbers out of range"
             raise ValueError(msg)
 
