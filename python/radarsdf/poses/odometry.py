@@ -21,16 +21,16 @@ from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, doppler_sign
 from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, followed
 from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
-from radarsdf.poses.imu import Inertial, implausible_rates, levelled
+from radarsdf.poses.gyroscope import UnusableGyroscopeError
+from radarsdf.poses.imu import Inertial, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
 from radarsdf.returns.rays import within_ranges
 from radarsdf.threads import Workers
 
-# Of the variance of a step's rotation, that the returns must take away. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
-# which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
+# Share of the variance of a step's rotation that the returns must remove. Over the scans whose planes are kept, this adds up to
+# all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_TOLD_TURN = 1 / WINDOW
 _MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
 
@@ -41,7 +41,7 @@ class NotToldError(ValueError):
 
 @dataclass(frozen=True)
 class Odometry:
-    """Poses that were estimated without any being given."""
+    """Poses that were estimated from the radar alone."""
 
     poses: Floats
     """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
@@ -78,7 +78,7 @@ def odometry(
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> Odometry:
-    """Estimates the poses of scans from the radar alone.
+    """Estimate the poses of scans from the radar alone.
 
     Fits each scan to the planes of the scans before it, starting from Doppler, a gyroscope or the motion so far; over a gap, by a
     search. Then adjusts all scans at once, as :func:`refine_poses` does. The motion prior, the noise of the sensor and the bias of
@@ -87,7 +87,7 @@ def odometry(
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, times and Doppler are used
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, times and Doppler are used
         where none are given here.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured.
@@ -113,6 +113,8 @@ def odometry(
 
     Raises
     ------
+    TypeError
+        If an argument has the wrong type.
     ValueError
         If scans, Doppler, times or rates are invalid, if there are no times, or if nothing measures a part of the motion:
         without Doppler, the position along a wall; without a gyroscope, the turns of a radar with few returns that is slower
@@ -144,34 +146,30 @@ def odometry(
         sign = doppler_sign(checked.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
     if angular_velocity is not None:
-        at = times_s if angular_velocity_times_s is None else angular_velocity_times_s
-        rates, at_s = _checked_rates(angular_velocity, at, checked)
-        inertial = Inertial(Gyroscope.of(rates, at_s, times_s))
-        if (why := implausible_rates(rates, velocities)) is not None:
-            inertial = inertial.without(why)
-    else:
-        used = points.imu if imu is None and isinstance(points, Scans) else imu
-        inertial = Inertial.of(used, velocities, times_s, checked.begin_s)
+        at_s = times_s + checked.begin_s if angular_velocity_times_s is None else angular_velocity_times_s
+        imu = _checked_imu(angular_velocity, at_s)
+    elif imu is None and isinstance(points, Scans):
+        imu = points.imu
+    inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
     limits = config.returns
     with Workers(config.num_threads) as workers:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
-        notes = [*checked.notes]
         try:
             drive, tracked = followed(drive, config, workers.num_threads, progress)
         except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, workers.num_threads, progress)
-        notes += inertial.notes
+        notes = [*checked.notes, *inertial.notes]
         told = _checked_told(tracked, drive, notes)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
     pieces = np.array([found.piece for found in tracked])
-    length_m = sum(
-        float(np.linalg.norm(steps(poses[rows])[:, :3, 3], axis=1).sum()) for rows in pieces_of(tracked)
-    )
+    lengths_m = np.linalg.norm(steps(poses)[:, :3, 3], axis=1)
+    length_m = float(lengths_m[np.diff(pieces) == 0].sum())
+    gyroscope = drive.gyroscope
     report = {
         "verdict": _verdict(pieces, length_m, velocities is not None, inertial),
         "length_m": length_m,
@@ -180,8 +178,8 @@ def odometry(
         "told_turn": told[1],
         "doppler": velocities is not None,
         "doppler_sign": sign,
-        "gyroscope": inertial.gyroscope is not None,
-        "gyroscope_bias": None if drive.gyroscope is None else drive.gyroscope.bias.mean.tolist(),
+        "gyroscope": gyroscope is not None,
+        "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
         "movers": checked.movers,
         "notes": notes,
@@ -211,7 +209,7 @@ def _together(
 
 
 def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tuple[float, float]:
-    """The shares of variance that returns took away. Raises a NotToldError where nothing measures a motion; notes assumptions."""
+    """The shares of variance that returns removed. Raises a NotToldError where nothing measures a motion; notes assumptions."""
     if len(tracked) < 2:
         return 0.0, 0.0
     way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
@@ -237,9 +235,8 @@ def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tup
 
 
 def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
-    sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
-    by = " and ".join(filter(None, [", ".join(sources[:-1]), sources[-1]]))
-    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by {by}."]
+    sources = [", Doppler"] * doppler + [", a gyroscope"] * (inertial.gyroscope is not None)
+    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by returns{''.join(sources)}."]
     if inertial.alignment is not None:
         sentences.append(inertial.alignment.words)
     begins = np.flatnonzero(np.diff(pieces)) + 1
@@ -251,26 +248,11 @@ def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial
     return " ".join(sentences)
 
 
-def _checked_rates(
-    angular_velocity: ArrayLike, at: ArrayLike, checked: CheckedScans
-) -> tuple[Floats, Floats]:
-    """Rates (G, 3) and their times (G,) from the first scan on."""
+def _checked_imu(angular_velocity: ArrayLike, at_s: ArrayLike) -> Imu:
+    """A gyroscope in the axes of the radar."""
     rates: Floats = real_array(angular_velocity, "angular_velocity")
-    at_s: Floats = real_array(at, "angular_velocity_times_s")
-    at_s = at_s if at is checked.times_s else at_s - checked.begin_s
-    if rates.ndim != 2 or rates.shape[1] != 3 or at_s.shape != (len(rates),) or len(rates) == 0:
-        msg = f"angular_velocity must have shape (G, 3), G > 0, and one time for each rate, not {rates.shape} and {at_s.shape}"
+    times_s: Floats = real_array(at_s, "angular_velocity_times_s")
+    if not (np.abs(rates) <= _MAX_RATE_RAD_S).all() or not (np.abs(times_s) <= MAX_TIME_S).all():
+        msg = f"angular_velocity must be within {_MAX_RATE_RAD_S:g} rad/s, its times within {MAX_TIME_S:g} s"
         raise ValueError(msg)
-    within = (np.abs(rates) <= _MAX_RATE_RAD_S).all() and (np.abs(at_s) <= MAX_TIME_S).all()
-    if not within or (np.diff(at_s) < 0).any():
-        msg = (
-            f"angular_velocity must be finite and within {_MAX_RATE_RAD_S:g} rad/s, its times finite, within {MAX_TIME_S:g} s, "
-            "and ascending"
-        )
-        raise ValueError(msg)
-    times_s = checked.times_s
-    assert times_s is not None
-    if at_s[0] > times_s[-1] or at_s[-1] < 0:
-        msg = "angular_velocity was measured before or after all scans: are both times of one clock?"
-        raise ValueError(msg)
-    return rates, at_s
+    return Imu(times_s, rates, R_sensor_imu=np.eye(3))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
+from radarsdf.checks import MISSING_POSES, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import CheckedScans
@@ -28,7 +28,7 @@ from radarsdf.threads import Workers
 
 # The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees
 # end with the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
-_FIRST_SIGMA_M, _FIRST_SIGMA_RAD = 0.1, 0.01
+_FIRST_SIGMAS = 0.1, 0.01
 _CONTRADICTED = 0.5  # share of the squared motion, from which on Doppler and poses cannot be of one drive
 
 
@@ -57,12 +57,10 @@ def refine_poses(
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
     times_s: ArrayLike | None = None,
-    sigma_m: float | None = None,
-    sigma_rad: float | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> RefinedPoses:
-    """Refines the poses of scans, so that their returns lie on common surfaces.
+    """Refine the poses of scans so that their returns lie on common surfaces.
 
     Adjusts all scans at once: residuals are the distances of returns from planes that scans have in common, which are unknown,
     too, and the given motions from scan to scan. The noise of the sensor, the errors of the given steps and their bias are
@@ -71,7 +69,7 @@ def refine_poses(
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, poses, times and Doppler are
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, poses, times and Doppler are
         used where none are given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan.
@@ -80,8 +78,6 @@ def refine_poses(
         move are excluded. Needs `times_s`.
     times_s : (F,) array_like, optional
         Of the scans, s. After a gap, a step has larger errors. By default all steps are alike.
-    sigma_m, sigma_rad : float, optional
-        Standard deviations of each component of a step's translation, m, and rotation, rad. By default estimated.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -94,8 +90,10 @@ def refine_poses(
 
     Raises
     ------
+    TypeError
+        If an argument has the wrong type.
     ValueError
-        If scans or poses are invalid (see :func:`radarsdf.returns.rays.prepare`), or times descend.
+        If poses are missing, shapes do not fit together, ranges cannot be in m, or times descend.
 
     Notes
     -----
@@ -117,23 +115,19 @@ def refine_poses(
     if poses is None:
         raise ValueError(MISSING_POSES)
     checked = CheckedScans.of(points, doppler_mps, times_s)
-    scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
+    scans, times_s, velocities, notes = checked.scans, checked.times_s, checked.velocities, [*checked.notes]
     given, rigid = usable_poses(poses, len(scans))
-    notes = [*checked.notes]
     if not rigid.all():
         notes += LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes
         scans = [scan if usable else scan[:0] for scan, usable in zip(scans, rigid, strict=True)]
-    known = sigma_m is not None, sigma_rad is not None
-    unsteady_m, unsteady_rad = unsteadiness(given, times_s)
-    sigma_m = max(_FIRST_SIGMA_M, unsteady_m) if sigma_m is None else not_negative(sigma_m, "sigma_m")
-    sigma_rad = (
-        max(_FIRST_SIGMA_RAD, unsteady_rad) if sigma_rad is None else not_negative(sigma_rad, "sigma_rad")
-    )
     limits = config.returns
     returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m)
+    report: dict[str, Any] = {"scans": len(scans), "returns": len(returns), "notes": notes}
     if len(scans) < 2 or len(returns) == 0:
-        return _kept(given, len(returns), "there are no two scans to compare", begin)
-    motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times_s, known)]
+        report["verdict"] = "The given poses are kept: there are no two scans to compare."
+        return RefinedPoses(given, np.zeros((len(given), 6, 6)), False, report)
+    sigmas = np.maximum(_FIRST_SIGMAS, unsteadiness(given, times_s)).tolist()
+    motions: list[Motion] = [Motion.of(given, *sigmas, times_s)]
     if velocities is not None and times_s is not None:
         if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
             velocities = velocities.turned
@@ -151,43 +145,24 @@ def refine_poses(
         used = returns.select(~held)
         found = PosesEstimate.of(used, given, motions, cell_m, limits, workers.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
-    steps_given = found.motions[0]
-    report = {
+    sigma_m, sigma_rad = found.motions[0].sigmas
+    report |= {
         "verdict": verdict.words,
         "gain": verdict.gain,
         "gain_error": verdict.error,
-        "sigma_m": steps_given.sigma_m,
-        "sigma_rad": steps_given.sigma_rad,
-        "bias": steps_given.bias.tolist(),
+        "sigma_m": sigma_m,
+        "sigma_rad": sigma_rad,
+        "bias": found.motions[0].bias.tolist(),
         **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
-        "notes": notes,
         "movers": checked.movers,
-        "scans": len(scans),
-        "returns": len(returns),
         "rounds": found.rounds,
         "seconds": time.perf_counter() - begin,
     }
     if verdict.improved:
         return RefinedPoses(found.poses, found.covariance, True, report)
     # Neither trajectory is excluded, so the errors of the given one may be as large as their difference.
-    return RefinedPoses(given, found.covariance + _squared_differences(given, found.poses), False, report)
-
-
-def _squared_differences(given: Floats, found: Floats) -> Floats:
-    """(F, 6, 6) outer products of the increments from given poses to others, once the scans in the middle coincide."""
     middle = len(given) // 2
-    placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found[middle]), found)
+    placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found.poses[middle]), found.poses)
     off = increments(given, placed)
-    squares: Floats = np.einsum("fi,fj->fij", off, off)
-    return squares
-
-
-def _kept(given: Floats, returns: int, why: str, begin: float) -> RefinedPoses:
-    report = {"verdict": f"The given poses are kept: {why}.", "scans": len(given), "returns": returns}
-    return RefinedPoses(
-        given,
-        np.zeros((len(given), 6, 6)),
-        False,
-        report | {"rounds": 0, "seconds": time.perf_counter() - begin},
-    )
+    return RefinedPoses(given, found.covariance + np.einsum("fi,fj->fij", off, off), False, report)
