@@ -42,9 +42,9 @@ def cumulated(turns: Floats) -> Floats:
     found: Floats = Rotation.from_rotvec(padded).as_matrix().reshape(width, width, 3, 3)
     # Rows in parallel, then one row after another: few steps of many products each.
     for k in range(1, width):
-        found[:, k] = np.einsum("rij,rjk->rik", found[:, k - 1], found[:, k])
+        found[:, k] = found[:, k - 1] @ found[:, k]
     for row in range(1, width):
-        found[row] = np.einsum("ij,kjl->kil", found[row - 1, -1], found[row])
+        found[row] = found[row - 1, -1] @ found[row]
     return found.reshape(-1, 3, 3)[:count]
 
 

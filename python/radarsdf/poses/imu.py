@@ -9,7 +9,7 @@ own frame:
     Q (Rᵀ v - ω x lever) = V + ∫ Q (f - bias) dt + g t
 
 within each window of some seconds, whose V is free. It is linear in the entries of Rᵀ, g and V, which initialises the search over
-the time offset. Robust nonlinear least squares ends it.
+the time offset. Robust nonlinear least squares (Gauss and Newton's method) ends it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from radarsdf.io.imu import Imu
@@ -43,6 +42,7 @@ _BIAS_CHANGE_RAD_S = 1e-3  # from one of them to the next: of cheap gyroscopes, 
 _FORCE_BIAS, _LEVER_M = 0.2, 0.3  # deviations of the accelerometer's bias, m/s², and of the lever
 _MEDIAN = 2.366  # of a chi-squared variable of three
 _ROBUST = 3.0  # deviations from which on a velocity counts less
+_ITERATIONS, _SETTLED, _DIFFERENCE = 20, 0.03, 1e-6  # of Gauss and Newton's method; in deviations; to find slopes
 
 # Half of the time, nothing that a radar is mounted on turns faster, or is accelerated more: a turn a second, three times gravity.
 _MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
@@ -202,35 +202,29 @@ def _fitted(
         whitened: Floats = np.einsum("fij,fjk,fk->fi", whiten, to_radar, left - means[window])
         return whitened
 
-    def residuals(x: Floats, scale: float) -> Floats:
+    def residuals(x: Floats) -> Floats:
         bias = x[13:].reshape(-1, 3)
         prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, bias[0] / FIRST_BIAS_RAD_S]
         changes = np.diff(bias, axis=0).ravel() / _BIAS_CHANGE_RAD_S
-        # A smaller scale is no better knowledge: errors that scans have in common do not show in it.
-        return np.concatenate([off(x).ravel() / np.sqrt(max(scale, 1.0)), *prior, changes])
-
-    def scale_of(x: Floats) -> float:
-        return max(float(np.median((off(x) ** 2).sum(axis=1))) / _MEDIAN, 1e-6)
+        return np.concatenate([off(x).ravel(), *prior, changes])
 
     x = np.concatenate([np.zeros(3), gravity, np.zeros(6), [late_s], np.zeros(3 * knots)])
-    for _ in range(2):
-        scale = scale_of(x)
-        least = least_squares(
-            residuals,
-            x,
-            loss="cauchy",
-            f_scale=_ROBUST * np.sqrt(min(scale, 1.0)),
-            x_scale="jac",
-            xtol=1e-4,
-            ftol=1e-4,
-            max_nfev=15,
-            args=(scale,),
-        )
-        x = least.x
-    deviations = np.linalg.inv(least.jac.T @ least.jac)
+    deviations = np.zeros((len(x), len(x)))
+    for _ in range(_ITERATIONS):
+        now = residuals(x)
+        slopes = (np.stack([residuals(x + h) for h in _DIFFERENCE * np.eye(len(x))]) - now) / _DIFFERENCE
+        weighted = slopes / (1 + (now / _ROBUST) ** 2)  # of Cauchy's loss
+        deviations = np.linalg.inv(np.einsum("kn,ln->kl", weighted, slopes))
+        step = -np.einsum("kl,ln,n->k", deviations, weighted, now)
+        x = x + step
+        if (np.abs(step) < _SETTLED * np.sqrt(deviations.diagonal())).all():
+            break
+    scale = float(np.median((off(x) ** 2).sum(axis=1))) / _MEDIAN
+    # A smaller scale is no better knowledge: errors that scans have in common do not show in it.
+    deviations *= max(scale, 1.0)
     sigma_rad = 0.0 if known else float(np.sqrt(np.linalg.eigvalsh(deviations[:3, :3])[-1]))
     late_s = float(x[12])
-    if scale_of(x) > _LEFT or sigma_rad > _KNOWN_RAD or abs(late_s) > 2 * _LATEST_S:
+    if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(late_s) > 2 * _LATEST_S:
         return None
     R = rotated(x)
     motion = _ImuMotion.of(imu, x[13:].reshape(-1, 3), x[6:9])
