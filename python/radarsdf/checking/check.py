@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +28,7 @@ def check(
     times_s: ArrayLike | None = None,
     config: FitConfig | None = None,
 ) -> list[Finding]:
-    """Finds mistakes in scans and poses, and estimates what a fit of them will cost.
+    """Find mistakes in scans and poses, and estimate the cost of a fit.
 
     Most findings compare how well returns of different scans agree in the world frame: with the data as they are, and as if
     one common mistake were corrected. Samples are taken at equal steps, so the same data give the same findings.
@@ -36,7 +36,7 @@ def check(
     Parameters
     ----------
     points : sequence of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, all the
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, all the
         rest is used where it is not given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
@@ -73,20 +73,14 @@ def check(
     )
     if poses is None:
         raise ValueError(MISSING_POSES)
-    recording = Recording.of(scans, poses, intensities, doppler_mps, times_s)
-    return _sorted(_find(recording, config, frames.FULL))
+    return _find(Recording.of(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
 
 
 def check_cheaply(
     points: Sequence[ArrayLike], poses: ArrayLike, intensities: Sequence[ArrayLike] | None = None
 ) -> list[Finding]:
     """The findings of :func:`check` that take little time compared with a fit, on a smaller sample."""
-    recording = Recording.of(points, poses, intensities, None, None)
-    return _sorted(_find(recording, None, frames.CHEAP))
-
-
-def _sorted(findings: list[Finding]) -> list[Finding]:
-    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+    return _find(Recording.of(points, poses, intensities), None, frames.CHEAP)
 
 
 def _stops(findings: list[Finding]) -> bool:
@@ -94,32 +88,36 @@ def _stops(findings: list[Finding]) -> bool:
 
 
 def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
-    """All findings. `config` None: only the cheap ones."""
+    """All findings, the worst first. `config` None: only the cheap ones."""
     found, recording = _usable(recording)
-    if _stops(found):
-        return found
-    for checked in (
-        trajectory.check_times,
-        noise.check_elevation,
-        trajectory.check_rounding,
-        check_intensities,
-        trajectory.check_duplicates,
-    ):
-        found += checked(recording)
-    wrong = [*frames.check_still(recording, effort)] or [*frames.check_frames(recording, effort)]
-    if not _stops(wrong):
-        wrong += trajectory.check_lengths(recording)
-    if not _stops(wrong):  # else the scans do not agree, whatever the clock
-        wrong += trajectory.check_jumps(recording, effort)
-        wrong += check_doppler(recording)
-        if config is not None and not any(finding.severity != "note" for finding in wrong):
-            wrong += frames.check_clock(recording, effort)
-        wrong += noise.check_ground(recording)
-    found += wrong
+    if not _stops(found):
+        found += _of_values(recording)
+        found += _of_poses(recording, config, effort)
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
             found += noise.check_drift(recording, config)
+    return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+def _of_values(recording: Recording) -> Iterator[Finding]:
+    yield from trajectory.check_times(recording)
+    yield from noise.check_elevation(recording)
+    yield from trajectory.check_rounding(recording)
+    yield from check_intensities(recording)
+    yield from trajectory.check_duplicates(recording)
+
+
+def _of_poses(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
+    found = [*frames.check_still(recording, effort)] or [*frames.check_frames(recording, effort)]
+    if not _stops(found):
+        found += trajectory.check_lengths(recording)
+    if not _stops(found):  # else the scans do not agree, whatever the clock
+        found += trajectory.check_jumps(recording, effort)
+        found += check_doppler(recording)
+        if config is not None and not any(finding.severity != "note" for finding in found):
+            found += frames.check_clock(recording, effort)
+        found += noise.check_ground(recording)
     return found
 
 
@@ -128,18 +126,14 @@ def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
     found = []
     left_out = [~measured(scan) for scan in recording.points]
     total, unmeasured = sum(map(len, left_out)), sum(int(mask.sum()) for mask in left_out)
-    infinite = total - sum(int(np.isfinite(scan).all(axis=1).sum()) for scan in recording.points)
-    nothing = "Nothing needs to be done: a fit leaves them out."
-    for count, name, what in (
-        (infinite, "returns_not_finite", "have coordinates that are not finite"),
-        (
-            unmeasured - infinite,
-            "padding",
-            "are no measurements: 0 0 0, or one point many times in succession",
-        ),
-    ):
-        if count > 0:
-            found.append(Finding(name, "note", f"{count} of {total} returns {what}.", nothing))
+    infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in recording.points)
+    if infinite:
+        evidence = f"{infinite} of {total} returns have coordinates that are not finite."
+        found.append(Finding("returns_not_finite", "note", evidence))
+    if unmeasured > infinite:
+        count = f"{unmeasured - infinite} of {total} returns"
+        evidence = f"{count} are no measurements: 0 0 0, or one point many times in succession."
+        found.append(Finding("padding", "note", evidence))
     if unmeasured:
         recording = recording.without(left_out)
     empty = np.array([mask.all() for mask in left_out])
@@ -147,8 +141,8 @@ def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
         evidence = (
             f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
         )
-        if empty.all():
-            return [*found, Finding("empty_scans", "error", evidence, "Pass the returns.")], recording
-        found.append(Finding("empty_scans", "note", evidence, nothing))
-    found += trajectory.check_rigid(recording)
-    return found, recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
+        found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
+    if not empty.all():
+        found += trajectory.check_rigid(recording)
+        recording = recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
+    return found, recording

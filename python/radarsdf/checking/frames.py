@@ -35,7 +35,7 @@ _MIN_SIGNIFICANCE = 4.0
 # on good recordings, and the smallest of right ones on broken data.
 _ERROR_GAIN = 0.12
 # To shrink positions, or to take points for points in the world, moves the cells of the sensor onto each other.
-_ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.08, "clock_offset": _MIN_GAIN}
+_ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.08}
 # Points in the world frame agree as badly if the poses move them forwards as if backwards. Measured: at most 0.06; on good
 # recordings of a sensor with coarse cells, 0.15 and more.
 _FORWARDS_GAIN = 0.1
@@ -53,18 +53,13 @@ _MIN_PAIRS = 3
 
 @dataclass(frozen=True)
 class Effort:
-    """How much of the data a check looks at."""
+    """How much of the data a check uses."""
 
-    pairs: int
-    """Pairs of scans."""
-    returns: int
-    """Largest number of returns of a scan that others are compared with."""
-    queries: int
-    """Returns of a scan that are compared with another one."""
-    all_axes: bool
-    """Whether all ways to swap axes are tried."""
-    lags: tuple[int, ...] = LAGS
-    """How far apart the scans of a pair are."""
+    pairs: int  # of scans
+    returns: int  # largest number of returns of a scan that others are compared with
+    queries: int  # returns of a scan that are compared with another one
+    all_axes: bool  # whether all ways to swap axes are tried
+    lags: tuple[int, ...] = LAGS  # how far apart the scans of a pair are
 
 
 FULL = Effort(pairs=48, returns=1000, queries=80, all_axes=True)
@@ -90,13 +85,11 @@ def check_frames(recording: Recording, effort: Effort = FULL) -> Iterator[Findin
     if best is None:
         return
     guess, gain, significance = best
-    yield Finding(
-        guess.finding,
-        _severity(gain, guess.finding),
-        f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times "
-        f"closer to each other ({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
-        guess.mend,
+    evidence = (
+        f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times closer to each other ({len(pairs)} pairs of "
+        f"scans, {significance:.0f} standard errors)."
     )
+    yield Finding(guess.finding, _severity(gain, guess.finding), evidence)
 
 
 def _severity(gain: float, finding: str) -> Severity:
@@ -125,59 +118,41 @@ def check_still(recording: Recording, effort: Effort = FULL) -> Iterator[Finding
     if moved:
         evidence += (
             f", but returns of scans far apart in time are {np.exp(change):.2f} times farther from each other than those of "
-            f"neighbours ({change / error:.0f} standard errors): the sensor moved"
+            f"neighbours ({change / error:.0f} standard errors)"
         )
-    yield Finding(
-        "poses_stand_still",
-        "error" if moved else "warning",
-        f"{evidence}.",
-        "Pass the position of the sensor for each scan. If it stood still, the map knows what is seen from there.",
-    )
+    yield Finding("poses_stand_still", "error" if moved else "warning", f"{evidence}.")
 
 
-def check_clock(recording: Recording, effort: Effort = FULL) -> list[Finding]:
-    """Whether the scans agree better with the poses of an earlier or a later time."""
-    count, poses = len(recording), recording.poses
-    if count < 2 * _MIN_PAIRS:
-        return []
-    # In s, or in scans where poses were taken from the wrong row.
-    clocks = [(recording.ascending_times_s, "s"), (np.arange(count, dtype=np.float64), "steps between scans")]
-    pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
-    agreement = Agreement(recording.points, effort.returns, effort.queries)
-    for times, unit in clocks:
-        found = [] if times is None else [*_shifted(agreement, poses, times, unit, pairs)]
-        if found:
-            return found
-    return []
-
-
-def _shifted(
-    agreement: Agreement, poses: FloatArray, times: FloatArray, unit: str, pairs: NDArray[np.int64]
-) -> Iterator[Finding]:
-    """:func:`check_clock` by one clock."""
+def check_clock(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+    """Whether the scans agree better with the poses of an earlier or a later time, or of another row."""
+    poses, times = recording.poses, recording.ascending_times_s
+    unit = "steps between scans" if times is None else "s"
+    times = np.arange(len(poses), dtype=np.float64) if times is None else times
+    if len(poses) < 2 * _MIN_PAIRS:
+        return
     step = float(np.median(np.diff(times)))
     shifts = step * np.array([-8.0, -4, -2, -1, -0.5, 0.5, 1, 2, 4, 8])
     shifts = shifts[np.abs(shifts) <= (times[-1] - times[0]) / 4]
+    pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
     # Beyond the first and the last pose nothing is known.
     far = float(np.abs(shifts).max(initial=0))
     pairs = pairs[((times[pairs] - far >= times[0]) & (times[pairs] + far <= times[-1])).all(axis=1)]
     if len(pairs) < _MIN_PAIRS or not len(shifts):
         return
-    shifted = [relative(_at(poses, times, times + shift), pairs) for shift in shifts]
-    scores = agreement.scores(pairs, np.stack([relative(poses, pairs), *shifted]))
+    along = Trajectory(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
+    shifted = [along.poses(np.clip(times + shift, times[0], times[-1])) for shift in shifts]
+    motions = np.stack([relative(moved, pairs) for moved in (poses, *shifted)])
+    scores = Agreement(recording.points, effort.returns, effort.queries).scores(pairs, motions)
     comparison = Comparison.of(scores[0], scores[1:])
     best = int(np.argmax(comparison.gains))
     gain, significance, shift = comparison.gains[best], comparison.significance[best], shifts[best]
-    if gain < _MIN_GAIN or significance < _MIN_SIGNIFICANCE:
-        return
-    yield Finding(
-        "clock_offset",
-        _severity(gain, "clock_offset"),
-        f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
-        f"different scans are {np.exp(gain):.2f} times closer to each other "
-        f"({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
-        "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
-    )
+    if gain >= _MIN_GAIN and significance >= _MIN_SIGNIFICANCE:
+        evidence = (
+            f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
+            f"different scans are {np.exp(gain):.2f} times closer to each other ({len(pairs)} pairs of scans, {significance:.0f} "
+            "standard errors)."
+        )
+        yield Finding("clock_offset", "error", evidence)
 
 
 def _best(
@@ -242,7 +217,7 @@ def _best_of(
 
 def _skewness(recording: Recording) -> FloatArray:
     """(3,) skewness of the coordinates of the returns. It is positive upwards: walls are higher than the sensor is."""
-    points = np.concatenate([recording.points[i] for i in recording.some_scans().tolist()]).astype(np.float64)
+    points = np.concatenate([recording.points[i] for i in recording.some_scans()]).astype(np.float64)
     centred = points - np.median(points, axis=0)
     skewness: FloatArray = (centred**3).mean(axis=0) / np.maximum(centred.std(axis=0) ** 3, 1e-300)
     return skewness
@@ -251,9 +226,8 @@ def _skewness(recording: Recording) -> FloatArray:
 def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> bool:
     """Whether the returns stay in one place of the frame that they came in, but not in the sensor's by the poses.
 
-    Where each scan sees other things, because the sensor moves far between them, the scans agree best as if the sensor
-    stood still: its field of view then is the same. So what is said to be in the world frame must not look like points
-    of a sensor's frame: in that one, their centre and the mean direction to them hardly move.
+    Where the sensor moves far between scans, they agree best as if it stood still: its field of view then is the same. But in
+    the world frame, the centre of the returns and the mean direction to them move.
     """
     rows = np.unique(pairs)
     given = [np.asarray(recording.points[i], np.float64) for i in rows.tolist()]
@@ -281,9 +255,3 @@ def _centre(scan: FloatArray) -> FloatArray:
 def _mean_direction(scan: FloatArray) -> FloatArray:
     direction: FloatArray = (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)
     return direction
-
-
-def _at(T_world_sensor: FloatArray, times: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Poses (F, 4, 4) at the wanted times (F,), interpolated. Beyond the ends: the first and the last pose."""
-    trajectory = Trajectory(times, T_world_sensor[:, :3, 3], Rotation.from_matrix(T_world_sensor[:, :3, :3]))
-    return trajectory.poses(np.clip(wanted, times[0], times[-1]))
