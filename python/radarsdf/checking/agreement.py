@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -190,7 +189,9 @@ def hypotheses(
         Hypothesis("poses_inverted", "the poses are inverted", relative(inverse(poses), pairs)),
         Hypothesis("points_in_world_frame", "the points are in the world frame already", still),
     ]
-    for matrix in sorted(_signed_permutations(), key=_surprise):
+    rotations_by_90 = Rotation.create_group("O").as_matrix().round()
+    # All ways to swap axes or change their signs, without the identity.
+    for matrix in sorted([*rotations_by_90, *-rotations_by_90], key=_surprise)[1:]:
         words, kind = _written(matrix), _kind(matrix)
         camera = kind == "camera_frame"
         # z up or down, x and y in any order; and the frame of a camera
@@ -234,25 +235,16 @@ def _transform(matrix: FloatArray) -> FloatArray:
     return found
 
 
-def _signed_permutations() -> Iterator[FloatArray]:
-    """The 47 matrices that swap axes or change their signs, the identity left out."""
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            if not np.array_equal(matrix, np.eye(3)):
-                yield matrix
-
-
 def _written(matrix: FloatArray) -> str:
     """A signed permutation as a user would write it: x, -y, -z."""
     axes = np.argmax(np.abs(matrix), axis=1)
     return ", ".join("-" * int(row[axis] < 0) + "xyz"[axis] for row, axis in zip(matrix, axes, strict=True))
 
 
-def _surprise(matrix: FloatArray) -> tuple[bool, float]:
-    """To sort matrices by: where z stays up, the mistake is more common. Few signs before many."""
-    return (matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum()))
+def _surprise(matrix: FloatArray) -> tuple[bool, bool, float]:
+    """To sort matrices by: the identity, those where z stays up, as in more common mistakes, few signs before many."""
+    key = matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum())
+    return not np.array_equal(matrix, np.eye(3)), *key
 
 
 def _kind(matrix: FloatArray) -> str:

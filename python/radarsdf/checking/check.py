@@ -7,12 +7,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checking import frames, noise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
-from radarsdf.checking.recording import SEVERITIES, Finding, Recording
+from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
 from radarsdf.checks import MISSING_POSES, are_rigid, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans, filled
@@ -73,21 +73,21 @@ def check(
     )
     if poses is None:
         raise ValueError(MISSING_POSES)
-    return _find(Recording.of(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
+    return _find(checked_input(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
 
 
 def check_cheaply(
     points: Sequence[ArrayLike], poses: ArrayLike, intensities: Sequence[ArrayLike] | None = None
 ) -> list[Finding]:
     """The findings of :func:`check` that take little time compared with a fit, on a smaller sample."""
-    return _find(Recording.of(points, poses, intensities), None, frames.CHEAP)
+    return _find(checked_input(points, poses, intensities), None, frames.CHEAP)
 
 
 def _stops(findings: list[Finding]) -> bool:
     return any(finding.severity == "error" for finding in findings)
 
 
-def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
+def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
     """All findings, the worst first. `config` None: only the cheap ones."""
     found, recording = _usable(recording)
     if not _stops(found):
@@ -100,7 +100,7 @@ def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort)
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
-def _of_values(recording: Recording) -> Iterator[Finding]:
+def _of_values(recording: Scans) -> Iterator[Finding]:
     yield from trajectory.check_times(recording)
     yield from noise.check_elevation(recording)
     yield from trajectory.check_rounding(recording)
@@ -108,7 +108,7 @@ def _of_values(recording: Recording) -> Iterator[Finding]:
     yield from trajectory.check_duplicates(recording)
 
 
-def _of_poses(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
+def _of_poses(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
     found = [*frames.check_still(recording, effort)] or [*frames.check_frames(recording, effort)]
     if not _stops(found):
         found += trajectory.check_lengths(recording)
@@ -121,7 +121,7 @@ def _of_poses(recording: Recording, config: FitConfig | None, effort: frames.Eff
     return found
 
 
-def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
+def _usable(recording: Scans) -> tuple[list[Finding], Scans]:
     """Findings about rows, scans and poses that a fit leaves out, and the recording without them."""
     found = []
     left_out = [~measured(scan) for scan in recording.points]
@@ -135,7 +135,7 @@ def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
         evidence = f"{count} are no measurements: 0 0 0, or one point many times in succession."
         found.append(Finding("padding", "note", evidence))
     if unmeasured:
-        recording = recording.without(left_out)
+        recording = _without(recording, left_out)
     empty = np.array([mask.all() for mask in left_out])
     if empty.any():
         evidence = (
@@ -146,3 +146,13 @@ def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
         found += trajectory.check_rigid(recording)
         recording = recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
     return found, recording
+
+
+def _without(recording: Scans, left_out: list[NDArray[np.bool_]]) -> Scans:
+    """Without the rows of each scan in its mask (N_i,)."""
+    points, intensities, doppler_mps = (
+        None if arrays is None else [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]
+        for arrays in (recording.points, recording.intensities, recording.doppler_mps)
+    )
+    assert points is not None
+    return Scans(points, recording.poses, intensities, doppler_mps=doppler_mps, times_s=recording.times_s)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checking.recording import Finding, FloatArray, Recording
+from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_scans
+from radarsdf.io.scans import Scans
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
 
 _STILL_MPS = 0.3  # slower, the direction of a velocity is noise
@@ -21,7 +22,7 @@ _MIN_YAW_RAD = np.radians(3)
 _MANY_MOVE = 0.4
 
 
-def check_doppler(recording: Recording) -> Iterator[Finding]:
+def check_doppler(recording: Scans) -> Iterator[Finding]:
     """Whether Doppler, intensities, poses and axes agree. The poses must be rigid transforms."""
     if recording.intensities is not None and _are_speeds(recording, recording.intensities):
         evidence = "In most scans the intensities agree with one velocity of the sensor, as Doppler does."
@@ -47,15 +48,15 @@ def check_doppler(recording: Recording) -> Iterator[Finding]:
 
 
 def _velocities(
-    recording: Recording, values: list[NDArray[Any]]
+    recording: Scans, values: list[NDArray[Any]]
 ) -> tuple[NDArray[np.int64], list[SensorVelocity]]:
     """Some scans, and their velocities by `values`, which may be Doppler."""
-    scans = [i for i in recording.some_scans() if len(recording.points[i]) >= MIN_DOPPLER_RETURNS]
+    scans = [i for i in some_scans(recording) if len(recording.points[i]) >= MIN_DOPPLER_RETURNS]
     found = sensor_velocities([recording.points[i] for i in scans], [values[i] for i in scans])
     return np.array(scans, np.int64), found
 
 
-def _are_speeds(recording: Recording, values: list[NDArray[Any]]) -> bool:
+def _are_speeds(recording: Scans, values: list[NDArray[Any]]) -> bool:
     """Whether values (N_i,) of the scans are Doppler: most scans agree on a velocity, which is not zero in all."""
     if min(float(np.min(value, initial=0)) for value in values) >= 0:
         return False  # Doppler has both signs, or a minus where the sensor comes nearer
@@ -67,10 +68,10 @@ def _are_speeds(recording: Recording, values: list[NDArray[Any]]) -> bool:
 
 
 def _compared_with_poses(
-    recording: Recording, scans: NDArray[np.int64], by_doppler: FloatArray
+    recording: Scans, scans: NDArray[np.int64], by_doppler: FloatArray
 ) -> Iterator[Finding]:
     """Compares the directions of velocities (K, 3) of scans (K,) by Doppler with those by poses: sign and yaw."""
-    times = recording.ascending_times_s
+    times = ascending_times_s(recording)
     knots = np.arange(len(recording), dtype=np.float64) if times is None else times
     if len(recording) < _MIN_SCANS:
         return

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -24,8 +25,9 @@ from radarsdf.checking.agreement import (
     relative,
     standing_still,
 )
-from radarsdf.checking.recording import Finding, FloatArray, Recording, Severity
+from radarsdf.checking.recording import Finding, FloatArray, Severity, ascending_times_s, some_points
 from radarsdf.io.poses.trajectory import Trajectory
+from radarsdf.io.scans import Scans
 
 # A hypothesis is noted if the scans agree better by this: of the mean logarithm of distances, and of its standard error. It
 # must agree better than standing still by as much, too: any pattern of the sensor's cells agrees with itself if it stands still.
@@ -41,9 +43,8 @@ _ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.
 _FORWARDS_GAIN = 0.1
 _EQUAL = 0.8  # of the best gain: mistakes that agree about as well cannot be told apart. The most common one is named
 _NOT_BEHIND = 2.5  # standard errors
-_FIELD_OF_VIEW_STAYS = (
-    -1.5
-)  # standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's
+# Standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's.
+_FIELD_OF_VIEW_STAYS = -1.5
 _UPSIDE_DOWN = (
     -0.5
 )  # skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it misleads
@@ -66,7 +67,7 @@ FULL = Effort(pairs=48, returns=1000, queries=80, all_axes=True)
 CHEAP = Effort(pairs=20, returns=400, queries=40, all_axes=False, lags=(1, 2))
 
 
-def check_frames(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     """The mistake in frames, axes or units without which the scans agree much better. Poses must be rigid transforms."""
     poses = recording.poses
     pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
@@ -97,7 +98,7 @@ def _severity(gain: float, finding: str) -> Severity:
     return "error" if gain >= _ERROR_GAINS.get(finding, _ERROR_GAIN) else "note"
 
 
-def check_still(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     """Whether all positions are the same although the sensor moved: what the scans see then changes with time."""
     positions = recording.poses[:, :3, 3]
     usable = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in recording.points])
@@ -123,9 +124,9 @@ def check_still(recording: Recording, effort: Effort = FULL) -> Iterator[Finding
     yield Finding("poses_stand_still", "error" if moved else "warning", f"{evidence}.")
 
 
-def check_clock(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+def check_clock(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     """Whether the scans agree better with the poses of an earlier or a later time, or of another row."""
-    poses, times = recording.poses, recording.ascending_times_s
+    poses, times = recording.poses, ascending_times_s(recording)
     unit = "steps between scans" if times is None else "s"
     times = np.arange(len(poses), dtype=np.float64) if times is None else times
     if len(poses) < 2 * _MIN_PAIRS:
@@ -156,7 +157,7 @@ def check_clock(recording: Recording, effort: Effort = FULL) -> Iterator[Finding
 
 
 def _best(
-    recording: Recording,
+    recording: Scans,
     pairs: NDArray[np.int64],
     guesses: list[Hypothesis],
     scores: FloatArray,
@@ -215,15 +216,15 @@ def _best_of(
     return guesses[chosen], float(comparison.gains[chosen]), float(comparison.significance[chosen])
 
 
-def _skewness(recording: Recording) -> FloatArray:
+def _skewness(recording: Scans) -> FloatArray:
     """(3,) skewness of the coordinates of the returns. It is positive upwards: walls are higher than the sensor is."""
-    points = np.concatenate([recording.points[i] for i in recording.some_scans()]).astype(np.float64)
+    points = np.concatenate(some_points(recording))
     centred = points - np.median(points, axis=0)
     skewness: FloatArray = (centred**3).mean(axis=0) / np.maximum(centred.std(axis=0) ** 3, 1e-300)
     return skewness
 
 
-def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> bool:
+def _looks_out_of_its_frame(recording: Scans, pairs: NDArray[np.int64]) -> bool:
     """Whether the returns stay in one place of the frame that they came in, but not in the sensor's by the poses.
 
     Where the sensor moves far between scans, they agree best as if it stood still: its field of view then is the same. But in
@@ -239,17 +240,12 @@ def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> b
     ]
     first, second = np.searchsorted(rows, pairs.T)
     significances = []
-    for of_scan in (_centre, _mean_direction):
+    for of_scan in (functools.partial(np.median, axis=0), _mean_direction):
         before, after = (np.array([of_scan(scan) for scan in scans]) for scans in (given, moved))
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
         significances.append(steadier.mean() / (steadier.std(ddof=1) / np.sqrt(len(steadier)) + 1e-12))
     return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
-
-
-def _centre(scan: FloatArray) -> FloatArray:
-    centre: FloatArray = np.median(scan, axis=0)
-    return centre
 
 
 def _mean_direction(scan: FloatArray) -> FloatArray:

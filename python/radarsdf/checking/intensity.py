@@ -8,7 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from radarsdf.checking.recording import Finding, FloatArray, Recording
+from radarsdf.checking.recording import Finding, FloatArray, some_scans
+from radarsdf.io.scans import Scans
 from radarsdf.returns.intensities import Plausible
 
 _SOME, _MANY = 0.005, 0.05  # share of the returns at the highest value
@@ -19,7 +20,7 @@ _LEAST_RETURNS = 100
 _NAMED = 3  # values in a message
 
 
-def check_intensities(recording: Recording) -> Iterator[Finding]:
+def check_intensities(recording: Scans) -> Iterator[Finding]:
     """Findings about the intensities."""
     if recording.intensities is None:
         return
@@ -35,7 +36,7 @@ def check_intensities(recording: Recording) -> Iterator[Finding]:
     held = plausible.holds(whole)
     if not held.all():
         yield from _outliers(whole[~held], whole[held])
-    scans = [np.asarray(recording.intensities[i], np.float64) for i in recording.some_scans()]
+    scans = [np.asarray(recording.intensities[i], np.float64) for i in some_scans(recording)]
     scans = [scan[np.isfinite(scan)] for scan in scans]
     scans = [scan[plausible.holds(scan)] for scan in scans]
     values = np.concatenate(scans)

@@ -8,9 +8,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from radarsdf.checking.recording import Finding, FloatArray, Recording
+from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import check_extent, estimate_rays
+from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.refine import refine_poses
 from radarsdf.returns.noise import SensorNoise, sensor_noise, variances_across
@@ -37,24 +38,23 @@ _LEAST_SCANS = 4
 _LEAST_MOVED = 0.15
 
 
-def check_elevation(recording: Recording) -> Iterator[Finding]:
+def check_elevation(recording: Scans) -> Iterator[Finding]:
     """Whether the sensor measures no elevation: then all returns lie in one plane of its frame."""
-    points = np.concatenate([np.asarray(recording.points[i], np.float64) for i in recording.some_scans()])
+    points = np.concatenate(some_points(recording))
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) >= _FEW_RETURNS and spread[2] <= _FLAT * spread[0]:
         evidence = f"All {len(points)} returns that were compared lie in one plane of the sensor's frame."
         yield Finding("no_elevation", "warning", evidence)
 
 
-def check_ground(recording: Recording) -> Iterator[Finding]:
+def check_ground(recording: Scans) -> Iterator[Finding]:
     """How many returns lie below the ground, as reflections in it do. The z axis of the world must be up.
 
     The ground is where most close returns below the sensor lie.
     """
-    some = recording.some_scans()
-    scans = [np.asarray(recording.points[i], np.float64) for i in some]
+    scans, upwards = some_points(recording), recording.poses[some_scans(recording), 2, :3]
     distance = np.concatenate([np.linalg.norm(scan, axis=1) for scan in scans])
-    height = np.concatenate([scan @ recording.poses[i, 2, :3] for i, scan in zip(some, scans, strict=True)])
+    height = np.concatenate([scan @ up for scan, up in zip(scans, upwards, strict=True)])
     height, distance = height[distance < _CLOSE_M], distance[distance < _CLOSE_M]
     below = height[height < -_BIN_M]
     if len(below) < _FEW_RETURNS:
@@ -70,7 +70,7 @@ def check_ground(recording: Recording) -> Iterator[Finding]:
         yield Finding("below_ground", "warning" if share > _MANY else "note", evidence)
 
 
-def check_noise_and_cost(recording: Recording, config: FitConfig) -> Iterator[Finding]:
+def check_noise_and_cost(recording: Scans, config: FitConfig) -> Iterator[Finding]:
     """The noise of the sensor and of the poses, and what a fit will cost, or why it would refuse."""
     try:
         rays = prepare(recording.points, recording.poses, recording.intensities, **config.preparation)
@@ -142,7 +142,7 @@ def _of_pairs(values: FloatArray, group: FloatArray, count: int) -> FloatArray:
     return np.stack([sums[0] * (sums[0] - 1) / 2, sums[0] * sums[2] - sums[1] ** 2])
 
 
-def check_drift(recording: Recording, config: FitConfig) -> Iterator[Finding]:
+def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
     """Whether held-out returns agree better once the poses are refined, in the clearest of some windows of scans."""
     count = len(recording)
     if count < _LEAST_SCANS:
@@ -154,7 +154,7 @@ def check_drift(recording: Recording, config: FitConfig) -> Iterator[Finding]:
         # Every n-th return: those of a scan come in the order of its angles.
         every = max(1, -(-sum(map(len, part.points)) // _RETURNS))
         points = [np.asarray(scan[::every], np.float64) for scan in part.points]
-        times_s, doppler_mps = part.ascending_times_s, None
+        times_s, doppler_mps = ascending_times_s(part), None
         if part.doppler_mps is not None and times_s is not None:
             doppler_mps = [speeds[::every] for speeds in part.doppler_mps]
         refined = refine_poses(

@@ -20,10 +20,9 @@ from radarsdf.checks import (
     real_array,
     refuse_masked,
 )
-from radarsdf.io.scans import chosen
+from radarsdf.io.scans import Scans
 
 FloatArray = NDArray[np.float64]
-Arrays = list[NDArray[Any]]
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # from the worst to the mildest
@@ -100,65 +99,45 @@ class Finding:
         return f"{self.severity}: {self.name}: {self.evidence} {self.mend}"
 
 
-@dataclass(frozen=True)
-class Recording:
-    """F scans with N_i returns each. Only shapes are valid: the values are what is checked."""
+def checked_input(
+    points: Sequence[ArrayLike],
+    poses: ArrayLike,
+    intensities: Sequence[ArrayLike] | None = None,
+    doppler_mps: Sequence[ArrayLike] | None = None,
+    times_s: ArrayLike | None = None,
+) -> Scans:
+    """Scans whose shapes and types fit together: the values are what is checked.
 
-    points: Arrays  # (N_i, 3) each; sensor frame, m, if nothing is wrong
-    poses: FloatArray  # (F, 4, 4); T_world_sensor, m, if nothing is wrong
-    intensities: Arrays | None  # (N_i,) each, sensor units
-    doppler_mps: Arrays | None  # (N_i,) each
-    times_s: FloatArray | None  # (F,)
+    Raises a TypeError or a ValueError that names the argument.
+    """
+    scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
+    check_scan_shapes(scans)
+    T_world_sensor = pose_matrices(poses, len(scans))
+    times = None if times_s is None else real_array(times_s, "times_s").copy()
+    if times is not None:
+        if times.shape != (len(scans),):
+            msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
+            raise ValueError(msg)
+        times[np.abs(times) > MAX_TIME_S] = np.nan
+    doppler = _values(doppler_mps, scans, "doppler_mps")
+    values = _values(intensities, scans, "intensities")
+    return Scans(scans, T_world_sensor, values, doppler_mps=doppler, times_s=times)
 
-    @classmethod
-    def of(
-        cls,
-        points: Sequence[ArrayLike],
-        poses: ArrayLike,
-        intensities: Sequence[ArrayLike] | None = None,
-        doppler_mps: Sequence[ArrayLike] | None = None,
-        times_s: ArrayLike | None = None,
-    ) -> Recording:
-        """Raises a TypeError or a ValueError that names the argument whose shape or type does not fit."""
-        scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
-        check_scan_shapes(scans)
-        T_world_sensor = pose_matrices(poses, len(scans))
-        times = None if times_s is None else real_array(times_s, "times_s").copy()
-        if times is not None:
-            if times.shape != (len(scans),):
-                msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
-                raise ValueError(msg)
-            times[np.abs(times) > MAX_TIME_S] = np.nan
-        values = _values(intensities, scans, "intensities"), _values(doppler_mps, scans, "doppler_mps")
-        return cls(scans, T_world_sensor, *values, times)
 
-    def __len__(self) -> int:
-        return len(self.points)
+def ascending_times_s(scans: Scans) -> FloatArray | None:
+    """Times (F,), if each is later than the one before; else None."""
+    times = scans.times_s
+    return times if times is not None and (np.diff(times) > 0).all() else None
 
-    @property
-    def ascending_times_s(self) -> FloatArray | None:
-        """`times_s`, if each is later than the one before; else None."""
-        times = self.times_s
-        return times if times is not None and (np.diff(times) > 0).all() else None
 
-    def select(self, scans: NDArray[np.int64]) -> Recording:
-        """The scans with these numbers (K,), in this order."""
-        times_s = None if self.times_s is None else self.times_s[scans]
-        values = chosen(self.intensities, scans), chosen(self.doppler_mps, scans)
-        return Recording([self.points[i] for i in scans], self.poses[scans], *values, times_s)
+def some_scans(scans: Scans) -> list[int]:
+    """Numbers of at most about `_SAMPLE` scans, at equal steps."""
+    return list(range(0, len(scans), -(-len(scans) // _SAMPLE)))
 
-    def without(self, left_out: Sequence[NDArray[np.bool_]]) -> Recording:
-        """Without the rows of each scan in its mask (N_i,)."""
 
-        def kept(arrays: Arrays) -> Arrays:
-            return [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]
-
-        intensities, doppler = (a if a is None else kept(a) for a in (self.intensities, self.doppler_mps))
-        return Recording(kept(self.points), self.poses, intensities, doppler, self.times_s)
-
-    def some_scans(self, count: int = _SAMPLE) -> list[int]:
-        """Numbers of at most about `count` scans, at equal steps."""
-        return list(range(0, len(self), -(-len(self) // count)))
+def some_points(scans: Scans) -> list[FloatArray]:
+    """The returns (N_i, 3) of these scans."""
+    return [np.asarray(scans.points[i], np.float64) for i in some_scans(scans)]
 
 
 def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
@@ -169,7 +148,9 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
     return real_array(values, name)
 
 
-def _values(given: Sequence[ArrayLike] | None, scans: Arrays, name: str) -> Arrays | None:
+def _values(
+    given: Sequence[ArrayLike] | None, scans: list[NDArray[Any]], name: str
+) -> list[NDArray[Any]] | None:
     if given is None:
         return None
     each = enumerate(one_for_each_scan(given, name))

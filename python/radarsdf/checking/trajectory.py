@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
 from radarsdf.checking.frames import FULL, Effort
-from radarsdf.checking.recording import Finding, FloatArray, Recording
+from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points
 from radarsdf.checks import are_rigid
+from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.rigid import steps
-from radarsdf.returns.moving import folding_interval_mps, sensor_velocity
 
 # No radar that gives points sees most of them from farther away, and none has most of them at its own housing.
 _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
@@ -28,11 +28,10 @@ _NEAR = 3  # steps before and after
 _JUMPS_TRIED = 12
 _MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs lie across a jump
 _CLOSES = 0.5  # of the difference to scans next to the jump
-_DOPPLER_SLACK_M = 1.0  # a step may be longer by this than the speed allows twice
 _CAUGHT_UP = 1.5  # times the median step
 
 
-def check_rigid(recording: Recording) -> Iterator[Finding]:
+def check_rigid(recording: Scans) -> Iterator[Finding]:
     """Whether the matrices are rigid transforms, and what they may be if not."""
     poses, usable = recording.poses, are_rigid(recording.poses)
     count, wrong, first = len(poses), int((~usable).sum()), int(np.argmin(usable))
@@ -61,7 +60,7 @@ def check_rigid(recording: Recording) -> Iterator[Finding]:
     yield Finding(name, "warning" if 2 * wrong < count else "error", evidence)
 
 
-def check_rounding(recording: Recording) -> Iterator[Finding]:
+def check_rounding(recording: Scans) -> Iterator[Finding]:
     """Whether the positions were rounded to float32 far from the origin, as with UTM coordinates."""
     positions = recording.poses[:, :3, 3]
     rounded = positions.astype(np.float32)
@@ -71,9 +70,9 @@ def check_rounding(recording: Recording) -> Iterator[Finding]:
         yield Finding("positions_rounded", "warning", evidence)
 
 
-def check_lengths(recording: Recording) -> Iterator[Finding]:
+def check_lengths(recording: Scans) -> Iterator[Finding]:
     """Whether ranges and speeds can be in metres. The poses must be finite."""
-    range_m, times = _typical_range_m(recording), recording.ascending_times_s
+    range_m, times = median_range_m(some_points(recording)), ascending_times_s(recording)
     if range_m > _FAR_M or range_m < _NEAR_M:
         # Points of a world frame far from its origin, such as UTM, have no ranges. Their distances to the sensor do.
         error = range_m > _VERY_FAR_M or range_m < _NEAR_M / 10
@@ -85,10 +84,10 @@ def check_lengths(recording: Recording) -> Iterator[Finding]:
             yield Finding("units", "error", f"By its poses, the sensor moves at {speed:.4g} m/s.")
 
 
-def check_times(recording: Recording) -> Iterator[Finding]:
+def check_times(recording: Scans) -> Iterator[Finding]:
     """Whether the times can be those of the scans."""
     times = recording.times_s
-    if times is None or len(times) < 2 or recording.ascending_times_s is not None:
+    if times is None or len(times) < 2 or ascending_times_s(recording) is not None:
         return
     wrong = int((~(np.diff(times) > 0)).sum())
     evidence = (
@@ -97,7 +96,7 @@ def check_times(recording: Recording) -> Iterator[Finding]:
     yield Finding("times", "warning", evidence)
 
 
-def check_duplicates(recording: Recording) -> Iterator[Finding]:
+def check_duplicates(recording: Scans) -> Iterator[Finding]:
     """Whether scans, or the poses of different scans, are the same."""
     first_of: dict[tuple[object, ...], int] = {}
     repeated = []
@@ -129,19 +128,22 @@ def check_duplicates(recording: Recording) -> Iterator[Finding]:
     yield Finding("duplicate_poses", "warning" if held else "note", f"{evidence}{leap}.")
 
 
-def check_jumps(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+def check_jumps(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     """Where the trajectory jumps: a step far longer than those near it, without which the scans agree better.
 
     A recording that pauses while the sensor moves has long steps too; then the scans agree with them.
     """
-    count, times = len(recording), recording.ascending_times_s
+    count, times = len(recording), ascending_times_s(recording)
     if count < 2 * _NEAR:
         return
     durations = np.ones(count - 1) if times is None else np.diff(times)
     motions = steps(recording.poses)
     # Turns count as translations of the returns at a typical range.
     turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
-    vectors = np.concatenate([motions[:, :3, 3], turns * _typical_range_m(recording)], 1) / durations[:, None]
+    vectors = (
+        np.concatenate([motions[:, :3, 3], turns * median_range_m(some_points(recording))], 1)
+        / durations[:, None]
+    )
     changes = np.zeros(len(vectors))
     for k in range(len(vectors)):
         others = np.concatenate([vectors[max(0, k - _NEAR) : k], vectors[k + 1 : k + 1 + _NEAR]])
@@ -155,38 +157,19 @@ def check_jumps(recording: Recording, effort: Effort = FULL) -> Iterator[Finding
         if changes[k] * durations[k] > _LEAST_JUMP * agreement.spacing_m(k)
     ]
     suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
-    confirmed = [
-        k
-        for k in suspects
-        if _faster_than_doppler(recording, k)
-        or _agree_without(recording, agreement, k, suspects, motions, durations)
-    ]
+    confirmed = [k for k in suspects if _agree_without(recording, agreement, k, suspects, motions, durations)]
     if confirmed:
         worst = max(confirmed, key=lambda k: changes[k])
         step_m, turn_deg = np.linalg.norm(motions[worst, :3, 3]), np.degrees(np.linalg.norm(turns[worst]))
         evidence = (
             f"{len(confirmed)} of {count - 1} steps are jumps, the largest after scan {worst}: {step_m:.3g} m and "
-            f"{turn_deg:.3g} degrees; Doppler or the agreement of the scans contradicts it."
+            f"{turn_deg:.3g} degrees; without them, the scans agree better."
         )
         yield Finding("pose_jumps", "error" if len(confirmed) > count // 10 else "warning", evidence)
 
 
-def _faster_than_doppler(recording: Recording, jump: int) -> bool:
-    """Whether a step is far longer than the speeds by the Doppler of the scans before and after it allow."""
-    times, doppler_mps = recording.times_s, recording.doppler_mps
-    if doppler_mps is None or times is None or not times[jump + 1] > times[jump]:
-        return False
-    interval = folding_interval_mps(doppler_mps)
-    velocities = [
-        sensor_velocity(recording.points[i], doppler_mps[i], interval_mps=interval).velocity_mps
-        for i in (jump, jump + 1)
-    ]
-    most_m = 2 * float(np.linalg.norm(velocities, axis=1).max() * (times[jump + 1] - times[jump]))
-    return bool(_steps_m(recording)[jump] > most_m + _DOPPLER_SLACK_M)  # False for NaN: no velocity
-
-
 def _agree_without(
-    recording: Recording,
+    recording: Scans,
     agreement: Agreement,
     jump: int,
     suspects: list[int],
@@ -232,11 +215,7 @@ def _agree_without(
     return False
 
 
-def _steps_m(recording: Recording) -> FloatArray:
+def _steps_m(recording: Scans) -> FloatArray:
     """(F - 1,) lengths of the steps between poses."""
     lengths: FloatArray = np.linalg.norm(np.diff(recording.poses[:, :3, 3], axis=0), axis=1)
     return lengths
-
-
-def _typical_range_m(recording: Recording) -> float:
-    return median_range_m([np.asarray(recording.points[i], np.float64) for i in recording.some_scans()])
