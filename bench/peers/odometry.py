@@ -21,6 +21,7 @@ import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.evaluation import trajectory_metrics
+from radarsdf.io import Imu
 from radarsdf.simulate import SCENES, measured_motion
 
 from bench.measure import ROOT, failure
@@ -95,7 +96,7 @@ def _ours(drive: Drive, *, doppler: bool, gyroscope: bool) -> str:
             drive.points,
             times_s=drive.times_s,
             doppler_mps=drive.doppler_mps if doppler else None,
-            angular_velocity=drive.rates if gyroscope else None,
+            imu=Imu(drive.times_s, drive.rates, R_sensor_imu=np.eye(3)) if gyroscope else None,
         )
     except ValueError:
         return "refused"

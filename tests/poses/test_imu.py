@@ -11,8 +11,8 @@ import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope, UnknownAxesError
-from radarsdf.poses.imu import ImuAlignment, Inertial, cumulated, levelled
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError, cumulated
+from radarsdf.poses.imu import ImuAlignment, Inertial, levelled
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
@@ -114,15 +114,15 @@ def test_turns_tell_it_without_an_accelerometer(ride):
     covariance = np.tile(0.005**2 * np.eye(3), (len(steps), 1, 1))
     bias = np.array([0.01, -0.02, 0.015])
     rates = measured_imu(poses, times_s, R_sensor_imu=R_SENSOR_IMU, gyroscope_bias_rad_s=tuple(bias))
-    unaligned = UnalignedGyroscope.of(rates.angular_velocity, rates.times_s, times_s)
+    unaligned = Gyroscope.of(rates.angular_velocity, rates.times_s, times_s, known_axes=False)
     found = unaligned.learnt(turns, covariance)
     off = np.degrees(np.linalg.norm(found.turns - found.bias.mean * 0.1 - steps.as_rotvec(), axis=1))
     assert np.median(off) < 0.1
     # Three deviations of the mean of 299 turns of 0.1 s, each known to 0.005 rad.
     np.testing.assert_allclose(found.bias.mean, R_SENSOR_IMU @ bias, atol=3 * 0.05 / np.sqrt(299))
-    with pytest.raises(UnknownAxesError):
+    with pytest.raises(UnusableGyroscopeError):
         unaligned.learnt(turns[::-1], covariance)
-    with pytest.raises(UnknownAxesError):
+    with pytest.raises(UnusableGyroscopeError):
         unaligned.learnt(rng.normal(0, 0.005, turns.shape), covariance)
 
 

@@ -16,7 +16,7 @@ from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, 
 from radarsdf.checks import are_rigid
 from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import median_range_m
-from radarsdf.poses.rigid import steps
+from radarsdf.poses.rigid import step_vectors, steps
 
 # No radar that gives points sees most of them from farther away, and none has most of them at its own housing.
 _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
@@ -137,13 +137,10 @@ def check_jumps(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     if count < 2 * _NEAR:
         return
     durations = np.ones(count - 1) if times is None else np.diff(times)
-    motions = steps(recording.poses)
     # Turns count as translations of the returns at a typical range.
-    turns = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
-    vectors = (
-        np.concatenate([motions[:, :3, 3], turns * median_range_m(some_points(recording))], 1)
-        / durations[:, None]
-    )
+    motions, moved = steps(recording.poses), step_vectors(recording.poses)
+    lever_m = np.repeat([1.0, median_range_m(some_points(recording))], 3)
+    vectors = moved * lever_m / durations[:, None]
     changes = np.zeros(len(vectors))
     for k in range(len(vectors)):
         others = np.concatenate([vectors[max(0, k - _NEAR) : k], vectors[k + 1 : k + 1 + _NEAR]])
@@ -160,7 +157,7 @@ def check_jumps(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     confirmed = [k for k in suspects if _agree_without(recording, agreement, k, suspects, motions, durations)]
     if confirmed:
         worst = max(confirmed, key=lambda k: changes[k])
-        step_m, turn_deg = np.linalg.norm(motions[worst, :3, 3]), np.degrees(np.linalg.norm(turns[worst]))
+        step_m, turn_deg = np.linalg.norm(moved[worst, :3]), np.degrees(np.linalg.norm(moved[worst, 3:]))
         evidence = (
             f"{len(confirmed)} of {count - 1} steps are jumps, the largest after scan {worst}: {step_m:.3g} m and "
             f"{turn_deg:.3g} degrees; without them, the scans agree better."

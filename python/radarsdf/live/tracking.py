@@ -17,10 +17,9 @@ import numpy as np
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog
 from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
-from radarsdf.poses.drive import LEAST_TOLD, Drive, followed, rates_of
 from radarsdf.poses.motion import Rate
 from radarsdf.poses.rigid import Floats, rotation_vector
-from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begun
+from radarsdf.poses.tracking import LEAST_TOLD, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from radarsdf.poses.motion import Motion, spans_of, way
-from radarsdf.poses.rigid import Floats, rotation_vector, steps
+from radarsdf.poses.rigid import Floats, rotation_vector, step_vectors, steps
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _MOST_MPS = 150.0  # speed of a sensor, median
@@ -48,13 +47,9 @@ class SensorVelocities:
     change: Floats  # (3,) by how much the square of each component's change grows with time, m²/s³
     static: list[
         NDArray[np.bool_]
-    ]  # (N_i,) of each scan: returns that do not contradict its velocity, or all
-    found: NDArray[
-        np.bool_
-    ]  # (F,) whether the returns of a scan agree on a velocity. Elsewhere it is interpolated
-    climb_assumed: int = (
-        0  # scans whose vertical velocity is assumed to be small, as their Doppler hardly measures it
-    )
+    ]  # (N_i,) of each scan: returns that agree with its velocity, if it has one
+    found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Elsewhere it is interpolated
+    climb_assumed: int = 0  # scans whose Doppler hardly measures the vertical velocity
 
     @classmethod
     def of(
@@ -74,10 +69,8 @@ class SensorVelocities:
         if speed_mps > _MOST_MPS:
             msg = f"by it, the sensor moves at {speed_mps:.0f} m/s: it may be in mm/s or cm/s"
             raise NoVelocityError(msg)
-        mean, covariance, weak = upright(
-            means,
-            np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3),
-        )
+        covariance = np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3)
+        mean, covariance, weak = upright(means, covariance)
         static = [
             velocity.static | np.isnan(speeds) if velocity.found else np.ones(len(scan), bool)
             for velocity, scan, speeds in zip(each, scans, doppler_mps, strict=True)
@@ -145,8 +138,8 @@ class DopplerMotion(Motion):
         cls, velocities: SensorVelocities, times_s: Floats, poses: Floats, turns: Floats | None = None
     ) -> DopplerMotion:
         """Of scans with these times (F,) and about these poses (F, 4, 4). `turns` None: those of the poses."""
-        durations_s, given = np.diff(times_s), steps(poses)
-        turns = Rotation.from_matrix(given[:, :3, :3]).as_rotvec() if turns is None else turns
+        durations_s = np.diff(times_s)
+        turns = step_vectors(poses)[:, 3:] if turns is None else turns
         ways = np.stack([velocities.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
         shares = np.full((len(durations_s), 6), np.inf)
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
@@ -154,7 +147,7 @@ class DopplerMotion(Motion):
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([_IN_COMMON * speed_mps * np.median(durations_s), 0.0], 3)
         unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
-        return cls(given, *unknown, bias_sigma=common).at(poses)
+        return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002
         """As it is: the velocities' own covariances are known. If they were learnt, real drives ended four times as far off."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from radarsdf.poses.rigid import Floats, rotation, skew, steps, transform
+from radarsdf.poses.rigid import Floats, between, rotation, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # steps that the first guess of habits is worth
 
@@ -145,13 +145,7 @@ class Motion:
     least_variances: Floats = field(default_factory=lambda: np.zeros(2), kw_only=True)
 
     @classmethod
-    def of(
-        cls,
-        poses: Floats,
-        sigma_m: float,
-        sigma_rad: float,
-        times_s: Floats | None = None,
-    ) -> Motion:
+    def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> Motion:
         """Of given poses (F, 4, 4), at `times_s` (F,) or equally far apart. Errors of steps add up: variances grow with time."""
         spans = spans_of(times_s, len(poses))
         shares = np.repeat(spans[:, None], 6, axis=1)
@@ -176,9 +170,10 @@ class Motion:
 
     def errors(self, poses: Floats) -> Floats:
         """(F - 1, 6) of the given steps, if `poses` (F, 4, 4) are right: translations, m, and rotation vectors, rad."""
-        found, given = steps(poses), self.steps
-        turns = np.einsum("fji,fjk->fik", given[:, :3, :3], found[:, :3, :3])
-        return np.concatenate([found[:, :3, 3] - given[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], 1)
+        found = steps(poses)
+        turns = between(self.steps, found)[:, :3, :3]
+        off_m = found[:, :3, 3] - self.steps[:, :3, 3]
+        return np.concatenate([off_m, Rotation.from_matrix(turns).as_rotvec()], 1)
 
     @staticmethod
     def _jacobians(poses: Floats) -> tuple[Floats, Floats]:
@@ -219,34 +214,23 @@ class Motion:
         square of an error is that of its estimate and its variance.
         """
         first, second = self._jacobians(before)
-        crossed = np.einsum("fai,fij,faj->fa", second, below, first)
-        variances = (
-            np.einsum("fai,fij,faj->fa", first, diagonal[:-1], first)
-            + np.einsum("fai,fij,faj->fa", second, diagonal[1:], second)
-            + 2 * crossed
-        )
-        errors, spans = self.errors(poses), self.spans[:, None]
-        measured = np.isfinite(self.shares)
-        weights = 1 / self.shares
+        blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
+        left = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
+        errors, spans, weights = self.errors(poses), self.spans[:, None], 1 / self.shares
+        counts = np.isfinite(self.shares).sum(axis=0)
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
-        bias *= self._believed(bias, (weights * variances).sum(axis=0) / np.maximum(measured.sum(axis=0), 1))
-        squares = ((errors - bias * spans) ** 2 + variances) * weights
-        floors, found = (_LEAST_M**2, _LEAST_RAD**2), self.variances.copy()
-        for k, rows in enumerate((slice(0, 3), slice(3, 6))):
-            if measured[:, rows].any():
-                found[k] = max(squares[:, rows].sum() / measured[:, rows].sum(), floors[k])
-        return dataclasses.replace(self, bias=bias, variances=found)
-
-    def _believed(self, bias: Floats, left: Floats) -> Floats:
-        """(6,) share of a bias (6,) that is applied, if returns and steps together leave a variance `left` (6,) of a step.
-
-        Where the returns alone leave more than the bias, along a corridor say, it would follow the poses, and these the bias,
-        for ever: a straight corridor was drawn together by 3 cm a step.
-        """
-        before = np.repeat(self.variances, 3)
-        gained = bias**2 * np.maximum(before - left, 0.0)
-        found: Floats = gained / np.maximum(gained + left * before, 1e-30)
-        return found
+        # Where the returns alone leave more than the bias, along a corridor say, it would follow the poses, and these the bias,
+        # for ever: a straight corridor was drawn together by 3 cm a step. So the share of the variance that is left shrinks it.
+        variances, left_mean = (
+            np.repeat(self.variances, 3),
+            (weights * left).sum(axis=0) / np.maximum(counts, 1),
+        )
+        gained = bias**2 * np.maximum(variances - left_mean, 0.0)
+        bias *= gained / np.maximum(gained + left_mean * variances, 1e-30)
+        squares = ((errors - bias * spans) ** 2 + left) * weights
+        sums, counts = squares.sum(axis=0).reshape(2, 3).sum(axis=1), counts.reshape(2, 3).sum(axis=1)
+        found = np.maximum(sums / np.maximum(counts, 1), [_LEAST_M**2, _LEAST_RAD**2])
+        return dataclasses.replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
@@ -256,11 +240,8 @@ def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
     """
     if len(poses) < 3:
         return 0.0, 0.0
-    between, spans = steps(poses), spans_of(times_s, len(poses))
-    rates = (
-        np.concatenate([between[:, :3, 3], Rotation.from_matrix(between[:, :3, :3]).as_rotvec()], 1)
-        / spans[:, None]
-    )
+    spans = spans_of(times_s, len(poses))
+    rates = step_vectors(poses) / spans[:, None]
     squares = np.diff(rates, axis=0) ** 2 / (1 / spans[1:] + 1 / spans[:-1])[:, None]
     sigma_m, sigma_rad = np.sqrt(np.median(squares.reshape(-1, 2, 3).mean(axis=2), axis=0)).tolist()
     return sigma_m, sigma_rad

@@ -13,26 +13,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_TIME_S, instance, real_array
+from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, doppler_sign
-from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, followed
-from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.gyroscope import UnusableGyroscopeError
 from radarsdf.poses.imu import Inertial, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.rigid import Floats, steps
-from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
+from radarsdf.poses.refine import PosesEstimate
+from radarsdf.poses.rigid import Floats
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_TOLD, WINDOW, Drive, Tracked, followed, pieces_of
 from radarsdf.returns.rays import within_ranges
 from radarsdf.threads import Workers
 
 # Share of the variance of a step's rotation that the returns must remove. Over the scans whose planes are kept, this adds up to
 # all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_TOLD_TURN = 1 / WINDOW
-_MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
 
 
 class NotToldError(ValueError):
@@ -50,15 +48,11 @@ class Odometry:
     pieces: NDArray[np.int64]
     """(F,) number of the piece of the drive that each scan belongs to. Where tracking was lost, mostly over a gap in time, a new
     piece begins: its position relative to the one before is dead reckoning, and no map should join them."""
-    agreeing: Floats
-    """(F,) share of the returns of each scan that lie on planes of the scans before it. NaN where a piece begins."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the trajectory; `pieces`, their number; `told` and `told_turn`, the median share of the
-    variance of a step's translation and rotation that the returns removed, in the least certain direction; `doppler` and
-    `gyroscope`, whether they were used; `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`,
-    rad/s; `imu`, None or its `R_sensor_imu` with `sigma_rad`, `late_s`, by which the times of scans are too late in its clock, and
-    `lever_m`, from it to the radar in its axes; `movers`, returns that were excluded; `notes` on what was not used or was assumed;
-    `scans`, `seconds`."""
+    """`verdict` in words; `length_m` of the trajectory; `pieces`, their number; `doppler` and `gyroscope`, whether they were used;
+    `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`, rad/s; `imu`, None or its `R_sensor_imu` with
+    `sigma_rad`, `late_s`, by which the times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes;
+    `movers`, returns that were excluded; `notes` on what was not used or was assumed; `scans`, `seconds`."""
 
     def longest_piece(self) -> slice:
         """The scans of the piece with the most scans: those to make a map of."""
@@ -72,8 +66,6 @@ def odometry(
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
     times_s: ArrayLike | None = None,
-    angular_velocity: ArrayLike | None = None,
-    angular_velocity_times_s: ArrayLike | None = None,
     imu: Imu | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
@@ -93,14 +85,9 @@ def odometry(
         (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured.
     times_s : (F,) array_like
         Of the scans, s.
-    angular_velocity : (G, 3) array_like, optional
-        Of a gyroscope, rad/s, in the axes of the radar.
-    angular_velocity_times_s : (G,) array_like, optional
-        When it was measured, s, in the clock of `times_s`. Default: at the times of the scans.
     imu : Imu, optional
-        An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. Its rotation on the radar and the offset of
-        its clock are estimated from its accelerometer and the Doppler, or from turns that returns measure. The accelerometer
-        also gives the direction of up.
+        A gyroscope, and an accelerometer where there is one; of Scans, theirs. Without `R_sensor_imu`, its rotation on the radar
+        is estimated, and with an accelerometer and Doppler the offset of its clock and the direction of up.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -145,10 +132,7 @@ def odometry(
     if velocities is not None:
         sign = doppler_sign(checked.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
-    if angular_velocity is not None:
-        at_s = times_s + checked.begin_s if angular_velocity_times_s is None else angular_velocity_times_s
-        imu = _checked_imu(angular_velocity, at_s)
-    elif imu is None and isinstance(points, Scans):
+    if imu is None and isinstance(points, Scans):
         imu = points.imu
     inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
     limits = config.returns
@@ -162,20 +146,17 @@ def odometry(
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, workers.num_threads, progress)
         notes = [*checked.notes, *inertial.notes]
-        told = _checked_told(tracked, drive, notes)
+        _check_measured(tracked, drive, notes)
         poses, covariance = _together(drive, tracked, config, workers.num_threads)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
     pieces = np.array([found.piece for found in tracked])
-    lengths_m = np.linalg.norm(steps(poses)[:, :3, 3], axis=1)
-    length_m = float(lengths_m[np.diff(pieces) == 0].sum())
+    length_m = trajectory_length_m(poses, pieces)
     gyroscope = drive.gyroscope
     report = {
         "verdict": _verdict(pieces, length_m, velocities is not None, inertial),
         "length_m": length_m,
         "pieces": int(pieces[-1]) + 1,
-        "told": told[0],
-        "told_turn": told[1],
         "doppler": velocities is not None,
         "doppler_sign": sign,
         "gyroscope": gyroscope is not None,
@@ -186,8 +167,13 @@ def odometry(
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
     }
-    agreeing = np.array([found.agreeing for found in tracked])
-    return Odometry(poses, covariance, pieces, agreeing, report)
+    return Odometry(poses, covariance, pieces, report)
+
+
+def trajectory_length_m(poses: Floats, pieces: NDArray[np.int64]) -> float:
+    """Length of the steps within pieces of a trajectory of poses (F, 4, 4)."""
+    lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return float(lengths_m[np.diff(pieces) == 0].sum())
 
 
 def _together(
@@ -198,7 +184,7 @@ def _together(
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for rows in pieces_of(tracked):
-        returns = SensorReturns.of(drive.new_returns(tracked, rows), limits.min_range_m, limits.max_range_m)
+        returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(tracked, rows)
@@ -208,17 +194,18 @@ def _together(
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance
 
 
-def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tuple[float, float]:
-    """The shares of variance that returns removed. Raises a NotToldError where nothing measures a motion; notes assumptions."""
+def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> None:
+    """Raises a NotToldError where nothing measures a part of the motion; adds notes on assumptions."""
     if len(tracked) < 2:
-        return 0.0, 0.0
+        return
     way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
-    dropped = any(note.startswith(NOT_USED) for note in notes)
-    doppler = "Doppler that most returns of a scan agree on" if dropped else "their Doppler (doppler_mps)"
+    doppler = "their Doppler (doppler_mps)"
+    if any(note.startswith(NOT_USED) for note in notes):
+        doppler = "Doppler that most returns of a scan agree on"
     turns_known = drive.gyroscope is not None or drive.turns_slowly
     for told, least, measured, moved, missing in (
         (way, LEAST_TOLD, drive.velocities is not None, "moved", doppler),
-        (turn, _LEAST_TOLD_TURN, turns_known, "turned", "its angular_velocity"),
+        (turn, _LEAST_TOLD_TURN, turns_known, "turned", "a gyroscope (imu)"),
     ):
         if not measured and told < least:
             msg = (
@@ -231,7 +218,6 @@ def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tup
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
             "trajectory make of its speed; the returns of a scan hardly measure it."
         )
-    return way, turn
 
 
 def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
@@ -246,13 +232,3 @@ def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial
             f"The drive was lost before the scans {before}: {len(begins) + 1} pieces, which do not belong together."
         )
     return " ".join(sentences)
-
-
-def _checked_imu(angular_velocity: ArrayLike, at_s: ArrayLike) -> Imu:
-    """A gyroscope in the axes of the radar."""
-    rates: Floats = real_array(angular_velocity, "angular_velocity")
-    times_s: Floats = real_array(at_s, "angular_velocity_times_s")
-    if not (np.abs(rates) <= _MAX_RATE_RAD_S).all() or not (np.abs(times_s) <= MAX_TIME_S).all():
-        msg = f"angular_velocity must be within {_MAX_RATE_RAD_S:g} rad/s, its times within {MAX_TIME_S:g} s"
-        raise ValueError(msg)
-    return Imu(times_s, rates, R_sensor_imu=np.eye(3))

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scan, Scans, scans_in_memory
-from radarsdf.poses.odometry import NotToldError, Odometry, odometry
+from radarsdf.poses.odometry import NotToldError, Odometry, odometry, trajectory_length_m
 from radarsdf.poses.refine import RefinedPoses, refine_poses
 from radarsdf.poses.rigid import (
     Floats,
@@ -29,7 +29,6 @@ from radarsdf.poses.rigid import (
     moved,
     moved_by,
     placed,
-    steps,
 )
 from radarsdf.progress import hides_bar
 
@@ -47,7 +46,6 @@ class JoinedPoses:
     def __init__(self) -> None:
         self.poses: Floats = np.zeros((0, 4, 4))  # T_world_sensor, m
         self.covariance: Floats = np.zeros((0, 6, 6))  # relative to the scan in the middle of its window
-        self.agreeing: Floats = np.zeros(0)  # as of Odometry; NaN where it is not known
         self._pieces = np.zeros(0, np.int64)
         self._upright = True
 
@@ -63,7 +61,7 @@ class JoinedPoses:
         new = begin + count - len(self.poses)
         last = self.poses[-1:] if len(self.poses) else np.eye(4)[None]
         poses, nowhere = np.repeat(last, new, axis=0), np.full(new, _NOWHERE)
-        self._replace(len(self.poses), poses, np.zeros((new, 6, 6)), nowhere, np.full(new, np.nan))
+        self._replace(len(self.poses), poses, np.zeros((new, 6, 6)), nowhere)
 
     def add(
         self,
@@ -71,7 +69,6 @@ class JoinedPoses:
         poses: Floats,
         covariance: Floats,
         pieces: NDArray[np.int64] | None = None,
-        agreeing: Floats | None = None,
         *,
         upright: bool = False,
     ) -> None:
@@ -80,7 +77,6 @@ class JoinedPoses:
         `upright`: the z axis of that world points up. Between two such windows, no tilt adds up.
         """
         pieces = np.zeros(len(poses), np.int64) if pieces is None else pieces
-        agreeing = np.full(len(poses), np.nan) if agreeing is None else agreeing
         common = len(self.poses) - begin
         piece = self._pieces[-1] if common else _NOWHERE
         if piece == _NOWHERE:
@@ -107,18 +103,14 @@ class JoinedPoses:
             poses[first:common] = moved(before, shares[:, None] * off)
             sooner = first + int((shares <= 0.5).sum())
             covariance[first:sooner] = self.covariance[begin + first : begin + sooner]
-            pieces[first:common], agreeing[first:common] = piece, self.agreeing[begin + first :]
-        rows = slice(first, None)
-        self._replace(begin + first, poses[rows], covariance[rows], pieces[rows], agreeing[rows])
+            pieces[first:common] = piece
+        self._replace(begin + first, poses[first:], covariance[first:], pieces[first:])
 
-    def _replace(
-        self, begin: int, poses: Floats, covariance: Floats, pieces: NDArray[np.int64], agreeing: Floats
-    ) -> None:
+    def _replace(self, begin: int, poses: Floats, covariance: Floats, pieces: NDArray[np.int64]) -> None:
         """All scans from number `begin` on."""
         self.poses = np.concatenate([self.poses[:begin], poses])
         self.covariance = np.concatenate([self.covariance[:begin], covariance])
         self._pieces = np.concatenate([self._pieces[:begin], pieces])
-        self.agreeing = np.concatenate([self.agreeing[:begin], agreeing])
 
 
 @dataclass(frozen=True)
@@ -163,18 +155,17 @@ def refine_in_windows(
     joined = JoinedPoses()
     for window, whole in _read(scans, None, "refine", progress):
         with _named(window):
-            answer = refine_poses(whole, config=config, progress=False)
-        joined.add(window.begin, answer.poses, answer.covariance)
+            answers.append(refine_poses(whole, config=config, progress=False))
+        joined.add(window.begin, answers[-1].poses, answers[-1].covariance)
         given.append(whole.poses[window.common :])
-        answers.append(answer)
     before = np.concatenate(given)
     if len(answers) == 1:
         return answers[0], before
     better = [answer for answer in answers if answer.improved]
     poses = aligned(joined.poses, before) if better else before
-    verdict = f"The refined poses make a sharper map in {len(better)} of {len(answers)} windows of scans"
+    count = f"{len(better)} of {len(answers)} windows of scans"
     report = {
-        "verdict": f"{verdict}: in the others, the given steps are kept.",
+        "verdict": f"The refined poses make a sharper map in {count}: in the others, the given steps are kept.",
         "windows": [answer.improved for answer in answers],
         **moved_by(before, poses),
         "notes": _once(answer.report["notes"] for answer in answers),
@@ -208,31 +199,27 @@ def find_in_windows(
             joined.skip(window.begin, len(whole.points))
             continue
         upright = found.report["imu"] is not None
-        joined.add(window.begin, found.poses, found.covariance, found.pieces, found.agreeing, upright=upright)
+        joined.add(window.begin, found.poses, found.covariance, found.pieces, upright=upright)
         answers.append(found)
         notes.append(found.report["notes"])
     if not answers and refused is not None:
         raise refused
     if len(answers) == 1 and refused is None:
         return answers[0]
-    pieces, reports = joined.pieces, [found.report for found in answers]
-    lengths_m = np.linalg.norm(steps(joined.poses)[:, :3, 3], axis=1)
-    length_m = float(lengths_m[np.diff(pieces) == 0].sum())
-    longest = np.bincount(pieces).max()
+    pieces = joined.pieces
+    length_m = trajectory_length_m(joined.poses, pieces)
     report = {
+        **answers[0].report,
         "verdict": f"{len(pieces)} scans along {length_m:.1f} m were placed, in {len(answers)} windows of scans. The longest of "
-        f"{pieces[-1] + 1} pieces has {longest} scans.",
+        f"{pieces[-1] + 1} pieces has {np.bincount(pieces).max()} scans.",
         "length_m": length_m,
         "pieces": int(pieces[-1]) + 1,
-        "doppler": any(of_window["doppler"] for of_window in reports),
-        "doppler_sign": reports[0]["doppler_sign"],
-        "gyroscope": any(of_window["gyroscope"] for of_window in reports),
-        "imu": next((of_window["imu"] for of_window in reports if of_window["imu"] is not None), None),
+        "movers": sum(found.report["movers"] for found in answers),
         "notes": _once(notes),
         "scans": len(pieces),
         "seconds": time.perf_counter() - begin_s,
     }
-    return Odometry(joined.poses, joined.covariance, pieces, joined.agreeing, report)
+    return Odometry(joined.poses, joined.covariance, pieces, report)
 
 
 def _read(
@@ -257,8 +244,6 @@ def _named(window: Window) -> Iterator[None]:
     except NotToldError:
         raise
     except ValueError as error:
-        if window.begin == 0:
-            raise
         msg = f"{window}, numbered from the first of them: {error}"
         raise ValueError(msg) from error
 
