@@ -276,10 +276,12 @@ class Inertial:
         if alignment is not None:
             rates, at_s = alignment.angular_velocity, alignment.times_s
             return cls(Gyroscope.of(rates, at_s, times_s, alignment.bias_rad_s), alignment)
-        R = np.eye(3) if imu.R_sensor_imu is None else imu.R_sensor_imu
-        rates = np.einsum("ij,gj->gi", R, imu.angular_velocity)
-        known_axes = imu.R_sensor_imu is not None
-        return cls(Gyroscope.of(rates, imu.times_s, times_s, known_axes=known_axes))
+        if imu.R_sensor_imu is None:
+            return cls(None).without(
+                "its rotation on the radar is unknown, as accelerometer and Doppler do not determine it: give R_sensor_imu"
+            )
+        rates = np.einsum("ij,gj->gi", imu.R_sensor_imu, imu.angular_velocity)
+        return cls(Gyroscope.of(rates, imu.times_s, times_s))
 
     def without(self, why: object) -> Inertial:
         """Not used, and why."""

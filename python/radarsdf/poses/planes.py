@@ -17,7 +17,7 @@ from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sums import UPPER, merged_keys
+from radarsdf.returns.sums import merged_keys
 
 # The edge of a region is 2 to the power of this, in cells. Wide regions have many planes, and estimate errors well: with
 # 8 cells, the position along simulated walls had 5 times too small a deviation, with 16 to 64 not.
@@ -50,20 +50,17 @@ def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
     weights = surfels.counts[cells] / thickness
     # Of a regression: the variances of the two slopes.
     of_across, of_widest = (weights * thickness / (surfels.support[cells] * width) for width in widths)
-    sums = np.empty((len(planes), 12))
-    for k, (i, j) in enumerate(UPPER):
-        sums[:, k] = weights * normals[:, i] * normals[:, j]
-        sums[:, 6 + k] = of_across * across[:, i] * across[:, j] + of_widest * widest[:, i] * widest[:, j]
+    spread = np.einsum("n,ni,nj->nij", weights, normals, normals)
+    errors = np.einsum("n,ni,nj->nij", of_across, across, across)
+    errors += np.einsum("n,ni,nj->nij", of_widest, widest, widest)
+    sums = np.concatenate([spread, errors], axis=1).reshape(-1, 18)
     keys = surfels.keys[cells]
     for _ in range(_DOUBLINGS):
         keys = merged_keys(keys)
     regions, first, region = np.unique(keys, return_index=True, return_inverse=True)
     of_regions = np.add.reduceat(sums, first)
     of_regions = CellBlocks(regions).sum_round(regions, of_regions, NEIGHBOUR_WEIGHT, num_threads)
-    spread, errors = np.empty((2, len(regions), 3, 3))
-    for k, (i, j) in enumerate(UPPER):
-        spread[:, i, j] = spread[:, j, i] = of_regions[:, k]
-        errors[:, i, j] = errors[:, j, i] = of_regions[:, 6 + k]
+    spread, errors = of_regions.reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
     found = np.einsum("nij,nj->ni", reduction(spread, errors)[region], normals)
     lengths = np.sqrt(np.einsum("ni,ni->n", found, found))[:, None]
     # A normal that seems all error stays as it is: in this region, there are hardly any others.
