@@ -374,9 +374,7 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rat
     return Rate(now.turn / duration_s, of_turn), Rate(way / duration_s, of_way)
 
 
-Rates = (
-    tuple[Rate, Rate] | tuple[None, None]
-)  # of turning, rad/s, and moving, m/s. None: the drive was lost there
+Rates = tuple[Rate, Rate] | tuple[None, None]  # of turning, rad/s, and moving, m/s, if known
 
 
 def _tracked(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]]:
