@@ -81,7 +81,7 @@ class CheckedScans:
         if step_m > _MOST_REACHES * range_m or not low <= interval_s <= high:
             msg = (
                 f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler, "
-                f"while returns are {range_m:.1f} m away: give times in s"
+                f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s"
             )
             raise ValueError(msg)
 

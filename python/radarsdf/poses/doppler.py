@@ -18,7 +18,6 @@ from radarsdf.poses.motion import Motion, spans_of, way
 from radarsdf.poses.rigid import Floats, rotation_vector, step_vectors, steps
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
-_MOST_MPS = 150.0  # speed of a sensor, median
 _SAMPLED, _PAIRS = 400, 40  # returns of a scan, and pairs of neighbouring scans, that show the sign
 _ERRORS = 3.0  # standard errors of a difference that is no chance
 # Measured (Astyx drives): a velocity is off by more than its returns say, since they are not independent. So is one of
@@ -61,14 +60,10 @@ class SensorVelocities:
         if 2 * found.sum() < max(len(found), 2):
             msg = (
                 f"{found.sum()} of {len(found)} scans agree on a velocity of the sensor: at least {MIN_DOPPLER_RETURNS} returns with "
-                "Doppler, of which 40 % agree"
+                "Doppler in m/s, of which 40 % agree"
             )
             raise NoVelocityError(msg)
         means = np.stack([velocity.velocity_mps for velocity in each])
-        speed_mps = float(np.median(np.linalg.norm(means[found], axis=1)))
-        if speed_mps > _MOST_MPS:
-            msg = f"by it, the sensor moves at {speed_mps:.0f} m/s: it may be in mm/s or cm/s"
-            raise NoVelocityError(msg)
         covariance = np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3)
         mean, covariance, weak = upright(means, covariance)
         static = [

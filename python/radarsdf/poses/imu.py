@@ -223,6 +223,8 @@ def _fitted(
         x = x + step
         if (np.abs(step) < _SETTLED * np.sqrt(deviations.diagonal())).all():
             break
+    if not np.isfinite(x).all():
+        return None
     scale = float(np.median((off(x) ** 2).sum(axis=1))) / _MEDIAN
     # A smaller scale is no better knowledge: errors that scans have in common do not show in it.
     deviations *= max(scale, 1.0)

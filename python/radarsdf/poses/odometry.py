@@ -221,8 +221,8 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
 
 
 def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
-    sources = [", Doppler"] * doppler + [", a gyroscope"] * (inertial.gyroscope is not None)
-    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by returns{''.join(sources)}."]
+    sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
+    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]
     if inertial.alignment is not None:
         sentences.append(inertial.alignment.words)
     begins = np.flatnonzero(np.diff(pieces)) + 1

@@ -194,7 +194,8 @@ class Tracker:
             shifted = pose.copy()
             shifted[:3, 3] += shift * cell_m * axis
             hessian = self._normal_equations(self._planes[-1], scan, shifted)[0]
-            information.append(1 / (axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis))
+            variance = axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis
+            information.append(1 / variance if variance > 0 else 0.0)
         chance = min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
         widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
         covariance = covariance.copy()
