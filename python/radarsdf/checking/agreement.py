@@ -153,6 +153,7 @@ _TURNS_DEG = {"yaw": ("z", range(5, 50, 5)), "pitch": ("y", range(5, 25, 5))}
 # A sensor that turns more between scans may have poses of degrees taken for radians.
 _FAST_RAD = np.radians(3)
 _LOST_TURNS = 29  # whole turns tried
+STILL = 1  # number of the hypothesis under which the sensor does not move between scans: points in the world frame
 
 
 @dataclass(frozen=True)
@@ -221,11 +222,6 @@ def hypotheses(
             moved = T_vehicle_sensor.T @ motions @ T_vehicle_sensor
             found.append(Hypothesis("sensor_turned", what, moved))
     return found
-
-
-def standing_still(guesses: list[Hypothesis]) -> int:
-    """Number of the hypothesis under which the sensor does not move between scans: points in the world frame."""
-    return next(k for k, guess in enumerate(guesses) if guess.finding == "points_in_world_frame")
 
 
 def _transform(matrix: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -91,21 +91,20 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
     """All findings, the worst first. `config` None: only the cheap ones."""
     found, recording = _usable(recording)
     if not _stops(found):
-        found += _of_values(recording)
+        for check_values in (
+            trajectory.check_times,
+            noise.check_elevation,
+            trajectory.check_rounding,
+            check_intensities,
+            trajectory.check_duplicates,
+        ):
+            found += check_values(recording)
         found += _of_poses(recording, config, effort)
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
             found += noise.check_drift(recording, config)
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
-
-
-def _of_values(recording: Scans) -> Iterator[Finding]:
-    yield from trajectory.check_times(recording)
-    yield from noise.check_elevation(recording)
-    yield from trajectory.check_rounding(recording)
-    yield from check_intensities(recording)
-    yield from trajectory.check_duplicates(recording)
 
 
 def _of_poses(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from radarsdf.checking.agreement import (
     LAGS,
     MIN_RETURNS,
+    STILL,
     Agreement,
     Comparison,
     Hypothesis,
@@ -23,7 +24,6 @@ from radarsdf.checking.agreement import (
     inverse,
     pairs_apart,
     relative,
-    standing_still,
 )
 from radarsdf.checking.recording import Finding, FloatArray, Severity, ascending_times_s, some_points
 from radarsdf.io.poses.trajectory import Trajectory
@@ -45,9 +45,8 @@ _EQUAL = 0.8  # of the best gain: mistakes that agree about as well cannot be to
 _NOT_BEHIND = 2.5  # standard errors
 # Standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's.
 _FIELD_OF_VIEW_STAYS = -1.5
-_UPSIDE_DOWN = (
-    -0.5
-)  # skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it misleads
+# Skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it misleads.
+_UPSIDE_DOWN = -0.5
 _AFAR = 10.0  # distance of the returns from the origin, over their spread
 _MIN_PAIRS = 3
 
@@ -169,8 +168,12 @@ def _best(
     """
     lags = pairs[:, 1] - pairs[:, 0]
     possible = np.ones(len(guesses), bool)
-    possible[standing_still(guesses)] = in_world
-    upright = np.array([guess.up for guess in guesses]) @ _skewness(recording) > _UPSIDE_DOWN
+    possible[STILL] = in_world
+    # The skewness of the coordinates of the returns is positive upwards: walls are higher than the sensor is.
+    points = np.concatenate(some_points(recording))
+    centred = points - np.median(points, axis=0)
+    skewness = (centred**3).mean(axis=0) / np.maximum(centred.std(axis=0) ** 3, 1e-300)
+    upright = np.array([guess.up for guess in guesses]) @ skewness > _UPSIDE_DOWN
     # Neighbours first: scans far apart see different things, and agree best where a wrong motion makes their fields
     # of view overlap. What is clearly worse than the data as given for neighbours is not tried on scans farther apart.
     noted = None
@@ -196,9 +199,8 @@ def _best_of(
     # Returns come closer to each other, too, where the fields of view of two scans only cover more of each other. They do
     # so most if the sensor stands still. What explains the scans better than the data as given explains them better than
     # that. Measured: without this, 37 of 70 good recordings of 4 to 8 sparse scans had an error; with it, none of 258.
-    still = standing_still(guesses)
-    beats_still = Comparison.of(scores[1 + still], scores[1:]).gains >= _MIN_GAIN
-    beats_still[still] = True
+    beats_still = Comparison.of(scores[1 + STILL], scores[1:]).gains >= _MIN_GAIN
+    beats_still[STILL] = True
     good &= beats_still
     if not good.any():
         return None
@@ -214,14 +216,6 @@ def _best_of(
     of_kind = near & np.array([name == kind for name in kinds])
     chosen = int(np.argmax(np.where(of_kind, comparison.gains, -np.inf)))
     return guesses[chosen], float(comparison.gains[chosen]), float(comparison.significance[chosen])
-
-
-def _skewness(recording: Scans) -> FloatArray:
-    """(3,) skewness of the coordinates of the returns. It is positive upwards: walls are higher than the sensor is."""
-    points = np.concatenate(some_points(recording))
-    centred = points - np.median(points, axis=0)
-    skewness: FloatArray = (centred**3).mean(axis=0) / np.maximum(centred.std(axis=0) ** 3, 1e-300)
-    return skewness
 
 
 def _looks_out_of_its_frame(recording: Scans, pairs: NDArray[np.int64]) -> bool:

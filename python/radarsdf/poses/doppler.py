@@ -44,9 +44,7 @@ class SensorVelocities:
     mean_mps: Floats  # (F, 3)
     covariance: Floats  # (F, 3, 3), m²/s²
     change: Floats  # (3,) by how much the square of each component's change grows with time, m²/s³
-    static: list[
-        NDArray[np.bool_]
-    ]  # (N_i,) of each scan: returns that agree with its velocity, if it has one
+    static: list[NDArray[np.bool_]]  # (N_i,) of each scan: returns that agree with its velocity
     found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Elsewhere it is interpolated
     climb_assumed: int = 0  # scans whose Doppler hardly measures the vertical velocity
 
