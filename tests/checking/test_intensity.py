@@ -18,11 +18,6 @@ def good():
     return scans.points, scans.poses, scans.intensities
 
 
-def clipped(values):
-    highest = np.percentile(np.concatenate(values), 85)
-    return [np.minimum(value, highest) for value in values]
-
-
 def replaced(values, every, value):
     """Every so many of the intensities is another value, or values."""
     whole = np.concatenate(values)
@@ -30,30 +25,16 @@ def replaced(values, every, value):
     return np.split(whole, np.cumsum([len(v) for v in values])[:-1])
 
 
-BROKEN = {
-    "intensity_constant": ("error", lambda values: [np.full_like(v, 7) for v in values]),
-    "intensity_constant_in_scans": ("warning", lambda values: [np.full_like(v, v[0]) for v in values]),
-    "intensity_clipped": ("warning", clipped),
-    "intensity_steps": ("note", lambda values: [np.round(2 * v) / 2 for v in values]),
-    "intensity_offset": ("note", lambda values: [np.round(v - np.median(v)) + 128 for v in values]),
-    "intensity_sentinel": ("warning", lambda values: replaced(values, 50, -9999)),
-    "intensity_wild": ("warning", lambda values: replaced(values, 10**6, 1e9)),
-    "intensity_not_finite": ("note", lambda values: [np.where(v > 110, np.nan, v) for v in values]),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_a_breakage_is_named(good, name):
+def test_intensities_that_are_not_finite_are_noted(good):
     points, poses, intensities = good
-    severity, broken = BROKEN[name]
-    found = check_cheaply(points, poses, broken(intensities))
-    assert (name, severity) in [(finding.name, finding.severity) for finding in found]
+    found = check_cheaply(points, poses, [np.where(v > 110, np.nan, v) for v in intensities])
+    assert ("intensity_not_finite", "note") in [(finding.name, finding.severity) for finding in found]
 
 
 def test_good_intensities_are_at_most_noted(good):
     names = {finding.name: finding.severity for finding in radarsdf.check(*good)}
     assert set(names.values()) == {"note"}
-    assert not set(names) & set(BROKEN) - {"intensity_steps"}
+    assert not {name for name in names if name.startswith("intensity")} - {"intensity_steps"}
     assert {"noise", "cost"} <= set(names)
 
 

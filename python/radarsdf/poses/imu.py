@@ -42,11 +42,7 @@ _BIAS_CHANGE_RAD_S = 1e-3  # from one of them to the next: of cheap gyroscopes, 
 _FORCE_BIAS, _LEVER_M = 0.2, 0.3  # deviations of the accelerometer's bias, m/s², and of the lever
 _MEDIAN = 2.366  # of a chi-squared variable of three
 _ROBUST = 3.0  # deviations from which on a velocity counts less
-_ITERATIONS, _SETTLED, _DIFFERENCE = (
-    20,
-    0.03,
-    1e-6,
-)  # of Gauss and Newton's method; in deviations; to find slopes
+_ITERATIONS, _SETTLED, _DIFFERENCE = 20, 0.03, 1e-6  # steps, deviations at the end, increments for slopes
 
 # Half of the time, nothing that a radar is mounted on turns faster, or is accelerated more: a turn a second, three times gravity.
 _MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
