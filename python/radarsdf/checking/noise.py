@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points, some_scans
 from radarsdf.config.fit_config import FitConfig
@@ -136,7 +137,7 @@ def _check_poses(rays: Rays, surfels: Surfels, noise: SensorNoise) -> Iterator[F
     yield Finding("poses_disagree", "warning" if other > 2 * one else "note", evidence)
 
 
-def _of_pairs(values: FloatArray, group: FloatArray, count: int) -> FloatArray:
+def _of_pairs(values: FloatArray, group: NDArray[np.int64], count: int) -> FloatArray:
     """(2, G) number of pairs, and sum of their squared differences, of values (N,) in G groups."""
     sums = [np.bincount(group, weights, count) for weights in (None, values, values**2)]
     return np.stack([sums[0] * (sums[0] - 1) / 2, sums[0] * sums[2] - sums[1] ** 2])

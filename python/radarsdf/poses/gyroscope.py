@@ -86,14 +86,13 @@ class Gyroscope:
             return self
         off, covariance, durations_s = (self.turns - turns)[known], covariance[known], self.durations_s[known]
         noise = self._noise[known]
-        weights: Floats = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3))
+        weights = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3)).astype(np.float64)
         _check(off, turns[known], durations_s, weights, covariance)
-        before: Floats = np.linalg.inv(self.bias.covariance)
+        before = np.linalg.inv(self.bias.covariance).astype(np.float64)
         bias, information, _ = _fitted_bias(off, durations_s, weights, before)
         squares = (off - bias * durations_s[:, None]) ** 2 - np.einsum("fii->fi", covariance)
         noise_rad2 = np.maximum(squares * (self.noise_rad2 / noise)[:, None], 0.0).mean()
-        bias_covariance: Floats = np.linalg.inv(information)
-        fitted = Rate(bias, bias_covariance)
+        fitted = Rate(bias, np.linalg.inv(information).astype(np.float64))
         return dataclasses.replace(self, bias=fitted, noise_rad2=float(max(noise_rad2, 1e-10)))
 
 

@@ -43,9 +43,8 @@ _MOST_ROUNDS = 12  # with cells as small as a map's surfels
 _SETTLED = 0.3
 _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
 _EXACT = 1e-3  # tolerance where differences of solutions count
-_WEAK = (
-    1e-4  # information about each pose, 1/m² and 1/rad²: what returns and steps leave free stays where it is
-)
+# Information about each pose, 1/m² and 1/rad²: what returns and steps leave free stays where it is.
+_WEAK = 1e-4
 _FIXED = 1e10  # information about the pose that the covariance is relative to
 
 
@@ -143,8 +142,8 @@ def refine_poses(
     if len(scans) < 2 or len(returns) == 0:
         report["verdict"] = "The given poses are kept: there are no two scans to compare."
         return RefinedPoses(given, np.zeros((len(given), 6, 6)), False, report)
-    sigmas = np.maximum(_FIRST_SIGMAS, unsteadiness(given, times_s)).tolist()
-    motions: list[Motion] = [Motion.of(given, *sigmas, times_s)]
+    sigma_m, sigma_rad = np.maximum(_FIRST_SIGMAS, unsteadiness(given, times_s)).tolist()
+    motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times_s)]
     if velocities is not None and times_s is not None:
         if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
             velocities = velocities.turned

@@ -317,7 +317,8 @@ class Drive:
             by = Rate(rate.mean * duration_s, rate.covariance * duration_s**2)
         if self.velocities is not None:
             covariance = self.velocities.step_covariance(i - 1, duration_s)
-            return ExpectedStep(by, *self.velocities.mean_mps[i - 1 : i + 1], covariance, duration_s)
+            begin, end = self.velocities.mean_mps[i - 1 : i + 1]
+            return ExpectedStep(by, begin, end, covariance, duration_s)
         rate = self.moves.after(move, elapsed_s)
         return ExpectedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
 
@@ -346,8 +347,8 @@ class Drive:
         turn_sigma_rad_s = np.full(3, self.usual_turn_rad_s)
         if self.gyroscope is not None:
             least[1] = 0.0
-            turns = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
-            motion.steps[:, :3, :3] = rotation(np.stack(turns))
+            measured = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
+            motion.steps[:, :3, :3] = rotation(np.stack(measured))
             turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
         motion = dataclasses.replace(motion, least_variances=least)
         if self.velocities is None:
