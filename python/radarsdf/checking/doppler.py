@@ -41,8 +41,8 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
         return
     static = np.concatenate([velocity.static for velocity in velocities if velocity.found])
     moving = 1 - static.mean()
-    severity = "warning" if moving > _MANY_MOVE else "note"
-    yield Finding("moving_share", severity, f"By their Doppler, {moving:.1%} of the returns move.")
+    evidence = f"By their Doppler, {moving:.1%} of the returns move."
+    yield Finding("moving_share", "warning" if moving > _MANY_MOVE else "note", evidence)
     by_doppler = np.array([velocity.velocity_mps for velocity in velocities if velocity.found])
     yield from _compared_with_poses(recording, scans[good], by_doppler)
 

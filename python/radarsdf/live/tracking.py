@@ -19,7 +19,7 @@ from radarsdf.live.store import LoggedScan, ScanId, ScanLog
 from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
 from radarsdf.poses.motion import Rate
 from radarsdf.poses.rigid import Floats, rotation_vector
-from radarsdf.poses.tracking import LEAST_TOLD, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
+from radarsdf.poses.tracking import LEAST_OBSERVED, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
@@ -121,8 +121,8 @@ class Follower:
         if any(step.found.piece for step in found):
             msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places: give {missing}"
             raise Lost(msg)
-        told = [step.found.told[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
-        if not by_doppler and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
+        told = [step.found.observed[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
+        if not by_doppler and len(told) == _TOLD_STEPS and np.median(told) < LEAST_OBSERVED:
             msg = f"the returns alone do not tell how the sensor moves: give {missing}"
             raise Lost(msg)
         return found

@@ -24,16 +24,16 @@ from radarsdf.poses.imu import Inertial, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats
-from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_TOLD, WINDOW, Drive, Tracked, followed, pieces_of
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed, pieces_of
 from radarsdf.returns.rays import within_ranges
 from radarsdf.threads import Workers
 
 # Share of the variance of a step's rotation that the returns must remove. Over the scans whose planes are kept, this adds up to
 # all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
-_LEAST_TOLD_TURN = 1 / WINDOW
+_LEAST_OBSERVED_TURN = 1 / WINDOW
 
 
-class NotToldError(ValueError):
+class UnobservedMotionError(ValueError):
     """Neither the returns nor anything else measures how the sensor moved."""
 
 
@@ -195,25 +195,25 @@ def _together(
 
 
 def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> None:
-    """Raises a NotToldError where nothing measures a part of the motion; adds notes on assumptions."""
+    """Raises a UnobservedMotionError where nothing measures a part of the motion; adds notes on assumptions."""
     if len(tracked) < 2:
         return
-    way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
+    way, turn = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
     doppler = "their Doppler (doppler_mps)"
     if any(note.startswith(NOT_USED) for note in notes):
         doppler = "Doppler that most returns of a scan agree on"
     turns_known = drive.gyroscope is not None or drive.turns_slowly
-    for told, least, measured, moved, missing in (
-        (way, LEAST_TOLD, drive.velocities is not None, "moved", doppler),
-        (turn, _LEAST_TOLD_TURN, turns_known, "turned", "a gyroscope (imu)"),
+    for observed, least, measured, moved, missing in (
+        (way, LEAST_OBSERVED, drive.velocities is not None, "moved", doppler),
+        (turn, _LEAST_OBSERVED_TURN, turns_known, "turned", "a gyroscope (imu)"),
     ):
-        if not measured and told < least:
+        if not measured and observed < least:
             msg = (
-                f"the returns alone do not tell how the sensor {moved}: of a step's variance, they take away {told:.1%}, and "
+                f"the returns alone do not tell how the sensor {moved}: of a step's variance, they remove {observed:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
-            raise NotToldError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
-    if drive.gyroscope is None and turn < _LEAST_TOLD_TURN:
+            raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
+    if drive.gyroscope is None and turn < _LEAST_OBSERVED_TURN:
         notes.append(
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
             "trajectory make of its speed; the returns of a scan hardly measure it."

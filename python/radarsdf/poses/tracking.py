@@ -51,7 +51,7 @@ _MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 _PASSES = 3
 # Share of a step's variance that the returns must remove where nothing else measures the translation. Below a half, the motion before
 # says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
-LEAST_TOLD = 0.5
+LEAST_OBSERVED = 0.5
 # Deviation of the acceleration across the trajectory: what moves fast turns slowly. Vehicles on roads: about 1; drones and hands: 2.
 LATERAL_MPS2 = 2.0
 # Deviation of the rate of turning up to which it may stay unknown from step to step: the joint estimate and the covariance hold
@@ -73,7 +73,7 @@ class Tracked:
     turn: Floats  # (3,) rotation vector of the step in the frame of the scan before, rad; may exceed half a turn
     # Share of the expected step's variance that the returns removed, of the translation and of the rotation, each in the
     # least certain direction. 0: nothing.
-    told: tuple[float, float] = (0.0, 0.0)
+    observed: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass

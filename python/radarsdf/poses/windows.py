@@ -18,7 +18,7 @@ from tqdm import tqdm
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scan, Scans, scans_in_memory
-from radarsdf.poses.odometry import NotToldError, Odometry, odometry, trajectory_length_m
+from radarsdf.poses.odometry import Odometry, UnobservedMotionError, odometry, trajectory_length_m
 from radarsdf.poses.refine import RefinedPoses, refine_poses
 from radarsdf.poses.rigid import (
     Floats,
@@ -193,7 +193,7 @@ def find_in_windows(
         try:
             with _named(window):
                 found = odometry(whole, config=config, progress=False)
-        except NotToldError as why:
+        except UnobservedMotionError as why:
             refused = refused or why
             notes.append([f"There are no poses of the {window}: {why}"])
             joined.skip(window.begin, len(whole.points))
@@ -241,7 +241,7 @@ def _named(window: Window) -> Iterator[None]:
     """Errors name their window: they number its scans from its first one."""
     try:
         yield
-    except NotToldError:
+    except UnobservedMotionError:
         raise
     except ValueError as error:
         msg = f"{window}, numbered from the first of them: {error}"
