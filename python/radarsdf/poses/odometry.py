@@ -24,7 +24,7 @@ from radarsdf.poses.imu import Inertial, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats
-from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed, pieces_of
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed
 from radarsdf.returns.rays import within_ranges
 from radarsdf.threads import Workers
 
@@ -147,10 +147,10 @@ def odometry(
             drive, tracked = followed(drive, config, workers.num_threads, progress)
         notes = [*checked.notes, *inertial.notes]
         _check_measured(tracked, drive, notes)
-        poses, covariance = _together(drive, tracked, config, workers.num_threads)
+        pieces = np.array([found.piece for found in tracked])
+        poses, covariance = _together(drive, tracked, pieces, config, workers.num_threads)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
-    pieces = np.array([found.piece for found in tracked])
     length_m = trajectory_length_m(poses, pieces)
     gyroscope = drive.gyroscope
     report = {
@@ -177,13 +177,14 @@ def trajectory_length_m(poses: Floats, pieces: NDArray[np.int64]) -> float:
 
 
 def _together(
-    drive: Drive, tracked: list[Tracked], config: FitConfig, num_threads: int
+    drive: Drive, tracked: list[Tracked], pieces: NDArray[np.int64], config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats]:
     """Poses and covariances of all scans of each piece at once."""
     poses = np.stack([found.pose for found in tracked])
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
-    for rows in pieces_of(tracked):
+    for piece in range(pieces[-1] + 1):
+        rows = slice(*np.searchsorted(pieces, [piece, piece + 1]).tolist())
         returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -285,13 +284,6 @@ def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
 def thinned(scan: Floats, most: int) -> Floats:
     """At most about so many returns, evenly spread over the scan."""
     return np.ascontiguousarray(scan[:: max(1, -(-len(scan) // most))])
-
-
-def pieces_of(tracked: Sequence[Tracked]) -> list[slice]:
-    """The scans of each piece."""
-    number = np.array([found.piece for found in tracked])
-    edges = np.flatnonzero(np.diff(number, prepend=-1, append=number[-1] + 1))
-    return [slice(int(low), int(high)) for low, high in itertools.pairwise(edges)]
 
 
 @dataclass(frozen=True)
