@@ -11,8 +11,7 @@ import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError, cumulated
-from radarsdf.poses.imu import ImuAlignment, Inertial, levelled
+from radarsdf.poses.imu import Gyroscope, ImuAlignment, Inertial, UnusableGyroscopeError, cumulated, levelled
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import Imu
-from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
+from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.rigid import aligned
 from radarsdf.simulate import measured_motion
 

@@ -19,8 +19,7 @@ from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, doppler_sign
-from radarsdf.poses.gyroscope import UnusableGyroscopeError
-from radarsdf.poses.imu import Inertial, levelled
+from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats

@@ -17,7 +17,7 @@ from radarsdf._core import LocalPlanes
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
-from radarsdf.poses.gyroscope import Gyroscope
+from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import ExpectedStep, Motion, MotionPrior, Rate
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.rigid import Floats, increments, moved, rotation, rotation_vector
