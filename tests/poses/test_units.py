@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import Imu
+from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.rigid import aligned
 from radarsdf.simulate import measured_motion
@@ -45,11 +46,9 @@ def test_ranges_in_other_units_are_refused_at_once(drive, motion, factor):
 
 
 def test_speeds_in_other_units_are_left_out(drive, motion):
-    found = radarsdf.odometry(
-        drive.points, times_s=motion.times_s, doppler_mps=[100 * speeds for speeds in motion.doppler_mps]
-    )
-    assert not found.report["doppler"]
-    assert "Doppler in m/s" in found.report["notes"][0]
+    checked = CheckedScans.of(drive.points, [100 * speeds for speeds in motion.doppler_mps], motion.times_s)
+    assert checked.velocities is None
+    assert "Doppler in m/s" in checked.notes[0]
 
 
 @pytest.mark.parametrize(

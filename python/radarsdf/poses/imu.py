@@ -41,9 +41,7 @@ _WINDOW_S, _WINDOW_SCANS = 4.0, 10
 _LATEST_S, _LATE_STEP_S = 0.5, 0.02  # time offsets that are tried
 _UNRELATED_S = 2.0  # from here on, the motions that are compared have nothing to do with each other
 _UNRELATED = 60  # such offsets that are tried: none must fit as well
-_LEFT = (
-    4.0  # variances that velocities may differ by from what the IMU measures: 0.1 to 0.5 where it is right
-)
+_LEFT = 4.0  # variances of what the IMU leaves of velocities, at most: 0.1 to 0.5 where it is right
 _KNOWN_RAD = 0.1  # standard deviation of a rotation that is of use
 # Knots of the gyroscope's bias, linear between them, at least so far apart.
 _KNOTS, _KNOT_S = 12, 10.0
