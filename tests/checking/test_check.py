@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking import noise
-from radarsdf.checking.noise import check_drift
+from radarsdf.checking.noise import check_drift, check_noise_and_cost
 from radarsdf.checking.recording import checked_input
 from radarsdf.io import Scans
 from radarsdf.simulate import drifted
@@ -18,6 +18,9 @@ from radarsdf.simulate import drifted
 from tests.conftest import recorded_file
 
 from .breakages import slow
+
+SCANS = 36
+CONFIG = radarsdf.FitConfig(num_threads=1)
 
 
 def test_scans_are_taken_as_they_are():
@@ -37,11 +40,11 @@ def test_arrays_need_poses():
 
 def added_m(points, poses):
     """What the note says that the poses add, m. None without a note."""
-    notes = [f.evidence for f in radarsdf.check(points, poses) if f.name == "poses_disagree"]
+    findings = check_noise_and_cost(checked_input(points, poses), CONFIG)
+    notes = [finding.evidence for finding in findings if finding.name == "poses_disagree"]
     return float(re.search(r"about ([0-9.]+) m", notes[0])[1]) if notes else None
 
 
-@pytest.mark.usefixtures("right_frames")
 @pytest.mark.parametrize(("kind", "frames"), [("hugin", 16), ("wall", 20)])
 def test_exact_poses_add_nothing(kind, frames):
     scans = getattr(radarsdf.simulate, kind)(frames=frames, seed=1)
@@ -62,10 +65,6 @@ def test_a_way_back_that_has_drifted_is_found():
     poses = np.concatenate([scans.poses, scans.poses[::-1]])
     poses[:, :3, 3] += 0.4 * np.linspace(0, 1, 40)[:, None] * poses[0, :3, 1]
     assert added_m(points, poses) > 0.02
-
-
-SCANS = 36
-CONFIG = radarsdf.FitConfig(num_threads=1)
 
 
 @pytest.fixture(scope="module")
