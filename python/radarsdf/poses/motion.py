@@ -152,18 +152,6 @@ class Motion:
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
         return cls(steps(poses), np.zeros(6), variances, shares, spans)
 
-    @property
-    def sigmas(self) -> tuple[float, float]:
-        """Standard deviations of each component of a step's translation, m, and rotation, rad."""
-        sigma_m, sigma_rad = np.sqrt(self.variances).tolist()
-        return sigma_m, sigma_rad
-
-    def as_evidence(self) -> Motion:
-        """With the variances that the covariance of poses is computed with."""
-        # Steps that were tracked by the same returns have the errors of these. As independent measurements, they would
-        # halve the deviations.
-        return dataclasses.replace(self, variances=np.maximum(self.variances, self.least_variances))
-
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
         """As measured by a sensor with these poses (F, 4, 4). Most measurements are the same for all."""
         return self

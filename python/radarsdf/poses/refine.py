@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -161,7 +161,7 @@ def refine_poses(
         used = returns.select(~held)
         found = PosesEstimate.of(used, given, motions, cell_m, limits, workers.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
-    sigma_m, sigma_rad = found.motions[0].sigmas
+    sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
     report |= {
         "verdict": verdict.words,
         "gain": verdict.gain,
@@ -224,7 +224,9 @@ class PosesEstimate:
             if window == count and cells == 1 and decrement < _SETTLED**2 * steps.size:
                 break
         assert noise is not None
-        evidence = [motion.as_evidence() for motion in motions]
+        # Steps that were tracked by the same returns have the errors of these. As independent measurements, they would
+        # halve the deviations.
+        evidence = [replace(m, variances=np.maximum(m.variances, m.least_variances)) for m in motions]
         diagonal, below, gradient = _prior(evidence, poses)
         diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
