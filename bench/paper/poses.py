@@ -14,6 +14,7 @@ import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.evaluation import surface_metrics, trajectory_metrics
+from radarsdf.io import Imu
 from radarsdf.poses.rigid import aligned, moved
 from radarsdf.simulate import drifted, measured_motion
 from scipy.spatial.transform import Rotation, Slerp
@@ -85,16 +86,18 @@ def _odometry_rows(scene: Scene, seed: int, options: argparse.Namespace) -> Iter
     else:
         return
     for name in _SOURCES:
-        gyroscope = rates if "gyroscope" in name else None
-        if "gyroscope" in name and gyroscope is None:
-            continue
+        imu = None
+        if "gyroscope" in name:
+            if rates is None:
+                continue
+            imu = Imu(times_s, rates, R_sensor_imu=np.eye(3))
         try:
             with timed() as taken:
                 found = radarsdf.odometry(
                     scene.points,
                     doppler_mps=None if name == "returns alone" else doppler,
                     times_s=times_s,
-                    angular_velocity=gyroscope,
+                    imu=imu,
                 )
         except ValueError as error:
             yield {"poses": name, "why_not": str(error)}

@@ -21,6 +21,7 @@ import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.evaluation import trajectory_metrics
+from radarsdf.io import Imu
 from radarsdf.simulate import SCENES, measured_motion
 
 from bench.measure import ROOT, failure
@@ -90,12 +91,12 @@ _OURS: dict[str, dict[str, bool]] = {
 def _ours(drive: Drive, *, doppler: bool, gyroscope: bool) -> str:
     if gyroscope and drive.rates is None:
         return "–"
+    imu = None
+    if gyroscope and drive.rates is not None:
+        imu = Imu(drive.times_s, drive.rates, R_sensor_imu=np.eye(3))
     try:
         found = radarsdf.odometry(
-            drive.points,
-            times_s=drive.times_s,
-            doppler_mps=drive.doppler_mps if doppler else None,
-            angular_velocity=drive.rates if gyroscope else None,
+            drive.points, times_s=drive.times_s, doppler_mps=drive.doppler_mps if doppler else None, imu=imu
         )
     except ValueError:
         return "refused"

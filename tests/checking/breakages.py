@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +36,14 @@ class Data:
     intensities: list[NDArray[Any]]
     doppler_mps: list[NDArray[Any]] | None = None
     times_s: FloatArray | None = None
+
+    def scans(self, numbers: Iterable[int]) -> Data:
+        """The scans with these numbers, with the same poses and times."""
+        points, intensities, doppler_mps = (
+            None if values is None else [values[i] for i in numbers]
+            for values in (self.points, self.intensities, self.doppler_mps)
+        )
+        return dataclasses.replace(self, points=points, intensities=intensities, doppler_mps=doppler_mps)
 
     def arguments(self) -> dict[str, Any]:
         """Names and values of the arguments."""
@@ -162,29 +170,16 @@ def _one_off(poses: FloatArray) -> FloatArray:
 
 def _copied(data: Data) -> Data:
     """A scan in the middle is replaced by the one before."""
-
-    def copied(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-        middle = len(arrays) // 2
-        return [*arrays[:middle], arrays[middle - 1], *arrays[middle + 1 :]]
-
-    return dataclasses.replace(
-        data,
-        points=copied(data.points),
-        intensities=copied(data.intensities),
-        doppler_mps=None if data.doppler_mps is None else copied(data.doppler_mps),
-    )
+    numbers = np.arange(len(data.points))
+    numbers[len(numbers) // 2] -= 1
+    return data.scans(numbers)
 
 
 def _late(data: Data) -> Data:
     """Each scan has the pose of two scans before."""
-    return dataclasses.replace(
-        data,
-        points=data.points[_TIMES_OF_STEP:],
-        poses=data.poses[:-_TIMES_OF_STEP],
-        intensities=data.intensities[_TIMES_OF_STEP:],
-        doppler_mps=None if data.doppler_mps is None else data.doppler_mps[_TIMES_OF_STEP:],
-        times_s=None if data.times_s is None else data.times_s[:-_TIMES_OF_STEP],
-    )
+    times_s = None if data.times_s is None else data.times_s[:-_TIMES_OF_STEP]
+    later = data.scans(range(_TIMES_OF_STEP, len(data.points)))
+    return dataclasses.replace(later, poses=data.poses[:-_TIMES_OF_STEP], times_s=times_s)
 
 
 def _clipped(data: Data) -> Data:
@@ -216,15 +211,11 @@ def _below_ground(data: Data) -> Data:
 
 
 def _doppler_as_intensity(data: Data) -> Data:
-    return data if data.doppler_mps is None else dataclasses.replace(data, intensities=data.doppler_mps)
+    return dataclasses.replace(data, intensities=data.doppler_mps)
 
 
-def with_other_sign(data: Data) -> Data:
-    return (
-        data
-        if data.doppler_mps is None
-        else dataclasses.replace(data, doppler_mps=[-d for d in data.doppler_mps])
-    )
+def _with_other_sign(data: Data) -> Data:
+    return dataclasses.replace(data, doppler_mps=[-speeds for speeds in data.doppler_mps])
 
 
 def _sensor_turned(data: Data) -> Data:
@@ -286,15 +277,11 @@ WAYS: dict[str, tuple[str, Way]] = {
     "one intensity of 1e9": ("intensity_wild", _replaced(0, 1e9, 1e9)),
     "garbage in 1 of 100 intensities": ("intensity_wild", _replaced(0.01, -1e9, 1e9)),
     "Doppler as intensity": ("intensity_is_doppler", _doppler_as_intensity),
-    "Doppler with the other sign": ("doppler_sign", with_other_sign),
+    "Doppler with the other sign": ("doppler_sign", _with_other_sign),
     "sensor turned by 8 degrees": ("sensor_turned", _sensor_turned),
     "reflections below the ground": ("below_ground", _below_ground),
 }
 """What is broken, and the name of its finding and how to break it."""
-
-NEED_DOPPLER = {"Doppler as intensity", "Doppler with the other sign", "sensor turned by 8 degrees"}
-"""Ways of which nothing is found without Doppler."""
-
 
 _STEP_S = 0.1  # between scans, or more
 _FASTEST_MPS = 55.0

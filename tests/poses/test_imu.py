@@ -11,8 +11,7 @@ import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.gyroscope import Gyroscope, UnalignedGyroscope, UnknownAxesError
-from radarsdf.poses.imu import ImuAlignment, Inertial, cumulated, levelled
+from radarsdf.poses.imu import Gyroscope, ImuAlignment, Inertial, UnusableGyroscopeError, cumulated, levelled
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
@@ -106,24 +105,27 @@ def test_a_sensor_that_goes_straight_on_leaves_it_open():
     assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None
 
 
-def test_turns_tell_it_without_an_accelerometer(ride):
+def test_a_rotation_that_nothing_determines_is_asked_for(ride, imu):
+    times_s, _, velocities = ride
+    found = Inertial.of(dataclasses.replace(imu, specific_force=None), velocities, times_s, 0.0)
+    assert found.gyroscope is None
+    assert "give R_sensor_imu" in found.notes[0]
+
+
+def test_a_bias_is_found_by_turns(ride):
     times_s, poses, _ = ride
     steps = Rotation.from_matrix(poses[:-1, :3, :3]).inv() * Rotation.from_matrix(poses[1:, :3, :3])
-    rng = np.random.default_rng(3)
-    turns = steps.as_rotvec() + rng.normal(0, 0.005, (len(steps), 3))
+    turns = steps.as_rotvec() + np.random.default_rng(3).normal(0, 0.005, (len(steps), 3))
     covariance = np.tile(0.005**2 * np.eye(3), (len(steps), 1, 1))
     bias = np.array([0.01, -0.02, 0.015])
-    rates = measured_imu(poses, times_s, R_sensor_imu=R_SENSOR_IMU, gyroscope_bias_rad_s=tuple(bias))
-    unaligned = UnalignedGyroscope.of(rates.angular_velocity, rates.times_s, times_s)
-    found = unaligned.learnt(turns, covariance)
+    rates = measured_imu(poses, times_s, gyroscope_bias_rad_s=tuple(bias))
+    found = Gyroscope.of(rates.angular_velocity, rates.times_s, times_s).learnt(turns, covariance)
     off = np.degrees(np.linalg.norm(found.turns - found.bias.mean * 0.1 - steps.as_rotvec(), axis=1))
     assert np.median(off) < 0.1
     # Three deviations of the mean of 299 turns of 0.1 s, each known to 0.005 rad.
-    np.testing.assert_allclose(found.bias.mean, R_SENSOR_IMU @ bias, atol=3 * 0.05 / np.sqrt(299))
-    with pytest.raises(UnknownAxesError):
-        unaligned.learnt(turns[::-1], covariance)
-    with pytest.raises(UnknownAxesError):
-        unaligned.learnt(rng.normal(0, 0.005, turns.shape), covariance)
+    np.testing.assert_allclose(found.bias.mean, bias, atol=3 * 0.05 / np.sqrt(299))
+    with pytest.raises(UnusableGyroscopeError):
+        Gyroscope.of(np.degrees(rates.angular_velocity), rates.times_s, times_s).learnt(turns, covariance)
 
 
 def test_products_of_many_small_turns():

@@ -49,24 +49,9 @@ def test_deviations_and_bias_are_learnt_from_poses_that_are_known():
     given = drifted(true, 0.03, 0.004, 3, yaw_rad=0.01)
     nothing = np.zeros((400, 6, 6)), np.zeros((399, 6, 6))
     learnt = Motion.of(given, 0.1, 0.01).learnt(true, true, *nothing)
-    assert learnt.sigma_m == pytest.approx(0.03, rel=0.1)
-    assert learnt.sigma_rad == pytest.approx(0.004, rel=0.1)
+    assert np.sqrt(learnt.variances[0]) == pytest.approx(0.03, rel=0.1)
+    assert np.sqrt(learnt.variances[1]) == pytest.approx(0.004, rel=0.1)
     assert learnt.bias[5] == pytest.approx(-0.01, abs=5e-4)
-    kept = Motion.of(given, 0.1, 0.01, known=(True, True)).learnt(true, true, *nothing)
-    assert (kept.sigma_m, kept.sigma_rad) == pytest.approx((0.1, 0.01))
-
-
-def test_a_bias_is_believed_as_far_as_it_is_told():
-    motion = Motion.of(trajectory(6), 0.1, 0.02)
-    bias = np.array([0.05, 0.1, 0.2, 0.01, 0.02, 0.05])
-    shares = np.stack(
-        [motion._believed(bias, share * np.repeat(motion.variances, 3)) for share in (0, 0.3, 0.6, 1, 2)]
-    )
-    np.testing.assert_allclose(shares[[0, -2, -1]], [[1] * 6, [0] * 6, [0] * 6], atol=1e-12)
-    assert (np.diff(shares[:4], axis=0) < 0).all()
-    # One that is as large as the errors of steps, half of whose variance is left.
-    half = motion._believed(np.sqrt(np.repeat(motion.variances, 3)), 0.5 * np.repeat(motion.variances, 3))
-    np.testing.assert_allclose(half, 0.5)
 
 
 def test_velocities_lead_from_pose_to_pose():

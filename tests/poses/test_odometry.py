@@ -4,16 +4,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.drive import Drive
-from radarsdf.poses.rigid import aligned, rotation, turned_by
-from radarsdf.poses.tracking import Tracked
+from radarsdf.io import Imu
+from radarsdf.poses.rigid import aligned, turned_by
 from radarsdf.simulate import drifted, measured_motion
 
 from .drift import first, position_error_m
@@ -23,8 +19,8 @@ BIAS_RAD_S = (0.01, -0.02, 0.03)
 
 @pytest.fixture(scope="module")
 def drive():
-    """Half a lap."""
-    return first(radarsdf.simulate.oculii, 60, seed=62, frames=120)
+    """A third of a lap."""
+    return first(radarsdf.simulate.oculii, 40, seed=62, frames=120)
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +31,11 @@ def motion(drive):
 @pytest.fixture(scope="module")
 def found(drive, motion):
     return radarsdf.odometry(drive.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+
+
+def gyroscope(motion):
+    """In the axes of the radar."""
+    return Imu(motion.times_s, motion.angular_velocity, R_sensor_imu=np.eye(3))
 
 
 def length_m(poses):
@@ -54,9 +55,9 @@ def only(drive, rows):
 
 def test_returns_alone_are_not_counted_twice():
     """Steps that were tracked by the same returns are no evidence beside them: NEES / 3 was 8 and more."""
-    street = radarsdf.simulate.oculii(seed=6, frames=30)
+    street = first(radarsdf.simulate.oculii, 20, seed=6, frames=30)
     found = radarsdf.odometry(street.points, times_s=measured_motion(street).times_s)
-    T = street.poses[15] @ np.linalg.inv(found.poses[15])
+    T = street.poses[10] @ np.linalg.inv(found.poses[10])
     off = (np.einsum("ij,fjk->fik", T, found.poses) - street.poses)[:, :3, 3]
     covariance = np.einsum("ij,fjk,lk->fil", T[:3, :3], found.covariance[:, :3, :3], T[:3, :3])
     nees = [e @ np.linalg.solve(C, e) / 3 for e, C in zip(off, covariance, strict=True) if e.any()]
@@ -71,9 +72,6 @@ def test_doppler_and_returns_find_the_poses(drive, found):
     assert found.report["length_m"] == pytest.approx(length_m(drive.poses), rel=0.01)
     assert found.report["doppler_sign"] == 1
     assert 0.04 < found.report["movers"] / sum(map(len, drive.points)) < 0.2
-    assert np.isnan(found.agreeing[0])
-    assert found.agreeing[1:].min() > 0.2
-    assert "placed by returns and Doppler" in found.report["verdict"]
 
 
 def test_errors_are_as_large_as_the_covariance_says(drive, found):
@@ -92,26 +90,26 @@ def test_a_gyroscope_turns_and_its_bias_is_found(drive, motion, found):
         drive.points,
         doppler_mps=motion.doppler_mps,
         times_s=motion.times_s,
-        angular_velocity=motion.angular_velocity,
+        imu=gyroscope(motion),
     )
     assert errors(with_it.poses, drive.poses)[1] < errors(found.poses, drive.poses)[1]
     np.testing.assert_allclose(with_it.report["gyroscope_bias"], BIAS_RAD_S, atol=0.006)
-    assert "Doppler and a gyroscope" in with_it.report["verdict"]
+    assert with_it.report["gyroscope"]
 
 
 def test_the_sign_and_the_folds_of_the_doppler_do_not_matter(drive, motion):
     folded = measured_motion(drive, interval_mps=6.0, gyroscope_bias_rad_s=BIAS_RAD_S)
     assert max(np.abs(speeds).max() for speeds in folded.doppler_mps) <= 3.0 + 1e-6
-    points, true = only(drive, range(30))
+    points, true = only(drive, range(20))
     turned = radarsdf.odometry(
-        points, doppler_mps=[-speeds for speeds in folded.doppler_mps[:30]], times_s=motion.times_s[:30]
+        points, doppler_mps=[-speeds for speeds in folded.doppler_mps[:20]], times_s=motion.times_s[:20]
     )
     assert turned.report["doppler_sign"] == -1
     assert errors(turned.poses, true)[0] < 0.005 * length_m(true)
 
 
 def test_a_gap_is_bridged(drive, motion):
-    rows = np.r_[0:15, 21:36]
+    rows = np.r_[0:12, 18:28]
     points, true = only(drive, rows)
     found = radarsdf.odometry(
         points, doppler_mps=[motion.doppler_mps[i] for i in rows], times_s=motion.times_s[rows]
@@ -124,28 +122,27 @@ def test_a_drive_that_goes_on_elsewhere_is_in_two_pieces(drive):
     other = first(radarsdf.simulate.hugin, 10, seed=63, frames=20)
     motions = [measured_motion(scene) for scene in (drive, other)]
     found = radarsdf.odometry(
-        drive.points[:16] + other.points,
-        doppler_mps=motions[0].doppler_mps[:16] + motions[1].doppler_mps,
-        times_s=np.r_[motions[0].times_s[:16], motions[1].times_s + 60],
+        drive.points[:12] + other.points,
+        doppler_mps=motions[0].doppler_mps[:12] + motions[1].doppler_mps,
+        times_s=np.r_[motions[0].times_s[:12], motions[1].times_s + 60],
     )
-    assert found.pieces.tolist() == [0] * 16 + [1] * 10
-    assert np.flatnonzero(np.isnan(found.agreeing)).tolist() == [0, 16]
-    assert "lost before the scans 16: 2 pieces" in found.report["verdict"]
-    assert found.longest_piece() == slice(0, 16)
-    assert errors(found.poses[16:], other.poses)[0] < 0.1
+    assert found.pieces.tolist() == [0] * 12 + [1] * 10
+    assert "lost before the scans 12: 2 pieces" in found.report["verdict"]
+    assert found.longest_piece() == slice(0, 12)
+    assert errors(found.poses[12:], other.poses)[0] < 0.1
 
 
 def test_scans_alone_are_enough_where_they_tell(drive, motion):
-    points, true = only(drive, range(36))
-    found = radarsdf.odometry(points, times_s=motion.times_s[:36])
+    points, true = only(drive, range(20))
+    found = radarsdf.odometry(points, times_s=motion.times_s[:20])
     assert not found.report["doppler"]
     assert errors(found.poses, true)[0] < 0.01 * length_m(true)
 
 
 def test_a_wall_alone_is_refused():
-    wall = first(radarsdf.simulate.wall, 20, seed=5, frames=40)
+    wall = first(radarsdf.simulate.wall, 14, seed=5, frames=40)
     with pytest.raises(ValueError, match="returns alone do not tell"):
-        radarsdf.odometry(wall.points, times_s=np.arange(20) / 10)
+        radarsdf.odometry(wall.points, times_s=np.arange(14) / 10)
     motion = measured_motion(wall)
     found = radarsdf.odometry(wall.points, times_s=motion.times_s, doppler_mps=motion.doppler_mps)
     assert errors(found.poses, wall.poses)[0] < 0.05
@@ -156,18 +153,16 @@ def test_hardly_any_returns_of_a_turning_sensor_are_refused(drive, motion):
     speeds = [v[:: max(1, len(v) // 20)] for v in motion.doppler_mps]
     with pytest.raises(ValueError, match="how the sensor turned"):
         radarsdf.odometry(few, doppler_mps=speeds, times_s=motion.times_s)
-    found = radarsdf.odometry(
-        few, doppler_mps=speeds, times_s=motion.times_s, angular_velocity=motion.angular_velocity
-    )
+    found = radarsdf.odometry(few, doppler_mps=speeds, times_s=motion.times_s, imu=gyroscope(motion))
     assert found.report["length_m"] == pytest.approx(length_m(drive.poses), rel=0.05)
 
 
 def test_the_bits_do_not_depend_on_threads(drive, motion):
     one, three = (
         radarsdf.odometry(
-            drive.points[:16],
-            doppler_mps=motion.doppler_mps[:16],
-            times_s=motion.times_s[:16],
+            drive.points[:8],
+            doppler_mps=motion.doppler_mps[:8],
+            times_s=motion.times_s[:8],
             config=FitConfig(num_threads=threads),
         )
         for threads in (1, 3)
@@ -191,54 +186,23 @@ def test_hardly_any_returns_have_poses_as_well(counts):
 
 
 def test_refined_poses_with_doppler_are_better(drive, motion):
-    given = drifted(drive.poses[:40], 0.05, 0.004, 1)
+    given = drifted(drive.poses[:24], 0.05, 0.004, 1)
     plain, by_doppler = (
-        radarsdf.refine_poses(drive.points[:40], given, times_s=motion.times_s[:40], doppler_mps=speeds)
-        for speeds in (None, [-speeds for speeds in motion.doppler_mps[:40]])
+        radarsdf.refine_poses(drive.points[:24], given, times_s=motion.times_s[:24], doppler_mps=speeds)
+        for speeds in (None, [-speeds for speeds in motion.doppler_mps[:24]])
     )
     assert by_doppler.improved
     assert by_doppler.report["movers"] > 0
-    assert errors(by_doppler.poses, drive.poses[:40])[0] < 0.5 * errors(plain.poses, drive.poses[:40])[0]
+    assert errors(by_doppler.poses, drive.poses[:24])[0] < 0.5 * errors(plain.poses, drive.poses[:24])[0]
 
 
 def test_wrong_arguments_are_refused(drive, motion):
     points, speeds, times = drive.points[:4], motion.doppler_mps[:4], motion.times_s[:4]
-    rates, none = np.zeros((4, 3)), np.zeros(0)
     for wrong, named in (
         ({"times_s": None, "doppler_mps": None}, "times_s are missing"),
         ({"times_s": None}, "Doppler needs times"),
         ({"times_s": times * 1e300}, "^times_s "),
         ({"doppler_mps": speeds[:3]}, "doppler_mps"),
-        ({"angular_velocity": rates[:3]}, "shape"),
-        ({"angular_velocity": rates, "angular_velocity_times_s": times[::-1]}, "ascend"),
-        ({"angular_velocity": rates, "angular_velocity_times_s": times + 1e9}, "one clock"),
-        ({"angular_velocity": rates + 1e300}, "^angular_velocity "),
-        ({"angular_velocity": rates[:0], "angular_velocity_times_s": none}, "^angular_velocity "),
-        ({"angular_velocity": rates, "angular_velocity_times_s": times * 1e300}, "^angular_velocity "),
     ):
         with pytest.raises(ValueError, match=named):
             radarsdf.odometry(points, **{"doppler_mps": speeds, "times_s": times} | wrong)
-
-
-def test_scans_of_a_sensor_that_stands_do_not_count_again(drive):
-    """They have the same returns with the same errors. Slow or on the spot, a sensor does not stand."""
-    speeds = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.2])  # m/s
-    turned = np.array([0.0, 0.0, 0.02, 0.5, 0.5, 0.5, 0.8, 0.8])  # rad
-    velocities = SensorVelocities(
-        np.column_stack([speeds, 0 * speeds, 0 * speeds]),
-        np.tile(0.02**2 * np.eye(3), (8, 1, 1)),
-        np.ones(3),
-        [np.ones(len(scan), bool) for scan in drive.points[:8]],
-        np.ones(8, bool),
-    )
-    poses = np.tile(np.eye(4), (8, 1, 1))
-    poses[:, :3, :3] = rotation(np.column_stack([0 * turned, 0 * turned, turned]))
-    tracked = [Tracked(pose, 0.02**2 * np.eye(6), 1.0, 0, np.zeros(3)) for pose in poses]
-    followed = Drive(list(drive.points[:8]), np.arange(8.0), velocities, None)
-
-    def told(by, rows):
-        return [len(scan) > 0 for scan in by.new_returns(tracked, rows)]
-
-    assert told(followed, slice(0, 8)) == [True, False, False, True, True, False, True, True]
-    assert told(followed, slice(1, 4)) == [True, False, True]  # another piece has no other scan of this place
-    assert all(told(dataclasses.replace(followed, velocities=None), slice(0, 8)))

@@ -6,15 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import radarsdf
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.motion import Motion
-from radarsdf.poses.planes import Groups, PlaneGrid, SensorReturns, common_planes, unbiased_normals
-from radarsdf.poses.rigid import aligned, moved
+from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, unbiased_normals
 from radarsdf.returns.planes import Surfels
-from radarsdf.simulate import drifted, simulate
-
-from .drift import position_error_m, trajectory
 
 
 def surfels_of(points):
@@ -71,43 +65,3 @@ def test_a_noisy_scan_is_as_high_as_others(height_m):
     assert (
         abs(moved[::2].mean() - moved[1::2].mean()) < 0.01
     )  # 0.02, if returns belonged to the cell that they lie in
-
-
-@pytest.mark.parametrize(("count", "size"), [(13, 4), (12, 4), (9, 8), (16, 2), (7, 1)])
-def test_groups_cost_what_the_increments_of_their_scans_cost(count, size):
-    rng = np.random.default_rng(count)
-    poses = trajectory(count)
-    motion = Motion.of(drifted(poses, 0.1, 0.01, 1), 0.1, 0.01)
-    diagonal, below, gradient = motion.prior(poses)
-    groups = Groups(count, size)
-    of_groups = groups.prior((diagonal, below, gradient), poses)
-    for _ in range(3):
-        few = rng.normal(size=(len(groups.middles), 6))
-        many = groups.increments(few, poses)
-        assert many.shape == (count, 6)
-        assert cost(*of_groups, few) == pytest.approx(cost(diagonal, below, gradient, many), rel=1e-9)
-
-
-def cost(diagonal, below, gradient, x):
-    """Of increments x (F, 6): the quadratic function that a solver makes least."""
-    own = np.einsum("fi,fij,fj->", x, diagonal, x) / 2
-    return own + np.einsum("fi,fij,fj->", x[1:], below, x[:-1]) + np.einsum("fi,fi->", x, gradient)
-
-
-def test_groups_with_a_share_of_the_returns_close_a_loop():
-    court = radarsdf.simulate.oculii(seed=5, frames=60)
-    true = np.concatenate([court.poses, court.poses[:20]])
-    laps = simulate(court.scene, court.sensor, true, name="laps")
-    given = drifted(true, 0.0, 0.0, 1, 0.002)
-    returns = SensorReturns.of(laps.points, 0.5, None)
-    errors_m = []
-    for together in (1, 4):
-        grid, groups = PlaneGrid(len(true), False, 2.0, together), Groups(len(true), together)
-        planes, _ = common_planes(returns, given, grid, None, ReturnsConfig(), 1)
-        prior = groups.prior(Motion.of(given, 0.1, 0.01).prior(given), given)
-        found = planes.solve(*prior, 1e-4, 100, False, 1)[0]
-        assert found.shape == (-(-len(true) // together), 6)
-        poses = moved(given, groups.increments(found, given))
-        errors_m.append(position_error_m(aligned(poses, true), true))
-    assert errors_m[0] < 0.6 * position_error_m(aligned(given, true), true)
-    assert errors_m[1] < 1.1 * errors_m[0]

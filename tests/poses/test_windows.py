@@ -10,7 +10,7 @@ import radarsdf
 from radarsdf.evaluation import trajectory_metrics
 from radarsdf.io import Scan
 from radarsdf.poses import windows
-from radarsdf.poses.odometry import NotToldError
+from radarsdf.poses.odometry import UnobservedMotionError
 from radarsdf.poses.rigid import moved, transform
 from radarsdf.poses.windows import JoinedPoses, find_in_windows, refine_in_windows
 
@@ -129,7 +129,7 @@ def test_a_window_that_tells_nothing_ends_a_piece(monkeypatch):
     def odometry(part, **given):
         asked.append(len(part.points))
         if len(asked) == 2:
-            raise NotToldError(told)
+            raise UnobservedMotionError(told)
         return radarsdf.odometry(part, **given)
 
     monkeypatch.setattr(windows, "odometry", odometry)

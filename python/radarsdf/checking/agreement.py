@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,33 +28,19 @@ _MOTION = 0.05  # of the median range: a sensor that has moved less shows little
 
 
 class Agreement:
-    """Compares scans, each with the nearest-neighbour tree of a sample of its returns.
+    """Compares scans (N_i, 3), each with the nearest-neighbour tree of at most `returns` of its returns.
 
-    Parameters
-    ----------
-    scans : sequence of F arrays
-        (N_i, 3) each, real numbers, in the frame that they came in. They are sampled at equal steps: no random numbers.
-    returns : int
-        Largest number of returns of a scan in its tree.
-    queries : int
-        About so many returns of each scan are looked up in another one.
+    About `queries` returns of each scan are looked up in another one. They are sampled at equal steps: no random numbers.
     """
 
     def __init__(self, scans: Sequence[NDArray[Any]], returns: int, queries: int) -> None:
-        self._scans = scans
-        self._returns = returns
-        self._queries = queries
+        self._scans, self._returns, self._queries = scans, returns, queries
         self._trees: dict[int, tuple[cKDTree, FloatArray, FloatArray]] = {}
 
     def scores(self, pairs: NDArray[np.int64], T_j_i: FloatArray) -> FloatArray:
-        """Scores (H, P) of P pairs of scans under H hypotheses. The smaller, the better the scans agree.
+        """Scores (H, P) of pairs (P, 2) of scans i and j under H hypotheses. The smaller, the better the scans agree.
 
-        Parameters
-        ----------
-        pairs : ndarray
-            (P, 2) int64, scans i and j.
-        T_j_i : ndarray
-            (H, P, 4, 4) isometries, proper or not, from the frame of scan i to that of scan j.
+        `T_j_i` (H, P, 4, 4): isometries, proper or not, from the frame of scan i to that of scan j.
         """
         back = inverse(T_j_i)
         found = np.zeros(T_j_i.shape[:2])
@@ -68,28 +53,29 @@ class Agreement:
         return float(np.median(self._tree(i)[1])) if len(self._scans[i]) >= MIN_RETURNS else 0.0
 
     def _one_way(self, i: int, j: int, T_j_i: FloatArray) -> FloatArray:
-        """Mean logarithms (H,) of the quotients of returns of scan i in scan j."""
+        """Mean logarithms (H,) of the distances of returns of scan i from scan j, over the spacing there."""
         queries = self._tree(i)[2]
         tree, spacing, _ = self._tree(j)
         moved = np.einsum("hab,nb->hna", T_j_i[:, :3, :3], queries) + T_j_i[:, None, :3, 3]
         # Far from all returns, the quotient counts as _MOST anyway: the bound saves most of the search.
         distances, nearest = tree.query(moved.reshape(-1, 3), distance_upper_bound=_MOST * spacing.max())
-        quotients = distances / np.append(spacing, 1.0)[nearest]  # the tree says n where it found none
+        quotients = distances / np.append(spacing, 1.0)[nearest]  # the row is n where none was found
         logs = np.log(np.clip(quotients, _LEAST, _MOST)).reshape(moved.shape[:2])
         means: FloatArray = logs.mean(axis=1)
         return means
 
     def _tree(self, i: int) -> tuple[cKDTree, FloatArray, FloatArray]:
+        """Tree, spacing at its returns, and queries of a scan."""
         if i not in self._trees:
             scan = self._scans[i]
-            kept = np.asarray(scan[:: -(-len(scan) // self._returns)], np.float64)
+            kept, queries = (
+                np.asarray(scan[:: -(-len(scan) // count)], np.float64)
+                for count in (self._returns, self._queries)
+            )
             tree = cKDTree(kept)
             spacing = tree.query(kept, _NEIGHBOURS + 1)[0][:, 1:].mean(axis=1)
-            spacing = np.maximum(
-                spacing, 1e-9 * max(float(np.abs(kept).max()), 1.0)
-            )  # returns on one another
-            queries = np.asarray(scan[:: -(-len(scan) // self._queries)], np.float64)
-            self._trees[i] = tree, spacing, queries
+            least = 1e-9 * max(float(np.abs(kept).max()), 1.0)  # returns on one another
+            self._trees[i] = tree, np.maximum(spacing, least), queries
         return self._trees[i]
 
 
@@ -97,10 +83,10 @@ class Agreement:
 class Comparison:
     """How much better hypotheses agree than the data as given, over P pairs of scans."""
 
-    gains: FloatArray
-    """(H,) mean decrease of the score. exp(-gain) is the factor by which the distances shrink."""
-    errors: FloatArray
-    """(H,) standard error of the mean, from the differences between the pairs."""
+    gains: (
+        FloatArray  # (H,) mean decrease of the score. exp(-gain) is the factor by which the distances shrink
+    )
+    errors: FloatArray  # (H,) standard error of the mean, from the differences between the pairs
 
     @classmethod
     def of(cls, given: FloatArray, others: FloatArray) -> Comparison:
@@ -120,11 +106,10 @@ class Comparison:
 def choose_pairs(
     scans: Sequence[NDArray[Any]], positions: FloatArray, count: int, lags: Sequence[int] = LAGS
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of scans, about `count`, spread over the drive, with short and longer ways between them.
+    """Pairs (P, 2) of scans, about `count`, spread over the drive, neighbours and farther apart.
 
     Neighbours overlap most; but where scans are frequent, the sensor hardly moves between them, and any hypothesis
-    agrees. So some pairs are so far apart that the sensor moved a share of its range, as the poses say. Scans with
-    too few returns are left out.
+    agrees. So in some pairs, the sensor moved a share of its range, by the poses. Scans with too few returns are left out.
     """
     usable = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in scans])
     if len(usable) < 2:
@@ -135,10 +120,7 @@ def choose_pairs(
     most = max(1, len(usable) // 2)
     stride = int(np.clip(_MOTION * middle / step if step > 0 else 1, 1, max(1, most // lags[-1])))
     ways = sorted({min(lag, most) for lag in lags} | {lag * stride for lag in lags if lag * stride <= most})
-    found = []
-    for lag in ways:
-        found.append(pairs_apart(usable, lag, -(-count // len(ways))))
-    return np.concatenate(found)
+    return np.concatenate([pairs_apart(usable, lag, -(-count // len(ways))) for lag in ways])
 
 
 def pairs_apart(scans: NDArray[np.int64], lag: int, count: int) -> NDArray[np.int64]:
@@ -163,31 +145,25 @@ def inverse(T_a_b: FloatArray) -> FloatArray:
     return found
 
 
-_AXES = "xyz"
 _UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}
 # Of radar axes (x forward, y left, z up) in a camera frame (x right, y down, z forward).
 _CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 # Of a sensor on its vehicle, in yaw; in pitch up to 20.
-_TURNS_DEG = {"z": (5, 10, 15, 20, 25, 30, 35, 40, 45), "y": (5, 10, 15, 20)}
+_TURNS_DEG = {"yaw": ("z", range(5, 50, 5)), "pitch": ("y", range(5, 25, 5))}
 # A sensor that turns more between scans may have poses of degrees taken for radians.
 _FAST_RAD = np.radians(3)
 _LOST_TURNS = 29  # whole turns tried
+STILL = 1  # number of the hypothesis under which the sensor does not move between scans: points in the world frame
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """One way to read the data."""
 
-    finding: str
-    """Name of the finding, if this is right."""
-    what: str
-    """What the data are, in words that follow "the scans agree better if"."""
-    mend: str
-    """What to do, if this is right."""
-    T_j_i: FloatArray
-    """(P, 4, 4) motions of the pairs of scans, between the frames of the points as given."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """The axis of the points as given that is up then."""
+    finding: str  # its name, if this is right
+    what: str  # words that follow "the scans agree better if"
+    T_j_i: FloatArray  # (P, 4, 4) motions of the pairs of scans, between the frames of the points as given
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # the axis of the points as given that is up then
 
 
 def hypotheses(
@@ -197,97 +173,74 @@ def hypotheses(
 
     `all_axes`: whether to try all 47 ways to swap and turn axes, of points and of positions, or only the most common eight.
     """
-    return list(_hypotheses(T_world_sensor, pairs, all_axes))
+    poses, motions = T_world_sensor, relative(T_world_sensor, pairs)
 
+    def positions(values: FloatArray) -> FloatArray:
+        changed = poses.copy()
+        changed[:, :3, 3] = values
+        return relative(changed, pairs)
 
-def _hypotheses(poses: FloatArray, pairs: NDArray[np.int64], all_axes: bool) -> Iterator[Hypothesis]:
-    motions = relative(poses, pairs)
-    yield Hypothesis(
-        "poses_inverted",
-        "the poses are inverted",
-        "Invert each pose: np.linalg.inv(poses).",
-        relative(inverse(poses), pairs),
-    )
-    yield Hypothesis(
-        "points_in_world_frame",
-        "the points are in the world frame already",
-        "Move them back: (points - pose[:3, 3]) @ pose[:3, :3], or pass the points of the sensor frame.",
-        np.tile(np.eye(4), (len(pairs), 1, 1)),
-    )
-    yield from _axes(poses, pairs, all_axes)
+    def rotations(values: Rotation) -> FloatArray:
+        changed = poses.copy()
+        changed[:, :3, :3] = values.as_matrix()
+        return relative(changed, pairs)
+
+    still = np.tile(np.eye(4), (len(pairs), 1, 1))
+    found = [
+        Hypothesis("poses_inverted", "the poses are inverted", relative(inverse(poses), pairs)),
+        Hypothesis("points_in_world_frame", "the points are in the world frame already", still),
+    ]
+    rotations_by_90 = Rotation.create_group("O").as_matrix().round()
+    # All ways to swap axes or change their signs, without the identity.
+    for matrix in sorted([*rotations_by_90, *-rotations_by_90], key=_surprise)[1:]:
+        words, kind = _written(matrix), _kind(matrix)
+        camera = kind == "camera_frame"
+        # z up or down, x and y in any order; and the frame of a camera
+        if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
+            continue
+        turned = _transform(matrix)
+        up = float(matrix[2, 0]), float(matrix[2, 1]), float(matrix[2, 2])
+        what = f"the points are read as ({words})"
+        found.append(Hypothesis(kind, what, turned.T @ motions @ turned, up))
+        if all_axes or not camera:
+            what = f"the positions of the poses are read as ({words})"
+            found.append(Hypothesis(kind, what, positions(poses[:, :3, 3] @ matrix.T)))
     for factor, word in _UNITS.items():
-        yield Hypothesis(
-            "units",
-            f"the positions of the poses are multiplied by {word}",
-            f"Use metres for both: multiply the positions by {word}, or divide the points by it.",
-            relative(_with(poses, positions=poses[:, :3, 3] * factor), pairs),
-        )
-    for what, rotations in _angles(poses):
-        yield Hypothesis(
-            "angles_in_degrees",
-            what,
-            "Make the rotations of the poses anew, from angles in rad.",
-            relative(_with(poses, rotations=rotations), pairs),
-        )
+        what = f"the positions of the poses are multiplied by {word}"
+        found.append(Hypothesis("units", what, positions(poses[:, :3, 3] * factor)))
+    for what, angles in _angles(poses):
+        found.append(Hypothesis("angles_in_degrees", what, rotations(angles)))
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     for shift, order, other in ((-1, "w x y z", "x y z w"), (1, "x y z w", "w x y z")):
-        read = Rotation.from_quat(np.roll(quaternions, shift, axis=1))
-        yield Hypothesis(
-            "quaternion_order",
-            f"the quaternions of the poses are {order}, and were read as {other}",
-            f"Make the rotations of the poses anew, from quaternions in the order {order}.",
-            relative(_with(poses, rotations=read), pairs),
-        )
-    for axis, name in (("z", "yaw"), ("y", "pitch")):
-        for degrees in (sign * turn for turn in _TURNS_DEG[axis] for sign in (1, -1)):
-            T_vehicle_sensor = np.eye(4)
-            T_vehicle_sensor[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-            yield Hypothesis(
-                "sensor_turned",
-                f"the sensor is turned by {degrees} degrees of {name} on what the poses are of",
-                "Pass poses of the sensor: poses @ T_vehicle_sensor, by its calibration.",
-                T_vehicle_sensor.T @ motions @ T_vehicle_sensor,
-            )
-
-
-def standing_still(guesses: list[Hypothesis]) -> int:
-    """Number of the hypothesis under which the sensor does not move between scans: points in the world frame."""
-    return next(k for k, guess in enumerate(guesses) if guess.finding == "points_in_world_frame")
-
-
-def _with(
-    poses: FloatArray, *, positions: FloatArray | None = None, rotations: Rotation | None = None
-) -> FloatArray:
-    """Poses (F, 4, 4) with other positions (F, 3), m, or rotations (F,)."""
-    found = poses.copy()
-    if positions is not None:
-        found[:, :3, 3] = positions
-    if rotations is not None:
-        found[:, :3, :3] = rotations.as_matrix()
+        what = f"the quaternions of the poses are {order}, and were read as {other}"
+        rolled = Rotation.from_quat(np.roll(quaternions, shift, axis=1))
+        found.append(Hypothesis("quaternion_order", what, rotations(rolled)))
+    for name, (axis, turns) in _TURNS_DEG.items():
+        for degrees in (sign * turn for turn in turns for sign in (1, -1)):
+            T_vehicle_sensor = _transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+            what = f"the sensor is turned by {degrees} degrees of {name} on what the poses are of"
+            moved = T_vehicle_sensor.T @ motions @ T_vehicle_sensor
+            found.append(Hypothesis("sensor_turned", what, moved))
     return found
 
 
-def _signed_permutations() -> Iterator[FloatArray]:
-    """The 47 matrices that swap axes or change their signs, the identity left out."""
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            if not np.array_equal(matrix, np.eye(3)):
-                yield matrix
+def _transform(matrix: FloatArray) -> FloatArray:
+    """(4, 4) of a matrix (3, 3)."""
+    found = np.eye(4)
+    found[:3, :3] = matrix
+    return found
 
 
 def _written(matrix: FloatArray) -> str:
     """A signed permutation as a user would write it: x, -y, -z."""
     axes = np.argmax(np.abs(matrix), axis=1)
-    return ", ".join(
-        ("-" if row[axis] < 0 else "") + _AXES[axis] for row, axis in zip(matrix, axes, strict=True)
-    )
+    return ", ".join("-" * int(row[axis] < 0) + "xyz"[axis] for row, axis in zip(matrix, axes, strict=True))
 
 
-def _surprise(matrix: FloatArray) -> tuple[bool, float]:
-    """To sort matrices by: where z stays up, the mistake is more common. Few signs before many."""
-    return (matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum()))
+def _surprise(matrix: FloatArray) -> tuple[bool, bool, float]:
+    """To sort matrices by: the identity, those where z stays up, as in more common mistakes, few signs before many."""
+    key = matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum())
+    return not np.array_equal(matrix, np.eye(3)), *key
 
 
 def _kind(matrix: FloatArray) -> str:
@@ -296,32 +249,6 @@ def _kind(matrix: FloatArray) -> str:
         return "camera_frame"
     keeps_axes = np.array_equal(np.abs(matrix), np.eye(3))
     return "mirrored" if keeps_axes and np.linalg.det(matrix) < 0 else "axes_swapped"
-
-
-def _axes(poses: FloatArray, pairs: NDArray[np.int64], all_axes: bool) -> Iterator[Hypothesis]:
-    motions = relative(poses, pairs)
-    for matrix in sorted(_signed_permutations(), key=_surprise):
-        words, kind = _written(matrix), _kind(matrix)
-        camera = kind == "camera_frame"
-        # z up or down, x and y in any order; and the frame of a camera
-        if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
-            continue
-        turned = np.eye(4)
-        turned[:3, :3] = matrix
-        yield Hypothesis(
-            kind,
-            f"the points are read as ({words})",
-            f"Pass points with the columns ({words}): x forward, y left, z up.",
-            turned.T @ motions @ turned,
-            up=(float(matrix[2, 0]), float(matrix[2, 1]), float(matrix[2, 2])),
-        )
-        if all_axes or not camera:
-            yield Hypothesis(
-                kind,
-                f"the positions of the poses are read as ({words})",
-                "Make positions and rotations of the poses in one right-handed world frame with z up.",
-                relative(_with(poses, positions=poses[:, :3, 3] @ matrix.T), pairs),
-            )
 
 
 def _angles(poses: FloatArray) -> Iterator[tuple[str, Rotation]]:
@@ -335,10 +262,7 @@ def _angles(poses: FloatArray) -> Iterator[tuple[str, Rotation]]:
         return
     # Angles in degrees, taken for rad, have lost whole turns. Steps are small, so the turns between scans are known.
     angles = np.radians(np.unwrap(rotations.as_euler("ZYX"), axis=0))
-    turn = np.radians(2 * np.pi)  # what a lost turn was
     for turns in range(-_LOST_TURNS, _LOST_TURNS + 1):
-        lost = np.array([turns * turn, 0.0, 0.0])
-        yield (
-            "the angles of the poses are taken for degrees, not rad",
-            Rotation.from_euler("ZYX", angles + lost),
-        )
+        lost = np.array([turns * np.radians(2 * np.pi), 0.0, 0.0])
+        what = "the angles of the poses are taken for degrees, not rad"
+        yield what, Rotation.from_euler("ZYX", angles + lost)

@@ -7,12 +7,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checking import frames, noise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
-from radarsdf.checking.recording import SEVERITIES, Finding, Recording
+from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
 from radarsdf.checks import MISSING_POSES, are_rigid, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.scans import Scans, filled
@@ -28,7 +28,7 @@ def check(
     times_s: ArrayLike | None = None,
     config: FitConfig | None = None,
 ) -> list[Finding]:
-    """Finds mistakes in scans and poses, and estimates what a fit of them will cost.
+    """Find mistakes in scans and poses, and estimate the cost of a fit.
 
     Most findings compare how well returns of different scans agree in the world frame: with the data as they are, and as if
     one common mistake were corrected. Samples are taken at equal steps, so the same data give the same findings.
@@ -36,7 +36,7 @@ def check(
     Parameters
     ----------
     points : sequence of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, as they are, all the
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, all the
         rest is used where it is not given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
@@ -73,82 +73,85 @@ def check(
     )
     if poses is None:
         raise ValueError(MISSING_POSES)
-    recording = Recording.of(scans, poses, intensities, doppler_mps, times_s)
-    return _sorted(_find(recording, config, frames.FULL))
+    return _find(checked_input(scans, poses, intensities, doppler_mps, times_s), config, frames.FULL)
 
 
 def check_cheaply(
     points: Sequence[ArrayLike], poses: ArrayLike, intensities: Sequence[ArrayLike] | None = None
 ) -> list[Finding]:
     """The findings of :func:`check` that take little time compared with a fit, on a smaller sample."""
-    recording = Recording.of(points, poses, intensities, None, None)
-    return _sorted(_find(recording, None, frames.CHEAP))
-
-
-def _sorted(findings: list[Finding]) -> list[Finding]:
-    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+    return _find(checked_input(points, poses, intensities), None, frames.CHEAP)
 
 
 def _stops(findings: list[Finding]) -> bool:
     return any(finding.severity == "error" for finding in findings)
 
 
-def _find(recording: Recording, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
-    """All findings. `config` None: only the cheap ones."""
+def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
+    """All findings, the worst first. `config` None: only the cheap ones."""
     found, recording = _usable(recording)
-    if _stops(found):
-        return found
-    for checked in (
-        trajectory.check_times,
-        noise.check_elevation,
-        trajectory.check_rounding,
-        check_intensities,
-        trajectory.check_duplicates,
-    ):
-        found += checked(recording)
-    wrong = [*frames.check_still(recording, effort)] or [*frames.check_frames(recording, effort)]
-    if not _stops(wrong):
-        wrong += trajectory.check_lengths(recording)
-    if not _stops(wrong):  # else the scans do not agree, whatever the clock
-        wrong += trajectory.check_jumps(recording, effort)
-        wrong += check_doppler(recording)
-        if config is not None and not any(finding.severity != "note" for finding in wrong):
-            wrong += frames.check_clock(recording, effort)
-        wrong += noise.check_ground(recording)
-    found += wrong
+    if not _stops(found):
+        for check_values in (
+            trajectory.check_times,
+            noise.check_elevation,
+            trajectory.check_rounding,
+            check_intensities,
+            trajectory.check_duplicates,
+        ):
+            found += check_values(recording)
+        found += _of_poses(recording, config, effort)
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
             found += noise.check_drift(recording, config)
+    return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+def _of_poses(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
+    found = [*frames.check_still(recording, effort)] or [*frames.check_frames(recording, effort)]
+    if not _stops(found):
+        found += trajectory.check_lengths(recording)
+    if not _stops(found):  # else the scans do not agree, whatever the clock
+        found += trajectory.check_jumps(recording, effort)
+        found += check_doppler(recording)
+        if config is not None and not any(finding.severity != "note" for finding in found):
+            found += frames.check_clock(recording, effort)
+        found += noise.check_ground(recording)
     return found
 
 
-def _usable(recording: Recording) -> tuple[list[Finding], Recording]:
+def _usable(recording: Scans) -> tuple[list[Finding], Scans]:
     """Findings about rows, scans and poses that a fit leaves out, and the recording without them."""
     found = []
     left_out = [~measured(scan) for scan in recording.points]
     total, unmeasured = sum(map(len, left_out)), sum(int(mask.sum()) for mask in left_out)
-    infinite = total - sum(int(np.isfinite(scan).all(axis=1).sum()) for scan in recording.points)
-    nothing = "Nothing needs to be done: a fit leaves them out."
-    for count, name, what in (
-        (infinite, "returns_not_finite", "have coordinates that are not finite"),
-        (
-            unmeasured - infinite,
-            "padding",
-            "are no measurements: 0 0 0, or one point many times in succession",
-        ),
-    ):
-        if count > 0:
-            found.append(Finding(name, "note", f"{count} of {total} returns {what}.", nothing))
+    infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in recording.points)
+    if infinite:
+        evidence = f"{infinite} of {total} returns have coordinates that are not finite."
+        found.append(Finding("returns_not_finite", "note", evidence))
+    if unmeasured > infinite:
+        count = f"{unmeasured - infinite} of {total} returns"
+        evidence = f"{count} are no measurements: 0 0 0, or one point many times in succession."
+        found.append(Finding("padding", "note", evidence))
     if unmeasured:
-        recording = recording.without(left_out)
+        recording = _without(recording, left_out)
     empty = np.array([mask.all() for mask in left_out])
     if empty.any():
         evidence = (
             f"{empty.sum()} of {len(empty)} scans have no returns, the first is scan {np.argmax(empty)}."
         )
-        if empty.all():
-            return [*found, Finding("empty_scans", "error", evidence, "Pass the returns.")], recording
-        found.append(Finding("empty_scans", "note", evidence, nothing))
-    found += trajectory.check_rigid(recording)
-    return found, recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
+        found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
+    if not empty.all():
+        found += trajectory.check_rigid(recording)
+        recording = recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
+    return found, recording
+
+
+def _without(recording: Scans, left_out: list[NDArray[np.bool_]]) -> Scans:
+    """Without the rows of each scan in its mask (N_i,)."""
+    points, intensities, doppler_mps = (
+        None if arrays is None else [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]
+        for arrays in (recording.points, recording.intensities, recording.doppler_mps)
+    )
+    assert points is not None
+    return Scans(points, recording.poses, intensities, doppler_mps=doppler_mps, times_s=recording.times_s)

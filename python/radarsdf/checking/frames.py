@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from radarsdf.checking.agreement import (
     LAGS,
     MIN_RETURNS,
+    STILL,
     Agreement,
     Comparison,
     Hypothesis,
@@ -22,10 +24,10 @@ from radarsdf.checking.agreement import (
     inverse,
     pairs_apart,
     relative,
-    standing_still,
 )
-from radarsdf.checking.recording import Finding, FloatArray, Recording, Severity
+from radarsdf.checking.recording import Finding, FloatArray, Severity, ascending_times_s, some_points
 from radarsdf.io.poses import Trajectory
+from radarsdf.io.scans import Scans
 
 # A hypothesis is noted if the scans agree better by this: of the mean logarithm of distances, and of its standard error. It
 # must agree better than standing still by as much, too: any pattern of the sensor's cells agrees with itself if it stands still.
@@ -35,43 +37,36 @@ _MIN_SIGNIFICANCE = 4.0
 # on good recordings, and the smallest of right ones on broken data.
 _ERROR_GAIN = 0.12
 # To shrink positions, or to take points for points in the world, moves the cells of the sensor onto each other.
-_ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.08, "clock_offset": _MIN_GAIN}
+_ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.08}
 # Points in the world frame agree as badly if the poses move them forwards as if backwards. Measured: at most 0.06; on good
 # recordings of a sensor with coarse cells, 0.15 and more.
 _FORWARDS_GAIN = 0.1
 _EQUAL = 0.8  # of the best gain: mistakes that agree about as well cannot be told apart. The most common one is named
 _NOT_BEHIND = 2.5  # standard errors
-_FIELD_OF_VIEW_STAYS = (
-    -1.5
-)  # standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's
-_UPSIDE_DOWN = (
-    -0.5
-)  # skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it misleads
+# Standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's.
+_FIELD_OF_VIEW_STAYS = -1.5
+# Skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it misleads.
+_UPSIDE_DOWN = -0.5
 _AFAR = 10.0  # distance of the returns from the origin, over their spread
 _MIN_PAIRS = 3
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much of the data a check looks at."""
+    """How much of the data a check uses."""
 
-    pairs: int
-    """Pairs of scans."""
-    returns: int
-    """Largest number of returns of a scan that others are compared with."""
-    queries: int
-    """Returns of a scan that are compared with another one."""
-    all_axes: bool
-    """Whether all ways to swap axes are tried."""
-    lags: tuple[int, ...] = LAGS
-    """How far apart the scans of a pair are."""
+    pairs: int  # of scans
+    returns: int  # largest number of returns of a scan that others are compared with
+    queries: int  # returns of a scan that are compared with another one
+    all_axes: bool  # whether all ways to swap axes are tried
+    lags: tuple[int, ...] = LAGS  # how far apart the scans of a pair are
 
 
 FULL = Effort(pairs=48, returns=1000, queries=80, all_axes=True)
 CHEAP = Effort(pairs=20, returns=400, queries=40, all_axes=False, lags=(1, 2))
 
 
-def check_frames(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     """The mistake in frames, axes or units without which the scans agree much better. Poses must be rigid transforms."""
     poses = recording.poses
     pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
@@ -90,13 +85,11 @@ def check_frames(recording: Recording, effort: Effort = FULL) -> Iterator[Findin
     if best is None:
         return
     guess, gain, significance = best
-    yield Finding(
-        guess.finding,
-        _severity(gain, guess.finding),
-        f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times "
-        f"closer to each other ({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
-        guess.mend,
+    evidence = (
+        f"If {guess.what}, returns of different scans are {np.exp(gain):.2f} times closer to each other ({len(pairs)} pairs of "
+        f"scans, {significance:.0f} standard errors)."
     )
+    yield Finding(guess.finding, _severity(gain, guess.finding), evidence)
 
 
 def _severity(gain: float, finding: str) -> Severity:
@@ -104,7 +97,7 @@ def _severity(gain: float, finding: str) -> Severity:
     return "error" if gain >= _ERROR_GAINS.get(finding, _ERROR_GAIN) else "note"
 
 
-def check_still(recording: Recording, effort: Effort = FULL) -> Iterator[Finding]:
+def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     """Whether all positions are the same although the sensor moved: what the scans see then changes with time."""
     positions = recording.poses[:, :3, 3]
     usable = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in recording.points])
@@ -125,63 +118,45 @@ def check_still(recording: Recording, effort: Effort = FULL) -> Iterator[Finding
     if moved:
         evidence += (
             f", but returns of scans far apart in time are {np.exp(change):.2f} times farther from each other than those of "
-            f"neighbours ({change / error:.0f} standard errors): the sensor moved"
+            f"neighbours ({change / error:.0f} standard errors)"
         )
-    yield Finding(
-        "poses_stand_still",
-        "error" if moved else "warning",
-        f"{evidence}.",
-        "Pass the position of the sensor for each scan. If it stood still, the map knows what is seen from there.",
-    )
+    yield Finding("poses_stand_still", "error" if moved else "warning", f"{evidence}.")
 
 
-def check_clock(recording: Recording, effort: Effort = FULL) -> list[Finding]:
-    """Whether the scans agree better with the poses of an earlier or a later time."""
-    count, poses = len(recording), recording.poses
-    if count < 2 * _MIN_PAIRS:
-        return []
-    # In s, or in scans where poses were taken from the wrong row.
-    clocks = [(recording.ascending_times_s, "s"), (np.arange(count, dtype=np.float64), "steps between scans")]
-    pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
-    agreement = Agreement(recording.points, effort.returns, effort.queries)
-    for times, unit in clocks:
-        found = [] if times is None else [*_shifted(agreement, poses, times, unit, pairs)]
-        if found:
-            return found
-    return []
-
-
-def _shifted(
-    agreement: Agreement, poses: FloatArray, times: FloatArray, unit: str, pairs: NDArray[np.int64]
-) -> Iterator[Finding]:
-    """:func:`check_clock` by one clock."""
+def check_clock(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
+    """Whether the scans agree better with the poses of an earlier or a later time, or of another row."""
+    poses, times = recording.poses, ascending_times_s(recording)
+    unit = "steps between scans" if times is None else "s"
+    times = np.arange(len(poses), dtype=np.float64) if times is None else times
+    if len(poses) < 2 * _MIN_PAIRS:
+        return
     step = float(np.median(np.diff(times)))
     shifts = step * np.array([-8.0, -4, -2, -1, -0.5, 0.5, 1, 2, 4, 8])
     shifts = shifts[np.abs(shifts) <= (times[-1] - times[0]) / 4]
+    pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
     # Beyond the first and the last pose nothing is known.
     far = float(np.abs(shifts).max(initial=0))
     pairs = pairs[((times[pairs] - far >= times[0]) & (times[pairs] + far <= times[-1])).all(axis=1)]
     if len(pairs) < _MIN_PAIRS or not len(shifts):
         return
-    shifted = [relative(_at(poses, times, times + shift), pairs) for shift in shifts]
-    scores = agreement.scores(pairs, np.stack([relative(poses, pairs), *shifted]))
+    along = Trajectory(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
+    shifted = [along.poses(np.clip(times + shift, times[0], times[-1])) for shift in shifts]
+    motions = np.stack([relative(moved, pairs) for moved in (poses, *shifted)])
+    scores = Agreement(recording.points, effort.returns, effort.queries).scores(pairs, motions)
     comparison = Comparison.of(scores[0], scores[1:])
     best = int(np.argmax(comparison.gains))
     gain, significance, shift = comparison.gains[best], comparison.significance[best], shifts[best]
-    if gain < _MIN_GAIN or significance < _MIN_SIGNIFICANCE:
-        return
-    yield Finding(
-        "clock_offset",
-        _severity(gain, "clock_offset"),
-        f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
-        f"different scans are {np.exp(gain):.2f} times closer to each other "
-        f"({len(pairs)} pairs of scans, {significance:.0f} standard errors).",
-        "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
-    )
+    if gain >= _MIN_GAIN and significance >= _MIN_SIGNIFICANCE:
+        evidence = (
+            f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
+            f"different scans are {np.exp(gain):.2f} times closer to each other ({len(pairs)} pairs of scans, {significance:.0f} "
+            "standard errors)."
+        )
+        yield Finding("clock_offset", "error", evidence)
 
 
 def _best(
-    recording: Recording,
+    recording: Scans,
     pairs: NDArray[np.int64],
     guesses: list[Hypothesis],
     scores: FloatArray,
@@ -193,8 +168,12 @@ def _best(
     """
     lags = pairs[:, 1] - pairs[:, 0]
     possible = np.ones(len(guesses), bool)
-    possible[standing_still(guesses)] = in_world
-    upright = np.array([guess.up for guess in guesses]) @ _skewness(recording) > _UPSIDE_DOWN
+    possible[STILL] = in_world
+    # The skewness of the coordinates of the returns is positive upwards: walls are higher than the sensor is.
+    points = np.concatenate(some_points(recording))
+    centred = points - np.median(points, axis=0)
+    skewness = (centred**3).mean(axis=0) / np.maximum(centred.std(axis=0) ** 3, 1e-300)
+    upright = np.array([guess.up for guess in guesses]) @ skewness > _UPSIDE_DOWN
     # Neighbours first: scans far apart see different things, and agree best where a wrong motion makes their fields
     # of view overlap. What is clearly worse than the data as given for neighbours is not tried on scans farther apart.
     noted = None
@@ -220,9 +199,8 @@ def _best_of(
     # Returns come closer to each other, too, where the fields of view of two scans only cover more of each other. They do
     # so most if the sensor stands still. What explains the scans better than the data as given explains them better than
     # that. Measured: without this, 37 of 70 good recordings of 4 to 8 sparse scans had an error; with it, none of 258.
-    still = standing_still(guesses)
-    beats_still = Comparison.of(scores[1 + still], scores[1:]).gains >= _MIN_GAIN
-    beats_still[still] = True
+    beats_still = Comparison.of(scores[1 + STILL], scores[1:]).gains >= _MIN_GAIN
+    beats_still[STILL] = True
     good &= beats_still
     if not good.any():
         return None
@@ -240,20 +218,11 @@ def _best_of(
     return guesses[chosen], float(comparison.gains[chosen]), float(comparison.significance[chosen])
 
 
-def _skewness(recording: Recording) -> FloatArray:
-    """(3,) skewness of the coordinates of the returns. It is positive upwards: walls are higher than the sensor is."""
-    points = np.concatenate([recording.points[i] for i in recording.some_scans().tolist()]).astype(np.float64)
-    centred = points - np.median(points, axis=0)
-    skewness: FloatArray = (centred**3).mean(axis=0) / np.maximum(centred.std(axis=0) ** 3, 1e-300)
-    return skewness
-
-
-def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> bool:
+def _looks_out_of_its_frame(recording: Scans, pairs: NDArray[np.int64]) -> bool:
     """Whether the returns stay in one place of the frame that they came in, but not in the sensor's by the poses.
 
-    Where each scan sees other things, because the sensor moves far between them, the scans agree best as if the sensor
-    stood still: its field of view then is the same. So what is said to be in the world frame must not look like points
-    of a sensor's frame: in that one, their centre and the mean direction to them hardly move.
+    Where the sensor moves far between scans, they agree best as if it stood still: its field of view then is the same. But in
+    the world frame, the centre of the returns and the mean direction to them move.
     """
     rows = np.unique(pairs)
     given = [np.asarray(recording.points[i], np.float64) for i in rows.tolist()]
@@ -265,7 +234,7 @@ def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> b
     ]
     first, second = np.searchsorted(rows, pairs.T)
     significances = []
-    for of_scan in (_centre, _mean_direction):
+    for of_scan in (functools.partial(np.median, axis=0), _mean_direction):
         before, after = (np.array([of_scan(scan) for scan in scans]) for scans in (given, moved))
         steadier = np.linalg.norm(before[first] - before[second], axis=1)
         steadier -= np.linalg.norm(after[first] - after[second], axis=1)
@@ -273,17 +242,6 @@ def _looks_out_of_its_frame(recording: Recording, pairs: NDArray[np.int64]) -> b
     return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
 
 
-def _centre(scan: FloatArray) -> FloatArray:
-    centre: FloatArray = np.median(scan, axis=0)
-    return centre
-
-
 def _mean_direction(scan: FloatArray) -> FloatArray:
     direction: FloatArray = (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)
     return direction
-
-
-def _at(T_world_sensor: FloatArray, times: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Poses (F, 4, 4) at the wanted times (F,), interpolated. Beyond the ends: the first and the last pose."""
-    trajectory = Trajectory(times, T_world_sensor[:, :3, 3], Rotation.from_matrix(T_world_sensor[:, :3, :3]))
-    return trajectory.poses(np.clip(wanted, times[0], times[-1]))

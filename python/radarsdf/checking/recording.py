@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The input of a check, with shapes that fit together, and what a check finds."""
+"""The input of a check, with shapes that fit together, and its findings."""
 
 from __future__ import annotations
 
@@ -20,16 +20,62 @@ from radarsdf.checks import (
     real_array,
     refuse_masked,
 )
-from radarsdf.io.scans import chosen
+from radarsdf.io.scans import Scans
 
 FloatArray = NDArray[np.float64]
-Arrays = list[NDArray[Any]]
 
 Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""From the worst to the mildest."""
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # from the worst to the mildest
 
 _SAMPLE = 40  # scans that show what returns of a sensor are like
+
+_LEFT_OUT = "Nothing needs to be done: a fit leaves them out."
+_FRAME = "Pass points of the sensor frame in metres, x forward, y left, z up, and T_world_sensor."
+_ANGLES = "Make the rotations of the poses anew, from angles in rad or unit quaternions x y z w."
+_NO_VALUE = "Look up in the driver what they stand for. A fit leaves them out of the reflectance."
+MENDS = {
+    "returns_not_finite": _LEFT_OUT,
+    "padding": _LEFT_OUT,
+    "empty_scans": f"Pass the returns. {_LEFT_OUT}",
+    "intensity_not_finite": "Fit without intensities, if there are hardly any. A fit leaves them out of the reflectance.",
+    "no_elevation": "Read the map from above only: heights of its surface are those of the sensor, not of what it sees.",
+    "positions_rounded": "Keep poses in float64, or subtract an origin before they become float32.",
+    "poses_not_rigid": f"A fit leaves out their scans. {_ANGLES}",
+    "poses_transposed": "Transpose each pose: poses.transpose(0, 2, 1).",
+    "poses_inverted": "Invert each pose: np.linalg.inv(poses).",
+    "points_in_world_frame": "Move them back: (points - pose[:3, 3]) @ pose[:3, :3], or pass the points of the sensor frame.",
+    "camera_frame": _FRAME,
+    "axes_swapped": _FRAME,
+    "mirrored": f"{_FRAME} Frames are right-handed.",
+    "units": "Pass points and positions in metres.",
+    "angles_in_degrees": _ANGLES,
+    "quaternion_order": _ANGLES,
+    "sensor_turned": "Pass poses of the sensor: poses @ T_vehicle_sensor, by its calibration.",
+    "poses_stand_still": "Pass the position of the sensor for each scan. If it stood still, the map shows what is seen from there.",
+    "poses_disagree": "Use better poses, if there are any; state their errors as returns.pose_sigma_m, if not.",
+    "poses_drift": "Refine them: radarsdf poses, radarsdf fit --refine, or radarsdf.refine_poses(points, poses).",
+    "pose_jumps": "Use poses that were smoothed over the whole drive, or leave out the scans at the jumps.",
+    "clock_offset": "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
+    "times": "Sort scans, poses and times together, and use the times of record if those of the messages were never set.",
+    "duplicate_scans": "Leave out the copies: they count as measurements that never were.",
+    "duplicate_poses": "Interpolate the poses at the times of the scans, unless the sensor stood still.",
+    "intensity_constant": "Pass another field, or fit without intensities: the sensor does not measure this one.",
+    "intensity_constant_in_scans": "Look for a fault of the driver, or fit without intensities.",
+    "intensity_sentinel": _NO_VALUE,
+    "intensity_wild": _NO_VALUE,
+    "intensity_is_doppler": "Pass the field of the power or of the radar cross section as intensity.",
+    "intensity_clipped": "Lower the gain of the sensor, or read a field that is not clipped.",
+    "intensity_offset": "Subtract 128 for dBsm; a fit does not need it.",
+    "intensity_steps": "Nothing needs to be done.",
+    "doppler_without_velocity": "Pass the measured speed along the ray in m/s, not one with the sensor's motion taken out.",
+    "doppler_sign": "Change the sign of the Doppler, so that it is negative where the sensor comes nearer.",
+    "moving_share": "A fit leaves them out, unless returns.drop_movers is false.",
+    "below_ground": "Leave them out if they are reflections in the ground.",
+    "fit_refuses": "See the message.",
+    "noise": "Nothing needs to be done: a fit estimates it anew.",
+    "cost": "Lower effort if that is too much.",
+}
+"""What to do about each finding."""
 
 
 @dataclass(frozen=True)
@@ -42,86 +88,56 @@ class Finding:
     """``error``: a map of these data would be nonsense. ``warning``: it would suffer. ``note``: for information."""
     evidence: str
     """One sentence with the numbers that show it."""
-    mend: str
-    """One sentence that says what to do."""
+    mend: str = ""
+    """What to do, in a sentence or two. Default: that of the name."""
+
+    def __post_init__(self) -> None:
+        """Looks up what to do."""
+        object.__setattr__(self, "mend", self.mend or MENDS[self.name])
 
     def __str__(self) -> str:
-        return f"{self.severity}: {self.name}: {self.evidence} {self.mend}".rstrip()
+        return f"{self.severity}: {self.name}: {self.evidence} {self.mend}"
 
 
-@dataclass(frozen=True)
-class Recording:
-    """F scans with N_i returns each. Only shapes are valid: the values are what is checked."""
+def checked_input(
+    points: Sequence[ArrayLike],
+    poses: ArrayLike,
+    intensities: Sequence[ArrayLike] | None = None,
+    doppler_mps: Sequence[ArrayLike] | None = None,
+    times_s: ArrayLike | None = None,
+) -> Scans:
+    """Scans whose shapes and types fit together: the values are what is checked.
 
-    points: Arrays
-    """F arrays (N_i, 3); sensor frame, m, if nothing is wrong."""
-    poses: FloatArray
-    """(F, 4, 4); T_world_sensor, m, if nothing is wrong."""
-    intensities: Arrays | None
-    """F arrays (N_i,), sensor units."""
-    doppler_mps: Arrays | None
-    """F arrays (N_i,), m/s."""
-    times_s: FloatArray | None
-    """(F,) time of each scan, s."""
-
-    @classmethod
-    def of(
-        cls,
-        points: Sequence[ArrayLike],
-        poses: ArrayLike,
-        intensities: Sequence[ArrayLike] | None,
-        doppler_mps: Sequence[ArrayLike] | None,
-        times_s: ArrayLike | None,
-    ) -> Recording:
-        """Raises a TypeError or a ValueError that names the argument whose shape or type does not fit."""
-        scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
-        check_scan_shapes(scans)
-        T_world_sensor = pose_matrices(poses, len(scans))
-        times = None if times_s is None else real_array(times_s, "times_s").copy()
-        if times is not None and times.shape != (len(scans),):
+    Raises a TypeError or a ValueError that names the argument.
+    """
+    scans = [_numbers(scan, f"scan {i}") for i, scan in enumerate(one_for_each_scan(points, "points"))]
+    check_scan_shapes(scans)
+    T_world_sensor = pose_matrices(poses, len(scans))
+    times = None if times_s is None else real_array(times_s, "times_s").copy()
+    if times is not None:
+        if times.shape != (len(scans),):
             msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
             raise ValueError(msg)
-        if times is not None:
-            times[np.abs(times) > MAX_TIME_S] = np.nan
-        return cls(
-            scans,
-            T_world_sensor,
-            _values(intensities, scans, "intensities"),
-            _values(doppler_mps, scans, "doppler_mps"),
-            times,
-        )
+        times[np.abs(times) > MAX_TIME_S] = np.nan
+    doppler = _values(doppler_mps, scans, "doppler_mps")
+    values = _values(intensities, scans, "intensities")
+    return Scans(scans, T_world_sensor, values, doppler_mps=doppler, times_s=times)
 
-    def __len__(self) -> int:
-        return len(self.points)
 
-    @property
-    def ascending_times_s(self) -> FloatArray | None:
-        """`times_s`, if each is later than the one before; else None."""
-        times = self.times_s
-        return times if times is not None and (np.diff(times) > 0).all() else None
+def ascending_times_s(scans: Scans) -> FloatArray | None:
+    """Times (F,), if each is later than the one before; else None."""
+    times = scans.times_s
+    return times if times is not None and (np.diff(times) > 0).all() else None
 
-    def select(self, scans: NDArray[np.int64]) -> Recording:
-        """The scans with these numbers (K,), in this order."""
-        return Recording(
-            [self.points[i] for i in scans],
-            self.poses[scans],
-            chosen(self.intensities, scans),
-            chosen(self.doppler_mps, scans),
-            None if self.times_s is None else self.times_s[scans],
-        )
 
-    def without(self, left_out: Sequence[NDArray[np.bool_]]) -> Recording:
-        """Without the rows of each scan in its mask (N_i,)."""
+def some_scans(scans: Scans) -> list[int]:
+    """Numbers of at most about `_SAMPLE` scans, at equal steps."""
+    return list(range(0, len(scans), -(-len(scans) // _SAMPLE)))
 
-        def kept(arrays: Arrays) -> Arrays:
-            return [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]
 
-        intensities, doppler = (a if a is None else kept(a) for a in (self.intensities, self.doppler_mps))
-        return Recording(kept(self.points), self.poses, intensities, doppler, self.times_s)
-
-    def some_scans(self, count: int = _SAMPLE) -> NDArray[np.int64]:
-        """Numbers of at most about `count` scans, at equal steps."""
-        return np.arange(0, len(self), -(-len(self) // count))
+def some_points(scans: Scans) -> list[FloatArray]:
+    """The returns (N_i, 3) of these scans."""
+    return [np.asarray(scans.points[i], np.float64) for i in some_scans(scans)]
 
 
 def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
@@ -132,11 +148,12 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
     return real_array(values, name)
 
 
-def _values(given: Sequence[ArrayLike] | None, scans: Arrays, name: str) -> Arrays | None:
+def _values(
+    given: Sequence[ArrayLike] | None, scans: list[NDArray[Any]], name: str
+) -> list[NDArray[Any]] | None:
     if given is None:
         return None
-    values = [
-        _numbers(value, f"{name} of scan {i}") for i, value in enumerate(one_for_each_scan(given, name))
-    ]
+    each = enumerate(one_for_each_scan(given, name))
+    values = [_numbers(value, f"{name} of scan {i}") for i, value in each]
     check_values_of_scans(values, scans, name)
     return values

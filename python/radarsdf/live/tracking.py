@@ -17,10 +17,9 @@ import numpy as np
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog
 from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
-from radarsdf.poses.drive import LEAST_TOLD, Drive, followed, rates_of
 from radarsdf.poses.motion import Rate
 from radarsdf.poses.rigid import Floats, rotation_vector
-from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begun
+from radarsdf.poses.tracking import LEAST_OBSERVED, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
@@ -116,8 +115,8 @@ class Follower:
         if any(step.found.piece for step in found):
             msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places: {needed}"
             raise Lost(msg)
-        told = [step.found.told[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
-        if not by_doppler and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
+        observed = [step.found.observed[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
+        if not by_doppler and len(observed) == _TOLD_STEPS and np.median(observed) < LEAST_OBSERVED:
             msg = f"the returns alone do not tell how the sensor moves: {needed}"
             raise Lost(msg)
         return found

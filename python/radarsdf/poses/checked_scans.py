@@ -18,29 +18,20 @@ from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
 
 _MOST_M = 500.0  # median range, m. Imaging radars reach 300 m
-# Between scans, median: from 500 Hz to what the overlap of moving scans allows; and usual ones.
-_INTERVALS_S, _USUAL_S = (0.002, 20.0), (0.01, 1.0)
-_UNITS_S = {"ms": 1e-3, "µs": 1e-6, "ns": 1e-9, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+_INTERVALS_S = 0.002, 20.0  # median between scans: from 500 Hz to what the overlap of moving scans allows
 _MOST_REACHES = 10.0  # median ranges between two scans, that have nothing in common then
-_MOST_MPS = 150.0  # median of speeds
 
 
 @dataclass(frozen=True)
 class CheckedScans:
     """F scans of one drive."""
 
-    scans: list[Floats]
-    """(N_i, 3) each, sensor frame, m; without the returns that move."""
-    times_s: Floats | None
-    """(F,) from the first scan on."""
-    begin_s: float
-    """Time of the first scan."""
-    velocities: SensorVelocities | None
-    """By the Doppler. None: there is none, or it tells no velocity."""
-    movers: int
-    """Number of returns that were left out, because they move."""
-    notes: list[str]
-    """Sentences on what was not used."""
+    scans: list[Floats]  # (N_i, 3), sensor frame, m; without the returns that move
+    times_s: Floats | None  # (F,) from the first scan on
+    begin_s: float  # time of the first scan
+    velocities: SensorVelocities | None  # by the Doppler. None: there is none, or it yields no velocity
+    movers: int  # number of returns that were left out, because they move
+    notes: list[str]  # sentences on what was not used
 
     @classmethod
     def of(
@@ -55,24 +46,26 @@ class CheckedScans:
             raise ValueError(msg)
         given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
-        _check_ranges(scans)
-        times_s = None if times is None else _checked_times(times, len(scans))
-        begin_s = 0.0 if times_s is None else float(times_s[0])
-        times_s = None if times_s is None else times_s - begin_s
+        if (range_m := median_range_m(scans)) > _MOST_M:
+            msg = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: give them in m"
+            raise ValueError(msg)
+        times_s, begin_s, notes = None, 0.0, left_out.notes
+        if times is not None:
+            times_s = _checked_times(times, len(scans))
+            begin_s = float(times_s[0])
+            times_s = times_s - begin_s
         if doppler_mps is None or times_s is None:
-            return cls(scans, times_s, begin_s, None, 0, left_out.notes)
+            return cls(scans, times_s, begin_s, None, 0, notes)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
-        notes = left_out.notes if filler is None else [*left_out.notes, f"{filler}."]
+        notes = notes if filler is None else [*notes, f"{filler}."]
         try:
-            _check_speeds(speeds)
             velocities = SensorVelocities.of(scans, speeds, times_s)
         except NoVelocityError as why:
             return cls(scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {why}."])
         if velocities.climb_assumed:
-            notes.append(
-                f"Assumed: the sensor climbs by about a tenth of its speed, up or down; the Doppler of {velocities.climb_assumed} of "
-                f"{len(scans)} scans does not measure its vertical velocity as well."
-            )
+            count = f"{velocities.climb_assumed} of {len(scans)} scans"
+            climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
+            notes = [*notes, climb]
         movers = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
         return cls(standing, times_s, begin_s, velocities, movers, notes)
@@ -82,17 +75,14 @@ class CheckedScans:
         if self.times_s is None or len(self.scans) < 2:
             return
         interval_s = float(np.median(np.diff(self.times_s)))
-        speed_mps = 0.0 if self.velocities is None else self.velocities.usual_mps
+        step_m = 0.0 if self.velocities is None else self.velocities.usual_mps * interval_s
         range_m = median_range_m(self.scans)
-        what = f"times of scans are {interval_s:.3g} s apart, median"
-        far = speed_mps * interval_s > _MOST_REACHES * range_m
-        if far:
-            what = f"{what}: at {speed_mps:.1f} m/s, {speed_mps * interval_s:.0f} m, while returns are {range_m:.1f} m away"
-        if far or not _INTERVALS_S[0] <= interval_s <= _INTERVALS_S[1]:
-            units = [
-                unit for unit, size_s in _UNITS_S.items() if _USUAL_S[0] <= interval_s * size_s <= _USUAL_S[1]
-            ]
-            msg = f"{what}. " + "".join(f"They may be in {unit}: " for unit in units[:1]) + "give times in s"
+        low, high = _INTERVALS_S
+        if step_m > _MOST_REACHES * range_m or not low <= interval_s <= high:
+            msg = (
+                f"times of scans are {interval_s:.3g} s apart, median, in which the sensor moves {step_m:.3g} m by its Doppler, "
+                f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s"
+            )
             raise ValueError(msg)
 
 
@@ -100,21 +90,6 @@ def median_range_m(scans: Sequence[Floats]) -> float:
     """Of all returns (N_i, 3). 0 if there are none."""
     ranges_m = np.concatenate([np.linalg.norm(scan, axis=1) for scan in scans])
     return float(np.median(ranges_m)) if len(ranges_m) else 0.0
-
-
-def _check_ranges(scans: Sequence[Floats]) -> None:
-    if (range_m := median_range_m(scans)) > _MOST_M:
-        msg = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: give them in m"
-        raise ValueError(msg)
-
-
-def _check_speeds(doppler_mps: Sequence[Floats]) -> None:
-    """Raises a NoVelocityError if these (N_i,) cannot be in m/s."""
-    speeds = np.abs(np.concatenate(doppler_mps))
-    usual_mps = float(np.median(speeds[np.isfinite(speeds)])) if np.isfinite(speeds).any() else 0.0
-    if usual_mps > _MOST_MPS:
-        msg = f"its median is {usual_mps:.0f} m/s: it may be in mm/s or cm/s"
-        raise NoVelocityError(msg)
 
 
 def _checked_times(times: ArrayLike, num_scans: int) -> Floats:

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.poses.motion import Motion, spans_of, way
-from radarsdf.poses.rigid import Floats, rotation_vector, steps
+from radarsdf.poses.rigid import Floats, rotation_vector, step_vectors, steps
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
-_ASKED = 400  # returns of a scan, and
-_PAIRS = 40  # pairs of neighbouring scans, that tell the sign
+_SAMPLED, _PAIRS = 400, 40  # returns of a scan, and pairs of neighbouring scans, that show the sign
 _ERRORS = 3.0  # standard errors of a difference that is no chance
 # Measured (Astyx drives): a velocity is off by more than its returns say, since they are not independent. So is one of
 # elevations that all have the same error.
@@ -31,10 +30,7 @@ _LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
 # Share of the speed that all velocities of a drive may have too much, in any direction: the axes and the scale of a radar are known
 # to this. Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
 _IN_COMMON = 0.003
-
-
-NOT_USED = "The Doppler is not used"
-"""How notes begin on Doppler that was given, before they say why."""
+NOT_USED = "The Doppler is not used"  # how notes on it begin
 
 
 class NoVelocityError(ValueError):
@@ -45,18 +41,12 @@ class NoVelocityError(ValueError):
 class SensorVelocities:
     """Of the sensor in its own frame, at each of F scans."""
 
-    mean_mps: Floats
-    """(F, 3)."""
-    covariance: Floats
-    """(F, 3, 3), m²/s²."""
-    change: Floats
-    """(3,) by how much the square of each component's change grows with time, m²/s³."""
-    static: list[NDArray[np.bool_]]
-    """Of each scan (N_i,): returns that do not contradict the velocity. All, where none was found."""
-    found: NDArray[np.bool_]
-    """(F,) whether the returns of a scan agree on a velocity. Elsewhere it is that between its neighbours."""
-    climb_assumed: int = 0
-    """Number of scans whose vertical velocity is assumed to be small, because their Doppler measures it worse than that."""
+    mean_mps: Floats  # (F, 3)
+    covariance: Floats  # (F, 3, 3), m²/s²
+    change: Floats  # (3,) by how much the square of each component's change grows with time, m²/s³
+    static: list[NDArray[np.bool_]]  # (N_i,) of each scan: returns that agree with its velocity
+    found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Elsewhere it is interpolated
+    climb_assumed: int = 0  # scans whose Doppler hardly measures the vertical velocity
 
     @classmethod
     def of(
@@ -66,16 +56,14 @@ class SensorVelocities:
         each = sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
         if 2 * found.sum() < max(len(found), 2):
-            few = sum(int(np.isfinite(speeds).sum() < MIN_DOPPLER_RETURNS) for speeds in doppler_mps)
             msg = (
-                f"{found.sum()} of {len(found)} scans agree on a velocity of the sensor; {few} have fewer than "
-                f"{MIN_DOPPLER_RETURNS} returns with Doppler, in {len(found) - few - found.sum()} fewer than 40 % of the returns agree"
+                f"{found.sum()} of {len(found)} scans agree on a velocity of the sensor: at least {MIN_DOPPLER_RETURNS} returns with "
+                "Doppler in m/s, of which 40 % agree"
             )
             raise NoVelocityError(msg)
-        mean, covariance, weak = upright(
-            np.stack([velocity.velocity_mps for velocity in each]),
-            np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3),
-        )
+        means = np.stack([velocity.velocity_mps for velocity in each])
+        covariance = np.stack([velocity.covariance for velocity in each]) + LEAST_MPS**2 * np.eye(3)
+        mean, covariance, weak = upright(means, covariance)
         static = [
             velocity.static | np.isnan(speeds) if velocity.found else np.ones(len(scan), bool)
             for velocity, scan, speeds in zip(each, scans, doppler_mps, strict=True)
@@ -109,17 +97,16 @@ class SensorVelocities:
         return dataclasses.replace(self, mean_mps=-self.mean_mps)
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
-        """(3, 3) of the way from scan `i` to the next one, m²: of both velocities, and of those between (a Brownian bridge)."""
+        """(3, 3) of the translation from scan `i` to the next one, m²: of both velocities, and a Brownian bridge between them."""
         ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
         between: Floats = ends + np.diag(self.change) * duration_s**3 / 12
         return between
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
-    """Means (F, 3) and covariances (F, 3, 3) of velocities of a sensor that climbs little, and the number of those that this changes.
+    """Means (F, 3) and covariances (F, 3, 3) of velocities of a sensor that climbs little, and the number of changed ones.
 
-    Only where a vertical velocity is known less well than a share of the speed, and than it is large where it is known better: a
-    radar whose returns all lie in a plane does not measure it.
+    Where a vertical velocity is known less well than a share of the speed, as by a radar whose returns all lie in a plane.
     """
     variances = covariance[:, 2, 2]
     climbed = np.nansum(mean_mps[:, 2] ** 2 / variances) / np.nansum(1 / variances)
@@ -132,40 +119,28 @@ def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
 
 @dataclass(frozen=True)
 class DopplerMotion(Motion):
-    """Translations from scan to scan, by velocities. Which way a step leads depends on how the sensor turned meanwhile."""
+    """Translations from scan to scan, by velocities. They depend on how the sensor turned meanwhile."""
 
     velocities: SensorVelocities
-    durations_s: Floats
-    """(F - 1,)."""
+    durations_s: Floats  # (F - 1,)
+    # (F - 1, 3) rotation vectors of the steps, roughly: over a gap, a sensor may have turned by more than half a turn.
     turns: Floats
-    """(F - 1, 3) rotation vectors of the steps, roughly: over a gap, a sensor may have turned by more than half a turn."""
 
     @classmethod
     def by(
         cls, velocities: SensorVelocities, times_s: Floats, poses: Floats, turns: Floats | None = None
     ) -> DopplerMotion:
-        """Of scans with these times (F,) and about these poses (F, 4, 4). `turns` None: those that lead where the poses do."""
+        """Of scans with these times (F,) and about these poses (F, 4, 4). `turns` None: those of the poses."""
         durations_s = np.diff(times_s)
-        turns = _likely_turns(velocities, durations_s, steps(poses)) if turns is None else turns
+        turns = step_vectors(poses)[:, 3:] if turns is None else turns
         ways = np.stack([velocities.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
         shares = np.full((len(durations_s), 6), np.inf)
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
-        nothing = np.tile(np.eye(4), (len(durations_s), 1, 1))
         spans = spans_of(times_s, len(times_s))
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
         common = np.repeat([_IN_COMMON * speed_mps * np.median(durations_s), 0.0], 3)
-        return cls(
-            nothing,
-            np.zeros(6),
-            np.ones(2),
-            shares,
-            (True, True),
-            spans,
-            velocities,
-            durations_s,
-            turns,
-            bias_sigma=common,
-        ).at(poses)
+        unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
+        return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002
         """As it is: the velocities' own covariances are known. If they were learnt, real drives ended four times as far off."""
@@ -181,10 +156,7 @@ class DopplerMotion(Motion):
 
 
 def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
-    """Share of the squared displacements of poses (F, 4, 4), over some steps each, that the velocities contradict.
-
-    0 where they contradict no more than their own errors.
-    """
+    """Share of the squared displacements of poses (F, 4, 4) that velocities contradict, 0 if it is within their errors."""
     ways = np.einsum("fij,fj->fi", poses[:-1, :3, :3], motion.steps[:, :3, 3])
     count = min(_COMPARED, len(ways))
     measured, variance = (
@@ -198,21 +170,8 @@ def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
     return squares / max(float((given**2).sum()), float((measured**2).sum()))
 
 
-def _likely_turns(velocities: SensorVelocities, durations_s: Floats, given: Floats) -> Floats:
-    """(F - 1, 3) rotation vectors of given steps: of those that differ by whole turns, the one whose way ends nearest."""
-    found, means = [], velocities.mean_mps
-    for i, step in enumerate(given):
-        shortest = rotation_vector(step[:3, :3])
-        angle = float(np.linalg.norm(shortest))
-        longer = shortest * (1 - 2 * np.pi / angle) if angle > 0 else shortest
-        ends = (way(turn, means[i], means[i + 1], float(durations_s[i])) for turn in (shortest, longer))
-        off = [float(np.linalg.norm(end - step[:3, 3])) for end in ends]
-        found.append(longer if off[1] < off[0] else shortest)
-    return np.array(found).reshape(-1, 3)
-
-
 def doppler_sign(scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats) -> int:
-    """-1 if neighbouring scans, without what moves, agree better once all velocities are turned round, else 1."""
+    """-1 if neighbouring scans, without what moves, agree better with all velocities reversed, else 1."""
     moved_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * np.diff(times_s)
     usable = (
         velocities.found[1:] & velocities.found[:-1] & (np.diff(times_s) <= 2 * np.median(np.diff(times_s)))
@@ -223,10 +182,10 @@ def doppler_sign(scans: Sequence[Floats], velocities: SensorVelocities, times_s:
     gains = []
     for i in pairs.tolist():
         first, second = scans[i : i + 2]
-        asked = second[:: max(1, len(second) // _ASKED)]
+        sampled = second[:: max(1, len(second) // _SAMPLED)]
         moved = 0.5 * (velocities.mean_mps[i] + velocities.mean_mps[i + 1]) * (times_s[i + 1] - times_s[i])
         tree = cKDTree(first)
-        ahead, back = (np.log(np.maximum(tree.query(asked + s * moved)[0], 1e-3)).mean() for s in (1, -1))
+        ahead, back = (np.log(np.maximum(tree.query(sampled + s * moved)[0], 1e-3)).mean() for s in (1, -1))
         gains.append(ahead - back)
     if len(gains) < 2:
         return 1

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from radarsdf.poses.rigid import Floats, rotation, skew, steps, transform
+from radarsdf.poses.rigid import Floats, between, rotation, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # steps that the first guess of habits is worth
 
@@ -28,17 +28,15 @@ _LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # deviations to divide by: no radar tells les
 class MotionPrior:
     """What is expected of a rate with three components, of turning, rad/s, or moving, m/s."""
 
-    usual: Floats
-    """(3,) its mean square."""
-    change: Floats
-    """(3,) by how much the square of its change grows with time, per second."""
+    usual: Floats  # (3,) its mean square
+    change: Floats  # (3,) by how much the square of its change grows with time, per second
+    # Whether it comes back to zero (Ornstein and Uhlenbeck's process). Turns end, a drive goes on: with velocities that come
+    # back, a sparse simulated drive without Doppler was 4.8 m off instead of 0.25; with turns that stay, a real one 7.9 m
+    # instead of 1.
     settles: bool
-    """Whether it comes back to zero (Ornstein and Uhlenbeck's process). Turns end, a drive goes on: with velocities that come
-    back, a sparse simulated drive without Doppler was 4.8 m off instead of 0.25; with turns that stay, a real one 7.9 m
-    instead of 1."""
 
     def after(self, rate: Rate | None, elapsed_s: float) -> Rate:
-        """The rate once `elapsed_s` have gone by. None: it was not known."""
+        """The rate `elapsed_s` later. None: it was not known."""
         if rate is None:
             return Rate(np.zeros(3), np.diag(self.usual))
         if not self.settles:
@@ -68,10 +66,8 @@ class MotionPrior:
 class Rate:
     """A rate and how well it is known."""
 
-    mean: Floats
-    """(3,)."""
-    covariance: Floats
-    """(3, 3)."""
+    mean: Floats  # (3,)
+    covariance: Floats  # (3, 3)
 
 
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
@@ -85,16 +81,12 @@ def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> 
 
 @dataclass(frozen=True)
 class ExpectedStep:
-    """The motion from one scan to the next, in the frame of the first, before its returns are looked at."""
+    """The motion from one scan to the next, in the frame of the first, before its returns are used."""
 
-    turn: Rate
-    """Rotation vector, rad, and its covariance."""
-    begin_mps: Floats
-    """(3,) velocity at the first scan, in its frame."""
-    end_mps: Floats
-    """(3,) at the second scan, in the frame of that."""
-    way_covariance: Floats
-    """(3, 3) of the translation if the turn is known, m²."""
+    turn: Rate  # rotation vector, rad
+    begin_mps: Floats  # (3,) velocity at the first scan, in its frame
+    end_mps: Floats  # (3,) at the second scan, in the frame of that
+    way_covariance: Floats  # (3, 3) of the translation if the turn is known, m²
     duration_s: float
 
     def pose(self, turn: Floats | None = None) -> Floats:
@@ -136,69 +128,29 @@ class ExpectedStep:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motions between neighbouring scans as one source has them, with its errors: of given poses, of Doppler, of a gyroscope."""
+    """Motions between neighbouring scans as measured by one source: given poses, Doppler, or a gyroscope."""
 
-    steps: Floats
-    """(F - 1, 4, 4) as measured."""
-    bias: Floats
-    """(6,) that each step has too much: translation, m, rotation vector, rad, in the frame of the sensor."""
-    variances: Floats
-    """(2,) of each component of a step's translation, m², and of its rotation, rad², where its share is 1."""
-    shares: Floats
-    """(F - 1, 6) by which each step's variances differ from these. Infinite: the source does not tell this component."""
-    known: tuple[bool, bool]
-    """Whether the variances of translations, and of rotations, stay as they are."""
-    spans: Floats
-    """(F - 1,) duration of each step over the median. Biases grow with it."""
+    steps: Floats  # (F - 1, 4, 4)
+    bias: Floats  # (6,) of each step: translation, m, rotation vector, rad, in the frame of the sensor
+    variances: (
+        Floats  # (2,) of each component of a step's translation, m², and rotation, rad², where its share is 1
+    )
+    shares: (
+        Floats  # (F - 1, 6) factors of these variances. Infinite: the source does not measure this component
+    )
+    spans: Floats  # (F - 1,) duration of each step over the median. Biases grow with it
+    # (6,) deviation of the part of the bias that no measurement of this source can find.
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
-    """(6,) deviation of the part of the bias that no measurement of this source can find."""
+    # (2,) lower bounds of `variances` where the covariance is computed.
     least_variances: Floats = field(default_factory=lambda: np.zeros(2), kw_only=True)
-    """(2,) as `variances`, at least, where the covariance is computed."""
 
     @classmethod
-    def of(
-        cls,
-        poses: Floats,
-        sigma_m: float,
-        sigma_rad: float,
-        times_s: Floats | None = None,
-        known: tuple[bool, bool] = (False, False),
-    ) -> Motion:
+    def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> Motion:
         """Of given poses (F, 4, 4), at `times_s` (F,) or equally far apart. Errors of steps add up: variances grow with time."""
         spans = spans_of(times_s, len(poses))
         shares = np.repeat(spans[:, None], 6, axis=1)
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
-        return cls(steps(poses), np.zeros(6), variances, shares, known, spans)
-
-    @property
-    def sigma_m(self) -> float:
-        """Standard deviation of each component of a step's translation."""
-        return float(np.sqrt(self.variances[0]))
-
-    @property
-    def sigma_rad(self) -> float:
-        """Likewise of its rotation."""
-        return float(np.sqrt(self.variances[1]))
-
-    def with_turns(self, turns: Floats) -> Motion:
-        """With rotation vectors (F - 1, 3), rad, that another source measured."""
-        measured = self.steps.copy()
-        measured[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
-        return dataclasses.replace(self, steps=measured)
-
-    def rotations_only(self) -> Motion:
-        """Without the translations."""
-        shares = self.shares.copy()
-        shares[:, :3] = np.inf
-        return dataclasses.replace(self, shares=shares)
-
-    def as_evidence(self) -> Motion:
-        """With the variances that the covariance of poses is computed with.
-
-        Steps that were tracked by the same returns have the errors of these. As independent measurements, they would halve the
-        deviations.
-        """
-        return dataclasses.replace(self, variances=np.maximum(self.variances, self.least_variances))
+        return cls(steps(poses), np.zeros(6), variances, shares, spans)
 
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
         """As measured by a sensor with these poses (F, 4, 4). Most measurements are the same for all."""
@@ -206,9 +158,10 @@ class Motion:
 
     def errors(self, poses: Floats) -> Floats:
         """(F - 1, 6) of the given steps, if `poses` (F, 4, 4) are right: translations, m, and rotation vectors, rad."""
-        found, given = steps(poses), self.steps
-        turns = np.einsum("fji,fjk->fik", given[:, :3, :3], found[:, :3, :3])
-        return np.concatenate([found[:, :3, 3] - given[:, :3, 3], Rotation.from_matrix(turns).as_rotvec()], 1)
+        found = steps(poses)
+        turns = between(self.steps, found)[:, :3, :3]
+        off_m = found[:, :3, 3] - self.steps[:, :3, 3]
+        return np.concatenate([off_m, Rotation.from_matrix(turns).as_rotvec()], 1)
 
     @staticmethod
     def _jacobians(poses: Floats) -> tuple[Floats, Floats]:
@@ -244,55 +197,39 @@ class Motion:
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> Motion:
         """With the bias and the deviations that `poses` show.
 
-        Their covariance has blocks (F, 6, 6) and (F - 1, 6, 6), of increments of the poses `before`. Where the whole is, these
-        hardly know: only there does it cost nothing, and at other poses, it would seem errors of steps of half a metre.
-        A step of expectation maximisation (Dempster et al. 1977): the square of an error is that of its estimate and its
-        variance.
+        Their covariance has blocks `diagonal` (F, 6, 6) and `below` (F - 1, 6, 6), of increments of the poses `before`: elsewhere,
+        the free motion of the whole would seem errors of steps. A step of expectation maximisation (Dempster et al. 1977): the
+        square of an error is that of its estimate and its variance.
         """
         first, second = self._jacobians(before)
-        crossed = np.einsum("fai,fij,faj->fa", second, below, first)
-        variances = (
-            np.einsum("fai,fij,faj->fa", first, diagonal[:-1], first)
-            + np.einsum("fai,fij,faj->fa", second, diagonal[1:], second)
-            + 2 * crossed
-        )
-        errors, spans = self.errors(poses), self.spans[:, None]
-        told = np.isfinite(self.shares)
-        weights = 1 / self.shares
+        blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
+        left = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
+        errors, spans, weights = self.errors(poses), self.spans[:, None], 1 / self.shares
+        counts = np.isfinite(self.shares).sum(axis=0)
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
-        bias *= self._believed(bias, (weights * variances).sum(axis=0) / np.maximum(told.sum(axis=0), 1))
-        squares = ((errors - bias * spans) ** 2 + variances) * weights
-        floors, found = (_LEAST_M**2, _LEAST_RAD**2), self.variances.copy()
-        for k, rows in enumerate((slice(0, 3), slice(3, 6))):
-            if not self.known[k] and told[:, rows].any():
-                found[k] = max(squares[:, rows].sum() / told[:, rows].sum(), floors[k])
-        return dataclasses.replace(self, bias=bias, variances=found)
-
-    def _believed(self, bias: Floats, left: Floats) -> Floats:
-        """(6,) share of a bias (6,) that is believed, if returns and steps together leave a variance `left` (6,) of a step.
-
-        The returns alone leave more. Where that is more than the bias, along a corridor say, it would follow the poses, and
-        these the bias, for ever: a straight corridor was drawn together by 3 cm a step.
-        """
-        before = np.repeat(self.variances, 3)
-        gained = bias**2 * np.maximum(before - left, 0.0)
-        found: Floats = gained / np.maximum(gained + left * before, 1e-30)
-        return found
+        # Where the returns alone leave more than the bias, along a corridor say, it would follow the poses, and these the bias,
+        # for ever: a straight corridor was drawn together by 3 cm a step. So the share of the variance that is left shrinks it.
+        variances, left_mean = (
+            np.repeat(self.variances, 3),
+            (weights * left).sum(axis=0) / np.maximum(counts, 1),
+        )
+        gained = bias**2 * np.maximum(variances - left_mean, 0.0)
+        bias *= gained / np.maximum(gained + left_mean * variances, 1e-30)
+        squares = ((errors - bias * spans) ** 2 + left) * weights
+        sums, counts = squares.sum(axis=0).reshape(2, 3).sum(axis=1), counts.reshape(2, 3).sum(axis=1)
+        found = np.maximum(sums / np.maximum(counts, 1), [_LEAST_M**2, _LEAST_RAD**2])
+        return dataclasses.replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
-    """Deviation by which steps of poses (F, 4, 4) differ from the one before, as if it were noise: m, rad.
+    """Deviations by which steps of poses (F, 4, 4) differ from the one before, as if it were noise: m, rad.
 
-    Errors of poses that are repeated, or from another clock, are as large as the steps. An estimate that begins with less takes
-    returns that are so far off for wrong ones.
+    Errors of poses that are repeated, or from another clock, are as large as the steps: with less, returns would seem outliers.
     """
     if len(poses) < 3:
         return 0.0, 0.0
-    between, spans = steps(poses), spans_of(times_s, len(poses))
-    rates = (
-        np.concatenate([between[:, :3, 3], Rotation.from_matrix(between[:, :3, :3]).as_rotvec()], 1)
-        / spans[:, None]
-    )
+    spans = spans_of(times_s, len(poses))
+    rates = step_vectors(poses) / spans[:, None]
     squares = np.diff(rates, axis=0) ** 2 / (1 / spans[1:] + 1 / spans[:-1])[:, None]
     sigma_m, sigma_rad = np.sqrt(np.median(squares.reshape(-1, 2, 3).mean(axis=2), axis=0)).tolist()
     return sigma_m, sigma_rad

@@ -13,35 +13,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import MAX_TIME_S, instance, real_array
+from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, doppler_sign
-from radarsdf.poses.drive import LATERAL_MPS2, LEAST_TOLD, Drive, followed
-from radarsdf.poses.estimate import PosesEstimate
-from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
-from radarsdf.poses.imu import Inertial, implausible_rates, levelled
+from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
-from radarsdf.poses.rigid import Floats, steps
-from radarsdf.poses.tracking import WINDOW, Tracked, pieces_of
+from radarsdf.poses.refine import PosesEstimate
+from radarsdf.poses.rigid import Floats
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed
 from radarsdf.returns.rays import within_ranges
 from radarsdf.threads import Workers
 
-# Of the variance of a step's rotation, that the returns must take away. Over the scans whose planes are kept, this adds up to all. A hand-held radar of 41 returns a scan,
-# which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
-_LEAST_TOLD_TURN = 1 / WINDOW
-_MAX_RATE_RAD_S = 1e4  # more than any gyroscope measures, even in degrees
+# Share of the variance of a step's rotation that the returns must remove. Over the scans whose planes are kept, this adds up to
+# all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
+_LEAST_OBSERVED_TURN = 1 / WINDOW
 
 
-class NotToldError(ValueError):
+class UnobservedMotionError(ValueError):
     """Neither the returns nor anything else measures how the sensor moved."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Poses that were estimated without any being given."""
+    """Poses that were estimated from the radar alone."""
 
     poses: Floats
     """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
@@ -50,15 +47,11 @@ class Odometry:
     pieces: NDArray[np.int64]
     """(F,) number of the piece of the drive that each scan belongs to. Where tracking was lost, mostly over a gap in time, a new
     piece begins: its position relative to the one before is dead reckoning, and no map should join them."""
-    agreeing: Floats
-    """(F,) share of the returns of each scan that lie on planes of the scans before it. NaN where a piece begins."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the trajectory; `pieces`, their number; `told` and `told_turn`, the median share of the
-    variance of a step's translation and rotation that the returns removed, in the least certain direction; `doppler` and
-    `gyroscope`, whether they were used; `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`,
-    rad/s; `imu`, None or its `R_sensor_imu` with `sigma_rad`, `late_s`, by which the times of scans are too late in its clock, and
-    `lever_m`, from it to the radar in its axes; `movers`, returns that were excluded; `notes` on what was not used or was assumed;
-    `scans`, `seconds`."""
+    """`verdict` in words; `length_m` of the trajectory; `pieces`, their number; `doppler` and `gyroscope`, whether they were used;
+    `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`, rad/s; `imu`, None or its `R_sensor_imu` with
+    `sigma_rad`, `late_s`, by which the times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes;
+    `movers`, returns that were excluded; `notes` on what was not used or was assumed; `scans`, `seconds`."""
 
     def longest_piece(self) -> slice:
         """The scans of the piece with the most scans: those to make a map of."""
@@ -72,13 +65,11 @@ def odometry(
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
     times_s: ArrayLike | None = None,
-    angular_velocity: ArrayLike | None = None,
-    angular_velocity_times_s: ArrayLike | None = None,
     imu: Imu | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> Odometry:
-    """Estimates the poses of scans from the radar alone.
+    """Estimate the poses of scans from the radar alone.
 
     Fits each scan to the planes of the scans before it, starting from Doppler, a gyroscope or the motion so far; over a gap, by a
     search. Then adjusts all scans at once, as :func:`refine_poses` does. The motion prior, the noise of the sensor and the bias of
@@ -87,20 +78,15 @@ def odometry(
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, times and Doppler are used
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, times and Doppler are used
         where none are given here.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured.
     times_s : (F,) array_like
         Of the scans, s.
-    angular_velocity : (G, 3) array_like, optional
-        Of a gyroscope, rad/s, in the axes of the radar.
-    angular_velocity_times_s : (G,) array_like, optional
-        When it was measured, s, in the clock of `times_s`. Default: at the times of the scans.
     imu : Imu, optional
-        An IMU in axes of its own, in place of `angular_velocity`; of Scans, theirs. Its rotation on the radar and the offset of
-        its clock are estimated from its accelerometer and the Doppler, or from turns that returns measure. The accelerometer
-        also gives the direction of up.
+        A gyroscope, and an accelerometer where there is one; of Scans, theirs. Without `R_sensor_imu`, its rotation on the radar
+        is estimated, and with an accelerometer and Doppler the offset of its clock and the direction of up.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -113,6 +99,8 @@ def odometry(
 
     Raises
     ------
+    TypeError
+        If an argument has the wrong type.
     ValueError
         If scans, Doppler, times or rates are invalid, if there are no times, or if nothing measures a part of the motion:
         without Doppler, the position along a wall; without a gyroscope, the turns of a radar with few returns that is slower
@@ -143,64 +131,60 @@ def odometry(
     if velocities is not None:
         sign = doppler_sign(checked.scans, velocities, times_s)
         velocities = velocities.turned if sign < 0 else velocities
-    if angular_velocity is not None:
-        at = times_s if angular_velocity_times_s is None else angular_velocity_times_s
-        rates, at_s = _checked_rates(angular_velocity, at, checked)
-        inertial = Inertial(Gyroscope.of(rates, at_s, times_s))
-        if (why := implausible_rates(rates, velocities)) is not None:
-            inertial = inertial.without(why)
-    else:
-        used = points.imu if imu is None and isinstance(points, Scans) else imu
-        inertial = Inertial.of(used, velocities, times_s, checked.begin_s)
+    if imu is None and isinstance(points, Scans):
+        imu = points.imu
+    inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
     limits = config.returns
     with Workers(config.num_threads) as workers:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
-        notes = [*checked.notes]
         try:
             drive, tracked = followed(drive, config, workers.num_threads, progress)
         except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, workers.num_threads, progress)
-        notes += inertial.notes
-        told = _checked_told(tracked, drive, notes)
-        poses, covariance = _together(drive, tracked, config, workers.num_threads)
+        notes = [*checked.notes, *inertial.notes]
+        _check_measured(tracked, drive, notes)
+        pieces = np.array([found.piece for found in tracked])
+        poses, covariance = _together(drive, tracked, pieces, config, workers.num_threads)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
-    pieces = np.array([found.piece for found in tracked])
-    length_m = sum(
-        float(np.linalg.norm(steps(poses[rows])[:, :3, 3], axis=1).sum()) for rows in pieces_of(tracked)
-    )
+    length_m = trajectory_length_m(poses, pieces)
+    gyroscope = drive.gyroscope
     report = {
         "verdict": _verdict(pieces, length_m, velocities is not None, inertial),
         "length_m": length_m,
         "pieces": int(pieces[-1]) + 1,
-        "told": told[0],
-        "told_turn": told[1],
         "doppler": velocities is not None,
         "doppler_sign": sign,
-        "gyroscope": inertial.gyroscope is not None,
-        "gyroscope_bias": None if drive.gyroscope is None else drive.gyroscope.bias.mean.tolist(),
+        "gyroscope": gyroscope is not None,
+        "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
         "movers": checked.movers,
         "notes": notes,
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
     }
-    agreeing = np.array([found.agreeing for found in tracked])
-    return Odometry(poses, covariance, pieces, agreeing, report)
+    return Odometry(poses, covariance, pieces, report)
+
+
+def trajectory_length_m(poses: Floats, pieces: NDArray[np.int64]) -> float:
+    """Length of the steps within pieces of a trajectory of poses (F, 4, 4)."""
+    lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return float(lengths_m[np.diff(pieces) == 0].sum())
 
 
 def _together(
-    drive: Drive, tracked: list[Tracked], config: FitConfig, num_threads: int
+    drive: Drive, tracked: list[Tracked], pieces: NDArray[np.int64], config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats]:
     """Poses and covariances of all scans of each piece at once."""
     poses = np.stack([found.pose for found in tracked])
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
-    for rows in pieces_of(tracked):
-        returns = SensorReturns.of(drive.new_returns(tracked, rows), limits.min_range_m, limits.max_range_m)
+    for piece in range(pieces[-1] + 1):
+        rows = slice(*np.searchsorted(pieces, [piece, piece + 1]).tolist())
+        returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(tracked, rows)
@@ -210,36 +194,35 @@ def _together(
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance
 
 
-def _checked_told(tracked: list[Tracked], drive: Drive, notes: list[str]) -> tuple[float, float]:
-    """The shares of variance that returns took away. Raises a NotToldError where nothing measures a motion; notes assumptions."""
+def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> None:
+    """Raises a UnobservedMotionError where nothing measures a part of the motion; adds notes on assumptions."""
     if len(tracked) < 2:
-        return 0.0, 0.0
-    way, turn = np.median([found.told for found in tracked[1:]], axis=0).tolist()
-    dropped = any(note.startswith(NOT_USED) for note in notes)
-    doppler = "Doppler that most returns of a scan agree on" if dropped else "their Doppler (doppler_mps)"
+        return
+    way, turn = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
+    doppler = "their Doppler (doppler_mps)"
+    if any(note.startswith(NOT_USED) for note in notes):
+        doppler = "Doppler that most returns of a scan agree on"
     turns_known = drive.gyroscope is not None or drive.turns_slowly
-    for told, least, measured, moved, missing in (
-        (way, LEAST_TOLD, drive.velocities is not None, "moved", doppler),
-        (turn, _LEAST_TOLD_TURN, turns_known, "turned", "its angular_velocity"),
+    for observed, least, measured, moved, missing in (
+        (way, LEAST_OBSERVED, drive.velocities is not None, "moved", doppler),
+        (turn, _LEAST_OBSERVED_TURN, turns_known, "turned", "a gyroscope (imu)"),
     ):
-        if not measured and told < least:
+        if not measured and observed < least:
             msg = (
-                f"the returns alone do not tell how the sensor {moved}: of a step's variance, they take away {told:.1%}, and "
+                f"the returns alone do not tell how the sensor {moved}: of a step's variance, they remove {observed:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
-            raise NotToldError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
-    if drive.gyroscope is None and turn < _LEAST_TOLD_TURN:
+            raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
+    if drive.gyroscope is None and turn < _LEAST_OBSERVED_TURN:
         notes.append(
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
             "trajectory make of its speed; the returns of a scan hardly measure it."
         )
-    return way, turn
 
 
 def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
-    by = " and ".join(filter(None, [", ".join(sources[:-1]), sources[-1]]))
-    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by {by}."]
+    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]
     if inertial.alignment is not None:
         sentences.append(inertial.alignment.words)
     begins = np.flatnonzero(np.diff(pieces)) + 1
@@ -249,28 +232,3 @@ def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial
             f"The drive was lost before the scans {before}: {len(begins) + 1} pieces, which do not belong together."
         )
     return " ".join(sentences)
-
-
-def _checked_rates(
-    angular_velocity: ArrayLike, at: ArrayLike, checked: CheckedScans
-) -> tuple[Floats, Floats]:
-    """Rates (G, 3) and their times (G,) from the first scan on."""
-    rates: Floats = real_array(angular_velocity, "angular_velocity")
-    at_s: Floats = real_array(at, "angular_velocity_times_s")
-    at_s = at_s if at is checked.times_s else at_s - checked.begin_s
-    if rates.ndim != 2 or rates.shape[1] != 3 or at_s.shape != (len(rates),) or len(rates) == 0:
-        msg = f"angular_velocity must have shape (G, 3), G > 0, and one time for each rate, not {rates.shape} and {at_s.shape}"
-        raise ValueError(msg)
-    within = (np.abs(rates) <= _MAX_RATE_RAD_S).all() and (np.abs(at_s) <= MAX_TIME_S).all()
-    if not within or (np.diff(at_s) < 0).any():
-        msg = (
-            f"angular_velocity must be finite and within {_MAX_RATE_RAD_S:g} rad/s, its times finite, within {MAX_TIME_S:g} s, "
-            "and ascending"
-        )
-        raise ValueError(msg)
-    times_s = checked.times_s
-    assert times_s is not None
-    if at_s[0] > times_s[-1] or at_s[-1] < 0:
-        msg = "angular_velocity was measured before or after all scans: are both times of one clock?"
-        raise ValueError(msg)
-    return rates, at_s

@@ -13,14 +13,14 @@ from scipy.spatial import cKDTree
 
 from radarsdf._core import CellBlocks, CommonPlanes
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.rigid import Floats, skew
+from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sums import UPPER, merged_keys
+from radarsdf.returns.sums import merged_keys
 
-# The edge of a region is 2 to the power of this, in cells. Wide regions have many planes, and know well what is error: with
-# 8 cells, the way along simulated walls was told 5 times too surely, with 16 to 64 not.
+# The edge of a region is 2 to the power of this, in cells. Wide regions have many planes, and estimate errors well: with
+# 8 cells, the position along simulated walls had 5 times too small a deviation, with 16 to 64 not.
 _DOUBLINGS = 4
 
 # Scans in the band that is factored. 16 to 128 take the same time, since fewer need more iterations.
@@ -29,18 +29,15 @@ _LEAST_RANGE_M = 1e-6  # to divide by
 # Cells are at least a quarter as wide as returns of one scan are apart: with 40 returns over 150 m, planes of smaller cells have too
 # few of them. Radars of 500 to 2,000 returns a scan have 0.2 to 0.5 m between them, so that their cells are those of a map.
 _CELLS_APART = 4
-_ASKED_SCANS = 16
-
-Blocks = tuple[Floats, Floats, Floats]
-"""Blocks on the diagonal (F, 6, 6), below it (F - 1, 6, 6), and a gradient (F, 6), as of :meth:`Motion.prior`."""
+_SAMPLED_SCANS = 16
 
 
 def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
-    """(P, 3) unit normals of the surfels.
+    """(P, 3) unit normals of the surfels, without the spread that their errors make.
 
-    Along a wall, each normal points a little along it by chance, and so all returns would tell where the sensor is. In each
-    region, what the normals have of each direction is compared with what their errors would make of it, and reduced to the rest
-    (errors in variables, Fuller 1987). Whatever the normals are, scans that move together lose nothing.
+    Along a wall, each normal points a little along it by chance, as if returns measured the position along it. In each region, the
+    spread of the normals is reduced by what their errors contribute (errors in variables, Fuller 1987). Whatever the normals are,
+    scans that move together lose nothing.
     """
     assert surfels.widest is not None
     planes = np.flatnonzero(surfels.is_flat())
@@ -53,21 +50,18 @@ def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
     weights = surfels.counts[cells] / thickness
     # Of a regression: the variances of the two slopes.
     of_across, of_widest = (weights * thickness / (surfels.support[cells] * width) for width in widths)
-    sums = np.empty((len(planes), 12))
-    for k, (i, j) in enumerate(UPPER):
-        sums[:, k] = weights * normals[:, i] * normals[:, j]
-        sums[:, 6 + k] = of_across * across[:, i] * across[:, j] + of_widest * widest[:, i] * widest[:, j]
+    spread = np.einsum("n,ni,nj->nij", weights, normals, normals)
+    errors = np.einsum("n,ni,nj->nij", of_across, across, across)
+    errors += np.einsum("n,ni,nj->nij", of_widest, widest, widest)
+    sums = np.concatenate([spread, errors], axis=1).reshape(-1, 18)
     keys = surfels.keys[cells]
     for _ in range(_DOUBLINGS):
         keys = merged_keys(keys)
     regions, first, region = np.unique(keys, return_index=True, return_inverse=True)
     of_regions = np.add.reduceat(sums, first)
     of_regions = CellBlocks(regions).sum_round(regions, of_regions, NEIGHBOUR_WEIGHT, num_threads)
-    spread, errors = np.empty((2, len(regions), 3, 3))
-    for k, (i, j) in enumerate(UPPER):
-        spread[:, i, j] = spread[:, j, i] = of_regions[:, k]
-        errors[:, i, j] = errors[:, j, i] = of_regions[:, 6 + k]
-    found = np.einsum("nij,nj->ni", _reduction(spread, errors)[region], normals)
+    spread, errors = of_regions.reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
+    found = np.einsum("nij,nj->ni", reduction(spread, errors)[region], normals)
     lengths = np.sqrt(np.einsum("ni,ni->n", found, found))[:, None]
     # A normal that seems all error stays as it is: in this region, there are hardly any others.
     all_normals = surfels.normals.copy()
@@ -75,24 +69,24 @@ def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
     return all_normals
 
 
-def _reduction(spread: Floats, errors: Floats) -> Floats:
-    """(R, 3, 3) linear maps after which sums of squares `spread` (R, 3, 3) are without their part `errors`, or 0."""
+def reduction(spread: Floats, errors: Floats) -> Floats:
+    """(..., K, K) linear maps M for which M spread Mᵀ is `spread` (..., K, K) less its part `errors`, or 0."""
     values, axes = np.linalg.eigh(spread)
-    root = np.sqrt(np.maximum(values, 1e-12 * values[:, 2:]))[:, None]
+    root = np.sqrt(np.maximum(values, 1e-12 * np.maximum(values[..., -1:], 1e-12)))[..., None, :]
     white = axes / root
-    shares, turned = np.linalg.eigh(np.einsum("rki,rkl,rlj->rij", white, errors, white))
+    shares, turned = np.linalg.eigh(np.einsum("...ki,...kl,...lj->...ij", white, errors, white))
     kept = np.sqrt(np.maximum(1 - shares, 0.0))
-    into = np.einsum("rij,rjk->rik", axes * root, turned)
-    back = np.einsum("rij,rjk->rik", white, turned)
-    found: Floats = np.einsum("rij,rj,rkj->rik", into, kept, back)
+    into = np.einsum("...ij,...jk->...ik", axes * root, turned)
+    back = np.einsum("...ij,...jk->...ik", white, turned)
+    found: Floats = np.einsum("...ij,...j,...kj->...ik", into, kept, back)
     return found
 
 
 def plane_cell_m(scans: Sequence[Floats], leaf_size_m: float) -> float:
     """Edge of the cell of a plane, m: as of a map's surfel, or larger where scans (N_i, 3) are sparse."""
-    asked = [scan for scan in scans if len(scan) > 1]
-    asked = asked[:: max(1, len(asked) // _ASKED_SCANS)]
-    apart_m = [float(np.median(cKDTree(scan).query(scan, 2)[0][:, 1])) for scan in asked]
+    sampled = [scan for scan in scans if len(scan) > 1]
+    sampled = sampled[:: max(1, len(sampled) // _SAMPLED_SCANS)]
+    apart_m = [float(np.median(cKDTree(scan).query(scan, 2)[0][:, 1])) for scan in sampled]
     return max(LEAVES_PER_SURFEL * leaf_size_m, float(np.median(apart_m or [0.0])) / _CELLS_APART)
 
 
@@ -100,12 +94,9 @@ def plane_cell_m(scans: Sequence[Floats], leaf_size_m: float) -> float:
 class SensorReturns:
     """Returns in the frames of their sensors, scan by scan."""
 
-    directions: NDArray[np.float32]
-    """(N, 3) unit vectors."""
-    ranges_m: NDArray[np.float32]
-    """(N,)."""
-    scans: NDArray[np.int32]
-    """(N,) ascending."""
+    directions: NDArray[np.float32]  # (N, 3) unit vectors
+    ranges_m: NDArray[np.float32]  # (N,)
+    scans: NDArray[np.int32]  # (N,) ascending
 
     @classmethod
     def of(
@@ -145,95 +136,13 @@ class SensorReturns:
         return Rays(origin, points, directions, self.ranges_m, None, self.scans, up, len(self))
 
 
-def plane_windows(num_scans: int, size: int, shifted: bool) -> list[tuple[int, int]]:
-    """Begin and end of windows of at most `size` scans whose returns share planes. `shifted`: by half of one."""
-    begin = -(size // 2) if shifted and size < num_scans else 0
-    ranges = [(max(0, k), min(num_scans, k + size)) for k in range(begin, num_scans, size)]
-    return [(low, high) for low, high in ranges if high - low > 1]
-
-
-@dataclass(frozen=True)
-class Groups:
-    """Consecutive scans, of which the middle one has an increment, and the others what lies between those of two middle ones."""
-
-    num_scans: int
-    size: int
-    """Scans of a group; the last one may have fewer. 1: each scan is on its own."""
-
-    @property
-    def middles(self) -> NDArray[np.intp]:
-        """(G,) number of the scan in the middle of each group."""
-        begins = np.arange(0, self.num_scans, self.size)
-        return (begins + np.minimum(begins + self.size, self.num_scans)) // 2
-
-    def of(self, scans: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The number of the group of each scan."""
-        return scans // np.int32(self.size)
-
-    def prior(self, of_scans: Blocks, poses: Floats) -> Blocks:
-        """Of increments of the groups, from that of increments of the scans with these poses (F, 4, 4)."""
-        if self.size == 1:
-            return of_scans
-        diagonal, below, gradient = of_scans
-        count = len(self.middles)
-        own, at = self._segments()
-        found = np.zeros((count, 6, 6)), np.zeros((count - 1, 6, 6)), np.zeros((count, 6))
-        ends = self._by_ends(poses, own, at)
-        for k, end in enumerate(ends):
-            np.add.at(found[0], own + k, np.einsum("fki,fkl,flj->fij", end, diagonal, end))
-            np.add.at(found[2], own + k, np.einsum("fki,fk->fi", end, gradient))
-        np.add.at(found[1], own, np.einsum("fki,fkl,flj->fij", ends[1], diagonal, ends[0]))
-        # Both scans of a step lie between the same two middles, or on them.
-        first = [end[:-1] for end in ends]
-        second = [end[1:] for end in self._by_ends(poses, np.concatenate([own[:1], own[:-1]]), at)]
-        products = [[np.einsum("fki,fkl,flj->fij", b, below, a) for a in first] for b in second]
-        for k in range(2):
-            np.add.at(found[0], own[:-1] + k, products[k][k] + products[k][k].transpose(0, 2, 1))
-        np.add.at(found[1], own[:-1], products[1][0] + products[0][1].transpose(0, 2, 1))
-        return found
-
-    def increments(self, of_groups: Floats, poses: Floats) -> Floats:
-        """(F, 6) of the scans with these poses (F, 4, 4), from those of the groups (G, 6)."""
-        if self.size == 1:
-            return of_groups
-        own, at = self._segments()
-        ends = self._by_ends(poses, own, at)
-        parts = [np.einsum("fij,fj->fi", end, of_groups[own + k]) for k, end in enumerate(ends)]
-        found: Floats = parts[0] + parts[1]
-        return found
-
-    def _segments(self) -> tuple[NDArray[np.intp], Floats]:
-        """(F,) for each scan, the group whose middle is the last one not after it; of the last group, the one before. And the
-        places (F,) of all scans: those before the first middle and after the last one are there."""
-        middles = self.middles
-        at = np.clip(np.arange(self.num_scans), middles[0], middles[-1])
-        own = np.searchsorted(middles, at, side="right") - 1
-        return np.minimum(own, len(middles) - 2), at.astype(np.float64)
-
-    def _by_ends(self, poses: Floats, own: NDArray[np.intp], at: Floats) -> list[Floats]:
-        """Two times (F, 6, 6): how the increment of each scan follows from those of the middles of its group `own` and of the next."""
-        middles = self.middles
-        shares = (at - middles[own]) / (middles[own + 1] - middles[own])
-        found = []
-        for share, middle in ((1 - shares, middles[own]), (shares, middles[own + 1])):
-            moved = np.tile(np.eye(6), (self.num_scans, 1, 1))
-            moved[:, :3, 3:] = -skew(poses[:, :3, 3] - poses[middle, :3, 3])
-            found.append(share[:, None, None] * moved)
-        return found
-
-
 @dataclass(frozen=True)
 class PlaneGrid:
-    """How returns are put together to planes."""
+    """How returns are grouped into planes."""
 
-    window: int
-    """So many scans that follow each other share planes."""
-    shifted: bool
-    """Whether windows begin in the middle of one."""
-    cell_m: float
-    """Edge of the cell of a plane, m."""
-    together: int = 1
-    """So many consecutive scans move as one, and have as many returns as one."""
+    window: int  # number of consecutive scans that share planes
+    shifted: bool  # whether windows begin in the middle of one
+    cell_m: float  # edge of the cell of a plane
 
 
 def common_planes(
@@ -244,15 +153,18 @@ def common_planes(
     config: ReturnsConfig,
     num_threads: int = 0,
 ) -> tuple[CommonPlanes, SensorNoise]:
-    """What returns on common planes say of the poses (F, 4, 4), and the noise of the sensor that this supposes.
+    """The normal equations of poses (F, 4, 4) from returns on common planes, and the noise of the sensor.
 
-    Of poses of groups of scans, if `grid` has them together. `noise` None: as these planes show it. `num_threads` 0: as many as OpenMP uses.
+    `noise` None: estimated from these planes. `num_threads` 0: as many as OpenMP uses.
     """
-    groups = Groups(len(poses), grid.together)
-    rays = returns.every(grid.together).posed(poses)
+    rays = returns.posed(poses)
     planes = np.full(len(rays), -1, np.int32)
     centres, normals, noises, total = [], [], [], 0
-    for low, high in plane_windows(len(poses), grid.window, grid.shifted):
+    begin = -(grid.window // 2) if grid.shifted and grid.window < len(poses) else 0
+    for k in range(begin, len(poses), grid.window):
+        low, high = max(0, k), min(len(poses), k + grid.window)
+        if high - low < 2:
+            continue
         rows = slice(*np.searchsorted(rays.scans, [low, high]).tolist())
         part = rays.select(rows)
         surfels = Surfels.of(part, grid.cell_m / LEAVES_PER_SURFEL, num_threads)
@@ -268,15 +180,15 @@ def common_planes(
         rays.points,
         rays.directions,
         rays.ranges_m,
-        groups.of(rays.scans),
+        rays.scans,
         planes,
-        poses[groups.middles, :3, 3] - rays.origin,
-        np.ascontiguousarray(rays.up_of_scan[groups.middles]),
+        poses[:, :3, 3] - rays.origin,
+        rays.up_of_scan,
         np.concatenate(centres),
         np.ascontiguousarray(np.concatenate(normals)),
         grid.cell_m,
         known.variances,
-        min(grid.window // grid.together, _TOGETHER),
+        min(grid.window, _TOGETHER),
         num_threads,
     )
     return common, known

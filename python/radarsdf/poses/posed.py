@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Refined or found poses, as maps and reports use them."""
+"""Refined or estimated poses, as maps and reports use them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _MOST = 500  # scans whose poses are kept: a plot shows no more
 
 
 def pose_sigmas(covariance: Floats) -> tuple[float, float]:
-    """Standard deviations of a pose's position, m, and rotation, rad, by axis, of the median scan.
+    """Compute the standard deviations of a pose's position, m, and rotation, rad, by axis, of the median scan.
 
-    These are what ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of a :class:`FitConfig` state.
+    These are the values for ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of a :class:`FitConfig`.
 
     Parameters
     ----------
@@ -39,14 +39,10 @@ def _sigmas(covariance: Floats) -> Floats:
 
 
 def way_of(found: RefinedPoses | Odometry, given: Floats | None, rows: slice = slice(None)) -> dict[str, Any]:
-    """The trajectory of the scans `rows` for the report of a fit, as values of JSON. `given` (F, 4, 4): the poses before.
-
-    `step_m` and `step_rad` are deviations of a given step; `before` and `after` positions, m, of some `scans`; `sigma_m` and
-    `sigma_rad` standard deviations by axis of their poses.
-    """
-    poses, covariance = found.poses[rows], found.covariance[rows]
+    """The trajectory of the scans `rows` for the report of a fit, as values of JSON. `given` (F, 4, 4): the poses before."""
+    poses = found.poses[rows]
     some = np.unique(np.linspace(0, len(poses) - 1, min(_MOST, len(poses))).astype(np.int64))
-    sigmas = _sigmas(covariance)[some]
+    sigmas = _sigmas(found.covariance[rows])[some]
     return {
         "verdict": found.report["verdict"],
         "improved": found.improved if isinstance(found, RefinedPoses) else None,
@@ -64,19 +60,13 @@ def way_of(found: RefinedPoses | Odometry, given: Floats | None, rows: slice = s
 class Posed:
     """The poses of the scans that a map is made of."""
 
-    poses: Floats
-    """(K, 4, 4) T_world_sensor, m."""
-    rows: slice
-    """The K scans among those of the drive: all, or the longest piece, if poses were found in several."""
-    given: Floats | None = None
-    """(K, 4, 4) the poses before. None: there were none."""
+    poses: Floats  # (K, 4, 4) T_world_sensor, m
+    rows: slice  # the K scans among those of the drive: all, or the longest piece, if poses were found in several
+    given: Floats | None = None  # (K, 4, 4) the poses before. None: there were none
     pieces: int = 1
-    way: dict[str, Any] | None = None
-    """The trajectory for the report of a map. None: the poses are as given."""
-    sigmas: tuple[float, float] | None = None
-    """Standard deviations of a pose, m and rad, if known."""
-    notes: tuple[str, ...] = ()
-    """Sentences on what was not used."""
+    way: dict[str, Any] | None = None  # the trajectory for the report of a map. None: the poses are as given
+    sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
+    notes: tuple[str, ...] = ()  # sentences on what was not used
 
     @classmethod
     def as_given(cls, poses: Floats) -> Posed:
@@ -93,16 +83,13 @@ class Posed:
     @classmethod
     def found(cls, found: Odometry) -> Posed:
         """The longest piece of a drive without poses."""
-        rows = found.longest_piece()
+        rows, report = found.longest_piece(), found.report
         sigmas, way = pose_sigmas(found.covariance[rows]), way_of(found, None, rows)
-        return cls(
-            found.poses[rows], rows, None, found.report["pieces"], way, sigmas, tuple(found.report["notes"])
-        )
+        return cls(found.poses[rows], rows, None, report["pieces"], way, sigmas, tuple(report["notes"]))
 
     def config(self, config: FitConfig) -> FitConfig:
         """`config` with the errors of the poses, unless it states some itself."""
-        stated = config.returns.pose_sigma_m or config.returns.pose_sigma_rad
-        if self.sigmas is None or stated:
+        if self.sigmas is None or config.returns.pose_sigma_m or config.returns.pose_sigma_rad:
             return config
         sigma_m, sigma_rad = self.sigmas
         return config.override(returns={"pose_sigma_m": sigma_m, "pose_sigma_rad": min(sigma_rad, 1.0)})

@@ -1,35 +1,51 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses that make returns of different scans agree."""
+"""Joint estimate of the poses of all scans, from common planes and measured motion."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from tqdm import tqdm
 
-from radarsdf.checks import MISSING_POSES, instance, not_negative, usable_poses
+from radarsdf.checks import MISSING_POSES, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
+from radarsdf.config.groups import ReturnsConfig
 from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
-from radarsdf.poses.estimate import PosesEstimate
 from radarsdf.poses.motion import Motion, unsteadiness
-from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.rigid import Floats, increments, moved_by, steps
+from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
+from radarsdf.poses.rigid import Floats, aligned, increments, moved, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
+from radarsdf.progress import hides_bar
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.returns.rays import LeftOut
 from radarsdf.threads import Workers
 
 # The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees
 # end with the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
-_FIRST_SIGMA_M, _FIRST_SIGMA_RAD = 0.1, 0.01
+_FIRST_SIGMAS = 0.1, 0.01
 _CONTRADICTED = 0.5  # share of the squared motion, from which on Doppler and poses cannot be of one drive
+# Within short windows of scans, the drift is small compared with a cell. Each window may be twice as long as the one before.
+_FIRST_WINDOW = 8
+_OF_WINDOWS = (4, 2)  # edges of cells, in those of a map's surfels
+_OF_ALL = (4, 4, 2, 2)  # the same, once all scans are together
+_MOST_ROUNDS = 12  # with cells as small as a map's surfels
+# Standard deviations that poses still move by. Planes change in each round, so that 0.1 is often never reached; 0.3
+# ends with the same errors in half the time.
+_SETTLED = 0.3
+_TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
+_EXACT = 1e-3  # tolerance where differences of solutions count
+# Information about each pose, 1/m² and 1/rad²: what returns and steps leave free stays where it is.
+_WEAK = 1e-4
+_FIXED = 1e10  # information about the pose that the covariance is relative to
 
 
 @dataclass(frozen=True)
@@ -57,12 +73,10 @@ def refine_poses(
     *,
     doppler_mps: Sequence[ArrayLike] | None = None,
     times_s: ArrayLike | None = None,
-    sigma_m: float | None = None,
-    sigma_rad: float | None = None,
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> RefinedPoses:
-    """Refines the poses of scans, so that their returns lie on common surfaces.
+    """Refine the poses of scans so that their returns lie on common surfaces.
 
     Adjusts all scans at once: residuals are the distances of returns from planes that scans have in common, which are unknown,
     too, and the given motions from scan to scan. The noise of the sensor, the errors of the given steps and their bias are
@@ -71,7 +85,7 @@ def refine_poses(
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, poses, times and Doppler are
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, poses, times and Doppler are
         used where none are given here.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan.
@@ -80,8 +94,6 @@ def refine_poses(
         move are excluded. Needs `times_s`.
     times_s : (F,) array_like, optional
         Of the scans, s. After a gap, a step has larger errors. By default all steps are alike.
-    sigma_m, sigma_rad : float, optional
-        Standard deviations of each component of a step's translation, m, and rotation, rad. By default estimated.
     config : FitConfig, optional
         Its ranges, noise, leaf cells and threads are used.
     progress : bool, optional
@@ -94,8 +106,10 @@ def refine_poses(
 
     Raises
     ------
+    TypeError
+        If an argument has the wrong type.
     ValueError
-        If scans or poses are invalid (see :func:`radarsdf.returns.rays.prepare`), or times descend.
+        If poses are missing, shapes do not fit together, ranges cannot be in m, or times descend.
 
     Notes
     -----
@@ -117,23 +131,19 @@ def refine_poses(
     if poses is None:
         raise ValueError(MISSING_POSES)
     checked = CheckedScans.of(points, doppler_mps, times_s)
-    scans, times_s, velocities = checked.scans, checked.times_s, checked.velocities
+    scans, times_s, velocities, notes = checked.scans, checked.times_s, checked.velocities, [*checked.notes]
     given, rigid = usable_poses(poses, len(scans))
-    notes = [*checked.notes]
     if not rigid.all():
         notes += LeftOut(poses=np.flatnonzero(~rigid).tolist()).notes
         scans = [scan if usable else scan[:0] for scan, usable in zip(scans, rigid, strict=True)]
-    known = sigma_m is not None, sigma_rad is not None
-    unsteady_m, unsteady_rad = unsteadiness(given, times_s)
-    sigma_m = max(_FIRST_SIGMA_M, unsteady_m) if sigma_m is None else not_negative(sigma_m, "sigma_m")
-    sigma_rad = (
-        max(_FIRST_SIGMA_RAD, unsteady_rad) if sigma_rad is None else not_negative(sigma_rad, "sigma_rad")
-    )
     limits = config.returns
     returns = SensorReturns.of(scans, limits.min_range_m, limits.max_range_m)
+    report: dict[str, Any] = {"scans": len(scans), "returns": len(returns), "notes": notes}
     if len(scans) < 2 or len(returns) == 0:
-        return _kept(given, len(returns), "there are no two scans to compare", begin)
-    motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times_s, known)]
+        report["verdict"] = "The given poses are kept: there are no two scans to compare."
+        return RefinedPoses(given, np.zeros((len(given), 6, 6)), False, report)
+    sigma_m, sigma_rad = np.maximum(_FIRST_SIGMAS, unsteadiness(given, times_s)).tolist()
+    motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times_s)]
     if velocities is not None and times_s is not None:
         if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
             velocities = velocities.turned
@@ -151,43 +161,113 @@ def refine_poses(
         used = returns.select(~held)
         found = PosesEstimate.of(used, given, motions, cell_m, limits, workers.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
-    steps_given = found.motions[0]
-    report = {
+    sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
+    report |= {
         "verdict": verdict.words,
         "gain": verdict.gain,
         "gain_error": verdict.error,
-        "sigma_m": steps_given.sigma_m,
-        "sigma_rad": steps_given.sigma_rad,
-        "bias": steps_given.bias.tolist(),
+        "sigma_m": sigma_m,
+        "sigma_rad": sigma_rad,
+        "bias": found.motions[0].bias.tolist(),
         **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
-        "notes": notes,
         "movers": checked.movers,
-        "scans": len(scans),
-        "returns": len(returns),
         "rounds": found.rounds,
         "seconds": time.perf_counter() - begin,
     }
     if verdict.improved:
         return RefinedPoses(found.poses, found.covariance, True, report)
     # Neither trajectory is excluded, so the errors of the given one may be as large as their difference.
-    return RefinedPoses(given, found.covariance + _squared_differences(given, found.poses), False, report)
-
-
-def _squared_differences(given: Floats, found: Floats) -> Floats:
-    """(F, 6, 6) outer products of the increments from given poses to others, once the scans in the middle coincide."""
     middle = len(given) // 2
-    placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found[middle]), found)
+    placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found.poses[middle]), found.poses)
     off = increments(given, placed)
-    squares: Floats = np.einsum("fi,fj->fij", off, off)
-    return squares
+    return RefinedPoses(given, found.covariance + np.einsum("fi,fj->fij", off, off), False, report)
 
 
-def _kept(given: Floats, returns: int, why: str, begin: float) -> RefinedPoses:
-    report = {"verdict": f"The given poses are kept: {why}.", "scans": len(given), "returns": returns}
-    return RefinedPoses(
-        given,
-        np.zeros((len(given), 6, 6)),
-        False,
-        report | {"rounds": 0, "seconds": time.perf_counter() - begin},
-    )
+@dataclass(frozen=True)
+class PosesEstimate:
+    """Poses (F, 4, 4), their covariance (F, 6, 6), and what was estimated with them."""
+
+    poses: Floats
+    covariance: Floats
+    motions: list[Motion]
+    noise: SensorNoise
+    rounds: int
+
+    @classmethod
+    def of(
+        cls,
+        returns: SensorReturns,
+        given: Floats,
+        motions: Sequence[Motion],
+        cell_m: float,
+        config: ReturnsConfig,
+        num_threads: int,
+        first_window: int = _FIRST_WINDOW,
+        progress: bool | None = False,
+    ) -> PosesEstimate:
+        """From `given` (F, 4, 4) and measured motions, by Gauss and Newton's method, with new planes in each round."""
+        poses, count, noise, motions = given, len(given), None, list(motions)
+        plan = _plan(count, first_window)
+        rounds = 0
+        for window, cells in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
+            grid = PlaneGrid(window, rounds % 2 == 1, cells * cell_m)
+            # The noise is estimated every other round: with the poses, it changes slowly.
+            known = None if rounds % 2 == 0 else noise
+            planes, noise = common_planes(returns, poses, grid, known, config, num_threads)
+            steps, inverse, inverse_below, decrement = planes.solve(
+                *_prior(motions, poses), _TOLERANCE, _MOST_ITERATIONS, True, num_threads
+            )
+            before, poses = poses, aligned(moved(poses, steps), given)
+            motions = [motion.at(poses).learnt(poses, before, inverse, inverse_below) for motion in motions]
+            rounds += 1
+            if window == count and cells == 1 and decrement < _SETTLED**2 * steps.size:
+                break
+        assert noise is not None
+        # Steps that were tracked by the same returns have the errors of these. As independent measurements, they would
+        # halve the deviations.
+        evidence = [replace(m, variances=np.maximum(m.variances, m.least_variances)) for m in motions]
+        diagonal, below, gradient = _prior(evidence, poses)
+        diagonal[count // 2] += _FIXED * np.eye(6)
+        covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
+
+        def solved(more: Floats | float) -> Floats:
+            """Increments (F, 6) once something is added to the gradient."""
+            right = gradient + more
+            return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
+
+        return cls(poses, covariance + _by_biases(evidence, poses, solved), motions, noise, rounds)
+
+
+def _plan(num_scans: int, window: int) -> list[tuple[int, int]]:
+    """Windows of scans and edges of cells, coarse to fine, and from short windows to all scans."""
+    plan = []
+    while window < num_scans:
+        plan += [(window, cells) for cells in _OF_WINDOWS]
+        window *= 2
+    return plan + [(num_scans, cells) for cells in _OF_ALL] + [(num_scans, 1)] * _MOST_ROUNDS
+
+
+def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Floats]:
+    """The sum of the motions' normal equations, as :meth:`Motion.prior`."""
+    parts = [motion.prior(poses) for motion in motions]
+    diagonal, below, gradient = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
+    return diagonal + _WEAK * np.eye(6), below, gradient
+
+
+def _by_biases(
+    motions: Sequence[Motion], poses: Floats, solved: Callable[[Floats | float], Floats]
+) -> Floats:
+    """(F, 6, 6) covariance of the poses by errors that all steps have in common, as far as returns leave them open.
+
+    The biases are unknowns, too, which the poses are eliminated from (the Schur complement).
+    """
+    by, own = (np.concatenate(parts) for parts in zip(*(m.by_bias(poses) for m in motions), strict=True))
+    if len(by) == 0:
+        return np.zeros((len(poses), 6, 6))
+    moved_by = np.stack([solved(each) for each in by]) - solved(0.0)
+    information = np.diag(own) + np.einsum("kfi,lfi->kl", by, moved_by)
+    values, axes = np.linalg.eigh((information + information.T) / 2)
+    root = np.einsum("kfi,kl->lfi", moved_by, axes / np.sqrt(1 + np.maximum(values, 0.0)))
+    found: Floats = np.einsum("lfi,lfj->fij", root, root)
+    return found

@@ -32,6 +32,12 @@ def steps(poses: Floats) -> Floats:
     return between(poses[:-1], poses[1:])
 
 
+def step_vectors(poses: Floats) -> Floats:
+    """(F - 1, 6) translations, m, and rotation vectors, rad, of these motions."""
+    motions = steps(poses)
+    return np.concatenate([motions[:, :3, 3], Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()], axis=1)
+
+
 def between(first: Floats, second: Floats) -> Floats:
     """(K, 4, 4) motion from each pose to the other one, in the frame of the first of the two."""
     found = np.tile(np.eye(4), (len(first), 1, 1))
@@ -65,8 +71,7 @@ def aligned(poses: Floats, reference: Floats) -> Floats:
 
 def turned_by(poses: Floats, others: Floats) -> Floats:
     """(F,) angles between the rotations of poses and others (F, 4, 4), rad."""
-    between = np.einsum("fji,fjk->fik", poses[:, :3, :3], others[:, :3, :3])
-    found: Floats = Rotation.from_matrix(between).magnitude()
+    found: Floats = Rotation.from_matrix(between(poses, others)[:, :3, :3]).magnitude()
     return found
 
 

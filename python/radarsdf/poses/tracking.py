@@ -1,22 +1,27 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Tracking: each scan is fitted to the planes of those before it."""
+"""Tracking of a drive without poses: each scan is registered with the planes of those before it."""
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.linalg import eigh
+from tqdm import tqdm
 
 from radarsdf._core import LocalPlanes
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.motion import ExpectedStep
-from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.rigid import Floats, moved, rotation_vector
+from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
+from radarsdf.poses.imu import Gyroscope
+from radarsdf.poses.motion import ExpectedStep, Motion, MotionPrior, Rate
+from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
+from radarsdf.poses.rigid import Floats, increments, moved, rotation, rotation_vector
+from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 
@@ -24,12 +29,12 @@ WINDOW = 25
 """Scans whose planes are kept. With 60, nothing was better on simulated drives, and wrong poses were remembered longer."""
 _CELLS = (4.0, 2.0)  # edges of cells, in those of a map's surfels
 _ITERATIONS, _SETTLED = 8, 0.03  # of Gauss and Newton's method, in each cell size; in standard deviations
-_MOST_RETURNS = 2000  # of a scan that are held against planes, evenly spread
-_SEARCHED = 250  # likewise, of a search
-_MOST_RADII = 10.0  # median ranges: deviation of an expected translation, up to which a search may meet the scans before
-_MOST_RECKONED_M = 1e4  # likewise, up to which a new piece begins where dead reckoning leads
+_MOST_RETURNS, _SEARCHED = 2000, 250  # returns of a scan that are registered, and that a search compares
+# Deviation of an expected translation up to which a search may reach the scans before, in median ranges; and up to which a new
+# piece begins where dead reckoning leads.
+_MOST_RADII, _MOST_RECKONED_M = 10.0, 1e4
 _FOLLOWED = 12  # best poses of a search
-_ELSEWHERE = 500  # poses that tell what agrees by chance
+_ELSEWHERE = 500  # poses that show what agrees by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
 _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
 # Of the last scans, that it is estimated from: so many tell a deviation to a percent. With all 25 scans of 2,000 returns, it took
@@ -38,52 +43,50 @@ _NOISE_RETURNS = 10_000
 _SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells: further than returns of one thing reach
 _SURE = 0.05  # cells: deviation of an expected translation that needs no returns
 _LEAST_VARIANCE = 1e-12
-_PARTS = slice(0, 3), slice(3, 6)  # of an increment: translation, rotation
+# Initial priors. The drive's own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
+# scans were lost, up to 9 degrees.
+_TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
+_MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
+_PASSES = 3
+# Share of a step's variance that the returns must remove where nothing else measures the translation. Below a half, the motion before
+# says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
+LEAST_OBSERVED = 0.5
+# Deviation of the acceleration across the trajectory: what moves fast turns slowly. Vehicles on roads: about 1; drones and hands: 2.
+LATERAL_MPS2 = 2.0
+# Deviation of the rate of turning up to which it may stay unknown from step to step: the joint estimate and the covariance hold
+# for small rotations. That of a sensor faster than 20 m/s.
+_SLOW_TURN_RAD_S = 0.1
+_TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
 
 
 @dataclass
 class Tracked:
     """One scan, where it was found."""
 
-    pose: Floats
-    """(4, 4) T_world_sensor, in the frame of its piece."""
-    covariance: Floats
-    """(6, 6) of the step that led here: translation, m, and rotation vector, rad, in world axes."""
-    agreeing: float
-    """Share of the returns that lie on planes of the scans before it, in [0, 1]. NaN: it begins a piece."""
-    piece: int
-    """Number of the piece of the drive that it is part of."""
-    turn: Floats
-    """(3,) rotation vector of the step that led here, in the frame of the scan before, rad. It may be more than half a turn."""
-    told: tuple[float, float] = (0.0, 0.0)
-    """Share of the expected step's variance that the returns took away, of the translation and of the rotation, each in the
-    direction that they tell least of. 0: nothing."""
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """A scan whose planes are kept."""
-
-    scan: Floats
-    """(N, 3) sensor frame, m."""
-    pose: Floats
-    """(4, 4)."""
-    world: Floats
-    """(N, 3) as they were added to the planes: taken out again, they leave nothing."""
+    pose: Floats  # (4, 4) T_world_sensor, in the frame of its piece
+    covariance: (
+        Floats  # (6, 6) of the step that led here: translation, m, and rotation vector, rad, in world axes
+    )
+    agreeing: float  # share of the returns on planes of the scans before, in [0, 1]. NaN: it begins a piece
+    piece: int  # number of the piece of the drive that it is part of
+    turn: Floats  # (3,) rotation vector of the step in the frame of the scan before, rad; may exceed half a turn
+    # Share of the expected step's variance that the returns removed, of the translation and of the rotation, each in the
+    # least certain direction. 0: nothing.
+    observed: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass
 class Tracker:
     """The last scans' planes, and where the last scan was."""
 
-    cell_size_m: float
-    """Edge of the cell of a map's surfel, m."""
+    cell_size_m: float  # edge of the cell of a map's surfel
     config: ReturnsConfig
     num_threads: int = 0
-    last: Tracked | None = None
+    last: Tracked = field(init=False)
     _planes: list[LocalPlanes] = field(default_factory=list)
-    _recent: deque[_Kept] = field(default_factory=deque)
-    _noise: SensorNoise | None = None
+    # Scans (N, 3), sensor frame, their poses, and the points as they were added to the planes: taken out again, they leave nothing.
+    _recent: deque[tuple[Floats, Floats, Floats]] = field(default_factory=deque)
+    _variances: list[float] = field(default_factory=list)
     _scans: int = 0
 
     def follow(self, scan: Floats, expected: ExpectedStep | None) -> Tracked:
@@ -94,7 +97,7 @@ class Tracker:
 
     def seek(self, scan: Floats, expected: ExpectedStep | None) -> Tracked:
         """Where :meth:`follow` would put a scan. Nothing changes."""
-        if expected is None or self.last is None:
+        if expected is None or not self._planes:
             return begun(np.eye(4))
         # Where a drive was lost, what was mapped before and after cannot be joined.
         if (found := self._sought(scan, expected)) is not None:
@@ -104,8 +107,8 @@ class Tracker:
         return begun(self.last.pose @ expected.pose() if reckoned else self.last.pose, self.last.piece + 1)
 
     def keep(self, scan: Floats, found: Tracked) -> None:
-        """The scan was there. The next ones are held against its planes, too."""
-        if self.last is None or found.piece != self.last.piece:
+        """Adds a scan to the planes that the next ones are registered with."""
+        if not self._planes or found.piece != self.last.piece:
             self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
             self._recent.clear()
             self._scans = 0
@@ -114,27 +117,27 @@ class Tracker:
         for planes in self._planes:
             planes.add(points)
             if gone is not None:
-                planes.add(gone.world, -1)
-        self._recent.append(_Kept(scan, found.pose, points))
+                planes.add(gone[2], -1)
+        self._recent.append((scan, found.pose, points))
         self.last = found
         self._scans += 1
         if self._scans in _NOISE_AT:
-            self._noise = self._estimated_noise()
+            self._variances = self._noise().variances
 
-    def _estimated_noise(self) -> SensorNoise:
-        counts = np.cumsum([len(kept.scan) for kept in reversed(self._recent)])
+    def _noise(self) -> SensorNoise:
+        counts = np.cumsum([len(scan) for scan, *_ in reversed(self._recent)])
         last = list(self._recent)[-max(2, int(np.searchsorted(counts, _NOISE_RETURNS, side="right"))) :]
-        scans, poses = [kept.scan for kept in last], [kept.pose for kept in last]
+        scans, poses = [scan for scan, *_ in last], [pose for _, pose, _ in last]
         rays = SensorReturns.of(scans, 0.0, None).posed(np.stack(poses))
         surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, self.num_threads)
         return sensor_noise(surfels, rays, self.config, self.num_threads)
 
     def _sought(self, scan: Floats, expected: ExpectedStep) -> Tracked | None:
-        assert self.last is not None
-        assert self._noise is not None
         scan = thinned(scan, _MOST_RETURNS)
         if len(scan) == 0:
-            return self._as_expected(expected)
+            covariance = self._in_world(expected.covariance())
+            pose = self.last.pose @ expected.pose()
+            return Tracked(pose, covariance, 0.0, self.last.piece, expected.turn.mean)
         radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
         capture_m = 0.5 * _CELLS[0] * self.cell_size_m
         if expected.spread_m(radius_m) <= capture_m:
@@ -143,14 +146,7 @@ class Tracker:
             return None  # where the scans so far are seen, if at all, is not among a search's few poses
         return self._searched(scan, expected, capture_m, radius_m)
 
-    def _as_expected(self, expected: ExpectedStep) -> Tracked:
-        assert self.last is not None
-        pose = self.last.pose @ expected.pose()
-        covariance = self._in_world(expected.covariance())
-        return Tracked(pose, covariance, 0.0, self.last.piece, expected.turn.mean)
-
     def _in_world(self, covariance: Floats) -> Floats:
-        assert self.last is not None
         both = np.kron(np.eye(2), self.last.pose[:3, :3])
         found: Floats = both @ covariance @ both.T
         return found
@@ -159,21 +155,34 @@ class Tracker:
         self, scan: Floats, expected: ExpectedStep, turn: Floats, start: Floats | None = None
     ) -> Tracked:
         """By Gauss and Newton's method from `start`, with what is expected of a sensor that turned by `turn`."""
-        assert self.last is not None
         middle = self.last.pose @ expected.pose(turn)
         prior = self._in_world(expected.covariance(turn)) + _LEAST_VARIANCE * np.eye(6)
         pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
         covariance = self._without_chance(scan, pose, prior, covariance)
         turned = rotation_vector(self.last.pose[:3, :3].T @ pose[:3, :3], turn)
-        told = tuple(_taken_away(prior[part, part], covariance[part, part]) for part in _PARTS)
-        return Tracked(pose, covariance, agreeing, self.last.piece, turned, (told[0], told[1]))
+        removed = (
+            _removed_share(prior[:3, :3], covariance[:3, :3]),
+            _removed_share(prior[3:, 3:], covariance[3:, 3:]),
+        )
+        return Tracked(pose, covariance, agreeing, self.last.piece, turned, removed)
+
+    def _normal_equations(
+        self, planes: LocalPlanes, scan: Floats, pose: Floats
+    ) -> tuple[Floats, Floats, float]:
+        """Hessian and gradient of an increment of `pose`, and the weight of the returns that agree.
+
+        Without the share that errors of the normals contribute: along a wall, normals that point a little along it would seem to
+        measure the position along it.
+        """
+        hessian, gradient, doubt, weight = planes.beside(scan, np.ascontiguousarray(pose), self._variances)
+        M = reduction(hessian, doubt)
+        return M @ hessian @ M.T, M @ (M @ gradient), weight
 
     def _without_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
-        """The covariance without what returns seem to say along the least certain axis wherever the scan is put.
+        """The covariance without the information along the least certain axis that returns have wherever the scan is put.
 
         Along a tunnel, returns match walls everywhere, and some of the matches hold the scan by chance.
         """
-        assert self._noise is not None
         cell_m = _CELLS[-1] * self.cell_size_m
         axis = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
         before, left = axis @ prior[:3, :3] @ axis, axis @ covariance[:3, :3] @ axis
@@ -183,9 +192,9 @@ class Tracker:
         for shift in _SHIFTS:
             shifted = pose.copy()
             shifted[:3, 3] += shift * cell_m * axis
-            hessian, gradient, doubt, _ = self._planes[-1].beside(scan, shifted, self._noise.variances)
-            hessian, _ = _without_normal_errors(hessian, gradient, doubt)
-            information.append(1 / (axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis))
+            hessian = self._normal_equations(self._planes[-1], scan, shifted)[0]
+            variance = axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis
+            information.append(1 / variance if variance > 0 else 0.0)
         chance = min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
         widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
         covariance = covariance.copy()
@@ -195,67 +204,58 @@ class Tracker:
     def _settled(
         self, scan: Floats, pose: Floats, middle: Floats, prior: Floats
     ) -> tuple[Floats, Floats, float]:
-        """The pose that the returns and a prior round `middle` lead to, its covariance, and the share of returns that agree."""
-        assert self._noise is not None
+        """The pose to which returns and a prior around `middle` lead, its covariance, and the share of returns that agree."""
         information, weight, covariance = np.linalg.inv(prior), 0.0, prior
         for planes in self._planes:
             for _ in range(_ITERATIONS):
-                hessian, gradient, doubt, weight = planes.beside(
-                    scan, np.ascontiguousarray(pose), self._noise.variances
-                )
-                hessian, gradient = _without_normal_errors(hessian, gradient, doubt)
-                off = np.concatenate(
-                    [pose[:3, 3] - middle[:3, 3], rotation_vector(pose[:3, :3] @ middle[:3, :3].T)]
-                )
+                hessian, gradient, weight = self._normal_equations(planes, scan, pose)
                 total = hessian + information
-                increment = -np.linalg.solve(total, gradient + np.einsum("ij,j->i", information, off))
-                pose = moved(pose[None], increment[None])[0]
+                off = increments(middle[None], pose[None])[0]
+                step = -np.linalg.solve(total, gradient + information @ off)
+                pose = moved(pose[None], step[None])[0]
                 covariance = np.linalg.inv(total)
-                if np.einsum("i,ij,j->", increment, total, increment) < 6 * _SETTLED**2:
+                if step @ total @ step < 6 * _SETTLED**2:
                     break
         return pose, covariance, weight / len(scan)
 
     def _searched(
         self, scan: Floats, expected: ExpectedStep, capture_m: float, radius_m: float
     ) -> Tracked | None:
-        """The best of many poses, if the returns agree there clearly better than at any other place and where it cannot be."""
-        assert self.last is not None
-        assert self._noise is not None
-        coarse, variances = self._planes[0], self._noise.variances
-        asked = thinned(scan, _SEARCHED)
+        """The best of many poses, if the returns agree there clearly better than at any other place and than by chance."""
+        coarse, sample = self._planes[0], thinned(scan, _SEARCHED)
+
+        def scores(poses: Floats) -> Floats:
+            found: Floats = coarse.scores(sample, np.ascontiguousarray(poses), self._variances)
+            return found
+
         turns, steps = expected.candidates(capture_m, radius_m)
-        poses = np.ascontiguousarray(np.einsum("ij,kjl->kil", self.last.pose, steps))
-        scores = coarse.scores(asked, poses, variances).mean(axis=1)
-        best = _best(scores)
+        poses = np.einsum("ij,kjl->kil", self.last.pose, steps)
+        means = scores(poses).mean(axis=1)
+        best = _best(means)
         # In a scene that repeats itself, the best poses may all be near one place, and the true one be another.
         elsewhere = np.flatnonzero(_apart_m(poses, poses[best[0]], radius_m) > 2 * capture_m)
-        best += elsewhere[_best(scores[elsewhere])].tolist()
+        best += elsewhere[_best(means[elsewhere])].tolist()
         found = [self._fitted(scan, expected, turns[i], poses[i]) for i in best]
         at = np.stack([one.pose for one in found])
-        chance = self._elsewhere()
-        chance = chance[_best(coarse.scores(asked, chance, variances).mean(axis=1))]
-        of_found, by_chance = (coarse.scores(asked, tried, variances) for tried in (at, chance))
+        chance = scores(self._elsewhere(radius_m))
+        of_found, by_chance = scores(at), chance[_best(chance.mean(axis=1))]
         first = int(np.argmax(of_found.mean(axis=1)))
         rivals = of_found[_apart_m(at, at[first], radius_m) > capture_m]
         gains = of_found[first] - np.concatenate([by_chance, rivals])
-        clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(asked))
+        clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(sample))
         return found[first] if clear.all() else None
 
-    def _elsewhere(self) -> Floats:
-        """(_ELSEWHERE, 4, 4) upright poses among those of the last scans, that look anywhere but where they looked."""
-        assert self.last is not None
+    def _elsewhere(self, reach_m: float) -> Floats:
+        """(_ELSEWHERE, 4, 4) upright poses near those of the last scans, in any other direction."""
         rng = np.random.default_rng(0)
-        known = np.stack([kept.pose for kept in self._recent])
-        reach_m = float(np.median(np.linalg.norm(self._recent[-1].scan, axis=1)))
+        known = np.stack([pose for _, pose, _ in self._recent])
+        up = self.last.pose[:3, 2]
         poses = known[rng.integers(0, len(known), _ELSEWHERE)]
-        turns = Rotation.from_rotvec(
-            rng.uniform(np.pi / 6, 2 * np.pi - np.pi / 6, _ELSEWHERE)[:, None] * self.last.pose[:3, 2]
-        ).as_matrix()
+        turns = rotation(rng.uniform(np.pi / 6, 2 * np.pi - np.pi / 6, _ELSEWHERE)[:, None] * up)
         poses[:, :3, :3] = np.einsum("kij,kjl->kil", turns, poses[:, :3, :3])
         shifts = rng.uniform(-reach_m, reach_m, (_ELSEWHERE, 3))
-        up = self.last.pose[:3, 2]
         poses[:, :3, 3] += shifts - np.einsum("ki,i->k", shifts, up)[:, None] * up
-        return np.ascontiguousarray(poses)
+        return poses
 
 
 def begun(pose: Floats, piece: int = 0) -> Tracked:
@@ -263,11 +263,9 @@ def begun(pose: Floats, piece: int = 0) -> Tracked:
     return Tracked(pose, np.zeros((6, 6)), np.nan, piece, np.zeros(3))
 
 
-def _taken_away(prior: Floats, covariance: Floats) -> float:
+def _removed_share(prior: Floats, covariance: Floats) -> float:
     """Share of the variance before that is gone, in the direction where it is least."""
-    root = np.linalg.cholesky(prior)
-    left = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
-    return max(1 - float(np.linalg.eigvalsh(left)[-1]), 0.0)
+    return max(1 - float(eigh(covariance, prior, eigvals_only=True)[-1]), 0.0)
 
 
 def _best(scores: Floats) -> list[int]:
@@ -278,25 +276,9 @@ def _best(scores: Floats) -> list[int]:
 
 def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
     """(K,) by how far poses (K, 4, 4) move a return at this range from where another pose puts it, m, at most."""
-    turns = Rotation.from_matrix(np.einsum("kij,lj->kil", poses[:, :3, :3], pose[:3, :3])).magnitude()
-    apart: Floats = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) + radius_m * turns
+    off = increments(np.broadcast_to(pose, poses.shape), poses)
+    apart: Floats = np.linalg.norm(off[:, :3], axis=1) + radius_m * np.linalg.norm(off[:, 3:], axis=1)
     return apart
-
-
-def _without_normal_errors(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
-    """Hessian and gradient without the share that errors of the normals make (errors in variables, Fuller 1987).
-
-    Along a wall, normals that point a little along it would tell where the sensor is.
-    """
-    values, axes = np.linalg.eigh(hessian)
-    root = np.sqrt(np.maximum(values, 1e-12 * max(values[-1], 1e-12)))
-    white = axes / root
-    shares, turned = np.linalg.eigh(np.einsum("ij,ik,kl->jl", white, doubt, white))
-    kept = np.maximum(1 - shares, 0.0)
-    into = np.einsum("ij,jk->ik", axes * root, turned)
-    back = np.einsum("ij,jk->ik", white, turned)
-    hessian = np.einsum("ij,j,kj->ik", into, kept, into)
-    return hessian, np.einsum("ij,j,kj,k->i", into, kept, back, gradient)
 
 
 def thinned(scan: Floats, most: int) -> Floats:
@@ -304,8 +286,130 @@ def thinned(scan: Floats, most: int) -> Floats:
     return np.ascontiguousarray(scan[:: max(1, -(-len(scan) // most))])
 
 
-def pieces_of(tracked: Sequence[Tracked]) -> list[slice]:
-    """The scans of each piece."""
-    number = np.array([found.piece for found in tracked])
-    edges = np.flatnonzero(np.diff(number, prepend=-1, append=number[-1] + 1))
-    return [slice(int(low), int(high)) for low, high in itertools.pairwise(edges)]
+@dataclass(frozen=True)
+class Drive:
+    """Measurements of a drive without poses."""
+
+    scans: list[Floats]  # (N_i, 3) static returns, sensor frame, m
+    times_s: Floats
+    velocities: SensorVelocities | None
+    gyroscope: Gyroscope | None
+    turns: MotionPrior = _TURNS  # of the sensor, in its own frame
+    moves: MotionPrior = _MOVES
+
+    def expected(self, i: int, turn: Rate | None, move: Rate | None) -> ExpectedStep:
+        """The step to scan `i`, after one with these rates. None: they are unknown."""
+        duration_s = float(self.times_s[i] - self.times_s[i - 1])
+        before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
+        elapsed_s = (duration_s + before_s) / 2
+        if self.gyroscope is not None:
+            by = self.gyroscope.step(i - 1)
+        else:
+            rate = self.turns.after(turn, elapsed_s)
+            by = Rate(rate.mean * duration_s, rate.covariance * duration_s**2)
+        if self.velocities is not None:
+            covariance = self.velocities.step_covariance(i - 1, duration_s)
+            begin, end = self.velocities.mean_mps[i - 1 : i + 1]
+            return ExpectedStep(by, begin, end, covariance, duration_s)
+        rate = self.moves.after(move, elapsed_s)
+        return ExpectedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
+
+    @property
+    def usual_turn_rad_s(self) -> float:
+        """Prior deviation of the rates at which a sensor with these velocities turns."""
+        usual = float(np.sqrt(_TURNS.usual[0]))
+        if self.velocities is None:
+            return usual
+        speed_mps = np.sqrt((self.velocities.mean_mps**2).sum(axis=1).mean())
+        return min(usual, LATERAL_MPS2 / max(float(speed_mps), 1e-9))
+
+    @property
+    def turns_slowly(self) -> bool:
+        """Whether it is so fast that it cannot turn far from scan to scan."""
+        return self.usual_turn_rad_s < _SLOW_TURN_RAD_S
+
+    def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
+        """The measured motions from scan to scan among these."""
+        times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
+        # The tracked steps initialise the estimate; it finds how good they are. Other measurements replace them.
+        motion = Motion.of(poses, _TRACKED_M, _TRACKED_RAD, times_s)
+        duration_s = float(np.median(np.diff(times_s)))
+        # They are no evidence in addition to the returns that they were tracked by, but for how this sensor usually moves.
+        least = duration_s**2 * np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
+        turn_sigma_rad_s = np.full(3, self.usual_turn_rad_s)
+        if self.gyroscope is not None:
+            least[1] = 0.0
+            measured = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
+            motion.steps[:, :3, :3] = rotation(np.stack(measured))
+            turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
+        motion = dataclasses.replace(motion, least_variances=least)
+        if self.velocities is None:
+            return [motion]
+        # Tracked translations in addition to Doppler, or in its place, double the errors of positions on simulated drives. What
+        # few returns hardly change of an expected turn is an error that all steps have in common.
+        motion.shares[:, :3] = np.inf
+        common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
+        turns = np.stack([found.turn for found in tracked[rows][1:]])
+        return [
+            dataclasses.replace(motion, bias_sigma=common),
+            DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
+        ]
+
+
+def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rate]:
+    """Of turning and moving, in the frame of the sensor."""
+    back = before[:3, :3].T
+    half = rotation(0.5 * now.turn).T @ back
+    way = half @ (now.pose[:3, 3] - before[:3, 3])
+    of_way, of_turn = (
+        matrix @ now.covariance[rows, rows] @ matrix.T / duration_s**2
+        for matrix, rows in ((half, slice(0, 3)), (back, slice(3, 6)))
+    )
+    return Rate(now.turn / duration_s, of_turn), Rate(way / duration_s, of_way)
+
+
+Rates = tuple[Rate, Rate] | tuple[None, None]  # of turning, rad/s, and moving, m/s, if known
+
+
+def _tracked(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]]:
+    """One pass over the scans, and the rates of each step."""
+    tracked = [tracker.follow(drive.scans[0], None)]
+    rates: list[Rates] = []
+    last: Rates = None, None
+    for i in range(1, len(drive.scans)):
+        expected = drive.expected(i, *last)
+        before, now = tracked[-1], tracker.follow(drive.scans[i], expected)
+        followed = now.piece == before.piece and expected.duration_s > 0
+        last = rates_of(before.pose, now, expected.duration_s) if followed else (None, None)
+        rates.append(last)
+        tracked.append(now)
+    return tracked, rates
+
+
+def followed(
+    drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
+) -> tuple[Drive, list[Tracked]]:
+    """The drive with its own motion prior, and its scans where the last pass found them."""
+    gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
+    cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
+    tracked: list[Tracked] = []
+    for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
+        tracked, rates = _tracked(drive, Tracker(cell_m, config.returns, num_threads))
+        turn_prior = drive.turns
+        if i == 0 and drive.turns_slowly and tracked[-1].piece > 0:
+            # Its returns agree nowhere. The next passes search less far.
+            usual = np.full(3, drive.usual_turn_rad_s**2)
+            turn_prior = MotionPrior(usual, usual, True)
+        drive = dataclasses.replace(
+            drive,
+            turns=turn_prior.learnt([turn for turn, _ in rates], durations_s),
+            moves=drive.moves.learnt([move for _, move in rates], durations_s),
+        )
+        if i == 0 and gyroscope is not None:
+            # Rotations that were found with its help could not show its bias.
+            vectors, covariance = np.full((len(rates), 3), np.nan), np.tile(np.eye(3), (len(rates), 1, 1))
+            for k, ((turn, _), duration_s) in enumerate(zip(rates, durations_s, strict=True)):
+                if turn is not None:
+                    vectors[k], covariance[k] = turn.mean * duration_s, turn.covariance * duration_s**2
+            drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(vectors, covariance))
+    return drive, tracked
