@@ -95,7 +95,7 @@ def test_the_version(capsys):
         (["report", "map", "-o", "a.html", "--holdout", "3"], "--holdout"),
         (["tiles", "scans"], "--out"),
         (["tiles", "fit"], "folder"),
-        (["tiles", "clean", "city", "--quick"], "--quick"),
+        (["tiles", "status", "city", "--quick"], "--quick"),
         (["tiles", "fit", "city", "--processes", "0"], "--processes"),
         (["info", "map", "more"], "more"),
     ],

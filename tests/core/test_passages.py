@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
-from radarsdf._core import find_passages
+from radarsdf._core import cell_keys, find_passages
 from radarsdf.returns.free_space import Passages
 
 LEAF_M = 0.2
@@ -73,4 +73,5 @@ def test_threads_make_no_difference_and_a_box_leaves_out_blocks():
     assert (passed > of_all).mean() < 0.1
     cells = np.random.default_rng(0).integers(-60, 60, (2000, 3))
     dense, _ = one.dense([-60] * 3, (120,) * 3)
-    np.testing.assert_array_equal(one.at(cells), dense[tuple((cells + 60).T)])
+    keys = cell_keys(((cells + 0.5) * LEAF_M).astype(np.float32), LEAF_M)
+    np.testing.assert_array_equal(one.at(keys), dense[tuple((cells + 60).T)])
