@@ -92,9 +92,9 @@ def _draw_returns(
     axes: Any, view: View, points: NDArray[Any], values: NDArray[Any] | None, limits: Any, title: str
 ) -> Any:
     azimuth_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 0]))
-    range_m, colors = np.linalg.norm(points, axis=1), "tab:blue" if values is None else values
-    low, high = limits
-    drawn = axes.scatter(azimuth_deg, range_m, 2, colors, vmin=low, vmax=high, linewidths=0)
+    range_m = np.linalg.norm(points, axis=1)
+    colors = {"color": "tab:blue"} if values is None else {"c": values, "vmin": limits[0], "vmax": limits[1]}
+    drawn = axes.scatter(azimuth_deg, range_m, 2, linewidths=0, **colors)
     axes.set(title=f"{title}: {len(points)} returns", xlabel="azimuth, °", ylabel="range, m")
     axes.set(xlim=np.rad2deg(view.sensor.azimuth_rad)[::-1], ylim=(0, view.sensor.range_m[1]))
     return drawn
