@@ -130,12 +130,9 @@ def compare(
     report: dict[str, Any] = {"alignment": alignment.words, "intensity_offset": None}
     if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
-        appeared = _repainted(appeared, differences.apart_from(np.concatenate(changed)))
+        appeared = _repainted(appeared, differences, np.concatenate(changed))
         report["intensity_offset"] = differences.offset
-        differences = (
-            f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units: "
-            "that is no change of a place."
-        )
+        differences = f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
     report["reflectance"] = differences
     if corners is not None:
         gone, appeared = _inside(corners, gone), _inside(corners, appeared)
@@ -180,9 +177,9 @@ def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: in
     return ChangedSurface(side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m, unknown)
 
 
-def _repainted(surface: ChangedSurface, differences: Differences) -> ChangedSurface:
-    """The later surface, with what changed its reflectance alone."""
-    change, repainted = differences.probability(surface.vertices, surface.kind == SAME)
+def _repainted(surface: ChangedSurface, differences: Differences, changed: Floats) -> ChangedSurface:
+    """The later surface, with what changed its reflectance alone, away from places (C, 3) that `changed` otherwise."""
+    change, repainted = differences.probability(surface.vertices, surface.kind == SAME, changed)
     return replace(
         surface,
         kind=np.where(repainted > _PROBABLE, REPAINTED, surface.kind).astype(np.int8),
@@ -221,8 +218,8 @@ def _check_common(
         if changed.sum() > _MOST_CHANGED * seen and (changed > agree).all():
             shares = " and ".join(f"{part:.0%}" for part in changed / (changed + agree))
             msg = (
-                f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. {alignment.words} "
-                "Give maps of one place, whose frames are at most some metres and degrees apart, with poses that do not drift"
+                f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. "
+                f"Give maps of one place, in about one frame. {alignment.words}"
             )
             raise ValueError(msg)
 
