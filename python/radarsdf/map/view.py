@@ -36,7 +36,6 @@ _HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
 _MIN_COSINE = 0.05
 _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
-_MOST_PLACES = 1 << 40
 _ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
 # Prior of the detection rate, in scans: with few scans that reached a patch, it is uncertain.
 _LOOKS_BEFORE = 2.0
@@ -220,26 +219,17 @@ def _patches(
 
 
 def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
-    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums."""
-    sums = np.cumsum(expected)
+    """At most `count` rows, spread evenly by the number `expected` (N,) of each, of which one row has at most one."""
     count = min(count, int(np.count_nonzero(expected)))
     if count == 0:
         return np.zeros(0, np.int64)
-
-    def rows_of(places: int) -> NDArray[np.int64]:
-        up_to = np.minimum(np.floor(sums * (places / sums[-1]) + 0.5), places)
-        return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
-
-    # Where a row expects more than one place, others get more of them, until there are `count` rows.
-    chosen, places, step, grows = rows_of(count), count, count, True
-    while 0 < step < _MOST_PLACES and len(chosen) < count:
-        more = rows_of(places + step)
-        if len(more) <= count:
-            chosen, places = more, places + step
-        else:
-            grows = False
-        step = 2 * step if grows else step // 2
-    return chosen
+    # The k largest have one each: of these k, the fewest after which no other one has more than its share of the rest.
+    falling = np.sort(expected)[::-1]
+    rest = np.cumsum(falling[::-1])[::-1]
+    full = int(np.argmax(falling * (count - np.arange(len(falling))) <= rest))
+    share = (count - full) / rest[full]
+    up_to = np.floor(np.cumsum(np.minimum(expected * share, 1.0)) + 0.5)
+    return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
 
 
 def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
