@@ -47,9 +47,8 @@ _COVERING = (-0.21, -0.79, -1.47, -2.68, -2.46)
 _CROWDED_RETURNS = 4.0  # returns in a cell that have half of the effect that any number has
 _BEND_CELLS = 2.0  # bending allowed by the smoothness term, leaf cells: a slope turns from -1 to 1
 _LEAST_LOGIT = -80.0  # what was observed is not impossible: float32 has this probability
-_DETECTION_RATE = (
-    1 / 36
-)  # least share of the scans that reach a surface that have a return in one of its cells
+# Least share of the scans that reach a surface that have a return in one of its cells.
+_DETECTION_RATE = 1 / 36
 _SMOOTH = 0.5  # standard deviations: a few more hits than needed are a little more evidence
 _ODDS_CELLS = 50_000  # evenly spread leaf cells that calibrate how much free-space crossings tell
 

@@ -57,16 +57,13 @@ class Sensor:
     interpolated. Empty: the sensor measures no intensities."""
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("azimuth_rad", -math.pi, math.pi),
-            ("elevation_rad", -math.pi / 2, math.pi / 2),
-            ("range_m", 0.0, _MAX_RANGE_M),
-        ):
-            first, last = limits = _pair(getattr(self, name), name)
-            if not low <= first < last <= high:
-                msg = f"{name} must be two ascending numbers in [{low:.4g}, {high:.4g}], not {first:.6g} and {last:.6g}"
+        limits = {"azimuth_rad": math.pi, "elevation_rad": math.pi / 2, "range_m": _MAX_RANGE_M}
+        for name, most in limits.items():
+            low, high = found = _pair(getattr(self, name), name)
+            if not (0.0 if name == "range_m" else -most) <= low < high <= most:
+                msg = f"{name} must be two ascending numbers up to {most:.4g}, not {low:.6g} and {high:.6g}"
                 raise ValueError(msg)
-            object.__setattr__(self, name, limits)
+            object.__setattr__(self, name, found)
         if not 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7:
             msg = f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}"
             raise ValueError(msg)
