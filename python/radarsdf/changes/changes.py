@@ -183,6 +183,15 @@ class Changes:
         write_mesh(path_of(path, "path"), self.mesh())
 
 
+def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
+    """Areas for a report."""
+    kinds, areas_m2 = (np.concatenate(of) for of in zip(*(s.of_faces() for s in surfaces), strict=True))
+    return {
+        "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},
+        "compared_m2": float(areas_m2[kinds != UNSEEN].sum()),
+    }
+
+
 def colors_of(kinds: NDArray[np.int8]) -> NDArray[np.uint8]:
     """(V, 3) sRGB of kinds (V,)."""
     table = np.array([COLORS[kind] for kind in sorted(COLORS)], np.uint8)

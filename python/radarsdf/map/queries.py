@@ -114,20 +114,14 @@ def evaluate(
 
 
 @torch.inference_mode(mode=False)
-def into_cells(
-    contents: MapContents,
-    points: Tensor,
-    size_m: float | None = None,
-    among: Callable[[MapContents, Tensor], Tensor] = occupied,
-) -> tuple[Tensor, Tensor]:
+def into_cells(contents: MapContents, points: Tensor, size_m: float | None = None) -> tuple[Tensor, Tensor]:
     """Points, of which those on the border of the occupied leaf cells are moved a little into one, and which are inside.
 
-    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features. `among`: which
-    points are in a cell that counts.
+    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features.
     """
     leaf_m = contents.config.leaf_size_m
     step_m = INWARD * (leaf_m if size_m is None else size_m)
-    inside = among(contents, points)
+    inside = occupied(contents, points)
     left = torch.nonzero(~inside)[:, 0]
     place = points[left] / leaf_m
     left = left[((place - place.round()).abs() * leaf_m <= step_m).any(dim=1)]
@@ -136,7 +130,7 @@ def into_cells(
     points, inside = points.clone(), inside.clone()
     for shift in itertools.product((-step_m, step_m), repeat=3):
         moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu")
-        found = among(contents, moved)
+        found = occupied(contents, moved)
         points[left[found]] = moved[found]
         inside[left[found]] = True
         left = left[~found]
