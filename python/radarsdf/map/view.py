@@ -60,8 +60,6 @@ class View:
     """(E,) elevations of the beams, ascending, rad."""
     beam_ranges_m: NDArray[np.float32]
     """(E, A) distance to the first surface along each beam, m. NaN where there is none."""
-    beam_intensities: NDArray[np.float32] | None
-    """(E, A) intensity of a return from there, sensor units. NaN where there is none."""
 
     def __len__(self) -> int:
         """Number of returns."""
@@ -178,10 +176,8 @@ def view_from(
     if flag(noise, "noise"):
         seed = seed if isinstance(seed, np.random.Generator) else whole_number(seed, "seed", 0)
         points = _with_noise(points, sensor, np.random.default_rng(seed))
-    ranges_m, beam_intensities = _first_surface(surface, pose[:3, :3], position, sensor, azimuth, elevation)
-    return View(
-        pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, ranges_m, beam_intensities
-    )
+    first_m = _first_surface(surface, pose[:3, :3], position, sensor, azimuth, elevation)
+    return View(pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, first_m)
 
 
 def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
@@ -256,17 +252,10 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 
 def _first_surface(
     surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, azimuth: _Floats, elevation: _Floats
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Range and intensity (E, A) of what each beam first meets, NaN where that is nothing."""
-    shape = (len(elevation), len(azimuth))
+) -> NDArray[np.float32]:
+    """Range (E, A) of what each beam first meets, NaN where that is nothing."""
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)
     ranges_m = surface.ranges(position, directions, float(sensor.range_m[1]))
     met = np.isfinite(ranges_m) & (ranges_m >= sensor.range_m[0])
-    places = position + directions[met] * ranges_m[met, None]
-    ranges_m = np.where(met, ranges_m, np.float32(np.nan))
-    if surface.intensity is None:
-        return ranges_m.reshape(shape), None
-    intensities = np.full(len(ranges_m), np.nan, np.float32)
-    intensities[met] = surface.intensity(places, position)
-    return ranges_m.reshape(shape), intensities.reshape(shape)
+    return np.where(met, ranges_m, np.float32(np.nan)).reshape(grid[0].shape)
