@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from radarsdf._core import vertex_areas
 from radarsdf.evaluation import confidence_metrics, surface_metrics
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.map.mesh import Surface
-from radarsdf.map.threshold import Limits, Tally, areas_round
+from radarsdf.map.threshold import Limits, Tally
 from radarsdf.simulate import SCENES
 from scipy.spatial import cKDTree
 from scipy.special import expit
@@ -86,7 +87,7 @@ class Example:
             surface,
             queries.terms(contents, surface.evidence).numpy(),
             queries.probabilities(contents, surface.evidence).reach.numpy(),
-            areas_round(surface.vertices, surface.faces),
+            vertex_areas(surface.vertices, surface.faces),
             distance_m <= leaf_m,
             np.concatenate([np.array(rows, np.int64) for rows in found]),
             np.repeat(np.arange(len(found)), [len(rows) for rows in found]),

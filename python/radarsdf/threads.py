@@ -16,7 +16,6 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import cached_property
 from typing import TypeVar
 
@@ -94,17 +93,6 @@ def resolve_num_threads(num_threads: int) -> int:
     """`num_threads`, or if it is 0 as many as PyTorch uses, or used before a block of :class:`Workers`."""
     with _state.lock:
         return num_threads or (_state.usual_threads if _state.open_blocks else torch.get_num_threads())
-
-
-@contextmanager
-def torch_threads(num_threads: int) -> Iterator[None]:
-    """A block in which PyTorch uses this number of threads, for several processes. 0: as before."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(num_threads or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class Workers:

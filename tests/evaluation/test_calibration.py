@@ -91,7 +91,7 @@ def test_bins_of_few_points_do_not_make_the_worst_gap():
         (confidence_metrics, ([0.5], [True, False]), "is_true"),
         (confidence_metrics, ([1.5], [True]), "confidence"),
         (confidence_metrics, ([0.5], [np.nan]), "is_true"),
-        (confidence_metrics, ([np.nan], [True]), "no point"),
+        (confidence_metrics, ([np.nan], [True]), "confidence"),
     ],
 )
 def test_wrong_arguments_are_refused(function, arguments, name):

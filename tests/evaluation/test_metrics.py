@@ -216,12 +216,10 @@ def test_the_choice_is_that_of_an_inner_hold_out():
     number = np.repeat(np.arange(6) * 7 - 3, 60)  # any numbers
     test = np.isin(number, holdout(number, 5)[1])
     errors = {}
-    for candidates in (1, 2, 4, 8, 16, 32, 64, 128):  # 240 returns remain
-        for k in (k for k in (1, 2, 4, 8, 16, 32) if k <= candidates):
-            inner = (a[~test] for a in (points, sensors, intensity))
-            knn = KNNIntensity(*inner, k=k, candidates=candidates)
-            predicted = knn.predict(points[test], sensors[test])
-            errors[k, candidates] = np.abs(predicted - intensity[test]).mean()
+    for k, candidates in ((4, 4), (8, 8), (16, 16), (16, 64), (16, 128)):  # 240 returns remain
+        inner = (a[~test] for a in (points, sensors, intensity))
+        predicted = KNNIntensity(*inner, k=k, candidates=candidates).predict(points[test], sensors[test])
+        errors[k, candidates] = np.abs(predicted - intensity[test]).mean()
     knn = KNNIntensity.chosen(points, sensors, intensity, number)
     assert (knn.k, knn.candidates) == min(errors, key=errors.get)
     whole = KNNIntensity(points, sensors, intensity, k=knn.k, candidates=knn.candidates)  # of all six scans

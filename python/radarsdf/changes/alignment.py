@@ -33,7 +33,6 @@ _PATCH_M = 4.0  # edge of a patch, whose errors are correlated
 _BY_CHANCE = 1e-3  # significance level
 # Standard error, in leaf cells, from which on an axis is not determined: fields reach two cells.
 _UNSURE_CELLS = 0.5
-_FIXED = 1e8  # information of what stays as given, 1/m²
 _ALIKE_CELLS = 0.25  # surfaces that are nearer lie on each other
 _SEARCH_CELLS = 8.0  # edge of the cells of a search, in leaf cells
 _SEARCHED = 500  # points of a search
@@ -45,12 +44,8 @@ _ERRORS = 3.0  # standard errors by which poses that agree about as well differ 
 class Alignment:
     """Where one map lies in the frame of another."""
 
-    T_before_after: Floats = field(
-        default_factory=lambda: np.eye(4)
-    )  # (4, 4) m. The identity unless `improved`
-    covariance: Floats = field(
-        default_factory=lambda: np.zeros((6, 6))
-    )  # translation, rotation vector about `centre`
+    T_before_after: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) m
+    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of an offset from the `centre`
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
     improved: bool = False  # whether the surfaces show that the frames are apart
     words: str = "The maps were taken as they are."  # the verdict in one sentence
@@ -65,8 +60,7 @@ class Alignment:
 def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     """Move the later map so that its surface lies on that of the earlier one, if that is more than chance explains.
 
-    It starts from the given frames, and from where a search by planes finds significantly more agreement. The verdict is on
-    the offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
+    The verdict is on the offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
     """
     if min(len(before.faces), len(after.faces)) < CELLS_OF_SURFACE:
         return Alignment()
@@ -79,23 +73,22 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
         return found
 
-    pose, covariance, undetermined = _determined(before, surface, np.eye(4))
-    other = _determined(before, surface, _searched(before, surface))
-    if Verdict.by_groups(far(pose) - far(other[0]), surface.patches).improved:
-        pose, covariance, undetermined = other
+    found = _determined(before, surface, np.eye(4))
+    searched = _determined(before, surface, _searched(before, surface))
+    if Verdict.by_groups(far(found[0]) - far(searched[0]), surface.patches).improved:
+        found = searched
+    pose, covariance, undetermined = found
     offset = surface.offset(pose)
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
     by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
-    moved_m = np.sqrt(((_placed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
-    figures = (
-        f"{moved_m:.3f} m, root mean square, {sigmas:.1f} standard errors, by chance up to {by_chance:.1f}"
-    )
     if sigmas <= by_chance or far(pose).mean() >= far(np.eye(4)).mean():
-        words = f"The frames were taken as they are: surfaces do not show that they are apart ({figures})."
+        words = "The frames were taken as they are: surfaces do not show that they are apart."
         return Alignment(covariance=covariance, centre=surface.centre, words=words)
-    words = f"The later map was moved so that its surface lies on the earlier one ({figures})."
-    if undetermined:
-        words += f" Along {undetermined} of 6 axes, surfaces do not determine it: there it stays as given."
+    moved_m = np.sqrt(((_placed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
+    words = (
+        f"The later map was moved by {moved_m:.3f} m, {sigmas:.1f} standard errors; "
+        f"surfaces do not determine {undetermined} of 6 axes, along which it stays as given."
+    )
     return Alignment(pose, covariance, surface.centre + offset[:3], True, words)
 
 
@@ -157,28 +150,24 @@ def _searched(before: PlacedMap, surface: _Surface) -> Floats:
 
 def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, int]:
     """The pose that fits the surfaces, its covariance, and how many axes they do not determine: there it stays as given."""
-    information = np.diag(_APART**-2.0)
-    pose, covariance = _settled(before, surface, start, information)
+    pose, covariance = _settled(before, surface, start)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
     variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
     most = (_UNSURE_CELLS * before.leaf_m) ** 2
     unsure = axes[:, variances > most]
-    if unsure.size:
-        offset = surface.offset(pose) * lever_m
-        offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
-        fixed = unsure * lever_m[:, None]
-        information += _FIXED * np.einsum("ik,jk->ij", fixed, fixed)
-        pose, _ = _settled(before, surface, surface.pose(offset / lever_m), information)
+    offset = surface.offset(pose) * lever_m
+    offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
     # Errors of normals would make larger ones errors of all surfaces.
     covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
-    return pose, covariance / np.outer(lever_m, lever_m), unsure.shape[1]
+    return surface.pose(offset / lever_m), covariance / np.outer(lever_m, lever_m), unsure.shape[1]
 
 
-def _settled(before: PlacedMap, surface: _Surface, pose: Floats, prior: Floats) -> tuple[Floats, Floats]:
+def _settled(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats, Floats]:
     """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change."""
     # Errors of the normals of both maps are independent: products of normals of different maps show along which axes
     # surfaces determine the pose (instrumental variables). Errors are correlated in a patch, so the scatter of its sums
     # is the covariance of the equations (Hansen 1982).
+    prior = np.diag(_APART**-2.0)
     covariance = np.linalg.inv(prior)
     for _ in range(_ITERATIONS):
         there, own = _placed(surface.points, pose), turned(surface.normals, pose[:3, :3])

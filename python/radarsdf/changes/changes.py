@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
-from radarsdf.io.npz import write_arrays
 from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.threshold import across_triangles
 
@@ -53,15 +52,7 @@ class ChangedSurface:
     in common. NaN without such views."""
 
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
-        """Compute kinds and areas of the faces.
-
-        Returns
-        -------
-        kind : (F,) ndarray of int8
-            That of most of its vertices, or of the first.
-        area_m2 : (F,) ndarray of float64
-            m².
-        """
+        """Return kinds (F,) int8 of the faces, that of most vertices or of the first, and areas (F,), m²."""
         kinds = self.kind[self.faces]
         _, twice_m2 = across_triangles(self.vertices, self.faces)
         return np.where(kinds[:, 1] == kinds[:, 2], kinds[:, 1], kinds[:, 0]), 0.5 * twice_m2
@@ -173,13 +164,12 @@ class Changes:
         return mesh
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the changes to a file. An old one is replaced only once the new one is complete.
+        """Write the mesh of :meth:`mesh` to a file. An old one is replaced only once the new one is complete.
 
         Parameters
         ----------
         path : path-like
-            A mesh as of :meth:`mesh`, by its suffix; or ``.npz``: all arrays, those of the surfaces as ``before_NAME`` and
-            ``after_NAME``.
+            The suffix tells the format, as for :func:`radarsdf.io.write_mesh`.
 
         Raises
         ------
@@ -190,15 +180,16 @@ class Changes:
         """
         from radarsdf.io.meshes import write_mesh  # noqa: PLC0415 - as above
 
-        target = path_of(path, "path")
-        if target.suffix != ".npz":
-            write_mesh(target, self.mesh())
-            return
-        surfaces = {"before": self.before, "after": self.after}
-        arrays = {
-            f"{side}_{name}": value for side, of in surfaces.items() for name, value in vars(of).items()
-        }
-        write_arrays(target, {"T_before_after": self.T_before_after} | arrays, compressed=True)
+        write_mesh(path_of(path, "path"), self.mesh())
+
+
+def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
+    """Areas for a report."""
+    kinds, areas_m2 = (np.concatenate(of) for of in zip(*(s.of_faces() for s in surfaces), strict=True))
+    return {
+        "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},
+        "compared_m2": float(areas_m2[kinds != UNSEEN].sum()),
+    }
 
 
 def colors_of(kinds: NDArray[np.int8]) -> NDArray[np.uint8]:

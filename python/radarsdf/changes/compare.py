@@ -14,16 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.changes.alignment import Alignment, align
 from radarsdf.changes.changes import (
     APPEARED,
-    CHANGED,
     GONE,
     MOVED,
-    NAMES,
     REPAINTED,
     SAME,
     UNSEEN,
     ChangedSurface,
     Changes,
-)
+    areas_of,
+)  # fmt: skip
 from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.changes.reflectance import Differences
 from radarsdf.checks import check_box
@@ -107,39 +106,34 @@ def compare(
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)
     corners = None if box is None else check_box(box)
-    placed = []
     for name, radar_map in (("before", before), ("after", after)):
         check_passages(radar_map, name)
-        placed.append(PlacedMap.of(radar_map))
-        if len(placed[-1].faces) == 0:
-            msg = f"{name} has no surface: its mesh has 0 triangles. Fit it with more scans of the place"
+    placed = PlacedMap.of(before), PlacedMap.of(after)
+    for name, found in zip(("before", "after"), placed, strict=True):
+        if len(found.faces) == 0:
+            msg = f"{name} has no surface: fit it with more scans of the place"
             raise ValueError(msg)
     earlier, later = placed
     alignment = align(earlier, later) if align_frames else Alignment()
     later = replace(later, T_common_map=alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
     errors = Errors.of(sides)
-    log_odds = [errors.log_odds(side) for side in sides]
-    share = share_of_changes(np.concatenate([absent for absent, _ in log_odds]))
-    gone, appeared = (
-        _changed(side, *odds, share, kind)
-        for side, odds, kind in zip(sides, log_odds, (GONE, APPEARED), strict=True)
-    )
+    (absent, moved), (absent_later, moved_later) = map(errors.log_odds, sides)
+    share = share_of_changes(np.concatenate([absent, absent_later]))
+    gone = _changed(sides[0], absent, moved, share, GONE)
+    appeared = _changed(sides[1], absent_later, moved_later, share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
     report: dict[str, Any] = {"alignment": alignment.words, "intensity_offset": None}
     if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
-        appeared = _repainted(appeared, differences.apart_from(np.concatenate(changed)))
+        appeared = _repainted(appeared, differences, np.concatenate(changed))
         report["intensity_offset"] = differences.offset
-        differences = (
-            f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units: "
-            "that is no change of a place."
-        )
+        differences = f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
     report["reflectance"] = differences
     if corners is not None:
         gone, appeared = _inside(corners, gone), _inside(corners, appeared)
-    return Changes(gone, appeared, alignment.T_before_after, report | _areas(gone, appeared))
+    return Changes(gone, appeared, alignment.T_before_after, report | areas_of(gone, appeared))
 
 
 def _quick(config: FitConfig) -> FitConfig:
@@ -180,9 +174,9 @@ def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: in
     return ChangedSurface(side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m, unknown)
 
 
-def _repainted(surface: ChangedSurface, differences: Differences) -> ChangedSurface:
-    """The later surface, with what changed its reflectance alone."""
-    change, repainted = differences.probability(surface.vertices, surface.kind == SAME)
+def _repainted(surface: ChangedSurface, differences: Differences, changed: Floats) -> ChangedSurface:
+    """The later surface, with what changed its reflectance alone, away from places (C, 3) that `changed` otherwise."""
+    change, repainted = differences.probability(surface.vertices, surface.kind == SAME, changed)
     return replace(
         surface,
         kind=np.where(repainted > _PROBABLE, REPAINTED, surface.kind).astype(np.int8),
@@ -221,18 +215,7 @@ def _check_common(
         if changed.sum() > _MOST_CHANGED * seen and (changed > agree).all():
             shares = " and ".join(f"{part:.0%}" for part in changed / (changed + agree))
             msg = (
-                f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. {alignment.words} "
-                "Give maps of one place, whose frames are at most some metres and degrees apart, with poses that do not drift"
+                f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. "
+                f"Give maps of one place, in about one frame. {alignment.words}"
             )
             raise ValueError(msg)
-
-
-def _areas(*surfaces: ChangedSurface) -> dict[str, Any]:
-    """Areas for a report."""
-    kinds, areas_m2 = (
-        np.concatenate(columns) for columns in zip(*(s.of_faces() for s in surfaces), strict=True)
-    )
-    return {
-        "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},
-        "compared_m2": float(areas_m2[kinds != UNSEEN].sum()),
-    }

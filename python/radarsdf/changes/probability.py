@@ -18,7 +18,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
-from scipy.special import betaln, expit, gammaln, stdtr
+from scipy.special import betaln, expit
+from scipy.stats import t as student
 
 from radarsdf.map.map import Map
 from radarsdf.products import turned
@@ -47,9 +48,7 @@ _MOST_DISTANCES = 5_000  # evenly spread, for both
 class PlaceEvidence:
     """Surface, hits and free space of a map at N places."""
 
-    distance_m: (
-        Floats  # (N,) from the surface along its normal, positive in free space. NaN where not observed
-    )
+    distance_m: Floats  # (N,) from the surface along its normal. NaN where not observed
     normals: Floats  # (N, 3) of that surface, towards free space, in the common frame
     sigma_m: Floats  # (N,) standard error of the surface's position. NaN where there are no returns
     confidence: Floats  # (N,) probability of a surface there
@@ -146,9 +145,7 @@ class Side:
     faces: NDArray[np.int32]  # (F, 3) rows of vertices
     own: PlaceEvidence
     other: PlaceEvidence
-    sigma_m: (
-        Floats  # (V,) standard error of the distance between both surfaces, with that of the alignment, m
-    )
+    sigma_m: Floats  # (V,) standard error of the distance between both surfaces, m
     reach_m: float  # see :attr:`PlacedMap.reach_m`, of the other map
 
     @property
@@ -194,18 +191,7 @@ class Errors:
 
     def log_density(self, distance_m: Floats, sigma_m: Floats) -> Floats:
         """(N,) logarithm of the density of distances (N,) with standard errors (N,), 1/m."""
-        width_m, n = self.scale * sigma_m, self.freedom
-        constant = gammaln((n + 1) / 2) - gammaln(n / 2) - 0.5 * np.log(n * np.pi)
-        found: Floats = constant - np.log(width_m) - (n + 1) / 2 * np.log1p((distance_m / width_m) ** 2 / n)
-        return found
-
-    def _log_spread(self, distance_m: Floats, sigma_m: Floats, lower_m: float, upper_m: float) -> Floats:
-        """:meth:`log_density` for a surface that lies anywhere in [lower_m, upper_m]."""
-        width_m = self.scale * sigma_m
-        inside = stdtr(self.freedom, (upper_m - distance_m) / width_m)
-        inside -= stdtr(self.freedom, (lower_m - distance_m) / width_m)
-        # Far outside, the difference is nothing but rounding.
-        found: Floats = np.log(np.maximum(inside, 1e-12) / (upper_m - lower_m))
+        found: Floats = student.logpdf(distance_m, self.freedom, scale=self.scale * sigma_m)
         return found
 
     def log_odds(self, side: Side) -> tuple[Floats, Floats]:
@@ -214,10 +200,19 @@ class Errors:
         observed, reach_m = side.observed, side.reach_m
         distance_m, sigma_m = side.other.distance_m[observed], side.sigma_m[observed]
         same = self.log_density(distance_m, sigma_m)
+
+        def elsewhere(lower_m: float) -> Floats:
+            """Of a surface that lies anywhere from `lower_m` to `reach_m`."""
+            error = student(self.freedom, distance_m, self.scale * sigma_m)
+            # Far outside, the difference is nothing but rounding.
+            inside = np.maximum(error.cdf(reach_m) - error.cdf(lower_m), 1e-12)
+            found: Floats = np.log(inside / (reach_m - lower_m)) - same
+            return found
+
         absent = _passed(side.own, side.other)
         shifted = np.full(len(absent), -np.inf)
-        shifted[observed] = self._log_spread(distance_m, sigma_m, -reach_m, reach_m) - same
-        absent[observed] += self._log_spread(distance_m, sigma_m, 0.0, reach_m) - same
+        shifted[observed] = elsewhere(-reach_m)
+        absent[observed] += elsewhere(0.0)
         return absent, shifted
 
 

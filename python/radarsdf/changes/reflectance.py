@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.changes.probability import Floats, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.products import turned
-from radarsdf.returns.view_statistics import PLACE_CELLS, EchoesAt, rows_of_views
+from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
 _OTHER_UNITS = 1.7  # ratio of spreads: half decibels and decibels differ by 2
 _FEWEST_VIEWS = 100  # fewer say little about units
@@ -64,7 +64,15 @@ class Differences:
         What both maps expect is subtracted from both days: so views may differ a little within what counts as one.
         """
         scales = [p.radar_map.intensity_scale for p in (before, after)]
-        days = [_placed(p) for p in (before, after)]
+        days = [p.radar_map.echoes() for p in (before, after)]
+        days = [
+            replace(
+                day,
+                points=p.to_common(day.points),
+                directions=turned(day.directions, p.T_common_map[:3, :3]),
+            )
+            for p, day in zip((before, after), days, strict=True)
+        ]
         if None in scales or not all(len(day.counts) for day in days):
             return "Reflectance was not compared: a map has no intensities."
         leaf_m = max(before.leaf_m, after.leaf_m)
@@ -87,10 +95,7 @@ class Differences:
             return "Reflectance was not compared: the maps share no view."
         spreads = [np.subtract(*np.percentile(day[2] / day[0], [95, 5])) for day in (first, second)]
         if first.shape[1] > _FEWEST_VIEWS and max(spreads) > _OTHER_UNITS * min(spreads):
-            return (
-                f"Reflectance was not compared: from the same views, intensities of the earlier map spread over {spreads[0]:.3g}, "
-                f"of the later one over {spreads[1]:.3g}, so they are in other units."
-            )
+            return "Reflectance was not compared: intensities from the same views spread so differently that they are in other units."
         values = second[1] / second[0] - first[1] / first[0]
         offset = float(np.median(values))
         between = _Means(
@@ -106,38 +111,23 @@ class Differences:
         width = max(scale.high - scale.low for scale in scales if scale is not None)
         return cls(between, within, offset, PLACE_CELLS * leaf_m, width)
 
-    def apart_from(self, changed: Floats) -> Differences:
-        """Without those near places (C, 3) that changed otherwise: the returns of one day are of what is not there on the other."""
-        if len(changed) == 0:
-            return self
-        away_m, _ = cKDTree(changed).query(self.between.points)
-        return replace(self, between=self.between.select(away_m > self.reach_m))
+    def probability(self, x: Floats, same: NDArray[np.bool_], changed: Floats) -> tuple[Floats, Floats]:
+        """(V,) difference near places (V, 3), and the probability that only the reflectance changed, of places that are `same` (V,).
 
-    def probability(self, x: Floats, counting: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        """(V,) difference near places (V, 3), and the probability that the reflectance there changed.
-
-        Only the places that are `counting` (V,) may have changed. Where views of one place differ by more than their numbers of
-        returns explain, on one day or in how far they changed, errors are as much larger (Birge's ratio): at edges, near
-        mirrors, in thickets. What is repainted changes alike from all views.
+        Views near places (C, 3) that `changed` otherwise do not count. Where views of one place differ by more than their
+        numbers of returns explain, on one day or in how far they changed, errors are as much larger (Birge's ratio): at edges,
+        near mirrors, in thickets. What is repainted changes alike from all views.
         """
-        mean, sigma, chi2_between, freedom_between = self.between.near(x, self.reach_m)
-        days = [means.near(x, self.reach_m) for means in self.within]
-        chi2, freedom = (np.sum([day[column] for day in days], axis=0) for column in (2, 3))
-        of_day, of_change = chi2 / np.maximum(freedom, 1), chi2_between / np.maximum(freedom_between, 1)
-        ratio = np.sqrt(np.maximum(np.maximum(of_day, of_change), 1))
-        known = counting & np.isfinite(mean)
+        between = self.between
+        if len(changed):
+            between = between.select(cKDTree(changed).query(between.points)[0] > self.reach_m)
+        mean, sigma, chi2, freedom = between.near(x, self.reach_m)
+        _, _, chi2_of_day, freedom_of_day = np.sum([day.near(x, self.reach_m) for day in self.within], axis=0)
+        ratios = chi2 / np.maximum(freedom, 1), chi2_of_day / np.maximum(freedom_of_day, 1)
+        sigma = sigma * np.sqrt(np.maximum(np.maximum(*ratios), 1))
+        known = same & np.isfinite(mean)
         # A change may have any size within the range of intensities.
-        odds = odds_of_differences(mean[known], (sigma * ratio)[known], self.width)
-        changed = np.zeros(len(x))
-        changed[known] = posterior(odds, share_of_changes(odds))
-        return mean, changed
-
-
-def _placed(placed: PlacedMap) -> EchoesAt:
-    """The echoes of a map in the common frame."""
-    echoes = placed.radar_map.echoes()
-    return replace(
-        echoes,
-        points=placed.to_common(echoes.points),
-        directions=turned(echoes.directions, placed.T_common_map[:3, :3]),
-    )
+        odds = odds_of_differences(mean[known], sigma[known], self.width)
+        probability = np.zeros(len(x))
+        probability[known] = posterior(odds, share_of_changes(odds))
+        return mean, probability

@@ -122,7 +122,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o
     "poses -o": (_OUT, "the poses to write: .tum (with times), .kitti, .npy; or .npz: the scans with these poses"),
     "report -o": (_OUT, "the page to write, .html"),
     "render -o": (_OUT, ".npz, scans as radarsdf fit takes them; .ply, points in the world frame; .png, a picture"),
-    "compare -o": (_FILE, "a mesh in colours to write, such as changes.ply, or .npz with all arrays"),
+    "compare -o": (_FILE, "a mesh in colours to write, such as changes.ply"),
     "grid -o": (_OUT | {"action": "append"}, ("a file to write, may be repeated: .npz with all arrays, .bt for OctoMap, "
                 ".yaml and .pgm for ROS's map_server")),
     "convert -o": (_OUT, (".npz: the scans with their poses; .ply, .pcd, .las, .laz, .npy, .csv: all returns in the world "

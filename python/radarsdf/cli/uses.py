@@ -27,7 +27,7 @@ _LISTED = 10  # regions, the largest first
 def compare(given: Namespace, results: Results) -> None:
     """Compare, write the surfaces, report what changed."""
     out, report = given.out, given.report
-    if out is not None and out.suffix != ".npz":
+    if out is not None:
         check_mesh_path(out)
     check_outputs([out, report], inputs_of(given))
     if report is not None:

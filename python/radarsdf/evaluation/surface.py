@@ -168,25 +168,26 @@ def format_metrics(metrics: Mapping[str, Any]) -> str:
     if "mae" in metrics:
         count = f"({metrics['num_returns']} returns, {metrics['protocol']})"
         return f"intensity error  mean {metrics['mae']:.2f}  median {metrics['medae']:.2f}  {count}"
-    s = metrics
-    shape, mean = _number(s["gamma_shape"], ""), _number(s["gamma_mean"], " rad", digits=3)
-    variance = _number(s["gamma_variance"], " rad²", digits=3)
-    of = f"{s['num_mesh_samples']} mesh samples and {s['num_ground_truth']} ground-truth points"
+
+    def shown(name: str, unit: str, factor: float = 1.0, digits: int = 2) -> str:
+        value = metrics[name]
+        return "undefined" if value is None else f"{value * factor:.{digits}f}{unit}"
+
+    def percent(name: str) -> str:
+        return shown(name, " %", 100)
+
     rows = {
-        "accuracy": f"error {_number(s['accuracy_error_m'], ' cm', 100)}  ratio {_number(s['accuracy_ratio'], ' %', 100)}"
-        f"  outliers beyond {s['outlier_m']:g} m {_number(s['outlier_ratio'], ' %', 100)}",
-        "completion": f"error {_number(s['completion_error_m'], ' cm', 100)}"
-        f"  ratio {_number(s['completion_ratio'], ' %', 100)}",
-        "F-score": f"{_number(s['f_score'], ' %', 100)}  with nothing discarded {_number(s['f_score_all'], ' %', 100)}"
-        f" (precision {_number(s['precision'], ' %', 100)})",
-        "angles": f"gamma shape {shape}  mean {mean}  variance {variance}",
-        "protocol": f"{s['protocol']}  threshold {s['threshold_m']:g} m  {of}",
+        "accuracy": f"error {shown('accuracy_error_m', ' cm', 100)}  ratio {percent('accuracy_ratio')}"
+        f"  outliers beyond {metrics['outlier_m']:g} m {percent('outlier_ratio')}",
+        "completion": f"error {shown('completion_error_m', ' cm', 100)}  ratio {percent('completion_ratio')}",
+        "F-score": f"{percent('f_score')}  with nothing discarded {percent('f_score_all')}"
+        f" (precision {percent('precision')})",
+        "angles": f"gamma shape {shown('gamma_shape', '')}  mean {shown('gamma_mean', ' rad', digits=3)}"
+        f"  variance {shown('gamma_variance', ' rad²', digits=3)}",
+        "protocol": f"{metrics['protocol']}  threshold {metrics['threshold_m']:g} m  {metrics['num_mesh_samples']} mesh"
+        f" samples and {metrics['num_ground_truth']} ground-truth points",
     }
     return "\n".join(f"{name:<12}{text}" for name, text in rows.items())
-
-
-def _number(value: float | None, unit: str, factor: float = 1.0, digits: int = 2) -> str:
-    return "undefined" if value is None else f"{value * factor:.{digits}f}{unit}"
 
 
 def _harmonic_mean(a: float, b: float) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import FEATURE_DIM, CellSet
 from radarsdf.checks import instance
-from radarsdf.config.fit_config import PAPER, FitConfig
+from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
 from radarsdf.fitting.average import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS, seen_jointly
@@ -34,13 +34,12 @@ _S_PER_INPUT, _S_PER_MULTIPLICATION = 2.2e-9, 2.6e-11  # of a network, which all
 # Bytes, measured as peaks of fits of 1e4 to 3e6 returns of a street: `python -m bench.estimates memory` repeats it.
 _ALWAYS = 35e6  # code that the fit loads, stacks and arenas of the threads
 _PER_RETURN, _PER_RETURN_CLEANED = 30.0, 200.0
-_PER_RETURN_OF_NETWORK, _PER_RETURN_OF_CLOSED_FORM = 130.0, 150.0
+_PER_RETURN_OF_INTENSITY = 150.0
 _PER_CELL = 230.0
 _COPIES = 4  # of each feature: value, two moments of Adam, last finite value
 
-# Leaf cells for each one with returns, and rows of features for each leaf cell: where cells hold many returns each, and what
-# is added where they hold one. Measured on `hugin`, `oculii` and `wall`, of 4 to all scans, with cells of 0.1 to 0.5 m: within
-# a factor of 2.
+# Leaf cells for each one with returns, and rows of features for each leaf cell, in dense scans, and what sparse ones add.
+# Measured on `hugin`, `oculii` and `wall`, of 4 to all scans, with cells of 0.1 to 0.5 m: within a factor of 2.
 _CELLS, _CELLS_AVERAGED = (1.4, 3.6), (1.9, 4.9)
 _ROWS, _ROWS_AVERAGED = {"tri-quadtree": (0.7, 1.3), "octree": (2.3, 2.5)}, (1.7, 1.5)
 
@@ -50,17 +49,15 @@ class Estimate:
     """Memory and time that a fit will take."""
 
     peak_memory_bytes: int
-    """Peak above the memory that the process has before. Within a factor of 2 on scans like those of the
-    measurement."""
+    """Peak above the memory that the process has before. Within a factor of 2."""
     seconds: float
-    """Wall-clock time. Within a factor of 2 on the quiet machine of the measurement. Of another machine, only
-    the number of processors is taken into account."""
+    """Wall-clock time. Within a factor of 2 on the machine of the measurement."""
     returns: int
     """Number of returns between `min_range_m` and `max_range_m`."""
     leaf_cells: int
     """Number of leaf cells. Within a factor of 2."""
     vertices: int
-    """Number of vertices, which is the number of rows of features. Within a factor of 2."""
+    """Number of vertices of the cells. Within a factor of 2."""
     iterations: dict[str, int]
     """Iterations of the stages `sdf` and `intensity`. Joint iterations count for both."""
 
@@ -129,7 +126,7 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
     """Of a map of so many `returns` of the rays, which lie in `with_returns` leaf cells."""
     sparse = with_returns / returns
     of_dense, of_sparse = _CELLS if config.train else _CELLS_AVERAGED
-    cells = with_returns * (of_dense + of_sparse * sparse**3)
+    cells = round(with_returns * (of_dense + of_sparse * sparse**3))
     of_dense, of_sparse = _ROWS[config.encoding.kind] if config.train else _ROWS_AVERAGED
     rows = round(cells * (of_dense + of_sparse * sparse**6))
     with_network = rays.intensities is not None and config.trains_intensity
@@ -144,15 +141,13 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
         gradients = 0 if config.moves_rows(with_network) else all_rows
         memory += 4 * rows * FEATURE_DIM * (_COPIES + gradients)
         memory += 4 * schedule.batch_size * sum(sdf_widths(config)) * (3 if normals else 1)
-    if with_network:
-        memory += returns * _PER_RETURN_OF_NETWORK
-    if rays.intensities is not None and config.closes_intensity:
-        memory += returns * _PER_RETURN_OF_CLOSED_FORM
+    if rays.intensities is not None:
+        memory += returns * _PER_RETURN_OF_INTENSITY
     return Estimate(
         peak_memory_bytes=int(max(memory, len(rays) * _PER_RETURN_CLEANED)),
-        seconds=seconds_of(config, schedule, len(rays), round(cells), rows, with_network),
+        seconds=seconds_of(config, schedule, len(rays), cells, rows, with_network),
         returns=returns,
-        leaf_cells=round(cells),
+        leaf_cells=cells,
         vertices=rows,
         iterations=schedule.iterations,
     )
@@ -166,29 +161,25 @@ def seconds_of(
     if not config.train:
         return seconds
     iterations = schedule.sdf_iterations
-    joint = iterations if with_network else 0
-    later = max(0, schedule.intensity_iterations - joint)
-    # In forward passes of a sample: forward and backward take 3. Normals take a backward pass of their own, and their
-    # gradient two more: 9 in all, or 3 if the field is frozen.
-    passes, frozen_passes = (9, 3) if config.networks.normals and with_network else (3, 1)
-    of_field = passes * iterations * schedule.batch_size
-    of_field += frozen_passes * later * schedule.intensity_batch_size
-    of_network = 3 * joint * seen_jointly(config, schedule.batch_size)
-    of_network += 3 * later * schedule.intensity_batch_size
-    multiplications = (
-        weights_of(sdf_widths(config)) * of_field + weights_of(intensity_widths(config)) * of_network
+    later = max(0, schedule.intensity_iterations - iterations) if with_network else 0
+    # Forward and backward passes cost three forward ones, and nine where the loss has normals.
+    passes = 9 if config.networks.normals and with_network else 3
+    of_field = passes * (iterations * schedule.batch_size + later * schedule.intensity_batch_size / 3)
+    shared = of_field * (
+        _S_PER_INPUT * sdf_widths(config)[0] + _S_PER_MULTIPLICATION * weights_of(sdf_widths(config))
     )
-    shared = _S_PER_INPUT * sdf_widths(config)[0] * of_field + _S_PER_MULTIPLICATION * multiplications
+    if with_network:
+        seen = iterations * seen_jointly(config, schedule.batch_size) + later * schedule.intensity_batch_size
+        shared += 3 * seen * _S_PER_MULTIPLICATION * weights_of(intensity_widths(config))
     moved = 0 if config.moves_rows(with_network) else rows * iterations
-    seconds += _S_PER_ITERATION * (iterations + later) + _S_PER_MOVED_ROW * moved
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return seconds + shared / min(resolve_num_threads(config.num_threads), processors)
+    threads = min(resolve_num_threads(config.num_threads), os.cpu_count() or 1)
+    return seconds + _S_PER_ITERATION * (iterations + later) + _S_PER_MOVED_ROW * moved + shared / threads
 
 
 def skipped_parts(
     config: FitConfig, schedule: Schedule, *, returns: int, cells: int, rows: int, with_intensity: bool
 ) -> list[tuple[str, float]]:
-    """Parts of the method that a fit does not run, with the reason, and the seconds that this saves."""
+    """Parts of the method that a fit does not run, and the seconds that this saves."""
 
     def seconds(network: bool, **changes: Any) -> float:
         changed = config.override(**changes)
@@ -198,30 +189,20 @@ def skipped_parts(
         return seconds_of(changed, scheduled, returns, cells, rows, network)
 
     network = with_intensity and config.trains_intensity
-    now_s = seconds(network)
+    now_s, surface_s = seconds(network), seconds(False, train=True)
     skipped = []
     if not config.train:
-        skipped.append(("training of the surface: it is averaged", seconds(False, train=True) - now_s))
+        skipped.append(("training of the surface: it is averaged", surface_s - now_s))
     if not config.returns.passages:
-        words = "free space and mean intensities by view, which grids and comparisons need: returns.passages is off"
-        skipped.append((words, _S_PER_RETURN_OF_FREE_SPACE * returns))
+        saved_s = _S_PER_RETURN_OF_FREE_SPACE * returns
+        skipped.append(("free space, which grids and comparisons need (returns.passages)", saved_s))
     if not network:
         why = "intensities are in closed form" if with_intensity else "there are no intensities"
-        trained_s = seconds(True, train=True) - seconds(False, train=True)
-        skipped.append((f"the intensity network: {why}", trained_s))
-    for name, setting in (("normals", "normals"), ("geometry feature", "geometry_feature_dim")):
-        if network and not getattr(config.networks, setting):
-            used = {setting: PAPER["networks"][setting]}
-            words = f"the {name}, which the intensity network does not use"
-            skipped.append((words, seconds(network, networks=used) - now_s))
+        skipped.append((f"the intensity network: {why}", seconds(True, train=True) - surface_s))
     if config.train and schedule.passes < 1 and config.training.sdf_iterations is None:
-        why = "the others were enough" if config.effort >= 1 else f"effort is {config.effort:g}"
         whole = math.ceil(schedule.sdf_iterations / schedule.passes)
-        words = f"{1 - schedule.passes:.0%} of the samples: {why}"
-        skipped.append((words, seconds(network, training={"sdf_iterations": whole}) - now_s))
-    if config.train and config.moves_rows(network):
-        words = "in each iteration, updates of features that its samples did not use"
-        skipped.append((words, _S_PER_MOVED_ROW * rows * schedule.sdf_iterations))
+        saved_s = seconds(network, training={"sdf_iterations": whole}) - now_s
+        skipped.append((f"{1 - schedule.passes:.0%} of the samples", saved_s))
     return skipped
 
 
@@ -234,23 +215,18 @@ def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = 
     expected = estimate_rays(rays, config, inside)
     if expected.peak_memory_bytes > available:
         msg = (
-            f"the fit would take about {expected.peak_memory_bytes / 1e9:.2f} GB for {expected.leaf_cells} leaf cells "
-            f"and {expected.returns} returns, of {available / 1e9:.2f}: use larger cells (leaf_size_m), drop far "
-            "returns (max_range_m), or set max_memory_bytes if the estimate is too high"
+            f"the fit would take more than the {available / 1e9:.2f} GB there are (max_memory_bytes): {expected}. "
+            "Use larger cells (leaf_size_m), or drop far returns (max_range_m)"
         )
         raise MemoryError(msg)
 
 
 def check_extent(rays: Rays, config: FitConfig) -> None:
     """Raises a ValueError if a return lies where there are no cells: one outlier must not be met in the middle of the work."""
-    limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
     reach_m = config.metres(NEAR_BAND_CELLS if config.train else max(BAND_CELLS, TRUNCATION_CELLS))
-    if np.abs(rays.points).max() + reach_m > limit_m:
-        distance_m = np.abs(rays.points).max(axis=1) + reach_m
-        outside = int((distance_m > limit_m).sum())
+    if np.abs(rays.points).max() + reach_m > MAX_CELLS_FROM_ORIGIN * config.leaf_size_m:
         msg = (
-            f"{outside} of {len(rays)} returns are not within a million cells of {config.leaf_size_m} m of the sensors' mean "
-            f"position, the furthest {distance_m.max():.3g} m away: drop them (max_range_m), use larger cells, or split "
-            "scans so far apart"
+            f"returns are not within a million cells of {config.leaf_size_m} m of the sensors' mean position: "
+            "drop them (max_range_m), or use larger cells"
         )
         raise ValueError(msg)

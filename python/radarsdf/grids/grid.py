@@ -33,12 +33,10 @@ class DistanceField:
     """(X, Y, Z) to the centre of the nearest occupied voxel, m; in occupied ones minus that to the nearest other one. The
     unknown does not count: infinite if nothing is occupied."""
     not_free_m: NDArray[np.float32]
-    """(X, Y, Z) to the centre of the nearest voxel that is not free, m: what is unknown, and what is beyond the grid,
-    counts as occupied. 0 in voxels that are not free. So far a robot may go whatever is in the unknown."""
+    """(X, Y, Z) to the centre of the nearest voxel that is not free or beyond the grid, m; 0 in voxels that are not free."""
     error_m: float
-    """Half a diagonal of a voxel, and the error of the surface's position, m: what voxels and noise add where the map has the
-    surface right. It is no bound on the distance to the truth: false returns that are called occupied make `occupied_m` too
-    small, and surface that the map does not have makes it too large."""
+    """Half a diagonal of a voxel, and the error of the surface's position, m. It is no bound: false returns and missing
+    surface add to it."""
 
 
 @settings
@@ -129,20 +127,17 @@ class Grid:
     @property
     def free(self) -> NDArray[np.bool_]:
         """(X, Y, Z) whether rays passed the voxel and nothing is in it."""
-        mask: NDArray[np.bool_] = self.state == FREE
-        return mask
+        return np.equal(self.state, FREE)
 
     @property
     def occupied(self) -> NDArray[np.bool_]:
         """(X, Y, Z) whether there probably is a surface in the voxel."""
-        mask: NDArray[np.bool_] = self.state == OCCUPIED
-        return mask
+        return np.equal(self.state, OCCUPIED)
 
     @property
     def unknown(self) -> NDArray[np.bool_]:
         """(X, Y, Z) whether the voxel is neither free nor occupied."""
-        mask: NDArray[np.bool_] = self.state == UNKNOWN
-        return mask
+        return np.equal(self.state, UNKNOWN)
 
     def centres(self, which: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
         """Compute the centres of voxels.
@@ -265,10 +260,7 @@ class Grid:
         height, _ = self._ground()
         top_m = float(self.origin[2] + self.shape[2] * self.voxel_size)
         if not np.isfinite(height).any():
-            msg = (
-                f"no column shows ground between z = {self.origin[2]:.2f} and {top_m:.2f} m: choose a box from below the "
-                "ground to two voxels or more above it"
-            )
+            msg = "no column of the grid shows ground: choose a box that reaches from below it to above it"
             raise ValueError(msg)
         nearest = distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
         base = height[tuple(nearest)]
@@ -344,17 +336,14 @@ def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | Distance
 def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Slope and largest residual of a plane through each column and its eight neighbours. NaN with fewer than three."""
     padded = np.pad(height.astype(np.float64), 1, constant_values=np.nan)
-    x, y = height.shape
-    shifts = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    stack = np.stack([padded[1 + i : 1 + i + x, 1 + j : 1 + j + y] for i, j in shifts])  # (9, X, Y)
-    known = np.isfinite(stack)
-    design = np.array([[1.0, i * size, j * size] for i, j in shifts])
-    normal = np.einsum("kxy,ka,kb->xyab", known.astype(np.float64), design, design)
-    right = np.einsum("kxy,ka->xya", np.where(known, stack, 0), design)
-    fits = (np.linalg.det(normal) > 1e-6 * size**4) & known[4]  # the column itself
-    safe = np.where(fits[..., None, None], normal, np.eye(3))
-    plane = np.linalg.solve(safe, right[..., None])[..., 0]
-    step = np.fmax.reduce(np.abs(stack - np.einsum("ka,xya->kxy", design, plane)), axis=0)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*height.shape, 9)
+    known = np.isfinite(around)
+    design = np.array([[1.0, i * size, j * size] for i, j in np.ndindex(3, 3)])
+    normal = np.einsum("xyk,ka,kb->xyab", known.astype(np.float64), design, design)
+    right = np.einsum("xyk,ka->xya", np.where(known, around, 0), design)
+    fits = (np.linalg.det(normal) > 1e-6 * size**4) & known[..., 4]  # the column itself
+    plane = np.full((*height.shape, 3), np.nan)
+    plane[fits] = np.linalg.solve(normal[fits], right[fits, :, None])[..., 0]
+    step = np.fmax.reduce(np.abs(around - np.einsum("ka,xya->xyk", design, plane)), axis=-1)
     slope = np.arctan(np.hypot(plane[..., 1], plane[..., 2]))
-    slope, step = (np.where(fits, values, np.nan).astype(np.float32) for values in (slope, step))
-    return slope, step
+    return slope.astype(np.float32), step.astype(np.float32)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -137,15 +138,14 @@ def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: t
 
 def _touched(
     voxels: NDArray[np.int64],
-    planes: tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    planes: tuple[NDArray[Any], ...],
     shape: tuple[int, ...],
     size: float,
     step: int,
 ) -> NDArray[np.float32]:
-    """Largest probability, in each voxel of a grid, that a surface of a voxel `step` away is in it.
+    """Largest probability, in each voxel of a grid, that the surface of one of the `voxels` (N, 3), `step` away, is in it.
 
-    Of the N voxels (N, 3) with planes: distance, normal, its standard error and the probability of a surface. A cell without
-    a return may still be cut by the surface of its neighbour.
+    `planes`: distances (N,), normals (N, 3), standard errors (N,) and probabilities of a surface (N,).
     """
     found = np.zeros(shape, np.float32)
     rows = np.flatnonzero(planes[3] > 0)
@@ -167,14 +167,13 @@ def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool
 
     What is only near zero may be the end of what the field knows.
     """
-    away_m = np.abs(distance_m)
-    before, behind = distance_m > 0, distance_m <= 0  # NaN is neither
+    padded = np.pad(distance_m, 1, constant_values=np.nan)
     found = np.zeros(distance_m.shape, bool)
     for axis in range(3):
-        for here, other in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
-            a, b = ((*(slice(None),) * axis, part) for part in (here, other))
-            crossed = (before[a] & behind[b]) | (behind[a] & before[b])
-            found[a] |= crossed & ((away_m[a] <= reach_m) | (away_m[a] <= away_m[b]))
+        for step in (-1, 1):
+            other = np.roll(padded, step, axis)[1:-1, 1:-1, 1:-1]
+            crossed = ((distance_m > 0) & (other <= 0)) | ((distance_m <= 0) & (other > 0))  # NaN is neither
+            found |= crossed & (np.abs(distance_m) <= np.maximum(np.abs(other), reach_m))
     return found
 
 

@@ -197,12 +197,10 @@ def _as_samples(volume: ArrayLike) -> NDArray[Any]:
 def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     refuse_masked(mask, "mask")
     array = np.asarray(mask)
-    if array.dtype != np.bool_:
-        msg = f"mask must be boolean, not {array.dtype}"
-        raise TypeError(msg)
-    if array.shape != shape:
-        msg = f"mask must have the shape of volume, {shape}, not {array.shape}"
-        raise ValueError(msg)
+    if array.dtype != np.bool_ or array.shape != shape:
+        error = TypeError if array.dtype != np.bool_ else ValueError
+        msg = f"mask must be boolean and have the shape of volume, {shape}, not {array.dtype} {array.shape}"
+        raise error(msg)
     return np.ascontiguousarray(array)
 
 
@@ -210,12 +208,10 @@ def _as_placement(
     spacing: ArrayLike, origin: ArrayLike, extent: tuple[float, ...]
 ) -> tuple[list[float], list[float]]:
     step, start = real_array(spacing, "spacing"), real_array(origin, "origin")
-    if step.shape != (3,) or not np.all(np.isfinite(step) & (step > 0)):
-        msg = f"spacing must be three finite positive numbers, not {spacing!r}"
-        raise ValueError(msg)
-    if start.shape != (3,) or not np.all(np.isfinite(start)):
-        msg = f"origin must be three finite numbers, not {origin!r}"
-        raise ValueError(msg)
+    for name, values, fits in (("spacing", step, step > 0), ("origin", start, start < np.inf)):
+        if values.shape != (3,) or not (fits & np.isfinite(values)).all():
+            msg = f"{name} must be three finite numbers, and positive ones as spacing, not {values}"
+            raise ValueError(msg)
     with np.errstate(over="ignore"):
         if not np.isfinite(np.abs(start) + step * extent).all():
             msg = f"spacing {spacing!r} puts the end of the lattice beyond float64"

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._core import vertex_areas
 from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.interrupts import whole_import
@@ -21,7 +22,7 @@ from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.threshold import Limits, Tally, areas_round
+from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_mesh
 from radarsdf.returns.intensities import IntensityScale
 
@@ -72,12 +73,11 @@ class Surface:
         faces: NDArray[np.int32],
         evidence: queries.EvidenceAt,
         cells_searched: int,
-        areas_m2: NDArray[np.float64] | None = None,
     ) -> Surface:
-        """From triangles and the evidence at their vertices. `areas_m2` (V,): of :func:`areas_round`, if known."""
+        """From triangles and the evidence at their vertices."""
         found = queries.probabilities(scene, evidence)
         confidence, uncertainty = found.confidence.float(), queries.uncertainty(scene, evidence).numpy()
-        areas_m2 = areas_round(vertices, faces) if areas_m2 is None else areas_m2
+        areas_m2 = vertex_areas(vertices, faces)
         columns = confidence.double(), found.covering, found.reach, evidence.detections.double()
         tally = Tally.of(areas_m2, *(column.numpy() for column in columns))
         return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)

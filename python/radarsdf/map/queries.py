@@ -47,9 +47,8 @@ _COVERING = (-0.21, -0.79, -1.47, -2.68, -2.46)
 _CROWDED_RETURNS = 4.0  # returns in a cell that have half of the effect that any number has
 _BEND_CELLS = 2.0  # bending allowed by the smoothness term, leaf cells: a slope turns from -1 to 1
 _LEAST_LOGIT = -80.0  # what was observed is not impossible: float32 has this probability
-_DETECTION_RATE = (
-    1 / 36
-)  # least share of the scans that reach a surface that have a return in one of its cells
+# Least share of the scans that reach a surface that have a return in one of its cells.
+_DETECTION_RATE = 1 / 36
 _SMOOTH = 0.5  # standard deviations: a few more hits than needed are a little more evidence
 _ODDS_CELLS = 50_000  # evenly spread leaf cells that calibrate how much free-space crossings tell
 
@@ -115,20 +114,14 @@ def evaluate(
 
 
 @torch.inference_mode(mode=False)
-def into_cells(
-    contents: MapContents,
-    points: Tensor,
-    size_m: float | None = None,
-    among: Callable[[MapContents, Tensor], Tensor] = occupied,
-) -> tuple[Tensor, Tensor]:
+def into_cells(contents: MapContents, points: Tensor, size_m: float | None = None) -> tuple[Tensor, Tensor]:
     """Points, of which those on the border of the occupied leaf cells are moved a little into one, and which are inside.
 
-    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features. `among`: which
-    points are in a cell that counts.
+    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features.
     """
     leaf_m = contents.config.leaf_size_m
     step_m = INWARD * (leaf_m if size_m is None else size_m)
-    inside = among(contents, points)
+    inside = occupied(contents, points)
     left = torch.nonzero(~inside)[:, 0]
     place = points[left] / leaf_m
     left = left[((place - place.round()).abs() * leaf_m <= step_m).any(dim=1)]
@@ -137,7 +130,7 @@ def into_cells(
     points, inside = points.clone(), inside.clone()
     for shift in itertools.product((-step_m, step_m), repeat=3):
         moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu")
-        found = among(contents, moved)
+        found = occupied(contents, moved)
         points[left[found]] = moved[found]
         inside[left[found]] = True
         left = left[~found]

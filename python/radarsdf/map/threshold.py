@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import vertex_areas
 from radarsdf.checks import number, whole_number
 from radarsdf.map.queries import VOXEL_M
 
@@ -100,7 +99,7 @@ class Tally:
     def of(
         cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, detections: Floats
     ) -> Tally:
-        """Of a surface by its vertices: areas by :func:`areas_round`, and numbers of :mod:`queries`, (V,) each."""
+        """Of a surface by its vertices: areas by ``vertex_areas`` of the core, and numbers of :mod:`queries`, (V,) each."""
         true_m2 = confidence * area_m2
         bins = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
@@ -156,8 +155,3 @@ def across_triangles(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return across, np.sqrt(np.einsum("ni,ni->n", across, across))
-
-
-def areas_round(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
-    """(V,) a third of the area of the triangles (F, 3) at each vertex (V, 3), m, in m²."""
-    return vertex_areas(vertices, faces)

@@ -36,7 +36,6 @@ _HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
 _MIN_COSINE = 0.05
 _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
-_MOST_PLACES = 1 << 40
 _ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
 # Prior of the detection rate, in scans: with few scans that reached a patch, it is uncertain.
 _LOOKS_BEFORE = 2.0
@@ -61,8 +60,6 @@ class View:
     """(E,) elevations of the beams, ascending, rad."""
     beam_ranges_m: NDArray[np.float32]
     """(E, A) distance to the first surface along each beam, m. NaN where there is none."""
-    beam_intensities: NDArray[np.float32] | None
-    """(E, A) intensity of a return from there, sensor units. NaN where there is none."""
 
     def __len__(self) -> int:
         """Number of returns."""
@@ -179,10 +176,8 @@ def view_from(
     if flag(noise, "noise"):
         seed = seed if isinstance(seed, np.random.Generator) else whole_number(seed, "seed", 0)
         points = _with_noise(points, sensor, np.random.default_rng(seed))
-    ranges_m, beam_intensities = _first_surface(surface, pose[:3, :3], position, sensor, azimuth, elevation)
-    return View(
-        pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, ranges_m, beam_intensities
-    )
+    first_m = _first_surface(surface, pose[:3, :3], position, sensor, azimuth, elevation)
+    return View(pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, first_m)
 
 
 def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
@@ -220,26 +215,17 @@ def _patches(
 
 
 def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
-    """At most `count` rows, about as dense as is `expected` (N,): those where evenly spread places fall on its sums."""
-    sums = np.cumsum(expected)
+    """At most `count` rows, spread evenly by the number `expected` (N,) of each, of which one row has at most one."""
     count = min(count, int(np.count_nonzero(expected)))
     if count == 0:
         return np.zeros(0, np.int64)
-
-    def rows_of(places: int) -> NDArray[np.int64]:
-        up_to = np.minimum(np.floor(sums * (places / sums[-1]) + 0.5), places)
-        return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
-
-    # Where a row expects more than one place, others get more of them, until there are `count` rows.
-    chosen, places, step, grows = rows_of(count), count, count, True
-    while 0 < step < _MOST_PLACES and len(chosen) < count:
-        more = rows_of(places + step)
-        if len(more) <= count:
-            chosen, places = more, places + step
-        else:
-            grows = False
-        step = 2 * step if grows else step // 2
-    return chosen
+    # The k largest have one each: of these k, the fewest after which no other one has more than its share of the rest.
+    falling = np.sort(expected)[::-1]
+    rest = np.cumsum(falling[::-1])[::-1]
+    full = int(np.argmax(falling * (count - np.arange(len(falling))) <= rest))
+    share = (count - full) / rest[full]
+    up_to = np.floor(np.cumsum(np.minimum(expected * share, 1.0)) + 0.5)
+    return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
 
 
 def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
@@ -266,17 +252,10 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 
 def _first_surface(
     surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, azimuth: _Floats, elevation: _Floats
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Range and intensity (E, A) of what each beam first meets, NaN where that is nothing."""
-    shape = (len(elevation), len(azimuth))
+) -> NDArray[np.float32]:
+    """Range (E, A) of what each beam first meets, NaN where that is nothing."""
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)
     ranges_m = surface.ranges(position, directions, float(sensor.range_m[1]))
     met = np.isfinite(ranges_m) & (ranges_m >= sensor.range_m[0])
-    places = position + directions[met] * ranges_m[met, None]
-    ranges_m = np.where(met, ranges_m, np.float32(np.nan))
-    if surface.intensity is None:
-        return ranges_m.reshape(shape), None
-    intensities = np.full(len(ranges_m), np.nan, np.float32)
-    intensities[met] = surface.intensity(places, position)
-    return ranges_m.reshape(shape), intensities.reshape(shape)
+    return np.where(met, ranges_m, np.float32(np.nan)).reshape(grid[0].shape)

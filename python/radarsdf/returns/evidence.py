@@ -21,8 +21,6 @@ CELLS_OF_SURFACE = 9
 BLOCK_BITS = np.uint64(9)
 """Bits by which the key of a leaf cell is longer than that of the block whose looks are counted."""
 
-_CELLS_AT_ONCE = 1 << 21  # of which there are sums in float64
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -62,9 +60,7 @@ class ReturnsOfCells:
     """What the returns in each leaf cell tell, in the order of their keys."""
 
     keys: NDArray[np.uint64]  # (M,) Morton keys of the leaf cells with returns, ascending
-    information: NDArray[
-        np.float32
-    ]  # (M,) 1 / variance of the position that the returns of a cell give together, m⁻²
+    information: NDArray[np.float32]  # (M,) 1 / variance of the position that its returns give together, m⁻²
     scans: NDArray[np.uint32]  # (M,) number of different scans with returns
     counts: NDArray[np.float64]  # (M,) number of returns
 
@@ -103,14 +99,8 @@ def sums_round(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """`information` and `detections` of :class:`Evidence`, (C,), in the leaf cells with these keys (C,), ascending."""
     columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)
-    cells = CellBlocks(returns.keys)
-    information = np.empty(len(leaf_keys), np.float32)
-    detections = np.empty(len(leaf_keys), np.uint32)
-    for first in range(0, len(leaf_keys), _CELLS_AT_ONCE):
-        part = slice(first, first + _CELLS_AT_ONCE)
-        sums = cells.sum_round(leaf_keys[part], columns, 1.0, num_threads)
-        information[part], detections[part] = sums.T
-    return information, detections
+    sums = CellBlocks(returns.keys).sum_round(leaf_keys, columns, 1.0, num_threads)
+    return sums[:, 0].astype(np.float32), sums[:, 1].astype(np.uint32)
 
 
 _MOST = float(np.iinfo(np.uint16).max)

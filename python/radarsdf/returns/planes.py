@@ -30,9 +30,7 @@ class Surfels:
     keys: NDArray[np.uint64]  # (C,) Morton keys of the cells that hold returns, ascending
     blocks: CellBlocks  # finds the row of a cell from its key
     counts: NDArray[np.float64]  # (C,) number of returns in each cell
-    support: NDArray[
-        np.float64
-    ]  # (C,) weighted number of returns in a cell and, with less weight, the 26 around it
+    support: NDArray[np.float64]  # (C,) number of returns in a cell and, with less weight, the 26 around it
     cell_of_plane: NDArray[np.int64]  # (P,) row of the cell of each surfel, ascending
     centres: NDArray[np.float64]  # (P, 3) weighted mean of the returns, local, m
     normals: NDArray[np.float64]  # (P, 3) unit vectors towards the sensors

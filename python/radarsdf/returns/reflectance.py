@@ -56,17 +56,13 @@ class Reflectance:
     """
 
     leaf_size_m: float  # edge of a leaf cell, m
-    coefficients: NDArray[
-        np.float64
-    ]  # (3, 14) of the regressions: see :class:`~radarsdf.returns.response.Response`
+    coefficients: NDArray[np.float64]  # (3, 14) of :class:`~radarsdf.returns.response.Response`
     table: Float32  # (48, 96) of what the first of them leaves, by range and elevation
     plane_keys: NDArray[np.uint64]  # (P,) Morton keys of the surfels' cells with a plane, ascending
     normals: Float32  # (P, 3) unit normals of these planes, local frame
     mean_keys: NDArray[np.uint64]  # (M,) keys of the cells with means
     means: NDArray[np.float16]  # (M,) means in them of what the regression leaves
-    network_share: float = (
-        0.0  # factor on the answer of the intensity network, to which the quantity is added
-    )
+    network_share: float = 0.0  # factor on the intensity network's answer, to which the quantity is added
 
     @cached_property
     def _response(self) -> Response:

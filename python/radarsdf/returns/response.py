@@ -45,9 +45,7 @@ _TABLE_SHRINKAGE = 1.0  # 0.5 to 2 differ by up to 2 %
 class Response:
     """A quantity of returns as a function of range, elevation, incidence and the kind of surface."""
 
-    coefficients: NDArray[
-        np.float64
-    ]  # (3, 14) of the regression, for each kind: `NO_SURFACE`, `LEVEL`, `STEEP`
+    coefficients: NDArray[np.float64]  # (3, 14) of the regression of each kind of surface
     table: Float32  # (48, 96) by range and elevation, of what the first of them leaves
 
     @classmethod

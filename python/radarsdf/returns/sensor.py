@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import number, real_array, usable_poses
-from radarsdf.io.scans import Scans
+from radarsdf.checks import number, usable_poses
 from radarsdf.returns.intensities import Plausible
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.rays import Rays
+from radarsdf.returns.rays import Rays, prepare
 
 # Of the returns: what lies beyond in azimuth, in elevation or in range is taken for a stray one.
 _STRAY = 0.002
@@ -57,16 +56,13 @@ class Sensor:
     interpolated. Empty: the sensor measures no intensities."""
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("azimuth_rad", -math.pi, math.pi),
-            ("elevation_rad", -math.pi / 2, math.pi / 2),
-            ("range_m", 0.0, _MAX_RANGE_M),
-        ):
-            first, last = limits = _pair(getattr(self, name), name)
-            if not low <= first < last <= high:
-                msg = f"{name} must be two ascending numbers in [{low:.4g}, {high:.4g}], not {first:.6g} and {last:.6g}"
+        limits = {"azimuth_rad": math.pi, "elevation_rad": math.pi / 2, "range_m": _MAX_RANGE_M}
+        for name, most in limits.items():
+            low, high = found = _pair(getattr(self, name), name)
+            if not (0.0 if name == "range_m" else -most) <= low < high <= most:
+                msg = f"{name} must be two ascending numbers up to {most:.4g}, not {low:.6g} and {high:.6g}"
                 raise ValueError(msg)
-            object.__setattr__(self, name, limits)
+            object.__setattr__(self, name, found)
         if not 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7:
             msg = f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}"
             raise ValueError(msg)
@@ -143,7 +139,7 @@ class Sensor:
     @classmethod
     def of(
         cls,
-        points: Sequence[ArrayLike] | Scans,
+        points: Sequence[ArrayLike],
         intensities: Sequence[ArrayLike] | None = None,
         *,
         noise: SensorNoise | None = None,
@@ -154,59 +150,41 @@ class Sensor:
 
         Returns outside the ranges do not count. A ValueError if none is left, or all are in one direction.
         """
-        if isinstance(points, Scans):
-            intensities = points.intensities if intensities is None else intensities
-            points = points.points
-        scans = [real_array(scan, "points") for scan in points]
-        counts = np.array([len(scan) for scan in scans])
-        returns = np.concatenate(scans) if scans else np.zeros((0, 3))
-        ranges_m = np.sqrt(np.einsum("ni,ni->n", returns, returns))
-        used = (ranges_m > 0) & (ranges_m >= min_range_m)
-        used &= ranges_m <= (np.inf if max_range_m is None else max_range_m)
-        if not used.any():
+        poses = np.tile(np.eye(4), (len(points), 1, 1))
+        limits: dict[str, Any] = {"min_range_m": min_range_m, "max_range_m": max_range_m}
+        rays = prepare(points, poses, intensities, whole=False, **limits)
+        if len(rays) == 0:
             msg = "no return lies within the ranges: a sensor cannot be told from its scans"
             raise ValueError(msg)
-        per_scan = np.bincount(np.repeat(np.arange(len(scans)), counts)[used], minlength=len(scans))
-        rows = np.flatnonzero(used)
-        rows = rows[:: -(-len(rows) // _MAX_RETURNS)]
-        values = None
-        if intensities is not None:
-            values = np.concatenate([real_array(v, "intensities") for v in intensities])[rows]
-            values = Plausible.of(values).kept(values)
-        return cls._of_returns(returns[rows], values, per_scan, noise)
+        if rays.intensities is not None:
+            kept = Plausible.of(rays.intensities).kept(rays.intensities)
+            rays = dataclasses.replace(rays, intensities=kept)
+        return cls.of_rays(rays, poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise)
 
     @classmethod
     def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
-        """The sensor that took `rays`, with poses (F, 4, 4) T_world_sensor, m: :meth:`of` the same returns."""
+        """The sensor that took `rays`, with poses (F, 4, 4) T_world_sensor, m."""
         T_world_sensor, _ = usable_poses(poses, len(rays.up_of_scan))
         rows = np.arange(0, len(rays), -(-len(rays) // _MAX_RETURNS))
         scans = rays.scans[rows]
         # Coordinate by coordinate: a matrix for each return takes three times as long.
         from_sensor = rays.points[rows].T - (T_world_sensor[:, :3, 3] - rays.origin)[scans].T
         R = T_world_sensor[:, :3, :3]
-        turned_back = [sum(R[:, j, i][scans] * from_sensor[j] for j in range(3)) for i in range(3)]
-        values = None if rays.intensities is None else rays.intensities[rows].astype(np.float64)
-        per_scan = np.bincount(rays.scans, minlength=len(T_world_sensor))
-        return cls._of_returns(np.stack(turned_back, 1), values, per_scan, noise)
-
-    @classmethod
-    def _of_returns(
-        cls,
-        returns: NDArray[np.float64],
-        values: NDArray[np.float64] | None,
-        per_scan: NDArray[np.int64],
-        noise: SensorNoise | None,
-    ) -> Sensor:
-        x, y, z = returns.T
+        x, y, z = (sum(R[:, j, i][scans] * from_sensor[j] for j in range(3)) for i in range(3))
         range_m = np.sqrt(x * x + y * y + z * z)
-        known = np.isfinite(range_m if values is None else values)
+        thresholds: tuple[tuple[float, float], ...] = ()
+        if rays.intensities is not None:
+            values = rays.intensities[rows].astype(np.float64)
+            known = np.isfinite(values)
+            thresholds = _thresholds(range_m[known], values[known])
+        per_scan = np.bincount(rays.scans)
         return cls(
             azimuth_rad=_limits(np.arctan2(y, x)),
             elevation_rad=_limits(np.arcsin(np.clip(z / range_m, -1, 1))),
             range_m=_limits(range_m),
             returns_per_scan=float(np.median(per_scan[per_scan > 0])),
-            noise=SensorNoise(0.0, 0.0, 0.0) if noise is None else noise,
-            thresholds=() if values is None else _thresholds(range_m[known], values[known]),
+            noise=noise,
+            thresholds=thresholds,
         )
 
 

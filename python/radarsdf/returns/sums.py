@@ -191,9 +191,7 @@ class MeanRays:
 
     keys: NDArray[np.uint64]  # (M,) Morton keys of the cells, ascending
     points: NDArray[np.float32]  # (M, 3) mean of the returns in each cell, local, m
-    directions: NDArray[
-        np.float32
-    ]  # (M, 3) mean of their rays, unit vectors; downwards where opposite rays leave none
+    directions: NDArray[np.float32]  # (M, 3) mean of their rays, unit vectors; downwards without one
     counts: NDArray[np.float32]  # (M,) number of returns in each cell
     scans: NDArray[np.uint32]  # (M,) number of different scans that they are of
     ranges_m: NDArray[np.float32]  # (M,) mean range of the returns in each cell, m
@@ -214,15 +212,7 @@ class MeanRays:
         )
 
     def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
-        columns: tuple[NDArray[Any], ...] = (
-            self.keys,
-            self.points,
-            self.directions,
-            self.counts,
-            self.scans,
-            self.ranges_m,
-        )
-        return MeanRays(*(column[part] for column in columns))
+        return MeanRays(**{name: column[part] for name, column in vars(self).items()})
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
         """(C,) uint64, ascending Morton keys of the leaf cells that rays cross within `reach_m` of their returns."""

@@ -32,9 +32,7 @@ class Material:
 
     name: str
     reflectivity_db: float  # echo at normal incidence, relative to the other materials [dB]
-    specular: Annotated[float, Field(ge=0, le=1)] = (
-        0.5  # share of the specular lobe at normal incidence, 0..1
-    )
+    specular: Annotated[float, Field(ge=0, le=1)] = 0.5  # share of the specular lobe at normal incidence
     lobe_width_rad: Annotated[float, Field(gt=0)] = 0.25  # w, standard deviation of the specular lobe [rad]
     looks: Annotated[float, Field(gt=0)] = 3.0  # independent scatterers in one return: few mean strong fading
     texture_db: Annotated[float, Field(ge=0)] = 0.0  # amplitude of slow changes over the surface [dB], >= 0

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from radarsdf.checks import check_poses, instance, positive, real_array
+from radarsdf.checks import check_poses, positive, real_array
 from radarsdf.io.imu import Imu, checked_rotation
 from radarsdf.poses.rigid import moved, steps
 
@@ -85,16 +85,10 @@ def measured_motion(
     >>> motion.times_s.round(3), motion.angular_velocity.shape
     (array([0. , 0.1, 0.2]), (3, 3))
     """
-    instance(simulation, Simulation, "simulation")
-    if len(simulation) < 2:
-        msg = "a motion has two scans or more"
-        raise ValueError(msg)
     poses = simulation.poses
     times_s = np.arange(len(poses), dtype=np.float64) / positive(rate_hz, "rate_hz")
-    velocities = CubicSpline(times_s, poses[:, :3, 3])(times_s, 1)
-    in_sensor = np.einsum("fji,fj->fi", poses[:, :3, :3], velocities)
-    # SciPy's rates are in the frame of the turned body.
-    rates = RotationSpline(times_s, Rotation.from_matrix(poses[:, :3, :3]))(times_s, 1)
+    positions, turning = _splines(poses, times_s)
+    in_sensor = np.einsum("fji,fj->fi", poses[:, :3, :3], positions(times_s, 1))
     doppler_mps = []
     for i, points in enumerate(simulation.points):
         rng = generator(seed, _MOTION_STREAM, i)
@@ -109,7 +103,7 @@ def measured_motion(
         doppler_mps.append(speeds.astype(np.float32))
     rng = generator(seed, _MOTION_STREAM, len(poses))
     noise = _GYROSCOPE_SIGMA_RAD_S * rng.standard_normal((len(poses), 3))
-    return MeasuredMotion(times_s, doppler_mps, rates + gyroscope_bias_rad_s + noise)
+    return MeasuredMotion(times_s, doppler_mps, turning(times_s, 1) + gyroscope_bias_rad_s + noise)
 
 
 def measured_imu(
@@ -161,25 +155,28 @@ def measured_imu(
     (2001, (2001, 3), True)
     """
     at_s: FloatArray = real_array(times_s, "times_s")
-    T_world_sensor = check_poses(poses)
-    if len(T_world_sensor) < 2 or at_s.shape != (len(T_world_sensor),) or not (np.diff(at_s) > 0).all():
-        msg = f"a motion has two poses or more, and an ascending time for each: {len(T_world_sensor)} poses, times {at_s.shape}"
-        raise ValueError(msg)
+    positions, turning = _splines(check_poses(poses), at_s)
     R_imu = np.eye(3) if R_sensor_imu is None else checked_rotation(R_sensor_imu)
     count = int(np.floor((at_s[-1] - at_s[0]) * positive(rate_hz, "rate_hz") + 1e-6)) + 1
     times = at_s[0] + np.arange(count) / rate_hz
-    turning = RotationSpline(at_s, Rotation.from_matrix(T_world_sensor[:, :3, :3]))
     # SciPy's rates are in the frame of the turned body, here turned on into that of the IMU.
     rates, changes = (np.einsum("ji,gj->gi", R_imu, turning(times, order)) for order in (1, 2))
     R_world_imu = np.einsum("gij,jk->gik", turning(times).as_matrix(), R_imu)
     lever = np.asarray(lever_m, np.float64)
     of_lever = np.cross(changes, lever) + np.cross(rates, np.cross(rates, lever))
-    accelerations = CubicSpline(at_s, T_world_sensor[:, :3, 3])(times, 2) - _GRAVITY_MPS2
+    accelerations = positions(times, 2) - _GRAVITY_MPS2
     forces = np.einsum("gji,gj->gi", R_world_imu, accelerations) - of_lever
     rng = generator(seed, _IMU_STREAM, 0)
     rates = rates + gyroscope_bias_rad_s + _GYROSCOPE_SIGMA_RAD_S * rng.standard_normal((count, 3))
     noise = _ACCELEROMETER_SIGMA_MPS2 * rng.standard_normal((count, 3))
     return Imu(times, rates, forces + _ACCELEROMETER_BIAS_MPS2 + noise)
+
+
+def _splines(poses: FloatArray, times_s: FloatArray) -> tuple[CubicSpline, RotationSpline]:
+    """Positions and rotations by time. Both raise a ValueError unless there are two poses, and ascending times."""
+    return CubicSpline(times_s, poses[:, :3, 3]), RotationSpline(
+        times_s, Rotation.from_matrix(poses[:, :3, :3])
+    )
 
 
 def drifted(

@@ -236,11 +236,7 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.45, materials.GRASS)
     sway, phase = rng.uniform(1.0, 3.5), rng.uniform(0, 2 * np.pi)
-
-    def path(u: FloatArray) -> FloatArray:
-        x = 60.0 * u
-        return np.stack([x, sway * np.sin(2 * np.pi * x / 70 + phase)], axis=1)
-
+    path = _winding(60.0, sway, 70, phase)
     site = Site(rng, terrain, taken=[(x, y, 2.2) for x, y in path(np.linspace(-0.1, 1.5, 200))])
     site.fill(_LANE, lambda near, far: site.beside(path, rng.uniform(0.1, 1.45), near, far))
     return _driven(site, path, (frames, 120), HUGIN_A3, "hugin", seed, height_m=1.5)
@@ -347,16 +343,21 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, rng.uniform(0.05, 0.3), materials.GRASS)
     length = 4.0 * rng.uniform(5, 10)
-    sway, wave, phase = rng.uniform(1.0, 5.0), rng.uniform(80, 140), rng.uniform(0, 2 * np.pi)
-
-    def path(u: FloatArray) -> FloatArray:
-        x = length * u
-        return np.stack([x, sway * np.sin(2 * np.pi * x / wave + phase)], axis=1)
-
+    path = _winding(length, rng.uniform(1.0, 5.0), rng.uniform(80, 140), rng.uniform(0, 2 * np.pi))
     first, last = -10.0, length + 100.0
     site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in path(np.arange(first, last, 2.0) / length)])
     site.fill(_STREET, lambda near, far: site.beside(path, rng.uniform(first, last) / length, near, far))
     return _driven(site, path, (frames, 20), ASTYX_HIRES, "astyx", seed, height_m=1.25)
+
+
+def _winding(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
+    """A lane along x that winds as a sine."""
+
+    def path(u: FloatArray) -> FloatArray:
+        x = length_m * u
+        return np.stack([x, sway_m * np.sin(2 * np.pi * x / wave_m + phase)], axis=1)
+
+    return path
 
 
 def _driven(

@@ -21,7 +21,6 @@ __all__ = ["Box", "CornerReflector", "Hits", "Pole", "Primitive", "Scene", "Terr
 
 FloatArray = NDArray[np.float64]
 _First = tuple[FloatArray, FloatArray]
-_CHUNK = 32768  # rays or points at a time; they take some tens of MB
 
 
 class Primitive(ABC):
@@ -305,9 +304,7 @@ class Hits(NamedTuple):
     """First hits of N rays."""
 
     range_m: FloatArray  # (N,) inf where the ray hits nothing
-    normals: (
-        FloatArray  # (N, 3) unit vectors, world, towards the origin of the ray; zero where it hits nothing
-    )
+    normals: FloatArray  # (N, 3) unit vectors, world, towards the ray's origin; zero where it hits nothing
     primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 where it hits nothing
 
 
@@ -349,15 +346,8 @@ class Scene:
             `range_m` (N,), m, `normals` (N, 3), world, and `primitive` (N,), the row in `parts`. Inf, zeros and -1 where
             a ray hits nothing.
         """
-        d = np.asarray(directions, dtype=np.float64)
-        o = np.broadcast_to(np.asarray(origins, dtype=np.float64), d.shape)
-        chunks = [
-            self._raycast(o[i : i + _CHUNK], d[i : i + _CHUNK], max_range_m)
-            for i in range(0, max(len(d), 1), _CHUNK)
-        ]
-        return Hits(*map(np.concatenate, zip(*chunks, strict=True)))
-
-    def _raycast(self, origins: FloatArray, directions: FloatArray, max_range_m: float) -> Hits:
+        directions = np.asarray(directions, dtype=np.float64)
+        origins = np.broadcast_to(np.asarray(origins, dtype=np.float64), directions.shape)
         nearest = np.full(len(directions), max_range_m)
         normals = np.zeros_like(directions)
         primitive = np.full(len(directions), -1, dtype=np.int64)
@@ -389,10 +379,8 @@ class Scene:
         """
         p = np.asarray(points, dtype=np.float64)
         best = np.full(len(p), np.inf)
-        for i in range(0, len(p), _CHUNK):
-            for part in self.parts:
-                of_part = part.signed_distance(p[i : i + _CHUNK])
-                best[i : i + _CHUNK] = np.minimum(best[i : i + _CHUNK], of_part)
+        for part in self.parts:
+            np.minimum(best, part.signed_distance(p), out=best)
         return best
 
     def echo_db(self, points: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
