@@ -82,14 +82,10 @@ class RegionTable:
         """Keys of the regions that have rows, ascending."""
         return np.array(sorted(self._parts), np.uint64)
 
-    @property
-    def num_rows(self) -> int:
-        """Number of all rows."""
-        return sum(len(part["keys"]) for part in self._parts.values())
-
-    def gather(self, regions: Keys) -> Rows:
-        """The rows of `regions` (R,), ascending, in the order of their keys."""
-        parts = [self._parts[region] for region in regions.tolist() if region in self._parts]
+    def gather(self, regions: Keys | None = None) -> Rows:
+        """The rows of `regions` (R,), ascending, in the order of their keys. None: all."""
+        wanted = sorted(self._parts) if regions is None else regions.tolist()
+        parts = [self._parts[region] for region in wanted if region in self._parts]
         return {
             name: np.concatenate([new[:0], *(part[name] for part in parts)])
             for name, new in self._new.items()
