@@ -106,7 +106,7 @@ def test_a_change_far_along_a_drive_is_all_that_is_made_anew():
     live = map_of(range(7), poses=poses)
     live.mesh()
     live.integrate(SCENE.points[7], poses[6], SCENE.intensities[7])
-    surface, changes = live._state.changes()
+    surface, changes, _ = live._state.changes()
     redone = surface.update(*changes)
     assert 0 < len(redone) < 0.4 * len(surface.distances.regions)
     grown = mesh_bits(live.mesh())

@@ -40,6 +40,7 @@ from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, planes_round, support_round
 from radarsdf.returns.sums import MeanRays, ScanSums, lattice_of, merged_keys
+from radarsdf.threads import resolve_num_threads
 
 _BLOCK_CELLS, _LARGE_CELLS = 8, 16  # edges of cubes, in which distances from changes are counted
 
@@ -106,8 +107,9 @@ class GrowingSurface:
         changed = np.union1d(changed, self._find_normals(of_planes, num_threads))
         return self._derive_distances(changed, noise, num_threads)
 
-    def surface(self, looks: Looks, num_threads: int) -> tuple[WholeMap, Surface]:
+    def surface(self, looks: Looks) -> tuple[WholeMap, Surface]:
         """All triangles, with the evidence of their vertices. `looks`: of all blocks."""
+        num_threads = resolve_num_threads(self._config.num_threads)
         surfels, leaf_m = self._surfels, self._config.leaf_size_m
         scene = WholeMap(self._origin, self._config, surfels.rough_share(), surfels.returns_per_cell())
         rows = self.distances.gather()
