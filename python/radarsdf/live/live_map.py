@@ -472,8 +472,10 @@ def _checked_scan(
         if config.drop_movers:
             moving = Movers.of([scan], [speeds]).masks[0]
             static = ~moving if moving.any() else None
-    if time_s is not None and not abs(number(time_s, "time_s")) <= MAX_TIME_S:
-        msg = f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
-        raise ValueError(msg)
+    if time_s is not None:
+        time_s = number(time_s, "time_s")
+        if not abs(time_s) <= MAX_TIME_S:
+            msg = f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
+            raise ValueError(msg)
     values_of_scan = None if values is None else values[0].copy()
     return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s)
