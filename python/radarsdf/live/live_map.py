@@ -57,8 +57,7 @@ class Integrated:
     movers: int
     """Number of moving returns, which were left out."""
     moved: tuple[ScanId, ...] = ()
-    """Earlier scans without poses that were placed again, as it is clear only now how the sensor moves; see
-    :meth:`LiveMap.pose`."""
+    """Earlier scans that were placed again, as it is clear only now how the sensor moves; see :meth:`LiveMap.pose`."""
 
 
 class LiveMap:
@@ -122,15 +121,12 @@ class LiveMap:
         if config.returns.accumulate_scans != 1:
             msg = "returns.accumulate_scans must be 1: a live map gets scans one after another"
             raise ValueError(msg)
+        corner = None if origin is None else positions([np.asarray(origin)], "origin")[0]
+        most = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
         place = None if folder is None else path_of(folder, "folder")
         if place is not None:
             weakref.finalize(self, os.close, locked_folder(place))
-        self._state = GrowingState(
-            config,
-            None if origin is None else positions([np.asarray(origin)], "origin")[0],
-            None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1),
-            place,
-        )
+        self._state = GrowingState(config, corner, most, place)
         self._follower = Follower(config, config.num_threads)
         self._lock = threading.RLock()  # of the state
         self._reading = threading.Lock()  # of its surface, taken first

@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from radarsdf._core import GrowingSums, SumsChange
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
-from radarsdf.live.regions import (
-    NO_KEYS,
-    REGION_BITS,
-    REGION_CELLS,
-    Keys,
-    region_places,
-    regions_of,
-)
+from radarsdf.live.regions import REGION_BITS, REGION_CELLS, Keys, region_places, regions_of
 from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
 from radarsdf.live.surface import GrowingSurface
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
@@ -61,7 +54,7 @@ class GrowingState:
         self.origin = origin
         self.max_bytes = max_bytes
         self.log = ScanLog(folder)
-        self._store = None if folder is None else RegionStore(folder)
+        self._store = RegionStore(folder)
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
@@ -125,7 +118,7 @@ class GrowingState:
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
-        if self._store is not None:
+        if self._store.folder is not None:
             regions = regions_of(keys << BLOCK_BITS)
             lower = region_places(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
@@ -140,7 +133,7 @@ class GrowingState:
     @contextmanager
     def whole(self) -> Iterator[None]:
         """Within, nothing is put away. Afterwards, the same regions are again."""
-        away = NO_KEYS if self._store is None else self._store.regions
+        away = self._store.regions
         self._bring_back(away)
         try:
             yield
@@ -148,12 +141,10 @@ class GrowingState:
             self._put_away(away)
 
     def _bring_back(self, regions: Keys) -> None:
-        if self._store is not None:
-            blocks = self._store.bring_back(self.sums, np.intersect1d(regions, self._store.regions))
-            self._changed.update(blocks.tolist())
+        self._changed.update(self._store.bring_back(self.sums, regions).tolist())
 
     def _put_away(self, regions: Keys) -> Keys:
-        blocks = NO_KEYS if self._store is None else self._store.put_away(self.sums, regions)
+        blocks = self._store.put_away(self.sums, regions)
         self._changed.update(blocks.tolist())
         return blocks
 
@@ -262,14 +253,11 @@ class GrowingState:
 
 def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:
     """The rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
-    static = [slice(None) if scan.standing is None else scan.standing for scan in scans]
-    intensities = [
-        scan.intensities[own] for scan, own in zip(scans, static, strict=True) if scan.intensities is not None
-    ]
+    static = [scan.static for scan in scans]
     return prepare(
-        [scan.points[own] for scan, own in zip(scans, static, strict=True)],
-        np.stack([scan.pose for scan in scans]),
-        intensities or None,
+        [scan.points for scan in static],
+        np.stack([scan.pose for scan in static]),
+        [scan.intensities for scan in static if scan.intensities is not None] or None,
         origin=origin,
         whole=False,
         **config.preparation,

@@ -75,6 +75,14 @@ class LoggedScan:
         return {name: array for name in _KINDS if (array := getattr(self, name)) is not None}
 
     @property
+    def static(self) -> LoggedScan:
+        """With its static returns alone."""
+        if self.standing is None:
+            return self
+        kept = {name: array[self.standing] for name, array in self.arrays.items()}
+        return replace(self, **kept | {"standing": None})
+
+    @property
     def num_bytes(self) -> int:
         """Memory that it takes."""
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
@@ -205,8 +213,8 @@ class ScanLog:
 class RegionStore:
     """Sums of regions that were put away, in a file each in `folder`, which come back with the same bits."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
         self._away: set[int] = set()
 
     @property
@@ -215,7 +223,8 @@ class RegionStore:
         return np.array(sorted(self._away), np.uint64)
 
     def _path(self, region: int) -> Path:
-        return self._folder / f"region-{region:016x}.npz"
+        assert self.folder is not None
+        return self.folder / f"region-{region:016x}.npz"
 
     def put_away(self, sums: GrowingSums, regions: Keys) -> Keys:
         """Moves all blocks of `regions` out of `sums`, once all are written. Returns the keys of the blocks, ascending."""
@@ -232,7 +241,8 @@ class RegionStore:
         return gone
 
     def bring_back(self, sums: GrowingSums, regions: Keys) -> Keys:
-        """Moves `regions` that are put away into `sums`, all or none. Returns the keys of their blocks, ascending."""
+        """Moves those of `regions` that are put away into `sums`, all or none. Returns the keys of their blocks, ascending."""
+        regions = np.intersect1d(regions, self.regions)
         if len(regions) == 0:
             return NO_KEYS
         paths = [self._path(region) for region in regions.tolist()]

@@ -58,8 +58,7 @@ class Step:
     @property
     def scan(self) -> Floats:
         """(N, 3) static returns, sensor frame, m."""
-        points, static = self.logged.points, self.logged.standing
-        return np.ascontiguousarray(points if static is None else points[static], np.float64)
+        return np.ascontiguousarray(self.logged.static.points, np.float64)
 
     @cached_property
     def moves(self) -> bool:
