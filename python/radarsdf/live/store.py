@@ -87,11 +87,6 @@ class LoggedScan:
         """Memory that it takes."""
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
 
-    @property
-    def reach_m(self) -> float:
-        """Range of the farthest return."""
-        return float(np.sqrt(np.square(self.points, dtype=np.float64).sum(axis=1).max()))
-
     def at(self, pose: NDArray[np.float64]) -> LoggedScan:
         """The same from another pose (4, 4)."""
         return replace(self, pose=pose)
@@ -101,7 +96,6 @@ class LoggedScan:
 class _OnDisk:
     pose: NDArray[np.float64]
     path: Path
-    reach_m: float
     time_s: float | None
     num_bytes: int = _BYTES_OF_SCAN // 2
 
@@ -197,12 +191,14 @@ class ScanLog:
             path = self._folder / f"scan-{self._written:09d}.npz"
             write_arrays(path, scan.arrays)
             self._written += 1
-            self.put(scan_id, _OnDisk(scan.pose, path, scan.reach_m, scan.time_s))
+            self.put(scan_id, _OnDisk(scan.pose, path, scan.time_s))
 
     def seal_beyond(self, centre: NDArray[np.float64], radius_m: float) -> None:
-        """Seals the scans that reach beyond a ball around `centre` (3,), world, m."""
-        for scan_id, scan in list(self._scans.items()):
-            if float(np.linalg.norm(scan.pose[:3, 3] - centre)) + scan.reach_m > radius_m:
+        """Seals the scans with returns beyond a ball around `centre` (3,), world, m. None is on the disk."""
+        for scan_id in self.ids:
+            scan = self.get(scan_id)
+            reach_m = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1).max())
+            if np.linalg.norm(scan.pose[:3, 3] - centre) + reach_m > radius_m:
                 self._seal(scan_id)
 
     def _seal(self, scan_id: ScanId) -> None:

@@ -78,14 +78,8 @@ def fit_tiles(
     OSError
         If `out` cannot be written, or another process makes its plan.
     """
-    plan_tiles(
-        scans,
-        out,
-        tile_size=tile_size,
-        halo=halo,
-        config=config,
-        threads=None if executor is None else 1,
-    )
+    threads = None if executor is None else 1
+    plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=threads)
     return run_fits(out, executor=executor, progress=progress)
 
 
@@ -98,10 +92,7 @@ def plan_tiles(
     config: FitConfig | None = None,
     threads: int | None = None,
 ) -> Plan:
-    """The first step of :func:`fit_tiles`: writes the plan and the rays of each tile, in one pass over the scans.
-
-    `threads`: of each fit, if the configuration does not say. Default: as many as PyTorch uses.
-    """
+    """Writes the plan and the rays of each tile, in one pass over the scans. `threads`: of a fit, if `config` names none."""
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
@@ -130,11 +121,8 @@ def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: CheckedS
     if config.num_threads not in (0, plan.config.num_threads):
         msg = f"{folder} was planned for {plan.config.num_threads} threads a tile, not {config.num_threads}"
         raise ValueError(msg)
-    found = {
-        name: getattr(plan.config.returns, name)
-        for name in NOISE_SETTINGS
-        if getattr(config.returns, name) is None
-    }
+    unknown = [name for name in NOISE_SETTINGS if getattr(config.returns, name) is None]
+    found = {name: getattr(plan.config.returns, name) for name in unknown}
     ours, theirs = (settings_of_results(own) for own in (config.override(returns=found), plan.config))
     different = [name for name in ours if ours[name] != theirs[name]]
     different += ["tile_size"] * (grid.tile_m != plan.tile_m) + ["halo"] * (grid.halo_m != plan.halo_m)
@@ -177,7 +165,7 @@ def run_fits(
 
 
 def fit_tile(folder: str, name: str, run: str = "") -> None:  # noqa: ARG001 - see run_tasks
-    """Fits the tile of this name, unless its map is there. A task takes names, so that it can run anywhere."""
+    """Fits a tile, unless its map is there. A task takes names, so that it can run anywhere."""
     root = Path(folder)
     plan = Plan.load(root)
     (tile,) = (planned for planned in plan.tiles if planned.name == name)
@@ -204,16 +192,12 @@ def fit_tile(folder: str, name: str, run: str = "") -> None:  # noqa: ARG001 - s
 def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> TileGrid:
     lattice = config.lattice
 
-    def blocks(value: float | None, default: float, name: str) -> float:
-        wanted = default if value is None else positive(value, name)
+    def blocks(value: float | None, cells: int, name: str) -> float:
+        wanted = cells * lattice.cell_m if value is None else positive(value, name)
         return lattice.block_m * max(1, round(wanted / lattice.block_m))
 
-    grid = TileGrid(
-        tile_m=blocks(tile_size, _TILE_CELLS * lattice.cell_m, "tile_size"),
-        halo_m=blocks(halo, _HALO_CELLS * lattice.cell_m, "halo"),
-        corner_m=float(lattice.position(0)),
-    )
-    if grid.halo_m > grid.tile_m:
-        msg = f"the halo, {grid.halo_m:g} m, is larger than the tile, {grid.tile_m:g} m: use larger tiles"
+    tile_m, halo_m = blocks(tile_size, _TILE_CELLS, "tile_size"), blocks(halo, _HALO_CELLS, "halo")
+    if halo_m > tile_m:
+        msg = f"the halo, {halo_m:g} m, is larger than the tile, {tile_m:g} m: use larger tiles"
         raise ValueError(msg)
-    return grid
+    return TileGrid(tile_m, halo_m, corner_m=float(lattice.position(0)))

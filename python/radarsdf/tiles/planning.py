@@ -89,16 +89,14 @@ def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGr
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
     """Lists of consecutive scans, in which whole groups are accumulated."""
     chunk: list[Scan] = []
-    returns = 0
     for scan in scans:
         if chunk and len(chunk) % together == 0:
-            first, here = (np.asarray(one.T_world_sensor)[:3, 3] for one in (chunk[0], scan))
-            is_near = (np.abs(here - first) < _CHUNK_M).all()
-            if len(chunk) >= _CHUNK_SCANS or returns >= _CHUNK_RETURNS or not is_near:
+            way = np.asarray(scan.T_world_sensor)[:3, 3] - np.asarray(chunk[0].T_world_sensor)[:3, 3]
+            is_far, returns = (np.abs(way) >= _CHUNK_M).any(), sum(map(len, chunk))
+            if is_far or len(chunk) >= _CHUNK_SCANS or returns >= _CHUNK_RETURNS:
                 yield chunk
-                chunk, returns = [], 0
+                chunk = []
         chunk.append(scan)
-        returns += len(scan)
     if chunk:
         yield chunk
 
@@ -224,13 +222,14 @@ class _Planner:
             cost = estimate_rays(rays, plan.config, inside)
             seconds = round(cost.seconds, 3)
             tiles.append(dataclasses.replace(tile, memory_bytes=cost.peak_memory_bytes, seconds=seconds))
-            if len(noises) < _SAMPLED_TILES:
-                with Workers(plan.config.num_threads) as workers:
-                    surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
-                noises.append(surface.noise)
-                clutter += surface.surfels.rough_share() * len(rays)
-                returns += len(rays)
-                cells += len(surface.surfels.keys)
+            if len(noises) == _SAMPLED_TILES:
+                continue
+            with Workers(plan.config.num_threads) as workers:
+                surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
+            noises.append(surface.noise)
+            clutter += surface.surfels.rough_share() * len(rays)
+            returns += len(rays)
+            cells += len(surface.surfels.keys)
         noise = SensorNoise.median(noises)
         return dataclasses.replace(
             plan,
@@ -260,12 +259,8 @@ def rays_path(folder: Path, tile: Tile) -> Path:
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
     """The rays that cross a tile, in the frame of its map, and which of their returns (N,) are in it or its halo."""
     path = rays_path(folder, tile.tile)
-    if not path.exists():
-        msg = f"{path} is gone, as after radarsdf tiles clean: fit the scans again in a new folder"
-        raise ValueError(msg)
-    found = path.stat().st_size / _RECORD.itemsize
-    if found != tile.rays:
-        msg = f"{path} has {found:g} rays instead of {tile.rays}: make the plan again"
+    if not path.exists() or path.stat().st_size != tile.rays * _RECORD.itemsize:
+        msg = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean: fit in a new folder"
         raise ValueError(msg)
     rows = np.fromfile(path, _RECORD)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)

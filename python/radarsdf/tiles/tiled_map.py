@@ -80,14 +80,8 @@ class TiledMap(TileBlend):
         ----------
         voxel_size : float
             Edge of a voxel, m. It must divide the edge of a leaf cell.
-        box : (2, 3) array_like, optional
-            Lower and upper corner, world, m. Only voxels with their centre inside are meshed.
-        viewpoint : (3,) array_like, optional
-            Sensor position, world, m, for which intensities are predicted at the vertices.
-        progress : bool, optional
-            Whether to show a progress bar. Default: only on a terminal.
-        **limits
-            `min_confidence`, `max_uncertainty` and `min_component_triangles` of :meth:`Map.mesh`.
+        box, viewpoint, progress, **limits
+            As of :meth:`Map.mesh`.
 
         Returns
         -------
@@ -169,9 +163,7 @@ class TiledMap(TileBlend):
             ``NAME.json``: 3D Tiles 1.1, a GLB file for each tile in a folder ``NAME`` next to it, in the frame of the world. To
             place it on the earth, set the ``transform`` of its root. Small components that reach into the next tile stay.
             Another suffix: one file, as of :func:`radarsdf.io.write_mesh`.
-        voxel_size : float
-            Edge of a voxel, m. It must divide the edge of a leaf cell.
-        progress, **limits
+        voxel_size, progress, **limits
             As of :meth:`mesh`; also its `box`.
 
         Returns
@@ -181,12 +173,10 @@ class TiledMap(TileBlend):
 
         Raises
         ------
-        ValueError
-            If an argument is out of range, the suffix is another, or there is no surface for 3D Tiles.
+        ValueError, MemoryError
+            As of :meth:`mesh`, or if the suffix is another, or there is no surface for 3D Tiles.
         OSError
             If a file cannot be written.
-        MemoryError
-            If memory cannot hold the mesh of one file.
         """
         from radarsdf.tiles.mesh import export_mesh  # noqa: PLC0415 - as above
 
@@ -199,11 +189,7 @@ class TiledMap(TileBlend):
 
         Parameters
         ----------
-        voxel_size : float
-            Edge of a voxel, m.
-        progress : bool, optional
-            Whether to show a progress bar. Default: only on a terminal.
-        **limits
+        voxel_size, progress, **limits
             As of :meth:`mesh`; also its `box`.
 
         Returns
@@ -216,12 +202,12 @@ class TiledMap(TileBlend):
         return threshold_of(self, voxel_size, progress, **limits)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Copy the plan and the maps of the tiles that are done to a new folder, without the rays of the tiles.
+        """Copy the plan and the maps of the tiles that are done to a new folder, which :func:`radarsdf.load` reads.
 
         Parameters
         ----------
         path : path-like
-            The folder. :func:`radarsdf.load` reads it; its results have the same bits.
+            The folder. The rays of the tiles are not copied.
 
         Raises
         ------
@@ -249,21 +235,18 @@ class TiledMap(TileBlend):
         `missing_tiles`: names.
         """
         reports = [report_of(self.folder, tile) for tile in self.tiles]
+        timed = [
+            name for name, value in reports[0].items() if name.endswith("_s") and isinstance(value, float)
+        ]
         return {
             "tiles": len(reports),
             "missing_tiles": list(self.missing),
             "scans": self.plan.scans,
             "returns": sum(tile.returns for tile in self.plan.tiles),
             "leaf_cells": self.num_cells,
-            **{name: value for name, value in reports[0].items() if name == "noise"},
-            "skipped": list(
-                dict.fromkeys(words for report in reports for words in report.get("skipped", []))
-            ),
-            **{
-                step: sum(report.get(step, 0.0) for report in reports)
-                for step, seconds in reports[0].items()
-                if step.endswith("_s") and isinstance(seconds, float)
-            },
+            "noise": reports[0].get("noise"),
+            "skipped": list(dict.fromkeys(step for report in reports for step in report.get("skipped", []))),
+            **{name: sum(report.get(name, 0.0) for report in reports) for name in timed},
         }
 
     @cached_property
