@@ -110,7 +110,7 @@ def test_a_tile_that_fails_is_named_and_the_others_go_on(drive, tmp_path):
     rays.write_bytes(rays.read_bytes()[:-7])
     city = run_fits(out, progress=False)
     assert list(city.missing) == [bad]
-    assert "rays instead of" in city.missing[bad]
+    assert "rays of the plan" in city.missing[bad]
     assert len(city.tiles) == len(plan.tiles) - 1
     assert len(city.mesh(0.2, progress=False).faces) > 1000
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -28,8 +28,8 @@ from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.progress import hides_bar
-from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import Tile, folder_of, neighbours
+from radarsdf.tiles.tiled_map import TiledMap
 from radarsdf.tiles.tileset import content_folder, write_tileset
 
 if TYPE_CHECKING:
@@ -76,9 +76,9 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
 
 
 def _parts_of(
-    city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
-) -> tuple[list[Path], Limits]:
-    """Meshes all tiles: the files of the parts, and the limits of a mesh of them, as `wanted` of :meth:`Map.mesh`."""
+    city: TiledMap, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
+) -> tuple[list[Path], Limits, Threshold]:
+    """Meshes all tiles: the files of the parts, the limits of a mesh of them (`wanted`), and what these come to."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
     leaf_m = city.config.leaf_size_m
     steps = round(leaf_m / voxel_size) if voxel_size <= leaf_m else 0
@@ -96,10 +96,11 @@ def _parts_of(
         if not path.is_file():
             write_arrays(path, vars(_part_of(city, planned.tile, steps, corners)))
         paths.append(path)
-    return paths, limits
+    tally = sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS))
+    return paths, limits, Tally.of_sums(tally).threshold(limits.min_confidence)
 
 
-def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
+def _part_of(city: TiledMap, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
     """The triangles near returns in the leaf cells of a tile, of `steps` voxels along their edges."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
@@ -134,7 +135,7 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
     return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
 
 
-def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
+def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
     """(C, 3) leaf cells of a tile, as the lattice numbers them: those of its map, and of others with a weight there."""
     plan = city.plan
     parts = []
@@ -147,13 +148,13 @@ def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
     return found
 
 
-def _on_borders(city: TileBlend, vertices: _Floats) -> NDArray[np.int64]:
+def _on_borders(city: TiledMap, vertices: _Floats) -> NDArray[np.int64]:
     """(B,) rows of the vertices (V, 3) on the borders of tiles, which the next tile may have, too."""
     tiles = city.config.lattice.cells(vertices)[:, :2] / city.plan.tile_cells
     return np.flatnonzero((np.abs(tiles - np.round(tiles)) * city.plan.tile_cells < _ON_LATTICE).any(axis=1))
 
 
-def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
+def _welded(city: TiledMap, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
     """The vertices (V, 3) of all parts, and the faces (F, 3), of which no two use different vertices in one place."""
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0, *[len(part.vertices) for part in parts]], dtype=np.int32)
@@ -167,12 +168,11 @@ def _allowed(part: Part, min_confidence: float, limits: Limits) -> NDArray[np.bo
     return with_all(certain & (part.confidence >= min_confidence), part.faces)
 
 
-def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
+def mesh_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
-    paths, found = _parts_of(city, voxel_size, progress, **limits)
+    paths, found, threshold = _parts_of(city, voxel_size, progress, **limits)
     size = sum(path.stat().st_size for path in paths)
     check_triangles(size // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
-    threshold = _tally_of(paths).threshold(found.min_confidence)
     parts = [Part(**_read(path)) for path in paths]
     vertices, faces = _welded(city, parts)
     kept = np.concatenate([_allowed(part, threshold.min_confidence, found) for part in parts])
@@ -192,13 +192,13 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits:
 
 
 def export_mesh(
-    city: TileBlend, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
+    city: TiledMap, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
 ) -> tuple[int, int]:
     """See :meth:`TiledMap.export`. What cannot be written is noticed before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
         content_folder(Path(path))
-        paths, found = _parts_of(city, voxel_size, progress, **limits)
-        return write_tileset(city, Path(path), _separate(city, paths, found))
+        parts = _parts_of(city, voxel_size, progress, **limits)
+        return write_tileset(city, Path(path), _separate(city, *parts))
     check_mesh_path(path)
     check_outputs([path])
     mesh = mesh_of(city, voxel_size, progress, **limits)
@@ -207,13 +207,12 @@ def export_mesh(
 
 
 def _separate(
-    city: TileBlend, paths: Sequence[Path], limits: Limits
+    city: TiledMap, paths: Sequence[Path], limits: Limits, threshold: Threshold
 ) -> Iterator[tuple[_Floats, NDArray[np.int32]]]:
     """Vertices (V, 3), world, m, and faces (F, 3) of one tile after another. Components that reach a border stay."""
-    least = _tally_of(paths).threshold(limits.min_confidence).min_confidence
     for path in paths:
         part = Part(**_read(path))
-        faces = part.faces[_allowed(part, least, limits)]
+        faces = part.faces[_allowed(part, threshold.min_confidence, limits)]
         labels, sizes = mesh_components(faces, len(part.vertices))
         on_border = np.zeros(len(part.vertices), bool)
         on_border[_on_borders(city, part.vertices)] = True
@@ -223,17 +222,12 @@ def _separate(
         yield part.vertices[used], faces
 
 
-def threshold_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> Threshold:
+def threshold_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: Any) -> Threshold:
     """See :meth:`TiledMap.threshold`."""
-    paths, found = _parts_of(city, voxel_size, progress, **limits)
-    return _tally_of(paths).threshold(found.min_confidence)
+    return _parts_of(city, voxel_size, progress, **limits)[2]
 
 
-def _tally_of(paths: Iterable[Path]) -> Tally:
-    return Tally.of_sums(sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS)))
-
-
-def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
+def viewed_tiles(city: TiledMap, tiles: list[Tile]) -> ViewedMap:
     """What views need of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)

@@ -186,7 +186,7 @@ class Plan:
 
     @cached_property
     def digest(self) -> str:
-        """Of all that is in the plan: results of another plan are not taken for results of this one."""
+        """Of all that is in the plan. Results of another plan are not taken for results of this one."""
         return hashlib.blake2b(self._to_json(), digest_size=16).hexdigest()
 
     def _to_json(self) -> bytes:
@@ -240,11 +240,10 @@ def failure_path(folder: Path, tile: TilePlan) -> Path:
 
 def failure_of(folder: Path, tile: TilePlan) -> str:
     """Why the fit of a tile failed, as one line of letters; empty if it was not tried, or was killed."""
-    path = failure_path(folder, tile)
-    if not path.is_file():
+    try:
+        text = failure_path(folder, tile).read_bytes()[:_MAX_REASON_BYTES].decode(errors="replace")
+    except OSError:
         return ""
-    with path.open("rb") as file:
-        text = file.read(_MAX_REASON_BYTES).decode(errors="replace")
     return "".join(letter if letter.isprintable() else " " for letter in text).strip()
 
 

@@ -119,7 +119,7 @@ class _Planner:
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
             if self._with_intensities not in (None, has):
-                msg = f"scan {number} has {'' if has else 'no '}intensities, and those before it have {'none' if has else 'some'}"
+                msg = f"either all scans have intensities, or none has: scan {number} is not like those before it"
                 raise ValueError(msg)
             self._with_intensities = has
             if number % self._every == 0:
@@ -140,11 +140,8 @@ class _Planner:
         pairs = list(self._grid.crossed(points, sensors))
         rows = np.concatenate([pair[0] for pair in pairs])
         tiles = np.concatenate([pair[1] for pair in pairs])
-        order = np.lexsort((rows, tiles[:, 1], tiles[:, 0]))
-        rows, tiles = rows[order], tiles[order]
-        starts = np.flatnonzero((tiles[1:] != tiles[:-1]).any(axis=1)) + 1
-        for (i, j), own in zip(tiles[np.append(0, starts)].tolist(), np.split(rows, starts), strict=True):
-            tile = (i, j)
+        for i, j in np.unique(tiles, axis=0).tolist():
+            tile, own = (i, j), np.sort(rows[(tiles == (i, j)).all(axis=1)])
             path = rays_path(self._folder, tile)
             if tile not in self._origins:
                 middle = self._grid.lower_corner(tile) + self._grid.tile_m / 2
