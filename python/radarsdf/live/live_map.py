@@ -92,8 +92,8 @@ class LiveMap:
     :meth:`finish` trains, and files depend on the order of scans.
 
     All methods may be called from any thread; readers see the map before a change or after it. After any error, the map is
-    as before. Poses are T_world_sensor, m. Methods that change the map return the keys of the blocks of 8 × 8 × 8 leaf cells
-    whose returns changed, uint64, ascending.
+    as before. Poses are T_world_sensor, m. Methods that change the map return the keys (B,) of the blocks of 8 × 8 × 8 leaf
+    cells whose returns changed, or are gone, uint64, ascending.
 
     Examples
     --------
@@ -286,11 +286,6 @@ class LiveMap:
         poses : mapping
             Pose, (4, 4), of each scan by its id.
 
-        Returns
-        -------
-        (B,) ndarray
-            Keys of the blocks whose returns changed.
-
         Raises
         ------
         KeyError, ValueError
@@ -321,17 +316,10 @@ class LiveMap:
         radius_m : float
             Blocks with their middle farther away, or regions of which all is farther away, go.
 
-        Returns
-        -------
-        (B,) ndarray
-            Keys of these blocks.
-
         Raises
         ------
-        ValueError
-            If an argument is out of range.
-        OSError
-            If a region cannot be written to the folder.
+        ValueError, OSError
+            If an argument is out of range, or a region cannot be written to the folder.
         """
         middle, radius = positions([np.asarray(centre)], "centre")[0], not_negative(radius_m, "radius_m")
         with self._lock:
@@ -342,10 +330,8 @@ class LiveMap:
 
         Raises
         ------
-        ValueError
-            If an id of a scan is neither a whole number nor a string.
-        OSError
-            If the file cannot be written.
+        ValueError, OSError
+            If an id of a scan is neither a whole number nor a string, or the file cannot be written.
         """
         with self._lock, self._state.whole():
             self._state.save(path)
@@ -411,10 +397,8 @@ class LiveMap:
 
         Raises
         ------
-        ValueError
-            If there is no scan that could be taken out.
-        OSError
-            If regions or scans in the folder cannot be read.
+        ValueError, OSError
+            If there is no scan that could be taken out, or files in the folder cannot be read.
         """
         with self._lock, self._state.whole():
             read = self._state.fit_input()
@@ -435,7 +419,7 @@ class LiveMap:
         """
         with self._lock:
             if sealed := self.sealed_scans:
-                msg = f"{sealed} scans were let go to bound the memory, so that they cannot be fitted: give the map a folder to keep scans in"
+                msg = f"{sealed} scans were let go, so that they cannot be fitted: give the map a folder to keep scans in"
                 raise ValueError(msg)
             scans, origin = self._state.scans(), self._state.origin
         intensities = [scan.intensities for scan in scans if scan.intensities is not None]

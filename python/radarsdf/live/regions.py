@@ -20,7 +20,7 @@ Rows = dict[str, NDArray[Any]]
 REGION_CELLS = 64  # leaf cells along the edge of a region
 REGION_BITS = np.uint64(18)  # by which the key of a leaf cell is longer than that of its region
 NO_KEYS = np.zeros(0, np.uint64)
-_FARTHEST = 15_600  # region along each axis: keys reach a million cells
+_FARTHEST = 1_000_000  # cell along each axis that has a key
 
 
 def steps_near(reach: int) -> NDArray[np.int64]:
@@ -50,8 +50,8 @@ def regions_of(leaf_keys: Keys) -> Keys:
 
 def regions_near(regions: Keys, reach: int) -> Keys:
     """Keys of these regions, and of those at most `reach` away along each axis, ascending."""
-    places = (region_places(regions)[:, None] + steps_near(reach)).reshape(-1, 3)
-    return np.unique(_keys_at(REGION_CELLS * np.clip(places, -_FARTHEST, _FARTHEST - 1)) >> REGION_BITS)
+    near = shifted(regions << REGION_BITS, REGION_CELLS * steps_near(reach))
+    return np.unique(near >> REGION_BITS)
 
 
 def region_places(regions: Keys) -> NDArray[np.int64]:
@@ -62,7 +62,7 @@ def region_places(regions: Keys) -> NDArray[np.int64]:
 def _keys_at(cells: NDArray[np.int64]) -> Keys:
     """(N,) keys of cells (N, 3)."""
     # The middle of a cell of 1 m is exact in float64.
-    return cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0, 1)
+    return cell_keys(np.clip(cells, -_FARTHEST, _FARTHEST - 1) + 0.5, 1.0, 1)
 
 
 class RegionTable:
@@ -76,11 +76,6 @@ class RegionTable:
         self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}
         self.num_bytes = 0
-
-    @property
-    def regions(self) -> Keys:
-        """Keys of the regions that have rows, ascending."""
-        return np.array(sorted(self._parts), np.uint64)
 
     def gather(self, regions: Keys | None = None) -> Rows:
         """The rows of `regions` (R,), ascending, in the order of their keys. None: all."""

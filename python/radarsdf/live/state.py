@@ -55,6 +55,7 @@ class GrowingState:
         self.max_bytes = max_bytes
         self.log = ScanLog(folder)
         self._store = RegionStore(folder)
+        self._num_threads = resolve_num_threads(config.num_threads)
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
@@ -78,14 +79,15 @@ class GrowingState:
         """Takes scans out and puts others in, also of the same ids, all or none. Returns the keys of the changed blocks."""
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         before, self.origin = self.origin, self.origin if origin is None else origin
-        blocks = None
         try:
             blocks = self._apply(come, left)
-            if come:
-                self._bound()
-        except BaseException:  # the disk is full, say
-            if blocks is not None:
+            try:
+                if come:
+                    self._bound()
+            except BaseException:  # the disk is full, say
                 self._apply(left, come)
+                raise
+        except BaseException:
             self.origin = before
             raise
         return blocks
@@ -168,15 +170,11 @@ class GrowingState:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes all to a file. Raises a ValueError for ids of scans that are neither numbers nor strings."""
-        keys, ids, sealed, scans = (
-            self.sums.block_keys(),
-            self.log.ids,
-            self.log.sealed,
-            list(self.log.scans()),
-        )
+        keys, ids, sealed = self.sums.block_keys(), self.log.ids, self.log.sealed
         if not all(type(scan_id) in (int, str) for scan_id in (*ids, *sealed)):
             msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
             raise ValueError(msg)
+        scans = list(self.log.scans())
         described: dict[str, Any] = {
             "config": self.config.to_dict(),
             "origin": None if self.origin is None else self.origin.tolist(),
@@ -212,8 +210,7 @@ class GrowingState:
 
     def fit_input(self) -> Callable[[], FitInput]:
         """What a fit of all scans starts from, with the sums that were kept up."""
-        scans, sums, origin = self.scans(), self._all_sums(), self.origin
-        looks = self._looks()
+        scans, sums, looks, origin = self.scans(), self._all_sums(), self._looks(), self.origin
 
         def read() -> FitInput:
             rays = _rays_of(scans, self.config, origin)
@@ -232,10 +229,6 @@ class GrowingState:
 
     def _looks(self) -> Looks:
         return Looks(*self.sums.looks_of(self.sums.block_keys()))
-
-    @property
-    def _num_threads(self) -> int:
-        return resolve_num_threads(self.config.num_threads)
 
     def _settle_noise(self) -> None:
         """Estimates the sensor's noise, if there are twice or half as many scans as the last time."""
