@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import os
-import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
@@ -170,7 +169,7 @@ def run_fits(
     return TiledMap(root)
 
 
-def fit_tile(folder: str, name: str, run: str = "") -> None:  # noqa: ARG001 - see run_tasks
+def fit_tile(folder: str, name: str) -> None:
     """Fits a tile, unless its map is there. A task takes names, so that it can run anywhere."""
     root = Path(folder)
     plan = Plan.load(root)
@@ -216,12 +215,7 @@ def run_tasks(
     *,
     progress: bool | None = None,
 ) -> dict[int, str]:
-    """Calls ``task(*arguments[i], run)`` for each i. Returns what went wrong, by i; the other tasks are done.
-
-    `run` is another text in each call of this function: an executor that remembers results by arguments, such as that of
-    dask.distributed, must not take an old path for a new file.
-    """
-    run = secrets.token_hex(8)
+    """Calls ``task(*arguments[i])`` for each i. Returns what went wrong, by i; the other tasks are done."""
     failed: dict[int, str] = {}
     futures: dict[Future[Any], int] = {}
     with tqdm(total=len(arguments), desc="fit", unit="tile", disable=hides_bar(progress)) as bar:
@@ -237,10 +231,10 @@ def run_tasks(
 
         if executor is None:
             for i, own in enumerate(arguments):
-                note(i, lambda own=own: task(*own, run))  # type: ignore[misc]
+                note(i, lambda own=own: task(*own))  # type: ignore[misc]
             return failed
         try:
-            futures = {executor.submit(task, *own, run): i for i, own in enumerate(arguments)}
+            futures = {executor.submit(task, *own): i for i, own in enumerate(arguments)}
             waiting = set(futures)
             while waiting:
                 done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
