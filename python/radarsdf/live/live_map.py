@@ -127,7 +127,7 @@ class LiveMap:
         if place is not None:
             weakref.finalize(self, os.close, locked_folder(place))
         self._state = GrowingState(config, corner, most, place)
-        self._follower = Follower(config, config.num_threads)
+        self._follower = Follower(config)
         self._lock = threading.RLock()  # of the state
         self._reading = threading.Lock()  # of its surface, taken first
 

@@ -34,10 +34,7 @@ def shifted(keys: Keys, steps: NDArray[np.int64]) -> Keys:
 
 
 def cubes_near(leaf_keys: Keys, edge: int, reach: int) -> Keys:
-    """Keys of the first leaf cells of all cubes of `edge` cells, a power of two, that are within `reach` cells of others.
-
-    Whole cubes are stepped over: stepping from all cells to all takes longer than what is found too far away.
-    """
+    """Keys of the first leaf cells of all cubes of `edge` cells, a power of two, that are within `reach` cells of others."""
     bits = np.uint64(3 * (edge.bit_length() - 1))
     corners = np.unique(leaf_keys >> bits) << bits
     return shifted(corners, edge * steps_near(math.ceil(reach / edge)))
@@ -66,12 +63,10 @@ def _keys_at(cells: NDArray[np.int64]) -> Keys:
 
 
 class RegionTable:
-    """Rows by the Morton keys of their cells, ascending, in regions.
-
-    `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2. `columns`: one row of each, as a new cell has it.
-    """
+    """Rows by the Morton keys of their cells, ascending, in regions. `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2."""
 
     def __init__(self, leaves_per_cell: int = 1, **columns: NDArray[Any]) -> None:
+        """`columns`: one row of each, as a new cell has it."""
         self._merged = leaves_per_cell.bit_length() - 1
         self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}

@@ -74,7 +74,6 @@ class Follower:
     """Tracks the sensor. The map owns the poses: they are read before each scan. A scan that is refused leaves no trace."""
 
     config: FitConfig
-    num_threads: int
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
     _rates: deque[tuple[Rate, Rate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
     _given: deque[tuple[ScanId, LoggedScan]] = field(default_factory=lambda: deque(maxlen=WINDOW))
@@ -100,9 +99,7 @@ class Follower:
         told = [step.found.told[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
         why = ""
         if any(step.found.piece for step in found):
-            why = (
-                f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places"
-            )
+            why = f"the scan at {new.time_s:.6f} s agrees nowhere near, or in several places"
         elif not by_doppler and len(told) == _TOLD_STEPS and np.median(told) < LEAST_TOLD:
             why = "the returns alone do not tell how the sensor moves"
         if why:
@@ -140,7 +137,7 @@ class Follower:
     def _begin(self, steps: Sequence[Step]) -> None:
         """As if only these scans had come."""
         size_m = LEAVES_PER_SURFEL * self.config.leaf_size_m
-        self._tracker = Tracker(size_m, self.config.returns, self.num_threads)
+        self._tracker = Tracker(size_m, self.config.returns, self.config.num_threads)
         self._steps.clear()
         self._rates.clear()
         for i, step in enumerate(steps):
@@ -237,7 +234,9 @@ class Follower:
 
         def by(sign: int) -> list[Tracked]:
             signed = None if velocities is None else _signed(velocities, sign)
-            return followed(dataclasses.replace(drive, velocities=signed), self.config, self.num_threads)[1]
+            return followed(
+                dataclasses.replace(drive, velocities=signed), self.config, self.config.num_threads
+            )[1]
 
         if sign or velocities is None:
             return sign, by(sign)

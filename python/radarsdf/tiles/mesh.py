@@ -75,7 +75,7 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _parts_of(
+def parts_of(
     city: TiledMap, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
 ) -> tuple[list[Path], Limits, Threshold]:
     """Meshes all tiles: the files of the parts, the limits of a mesh of them (`wanted`), and what these come to."""
@@ -170,13 +170,12 @@ def _allowed(part: Part, min_confidence: float, limits: Limits) -> NDArray[np.bo
 
 def mesh_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
-    paths, found, threshold = _parts_of(city, voxel_size, progress, **limits)
-    size = sum(path.stat().st_size for path in paths)
-    check_triangles(size // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
+    paths, found, threshold = parts_of(city, voxel_size, progress, **limits)
+    file_bytes = sum(path.stat().st_size for path in paths)
+    check_triangles(file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
     parts = [Part(**_read(path)) for path in paths]
     vertices, faces = _welded(city, parts)
-    kept = np.concatenate([_allowed(part, threshold.min_confidence, found) for part in parts])
-    faces = faces[kept]
+    faces = faces[np.concatenate([_allowed(part, threshold.min_confidence, found) for part in parts])]
     labels, sizes = mesh_components(faces, len(vertices))
     used, faces = renumbered(len(vertices), faces[sizes[labels] >= found.min_component_triangles])
     leaf_cells, cells_searched = np.sum([part.cells for part in parts], axis=0).tolist()
@@ -197,7 +196,7 @@ def export_mesh(
     """See :meth:`TiledMap.export`. What cannot be written is noticed before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
         content_folder(Path(path))
-        parts = _parts_of(city, voxel_size, progress, **limits)
+        parts = parts_of(city, voxel_size, progress, **limits)
         return write_tileset(city, Path(path), _separate(city, *parts))
     check_mesh_path(path)
     check_outputs([path])
@@ -220,11 +219,6 @@ def _separate(
         large[labels[on_border[faces].any(axis=1)]] = True
         used, faces = renumbered(len(part.vertices), faces[large[labels]])
         yield part.vertices[used], faces
-
-
-def threshold_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: Any) -> Threshold:
-    """See :meth:`TiledMap.threshold`."""
-    return _parts_of(city, voxel_size, progress, **limits)[2]
 
 
 def viewed_tiles(city: TiledMap, tiles: list[Tile]) -> ViewedMap:

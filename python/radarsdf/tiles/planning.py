@@ -137,9 +137,8 @@ class _Planner:
             self._intensities.add(rays.intensities)
         points, sensors = rays.in_world()
         owner = self._grid.tiles_of(points)
-        pairs = list(self._grid.crossed(points, sensors))
-        rows = np.concatenate([pair[0] for pair in pairs])
-        tiles = np.concatenate([pair[1] for pair in pairs])
+        pairs = zip(*self._grid.crossed(points, sensors), strict=True)
+        rows, tiles = (np.concatenate(parts) for parts in pairs)
         for i, j in np.unique(tiles, axis=0).tolist():
             tile, own = (i, j), np.sort(rows[(tiles == (i, j)).all(axis=1)])
             path = rays_path(self._folder, tile)
@@ -158,12 +157,10 @@ class _Planner:
 
     def _rays(self, scans: list[Scan], first: int) -> Rays:
         """Static returns, checked, in a frame of their own."""
-        held = scans_in_memory(scans)
+        held, given = scans_in_memory(scans), self._config.preparation
         try:
             static = Standing.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
-            return prepare(
-                static.points, held.poses, static.intensities, whole=False, **self._config.preparation
-            )
+            return prepare(static.points, held.poses, static.intensities, whole=False, **given)
         except (ValueError, TypeError) as error:
             msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
             raise ValueError(msg) from error

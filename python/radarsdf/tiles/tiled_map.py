@@ -269,9 +269,9 @@ class TiledMap(Map):
         Threshold
             The confidence that :meth:`mesh` applies, and the shares that its ``metadata`` holds.
         """
-        from radarsdf.tiles.mesh import threshold_of  # noqa: PLC0415 - as above
+        from radarsdf.tiles.mesh import parts_of  # noqa: PLC0415 - as above
 
-        return threshold_of(self, voxel_size, progress, **limits)
+        return parts_of(self, voxel_size, progress, **limits)[2]
 
     def save(self, path: str | PathLike[str]) -> None:
         """Copy the plan and the maps of the tiles that are done to a new folder, which :func:`radarsdf.load` reads.
