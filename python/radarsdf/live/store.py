@@ -79,7 +79,7 @@ class LoggedScan:
         """With its static returns alone."""
         if self.standing is None:
             return self
-        kept = {name: array[self.standing] for name, array in self.arrays.items()}
+        kept: dict[str, Any] = {name: array[self.standing] for name, array in self.arrays.items()}
         return replace(self, **kept | {"standing": None})
 
     @property
