@@ -78,8 +78,9 @@ def replay(
         done.seconds.append(time.perf_counter() - started)
         done.rows.append(i)
         done.poses.append(found.pose)
-        for row in found.moved:
-            done.poses[done.rows.index(row)] = live.pose(row)
+        for k, row in enumerate(done.rows):
+            if row in found.moved:
+                done.poses[k] = live.pose(row)
         if on_scan is not None:
             on_scan(done)
     return done
