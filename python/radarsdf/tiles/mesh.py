@@ -28,8 +28,8 @@ from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.progress import hides_bar
+from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import Tile, folder_of, neighbours
-from radarsdf.tiles.tiled_map import TiledMap
 from radarsdf.tiles.tileset import content_folder, write_tileset
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
 
 
 def parts_of(
-    city: TiledMap, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
+    city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
 ) -> tuple[list[Path], Limits, Threshold]:
     """Meshes all tiles: the files of the parts, the limits of a mesh of them (`wanted`), and what these come to."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
@@ -100,7 +100,7 @@ def parts_of(
     return paths, limits, Tally.of_sums(tally).threshold(limits.min_confidence)
 
 
-def _part_of(city: TiledMap, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
+def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
     """The triangles near returns in the leaf cells of a tile, of `steps` voxels along their edges."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
@@ -135,7 +135,7 @@ def _part_of(city: TiledMap, tile: Tile, steps: int = 1, box: _Box = None) -> Pa
     return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
 
 
-def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
+def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
     """(C, 3) leaf cells of a tile, as the lattice numbers them: those of its map, and of others with a weight there."""
     plan = city.plan
     parts = []
@@ -148,13 +148,13 @@ def _cells_in(city: TiledMap, tile: Tile) -> NDArray[np.int64]:
     return found
 
 
-def _on_borders(city: TiledMap, vertices: _Floats) -> NDArray[np.int64]:
+def _on_borders(city: TileBlend, vertices: _Floats) -> NDArray[np.int64]:
     """(B,) rows of the vertices (V, 3) on the borders of tiles, which the next tile may have, too."""
     tiles = city.config.lattice.cells(vertices)[:, :2] / city.plan.tile_cells
     return np.flatnonzero((np.abs(tiles - np.round(tiles)) * city.plan.tile_cells < _ON_LATTICE).any(axis=1))
 
 
-def _welded(city: TiledMap, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
+def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
     """The vertices (V, 3) of all parts, and the faces (F, 3), of which no two use different vertices in one place."""
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0, *[len(part.vertices) for part in parts]], dtype=np.int32)
@@ -168,7 +168,7 @@ def _allowed(part: Part, min_confidence: float, limits: Limits) -> NDArray[np.bo
     return with_all(certain & (part.confidence >= min_confidence), part.faces)
 
 
-def mesh_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
+def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
     paths, found, threshold = parts_of(city, voxel_size, progress, **limits)
     file_bytes = sum(path.stat().st_size for path in paths)
@@ -191,7 +191,7 @@ def mesh_of(city: TiledMap, voxel_size: float, progress: bool | None, **limits: 
 
 
 def export_mesh(
-    city: TiledMap, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
+    city: TileBlend, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
 ) -> tuple[int, int]:
     """See :meth:`TiledMap.export`. What cannot be written is noticed before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
@@ -206,7 +206,7 @@ def export_mesh(
 
 
 def _separate(
-    city: TiledMap, paths: Sequence[Path], limits: Limits, threshold: Threshold
+    city: TileBlend, paths: Sequence[Path], limits: Limits, threshold: Threshold
 ) -> Iterator[tuple[_Floats, NDArray[np.int32]]]:
     """Vertices (V, 3), world, m, and faces (F, 3) of one tile after another. Components that reach a border stay."""
     for path in paths:
@@ -221,7 +221,7 @@ def _separate(
         yield part.vertices[used], faces
 
 
-def viewed_tiles(city: TiledMap, tiles: list[Tile]) -> ViewedMap:
+def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     """What views need of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)

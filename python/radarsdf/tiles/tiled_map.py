@@ -1,32 +1,26 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One map that answers from many tiles, of which few are in memory."""
+"""One map that answers from many tiles."""
 
 from __future__ import annotations
 
 import shutil
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import cached_property, partial
 from os import PathLike
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
-from radarsdf.checks import path_of, positive
-from radarsdf.map import queries, storage
-from radarsdf.map.contents import MapContents
+from radarsdf.checks import path_of
+from radarsdf.map import queries
 from radarsdf.map.map import Map
 from radarsdf.map.radar_map import load_file
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sums import lattice_of
 from radarsdf.returns.view_statistics import EchoesAt
-from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path, neighbours, report_of
+from radarsdf.tiles.blend import TileBlend
+from radarsdf.tiles.plan import Tile, map_path, report_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -34,27 +28,10 @@ if TYPE_CHECKING:
     from radarsdf.map.threshold import Threshold
     from radarsdf.map.view import ViewedMap
 
-_MEMORY_BYTES = 1 << 30
-_OF_FEATURES = 2.4  # bytes in memory for each of the features: measured; tables of cells, evidence
 _Floats = NDArray[np.float64]
 
 
-class Share(NamedTuple):
-    """What one tile contributes at some of N positions."""
-
-    tile: Tile
-    contents: MapContents  # the map of the tile
-    rows: NDArray[np.int64]  # (M,) of the positions at which the tile has a weight
-    weights: _Floats  # (M,) there
-    local: Tensor  # (M, 3) the positions in the frame of the tile, m
-
-    def at(self, points: Tensor, chosen: NDArray[np.bool_]) -> Share:
-        """The share at some (M,) of its positions, of which the local `points` (M, 3) are these."""
-        local = points[torch.from_numpy(chosen)]
-        return self._replace(rows=self.rows[chosen], weights=self.weights[chosen], local=local)
-
-
-class TiledMap(Map):
+class TiledMap(TileBlend):
     """A map in tiles, made by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
 
     It has the methods of :class:`Map`. Where tiles overlap, their fields are averaged with weights that fall smoothly to zero,
@@ -74,57 +51,6 @@ class TiledMap(Map):
     """
 
     _viewed: tuple[list[Tile], ViewedMap] | None = None
-
-    def __init__(self, folder: str | PathLike[str], *, memory_bytes: float = _MEMORY_BYTES) -> None:
-        self.folder = Path(folder)
-        self.plan = Plan.load(self.folder)
-        self.memory_bytes = positive(memory_bytes, "memory_bytes")
-        self._held: OrderedDict[Tile, tuple[MapContents, int]] = OrderedDict()
-        self._lock = threading.Lock()
-        if not self.tiles:
-            msg = f"no tile of {self.folder} is done: radarsdf tiles fit {self.folder} makes them"
-            raise ValueError(msg)
-
-    @cached_property
-    def tiles(self) -> list[TilePlan]:
-        """The tiles that were done when they were first asked for."""
-        return [tile for tile in self.plan.tiles if is_done(self.folder, self.plan, tile)]
-
-    @property
-    def missing(self) -> dict[str, str]:
-        """The others by name, and why their fit failed; empty if it was not tried or was killed."""
-        return {
-            tile.name: failure_of(self.folder, tile) for tile in self.plan.tiles if not self.has(tile.tile)
-        }
-
-    @cached_property
-    def _done(self) -> set[Tile]:
-        return {tile.tile for tile in self.tiles}
-
-    def has(self, tile: Tile) -> bool:
-        """Whether there is such a tile, and it is done."""
-        return tile in self._done
-
-    @cached_property
-    def contents_of_any(self) -> MapContents:
-        """The map of a tile, for what all have in common."""
-        return self.contents_of(self.tiles[0].tile)
-
-    @property
-    def _contents_of_any(self) -> MapContents:
-        return self.contents_of_any
-
-    def contents_of(self, tile: Tile) -> MapContents:
-        """The map of a tile that is done. It is read, unless it is in memory."""
-        with self._lock:
-            if tile not in self._held:
-                contents = storage.load_contents(map_path(self.folder, self.plan.by_tile[tile]))
-                size = round(_OF_FEATURES * sum(p.nbytes for p in contents.field.parameters()))
-                while self._held and sum(n for _, n in self._held.values()) + size > self.memory_bytes:
-                    self._held.popitem(last=False)
-                self._held[tile] = contents, size
-            self._held.move_to_end(tile)
-            return self._held[tile][0]
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
@@ -338,110 +264,6 @@ class TiledMap(Map):
         """Size of the files of the tiles, bytes."""
         return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
-    def leaf_cells(self, of: Tile, within: Tile) -> NDArray[np.int64]:
-        """(C, 3) leaf cells, as the lattice numbers them, of the map of one tile that is done, which lie in another."""
-        keys = storage.load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
-        cells = lattice_of(keys).astype(np.int64) + self.plan.origin_cells(of)
-        inside: NDArray[np.bool_] = (cells[:, :2] // self.plan.tile_cells == within).all(axis=1)
-        return cells[inside]
-
-    def _shares(self, world: _Floats) -> Iterator[Share]:
-        """The contribution of each tile at positions (N, 3), world, m: in ascending order, on which the bits of sums depend.
-
-        Weights depend on the borders between tiles alone, not on what a tile observed.
-        """
-        grid = self.plan.grid
-        places = world[np.isfinite(world).all(axis=1), :2]
-        if len(places) == 0:
-            return
-        reach_m = np.array([-grid.halo_m / 2, grid.tile_m + grid.halo_m / 2])
-        for planned in self.tiles:
-            first, last = grid.lower_corner(planned.tile) + reach_m[:, None]
-            if (first > places.max(axis=0)).any() or (last < places.min(axis=0)).any():
-                continue
-            rows = grid.within_half_a_halo(planned.tile, world)
-            if len(rows):
-                contents = self.contents_of(planned.tile)
-                local = queries.to_local(contents, torch.from_numpy(world[rows]))
-                yield Share(planned.tile, contents, rows, grid.weights(planned.tile, world[rows]), local)
-
-    def _seen(self, world: _Floats) -> NDArray[np.bool_]:
-        """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border.
-
-        The tile that a position lies in decides, because tiles disagree: which returns are ghosts depends on surfaces before
-        them, of which a neighbour may have few returns. In the place of one that is not done, its neighbours do.
-        """
-        found = np.zeros(len(world), bool)
-        for share in self._shares(world):
-            _, inside = queries.into_cells(share.contents, share.local)
-            owners = self.plan.grid.tiles_of(world[share.rows])
-            for tile in neighbours(share.tile):
-                if tile == share.tile or not self.has(tile):
-                    found[share.rows] |= inside.numpy() & (owners == tile).all(axis=1)
-        return found
-
-    def _known_shares(self, world: _Floats, extrapolate: bool) -> Iterator[Share]:
-        """The shares of the tiles that observed a position, where it was seen. `extrapolate`: elsewhere, all of them."""
-        seen = self._seen(world)
-        unseen = ~seen & np.isfinite(world).all(axis=1) & extrapolate
-        for share in self._shares(world):
-            points, inside = queries.into_cells(share.contents, share.local)
-            yield share.at(points, (inside.numpy() & seen[share.rows]) | unseen[share.rows])
-
-    def _average(
-        self, world: Tensor, extrapolate: bool, of_tile: Callable[[Share], Tensor], columns: int = 1
-    ) -> Tensor:
-        positions = _contiguous(world)
-        shares = self._known_shares(positions, extrapolate)
-        return torch.from_numpy(_averages(shares, len(positions), of_tile, columns))
-
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._average(world, extrapolate, _distance)[:, 0]
-
-    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._average(
-            world, extrapolate, lambda share: queries.gradient(share.contents, share.local), columns=3
-        )
-
-    def _observed(self, world: Tensor) -> Tensor:
-        return torch.from_numpy(self._seen(_contiguous(world)))
-
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        def of_tile(share: Share) -> Tensor:
-            there = queries.to_local(share.contents, sensors[torch.from_numpy(share.rows)])
-            predicted = partial(queries.intensity, share.contents)
-            return queries.where(there.isfinite().all(dim=1), share.local, there, function=predicted)
-
-        return self._average(world, extrapolate, of_tile)[:, 0]
-
-    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
-        """All tiles count, because each one's evidence ends smoothly: less is known where a tile that looked has no returns."""
-        positions = _contiguous(world)
-
-        def of_tile(share: Share) -> Tensor:
-            return torch.stack(list(queries.evidence(share.contents, share.local)), 1)
-
-        found = np.nan_to_num(_averages(self._shares(positions), len(positions), of_tile, columns=3))
-        return queries.EvidenceAt(*torch.from_numpy(found).float().unbind(1))
-
-    def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
-        """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, numbered from the lattice's first corner.
-
-        They have the same bits whichever tile asks. NaN where no tile has an adjacent cell.
-        """
-        steps = round(self.config.leaf_size_m / voxel_m)
-
-        def touching() -> Iterator[Share]:
-            for share in self._shares(self.config.lattice.position(lattice / steps)):
-                # From integers: the same float32 position for every tile that asks.
-                origin = self.plan.origin_cells(share.tile) * steps
-                points = torch.from_numpy(((lattice[share.rows] - origin) * voxel_m).astype(np.float32))
-                # A corner on the border of the map may be in a cell beyond it, which has no features.
-                points, inside = queries.into_cells(share.contents, points, voxel_m)
-                yield share.at(points, inside.numpy())
-
-        return _averages(touching(), len(lattice), _distance)[:, 0].astype(np.float32)
-
 
 def load(path: str | PathLike[str]) -> Map:
     """Read a map: a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
@@ -477,25 +299,3 @@ def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
     found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)
     known = np.isfinite(found)
     return (rays, found) if known.all() else (rays.select(np.flatnonzero(known)), found[known])
-
-
-def _averages(
-    shares: Iterable[Share], count: int, of_tile: Callable[[Share], Tensor], columns: int = 1
-) -> _Floats:
-    """(N, columns) weighted averages of the values of tiles, (M, columns) each, at `count` positions. NaN without a share."""
-    sums, totals = np.zeros((count, columns)), np.zeros(count)
-    for share in shares:
-        values = of_tile(share).numpy().astype(np.float64).reshape(-1, columns)
-        sums[share.rows] += share.weights[:, None] * values
-        totals[share.rows] += share.weights
-    with np.errstate(invalid="ignore", divide="ignore"):
-        found: _Floats = sums / totals[:, None]
-    return found
-
-
-def _distance(share: Share) -> Tensor:
-    return queries.signed_distance(share.contents, share.local)
-
-
-def _contiguous(world: Tensor) -> _Floats:
-    return np.ascontiguousarray(world.double().numpy())

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.products import turned
-from radarsdf.tiles.tiled_map import TiledMap
+from radarsdf.tiles.blend import TileBlend
 
 with whole_import():
     import trimesh
@@ -36,7 +36,7 @@ def content_folder(path: Path) -> Path:
 
 
 def write_tileset(
-    city: TiledMap, path: Path, meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int32]]]
+    city: TileBlend, path: Path, meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int32]]]
 ) -> tuple[int, int]:
     """Writes ``NAME.json`` and a GLB file for each tile with triangles. Returns the numbers of vertices and triangles.
 
