@@ -128,8 +128,8 @@ class TileBlend(Map):
     def _seen(self, world: _Floats) -> NDArray[np.bool_]:
         """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border.
 
-        The tile that a position lies in decides, because tiles disagree: which returns are ghosts depends on surfaces before
-        them, of which a neighbour may have few returns. In the place of one that is not done, its neighbours do.
+        Tiles disagree, because ghosts depend on surfaces before them. The tile that a position lies in decides; in the place
+        of one that is not done, its neighbours do.
         """
         found = np.zeros(len(world), bool)
         for share in self._shares(world):

@@ -80,10 +80,8 @@ def fit_tiles(
 
     Raises
     ------
-    ValueError
-        If a scan is invalid, `out` holds something else or another plan, or all tiles failed.
-    OSError
-        If `out` cannot be written, or another process makes its plan.
+    ValueError, OSError
+        If a scan is invalid, `out` holds something else or another plan, cannot be written, or all tiles failed.
     """
     threads = None if executor is None else 1
     plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=threads)

@@ -138,10 +138,7 @@ class TilePlan:
 
 @settings
 class Plan:
-    """What the tasks have in common, and the tiles. A tile's map is a pure function of its plan and its rays.
-
-    Folders are named by these numbers, so their types are checked: nothing else must come in from a file.
-    """
+    """What the tasks have in common, and the tiles. Folders are named by its numbers, so their types are checked."""
 
     config: FitConfig  # of all fits, with the sensor's noise and the number of threads
     tile_m: _Length

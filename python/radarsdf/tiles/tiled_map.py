@@ -88,10 +88,8 @@ class TiledMap(TileBlend):
 
         Raises
         ------
-        ValueError
-            If an argument is out of range, or a tile could not be meshed.
-        MemoryError
-            If memory cannot hold the mesh: :meth:`export` writes 3D Tiles one after another.
+        ValueError, MemoryError
+            If an argument is out of range, or memory cannot hold the mesh: :meth:`export` writes 3D Tiles one after another.
         """
         return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
 
@@ -171,10 +169,8 @@ class TiledMap(TileBlend):
 
         Raises
         ------
-        ValueError, MemoryError
-            As of :meth:`mesh`, or if the suffix is another, or there is no surface for 3D Tiles.
-        OSError
-            If a file cannot be written.
+        ValueError, MemoryError, OSError
+            As of :meth:`mesh`, or if the suffix is another, there is no surface for 3D Tiles, or a file cannot be written.
         """
         from radarsdf.tiles.mesh import export_mesh  # noqa: PLC0415 - as above
 
