@@ -9,9 +9,9 @@ import time
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf.cli.live import replay
 from radarsdf.io.npz import write_scans
 from radarsdf.io.scans import Scans
-from radarsdf.live.replay import replay
 
 from ..conftest import ground_and_wall
 from .calls import refusal, values

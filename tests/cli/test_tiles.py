@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 import trimesh
 from radarsdf.io.npz import read_scans
-from radarsdf.tiles import tasks
+from radarsdf.tiles import fit_tiles
 
 from .calls import QUICK, call, refusal, values
 
@@ -115,6 +115,6 @@ def test_folders_and_words_that_are_wrong(city, tmp_path, capsys):
 
 def test_no_cluster(city, capsys, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(tasks, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(fit_tiles, "_CONNECT_S", 0.5)
     words = ["tiles", "fit", city, "--cluster", "tcp://127.0.0.1:9"]
     assert "127.0.0.1:9" in refusal(capsys, tmp_path, *words)

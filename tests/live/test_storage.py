@@ -67,16 +67,16 @@ def test_damaged_files_are_refused(tmp_path):
         with pytest.raises(ValueError, match=r"live\.npz"):
             LiveMap.load(file)
     for changed in (
-        {"counts": arrays["counts"] + 1},
+        {"standing 1": arrays["points 1"]},
         {"keys": arrays["keys"][::-1]},
-        {"points": arrays["points"][:, 0]},
+        {"points 0": arrays["points 0"][:, 0]},
     ):
         np.savez(file, **arrays | changed)
         with pytest.raises(ValueError, match=r"live\.npz"):
             LiveMap.load(file)
     described = json.loads(arrays["described"].tobytes())
     for name, value in (
-        ("format", 1), ("origin", None), ("noise", [math.nan] * 3), ("next_id", 1), ("max_bytes", -1), ("sealed", [0]),
+        ("format", 1), ("origin", None), ("noise", [math.nan] * 3), ("poses", []), ("max_bytes", -1), ("sealed", [0]),
         ("ids", [0, 0]), ("config", []),
     ):  # fmt: skip
         text = json.dumps(described | {name: value}).encode()

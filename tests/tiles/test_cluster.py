@@ -11,8 +11,8 @@ import pytest
 distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
 import radarsdf
+from radarsdf.tiles.fit_tiles import cluster_executor
 from radarsdf.tiles.plan import map_path
-from radarsdf.tiles.tasks import cluster_executor
 
 from .cluster import bits_of, cluster_in
 from .conftest import CONFIG, TILE_M
@@ -50,7 +50,7 @@ def test_a_tile_that_no_worker_can_hold_is_refused(cluster):
 
 
 def test_an_address_without_a_cluster(monkeypatch):
-    monkeypatch.setattr("radarsdf.tiles.tasks._CONNECT_S", 0.5)
+    monkeypatch.setattr("radarsdf.tiles.fit_tiles._CONNECT_S", 0.5)
     with pytest.raises(OSError, match="Timed out"), cluster_executor("tcp://127.0.0.1:9", 0):
         pass
 

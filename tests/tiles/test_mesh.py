@@ -64,7 +64,7 @@ def test_export_writes_the_same_mesh(city, tmp_path):
     np.testing.assert_array_equal(read.faces, mesh.faces)
     raw = read.metadata["_ply_raw"]["vertex"]["data"]
     np.testing.assert_array_equal(raw["uncertainty_m"].ravel(), mesh.vertex_attributes["uncertainty_m"])
-    with pytest.raises(ValueError, match=r"end in \.ply"):
+    with pytest.raises(ValueError, match=r"city\.txt"):
         city.export(tmp_path / "city.txt", 0.2)
 
 

@@ -8,6 +8,8 @@ import contextlib
 import threading
 import time
 from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +20,70 @@ from radarsdf.cli.results import Results, save_map, until_stopped
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
 from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
+from radarsdf.io.scans import Scans
 from radarsdf.live.live_map import LiveMap
-from radarsdf.live.replay import Replay, replay
+from radarsdf.live.tracking import Lost
 from radarsdf.view.pages import GrowingView
 from radarsdf.view.serving import url_of
 
 _SHOWN_EVERY_S = 0.5
+
+
+@dataclass
+class Replay:
+    """Results of a replay: rows of the scans that were integrated, with their poses and seconds, and of the others."""
+
+    rows: list[int] = field(default_factory=list)
+    poses: list[NDArray[np.float64]] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    dropped: list[int] = field(default_factory=list)  # the map was not ready
+    lost: list[int] = field(default_factory=list)  # without a pose, they could not be tracked
+
+
+def replay(
+    live: LiveMap,
+    scans: Scans,
+    *,
+    with_poses: bool = True,
+    rate: float = 1.0,
+    on_scan: Callable[[Replay], None] | None = None,
+) -> Replay:
+    """Integrates scans at `rate` times the recorded speed; 0: as fast as possible.
+
+    A scan waits until the next one arrives, and is then dropped. `on_scan` is called after each.
+    """
+    done, count = Replay(), len(scans.points)
+    times_s = scans.times_s if scans.times_s is not None else 0.1 * np.arange(count)
+    due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
+    begin = time.perf_counter()
+    for i in range(count):
+        now = time.perf_counter() - begin
+        if rate > 0 and i + 1 < count and due_s[i + 1] <= now:
+            done.dropped.append(i)
+            continue
+        time.sleep(max(due_s[i] - now, 0.0))
+        started = time.perf_counter()
+        try:
+            found = live.integrate(
+                scans.points[i],
+                scans.poses[i] if with_poses else None,
+                None if scans.intensities is None else scans.intensities[i],
+                doppler_mps=None if scans.doppler_mps is None else scans.doppler_mps[i],
+                time_s=float(times_s[i]),
+                scan_id=i,
+            )
+        except Lost:
+            done.lost.append(i)
+            continue
+        done.seconds.append(time.perf_counter() - started)
+        done.rows.append(i)
+        done.poses.append(found.pose)
+        for k, row in enumerate(done.rows):
+            if row in found.moved:
+                done.poses[k] = live.pose(row)
+        if on_scan is not None:
+            on_scan(done)
+    return done
 
 
 def live(given: Namespace, results: Results) -> None:
@@ -90,12 +150,13 @@ def _add_rates(results: Results, done: Replay, scans: int) -> None:
     in_map, dropped, lost = len(done.rows), len(done.dropped), len(done.lost)
     line = f"{in_map} of {scans} scans in the map, {dropped} dropped, {lost} lost"
     results.add(line, scans=in_map, dropped=dropped, lost=lost)
+    hertz = in_map / max(sum(done.seconds), 1e-9)
     p50, p99, worst = np.percentile(done.seconds, [50, 99, 100])
     results.add(
         f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99 of 100), {1e3 * worst:.1f} ms (worst): "
-        f"{done.hertz:.0f} scans a second",
+        f"{hertz:.0f} scans a second",
         p50_s=p50,
         p99_s=p99,
         worst_s=worst,
-        scans_per_second=done.hertz,
+        scans_per_second=hertz,
     )

@@ -19,9 +19,8 @@ from radarsdf.cli.scans import warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
 from radarsdf.io.scans import Notes, Scans, scans_in_memory
-from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
+from radarsdf.tiles.fit_tiles import cluster_executor, plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, failure_of, is_done
-from radarsdf.tiles.tasks import cluster_executor
 from radarsdf.tiles.tiled_map import TiledMap
 
 _FIRST_SCANS = 100  # that are checked before the work

@@ -57,17 +57,11 @@ class Integrated:
     movers: int
     """Number of moving returns, which were left out."""
     moved: tuple[ScanId, ...] = ()
-    """Earlier scans without poses that were placed again, as it is clear only now how the sensor moves; see
-    :meth:`LiveMap.pose`."""
+    """Earlier scans that were placed again, as it is clear only now how the sensor moves; see :meth:`LiveMap.pose`."""
 
 
 class LiveMap:
     """A map that grows scan by scan. Scans can be moved, and taken out again, without a trace.
-
-    A scan adds integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken out of has
-    the bits of one that never saw it, in any order. The noise of the sensor, if it is not given, intensities, what
-    :meth:`finish` trains, and files depend on the order of scans. All methods may be called from any thread; readers see the
-    map before a change or after it.
 
     Parameters
     ----------
@@ -90,6 +84,16 @@ class LiveMap:
         If a setting is out of range, several scans are to be accumulated, or `folder` holds other files.
     OSError
         If `folder` cannot be written, or another map uses it.
+
+    Notes
+    -----
+    A scan adds integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken out of has
+    the bits of one that never saw it, in any order. The noise of the sensor, if it is not given, intensities, what
+    :meth:`finish` trains, and files depend on the order of scans.
+
+    All methods may be called from any thread; readers see the map before a change or after it. After any error, the map is
+    as before. Poses are T_world_sensor, m. Methods that change the map return the keys (B,) of the blocks of 8 × 8 × 8 leaf
+    cells whose returns changed, or are gone, uint64, ascending.
 
     Examples
     --------
@@ -117,16 +121,13 @@ class LiveMap:
         if config.returns.accumulate_scans != 1:
             msg = "returns.accumulate_scans must be 1: a live map gets scans one after another"
             raise ValueError(msg)
+        corner = None if origin is None else positions([np.asarray(origin)], "origin")[0]
+        most = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
         place = None if folder is None else path_of(folder, "folder")
         if place is not None:
             weakref.finalize(self, os.close, locked_folder(place))
-        self._state = GrowingState(
-            config,
-            None if origin is None else positions([np.asarray(origin)], "origin")[0],
-            None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1),
-            place,
-        )
-        self._follower = Follower(config, config.num_threads)
+        self._state = GrowingState(config, corner, most, place)
+        self._follower = Follower(config)
         self._lock = threading.RLock()  # of the state
         self._reading = threading.Lock()  # of its surface, taken first
 
@@ -168,17 +169,7 @@ class LiveMap:
             return self._state.num_bytes
 
     def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
-        """Pose of a scan that can be taken out.
-
-        Parameters
-        ----------
-        scan_id : hashable
-            As of :meth:`integrate`.
-
-        Returns
-        -------
-        (4, 4) ndarray
-            T_world_sensor, m, float64.
+        """Pose of a scan, (4, 4) float64.
 
         Raises
         ------
@@ -212,7 +203,7 @@ class LiveMap:
         points : (N, 3) array_like
             Returns, sensor frame, m.
         pose : (4, 4) array_like, optional
-            T_world_sensor, m. Without it, the scan needs a time after that of the scan before.
+            Without it, the scan needs a time after that of the scan before.
         intensities : (N,) array_like, optional
             Sensor units. All scans have them, or none has.
         doppler_mps : (N,) array_like, optional
@@ -232,8 +223,7 @@ class LiveMap:
         ValueError
             If something is invalid, the map has a scan of this id, or a scan without a pose is late.
         Lost
-            A ValueError, if a scan without a pose agrees with the last ones nowhere near. After any error, the map is as
-            before.
+            A ValueError, if a scan without a pose agrees with the last ones nowhere near.
         """
         scan = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
@@ -241,10 +231,9 @@ class LiveMap:
         if given is None and scan.time_s is None:
             msg = "a scan needs a pose, or a time"
             raise ValueError(msg)
+        state = self._state
         with self._lock:
-            state = self._state
-            if scan_id is None:
-                scan_id = state.next_id
+            scan_id = state.next_id if scan_id is None else scan_id
             if scan_id in state.log:
                 msg = f"the map has a scan {scan_id!r} already: remove or move it"
                 raise ValueError(msg)
@@ -252,11 +241,10 @@ class LiveMap:
             if state.with_intensities not in (None, with_intensities):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
+            steps = [] if given is not None else self._follower.seek(state.log, scan_id, scan)
+            come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
             if given is not None:
-                steps, come = [], {scan_id: scan.at(given)}
-            else:
-                steps = self._follower.seek(state.log, scan_id, scan)
-                come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
+                come[scan_id] = scan.at(given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
             origin = None
             if state.origin is None:
@@ -264,27 +252,17 @@ class LiveMap:
                 origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
             blocks = state.exchange(come, again, origin)
             state.with_intensities = with_intensities
+            if isinstance(scan_id, int):
+                state.next_id = max(state.next_id, scan_id + 1)
             if given is None:
                 self._follower.keep(steps)
             else:
                 self._follower.place(scan_id, scan)
-            if isinstance(scan_id, int):
-                state.next_id = max(state.next_id, scan_id + 1)
         moving = 0 if scan.standing is None else int((~scan.standing).sum())
         return Integrated(scan_id, scan.pose.copy(), blocks, moving, again)
 
     def remove(self, scan_id: ScanId) -> Keys:
         """Take a scan out. The map then has the bits of one that never saw it.
-
-        Parameters
-        ----------
-        scan_id : hashable
-            As of :meth:`integrate`.
-
-        Returns
-        -------
-        (B,) ndarray
-            Keys of the blocks whose returns changed, uint64, ascending.
 
         Raises
         ------
@@ -297,46 +275,32 @@ class LiveMap:
             return self._state.exchange({}, [scan_id])
 
     def move(self, scan_id: ScanId, pose: ArrayLike) -> Keys:
-        """Move a scan to another pose.
-
-        Parameters
-        ----------
-        scan_id : hashable
-            As of :meth:`integrate`.
-        pose : (4, 4) array_like
-            T_world_sensor, m.
-
-        Returns
-        -------
-        (B,) ndarray
-            As of :meth:`remove`, whose errors it raises, too.
-        """
+        """Move a scan to another pose, (4, 4). Raises as :meth:`remove`."""
         return self.move_all({scan_id: pose})
 
     def move_all(self, poses: Mapping[ScanId, ArrayLike]) -> Keys:
-        """Move scans to other poses at once, as after a closed loop: all of them, or none if one cannot be moved.
+        """Move scans to other poses at once, as after a closed loop: all, or none if one cannot be moved.
 
         Parameters
         ----------
         poses : mapping
-            T_world_sensor, (4, 4), m, of each scan by its id.
+            Pose, (4, 4), of each scan by its id.
 
-        Returns
-        -------
-        (B,) ndarray
-            As of :meth:`remove`, whose errors it raises, too.
+        Raises
+        ------
+        KeyError, ValueError
+            As of :meth:`remove`, or if a pose is invalid.
         """
-        checked = {
-            scan_id: check_pose(pose, f"the pose of scan {scan_id!r:.50}").copy()
-            for scan_id, pose in instance(poses, Mapping, "poses").items()  # type: ignore[type-abstract]
-        }
+        instance(poses, Mapping, "poses")  # type: ignore[type-abstract]
         with self._lock:
-            scans = {scan_id: self._state.log.get(scan_id) for scan_id in checked}
-            moved = {
-                scan_id: scan.at(checked[scan_id])
-                for scan_id, scan in scans.items()
-                if (checked[scan_id] != scan.pose).any()
-            }
+            moved = {}
+            for scan_id, given in poses.items():
+                pose, scan = (
+                    check_pose(given, f"the pose of scan {scan_id!r:.50}"),
+                    self._state.log.get(scan_id),
+                )
+                if (pose != scan.pose).any():
+                    moved[scan_id] = scan.at(pose.copy())
             return self._state.exchange(moved, moved)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
@@ -350,45 +314,31 @@ class LiveMap:
         centre : (3,) array_like
             World, m.
         radius_m : float
-            Blocks with their middle farther away are forgotten, or regions are put away of which all is farther away.
-
-        Returns
-        -------
-        (B,) ndarray
-            Keys of these blocks, uint64, ascending.
+            Blocks with their middle farther away, or regions of which all is farther away, go.
 
         Raises
         ------
-        ValueError
-            If an argument is out of range.
-        OSError
-            If a region cannot be written to the folder. The map is as before.
+        ValueError, OSError
+            If an argument is out of range, or a region cannot be written to the folder.
         """
         middle, radius = positions([np.asarray(centre)], "centre")[0], not_negative(radius_m, "radius_m")
         with self._lock:
             return self._state.clear_outside(middle, radius)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the state to a file, from which :meth:`load` goes on.
-
-        Parameters
-        ----------
-        path : path-like
-            An ``.npz`` file. An old one is replaced once the new one is complete.
+        """Write the state to an ``.npz`` file, from which :meth:`load` goes on. An old one is replaced at once.
 
         Raises
         ------
-        ValueError
-            If an id of a scan is neither a whole number nor a string.
-        OSError
-            If the file cannot be written.
+        ValueError, OSError
+            If an id of a scan is neither a whole number nor a string, or the file cannot be written.
         """
         with self._lock, self._state.whole():
             self._state.save(path)
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> LiveMap:
-        """Read a map as it was saved. Scans without poses go on from the last scans with times.
+        """Read a map as it was saved, with its settings and bits. Scans without poses go on from the last scans with times.
 
         Parameters
         ----------
@@ -396,11 +346,6 @@ class LiveMap:
             A file that :meth:`save` wrote.
         folder : path-like, optional
             As of the constructor.
-
-        Returns
-        -------
-        LiveMap
-            With the settings, `origin` and `max_bytes` of the one that was saved, and its bits.
 
         Raises
         ------
@@ -418,7 +363,7 @@ class LiveMap:
         return live
 
     def mesh(self, **limits: Any) -> trimesh.Trimesh:
-        """Extract the surface as triangles, in voxels of the size of leaf cells. Only what changed is derived again.
+        """Extract the surface as triangles, in voxels of the size of leaf cells. Distances are derived again where they changed.
 
         Parameters
         ----------
@@ -438,29 +383,22 @@ class LiveMap:
         wanted = Limits.of(self.config.leaf_size_m, **limits)
         with self._reading:
             with self._lock:
-                growing, changes = self._state.changes()
+                growing, changes, looks = self._state.changes()
             try:
                 growing.update(*changes)
-                scene, surface = growing.surface()
+                scene, surface = growing.surface(looks)
             except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
                 self._state.forget_surface()
                 raise
         return surface.mesh(scene.origin, wanted, surface.cells_searched)
 
     def map(self) -> RadarMap:
-        """Fit a map to all scans that could be taken out, by :meth:`FitConfig.quick`, with the sums that were kept up.
-
-        Returns
-        -------
-        RadarMap
-            A map that does not grow, with intensities in closed form.
+        """Fit a map to all scans that could be taken out, by :meth:`FitConfig.quick`, with intensities in closed form.
 
         Raises
         ------
-        ValueError
-            If there is no scan that could be taken out.
-        OSError
-            If regions or scans in the folder cannot be read.
+        ValueError, OSError
+            If there is no scan that could be taken out, or files in the folder cannot be read.
         """
         with self._lock, self._state.whole():
             read = self._state.fit_input()
@@ -474,11 +412,6 @@ class LiveMap:
         progress : bool, optional
             Whether to show a progress bar. Default: only on a terminal.
 
-        Returns
-        -------
-        RadarMap
-            A map that does not grow.
-
         Raises
         ------
         ValueError
@@ -486,7 +419,7 @@ class LiveMap:
         """
         with self._lock:
             if sealed := self.sealed_scans:
-                msg = f"{sealed} scans were let go to bound the memory, so that they cannot be fitted: give the map a folder to keep scans in"
+                msg = f"{sealed} scans were let go, so that they cannot be fitted: give the map a folder to keep scans in"
                 raise ValueError(msg)
             scans, origin = self._state.scans(), self._state.origin
         intensities = [scan.intensities for scan in scans if scan.intensities is not None]

@@ -20,7 +20,7 @@ Rows = dict[str, NDArray[Any]]
 REGION_CELLS = 64  # leaf cells along the edge of a region
 REGION_BITS = np.uint64(18)  # by which the key of a leaf cell is longer than that of its region
 NO_KEYS = np.zeros(0, np.uint64)
-_FARTHEST = 15_600  # region along each axis: keys reach a million cells
+_FARTHEST = 1_000_000  # cell along each axis that has a key
 
 
 def steps_near(reach: int) -> NDArray[np.int64]:
@@ -34,10 +34,7 @@ def shifted(keys: Keys, steps: NDArray[np.int64]) -> Keys:
 
 
 def cubes_near(leaf_keys: Keys, edge: int, reach: int) -> Keys:
-    """Keys of the first leaf cells of all cubes of `edge` cells, a power of two, that are within `reach` cells of others.
-
-    Whole cubes are stepped over: stepping from all cells to all takes longer than what is found too far away.
-    """
+    """Keys of the first leaf cells of all cubes of `edge` cells, a power of two, that are within `reach` cells of others."""
     bits = np.uint64(3 * (edge.bit_length() - 1))
     corners = np.unique(leaf_keys >> bits) << bits
     return shifted(corners, edge * steps_near(math.ceil(reach / edge)))
@@ -50,8 +47,8 @@ def regions_of(leaf_keys: Keys) -> Keys:
 
 def regions_near(regions: Keys, reach: int) -> Keys:
     """Keys of these regions, and of those at most `reach` away along each axis, ascending."""
-    places = (region_places(regions)[:, None] + steps_near(reach)).reshape(-1, 3)
-    return np.unique(_keys_at(REGION_CELLS * np.clip(places, -_FARTHEST, _FARTHEST - 1)) >> REGION_BITS)
+    near = shifted(regions << REGION_BITS, REGION_CELLS * steps_near(reach))
+    return np.unique(near >> REGION_BITS)
 
 
 def region_places(regions: Keys) -> NDArray[np.int64]:
@@ -62,34 +59,23 @@ def region_places(regions: Keys) -> NDArray[np.int64]:
 def _keys_at(cells: NDArray[np.int64]) -> Keys:
     """(N,) keys of cells (N, 3)."""
     # The middle of a cell of 1 m is exact in float64.
-    return cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0, 1)
+    return cell_keys(np.clip(cells, -_FARTHEST, _FARTHEST - 1) + 0.5, 1.0, 1)
 
 
 class RegionTable:
-    """Rows by the Morton keys of their cells, ascending, in regions.
-
-    `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2. `columns`: one row of each, as a new cell has it.
-    """
+    """Rows by the Morton keys of their cells, ascending, in regions. `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2."""
 
     def __init__(self, leaves_per_cell: int = 1, **columns: NDArray[Any]) -> None:
+        """`columns`: one row of each, as a new cell has it."""
         self._merged = leaves_per_cell.bit_length() - 1
         self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}
         self.num_bytes = 0
 
-    @property
-    def regions(self) -> Keys:
-        """Keys of the regions that have rows, ascending."""
-        return np.array(sorted(self._parts), np.uint64)
-
-    @property
-    def num_rows(self) -> int:
-        """Number of all rows."""
-        return sum(len(part["keys"]) for part in self._parts.values())
-
-    def gather(self, regions: Keys) -> Rows:
-        """The rows of `regions` (R,), ascending, in the order of their keys."""
-        parts = [self._parts[region] for region in regions.tolist() if region in self._parts]
+    def gather(self, regions: Keys | None = None) -> Rows:
+        """The rows of `regions` (R,), ascending, in the order of their keys. None: all."""
+        wanted = sorted(self._parts) if regions is None else regions.tolist()
+        parts = [self._parts[region] for region in wanted if region in self._parts]
         return {
             name: np.concatenate([new[:0], *(part[name] for part in parts)])
             for name, new in self._new.items()

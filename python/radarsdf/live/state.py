@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from radarsdf._core import GrowingSums, SumsChange
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
-from radarsdf.live.regions import (
-    NO_KEYS,
-    REGION_BITS,
-    REGION_CELLS,
-    Keys,
-    region_places,
-    regions_of,
-)
+from radarsdf.live.regions import REGION_BITS, REGION_CELLS, Keys, region_places, regions_of
 from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
 from radarsdf.live.surface import GrowingSurface
 from radarsdf.returns.evidence import BLOCK_BITS, Looks
@@ -35,7 +28,6 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import QUANTA, ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
-_MARKS = 64  # lists of changed blocks, before they are joined
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
 _NOISE_RETURNS = 100_000  # for the noise: as many as those on flat surfels that are wanted, and more
 
@@ -62,14 +54,14 @@ class GrowingState:
         self.origin = origin
         self.max_bytes = max_bytes
         self.log = ScanLog(folder)
-        self._store = None if folder is None else RegionStore(folder)
+        self._store = RegionStore(folder)
+        self._num_threads = resolve_num_threads(config.num_threads)
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
         self.next_id = 0
         self._noise_of = 0  # number of scans that the noise was estimated from
-        self._returns_changed: list[Keys] = []
-        self._visibility_changed: list[Keys] = []
+        self._changed: set[int] = set()  # keys of the blocks that the surface has to take in
         self._surface: GrowingSurface | None = None
 
     @property
@@ -87,14 +79,15 @@ class GrowingState:
         """Takes scans out and puts others in, also of the same ids, all or none. Returns the keys of the changed blocks."""
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         before, self.origin = self.origin, self.origin if origin is None else origin
-        blocks = None
         try:
             blocks = self._apply(come, left)
-            if come:
-                self._bound()
-        except BaseException:  # the disk is full, say
-            if blocks is not None:
+            try:
+                if come:
+                    self._bound()
+            except BaseException:  # the disk is full, say
                 self._apply(left, come)
+                raise
+        except BaseException:
             self.origin = before
             raise
         return blocks
@@ -107,13 +100,13 @@ class GrowingState:
                 rays = _rays_of([scan], self.config, self.origin)
                 change.collect(rays.points, rays.directions, rays.ranges_m, sign)
         self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
-        returns, visibility = self.sums.apply(change)
-        self._mark(returns, visibility)
+        blocks, _ = self.sums.apply(change)
+        self._changed.update(blocks.tolist())
         for scan_id in gone.keys() - come.keys():
             self.log.drop(scan_id)
         for scan_id, scan in come.items():
             self.log.put(scan_id, scan)
-        return returns
+        return blocks
 
     def _bound(self) -> None:
         """Lets scans go, to the folder if there is one, where memory is short."""
@@ -127,7 +120,7 @@ class GrowingState:
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
-        if self._store is not None:
+        if self._store.folder is not None:
             regions = regions_of(keys << BLOCK_BITS)
             lower = region_places(regions) * (REGION_CELLS * self.config.leaf_size_m) + self.origin
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
@@ -136,13 +129,13 @@ class GrowingState:
         gone: Keys = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
         self.sums.erase(gone)
         self.log.seal_beyond(centre, radius_m)
-        self._mark(gone, gone)
+        self._changed.update(gone.tolist())
         return gone
 
     @contextmanager
     def whole(self) -> Iterator[None]:
         """Within, nothing is put away. Afterwards, the same regions are again."""
-        away = NO_KEYS if self._store is None else self._store.regions
+        away = self._store.regions
         self._bring_back(away)
         try:
             yield
@@ -150,33 +143,26 @@ class GrowingState:
             self._put_away(away)
 
     def _bring_back(self, regions: Keys) -> None:
-        if self._store is not None:
-            blocks = self._store.bring_back(self.sums, np.intersect1d(regions, self._store.regions))
-            self._mark(blocks, blocks)
+        self._changed.update(self._store.bring_back(self.sums, regions).tolist())
 
     def _put_away(self, regions: Keys) -> Keys:
-        blocks = NO_KEYS if self._store is None else self._store.put_away(self.sums, regions)
-        self._mark(blocks, blocks)
+        blocks = self._store.put_away(self.sums, regions)
+        self._changed.update(blocks.tolist())
         return blocks
 
-    def changes(self) -> tuple[GrowingSurface, tuple[Any, ...]]:
-        """The surface as it was derived last, and the arguments of its update."""
+    def changes(self) -> tuple[GrowingSurface, tuple[Any, ...], Looks]:
+        """The surface as it was derived last, the arguments of its update, and the visibility counts."""
+        self._settle_noise()  # which may fail, as scans may have to be read
         if self._surface is None:
             surface = GrowingSurface(self.quick, np.zeros(3) if self.origin is None else self.origin)
             self._surface = None if self.origin is None else surface
-            self._returns_changed = self._visibility_changed = [self.sums.block_keys()]
+            blocks = self.sums.block_keys()
         else:
             surface = self._surface
-        returns, seen = (
-            np.unique(np.concatenate([NO_KEYS, *keys]))
-            for keys in (self._returns_changed, self._visibility_changed)
-        )
-        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(returns)))
-        looks = Looks(*self.sums.looks_of(_blocks_of_regions(seen)))
-        self._returns_changed, self._visibility_changed = [], []
-        self._settle_noise()
-        num_threads = resolve_num_threads(self.config.num_threads)
-        return surface, (returns, sums, seen, looks, self.noise, num_threads)
+            blocks = np.array(sorted(self._changed), np.uint64)
+        self._changed.clear()
+        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(blocks)))
+        return surface, (blocks, sums, self.noise, self._num_threads), self._looks()
 
     def forget_surface(self) -> None:
         """The surface is derived again from all sums."""
@@ -184,10 +170,11 @@ class GrowingState:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes all to a file. Raises a ValueError for ids of scans that are neither numbers nor strings."""
-        keys, ids, sealed = self.sums.block_keys(), self.log.ids, list(self.log.sealed)
-        if not all(type(scan_id) in (int, str) for scan_id in [*ids, *sealed]):
+        keys, ids, sealed = self.sums.block_keys(), self.log.ids, self.log.sealed
+        if not all(type(scan_id) in (int, str) for scan_id in (*ids, *sealed)):
             msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
             raise ValueError(msg)
+        scans = list(self.log.scans())
         described: dict[str, Any] = {
             "config": self.config.to_dict(),
             "origin": None if self.origin is None else self.origin.tolist(),
@@ -196,11 +183,12 @@ class GrowingState:
             "next_id": self.next_id,
             "with_intensities": self.with_intensities,
             "max_bytes": self.max_bytes,
-            "sealed": sealed,
+            "sealed": list(sealed),
             "ids": ids,
+            "poses": [scan.pose.tolist() for scan in scans],
+            "times_s": [scan.time_s for scan in scans],
         }
-        sums = (*self.sums.sums_of(keys), *self.sums.looks_of(keys))
-        save_state(path, Described(**described), list(self.log.scans()), sums)
+        save_state(path, Described(**described), scans, (*self.sums.sums_of(keys), *self.sums.looks_of(keys)))
 
     def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[NDArray[Any]]) -> None:
         """Makes a new state that which was saved."""
@@ -222,8 +210,7 @@ class GrowingState:
 
     def fit_input(self) -> Callable[[], FitInput]:
         """What a fit of all scans starts from, with the sums that were kept up."""
-        scans, sums, origin = self.scans(), self._all_sums(), self.origin
-        looks = Looks(*self.sums.looks_of(self.sums.block_keys()))
+        scans, sums, looks, origin = self.scans(), self._all_sums(), self._looks(), self.origin
 
         def read() -> FitInput:
             rays = _rays_of(scans, self.config, origin)
@@ -240,38 +227,30 @@ class GrowingState:
     def _all_sums(self) -> ScanSums:
         return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
 
-    def _mark(self, returns: Keys, visibility: Keys) -> None:
-        """The surface has to take in these blocks. Of very many scans, the list must not grow without end."""
-        for marked, keys in ((self._returns_changed, returns), (self._visibility_changed, visibility)):
-            marked.append(keys)
-            if len(marked) > _MARKS:
-                marked[:] = [np.unique(np.concatenate(marked))]
+    def _looks(self) -> Looks:
+        return Looks(*self.sums.looks_of(self.sums.block_keys()))
 
     def _settle_noise(self) -> None:
-        """Estimates the sensor's noise, by some scans on the planes of all, if there are twice or half as many scans as then."""
+        """Estimates the sensor's noise, if there are twice or half as many scans as the last time."""
         scans = len(self.log)
         if self._noise_of / 2 < scans < 2 * self._noise_of:
             return
-        num_threads = resolve_num_threads(self.config.num_threads)
         sums = self._all_sums()
-        surfels = Surfels.of_sums(sums, num_threads)
         asked = list(self.log.scans(every=max(1, int(sums.counts.sum()) // _NOISE_RETURNS)))
         if asked:
+            surfels = Surfels.of_sums(sums, self._num_threads)
             rays = _rays_of(asked, self.config, self.origin)
-            self.noise = sensor_noise(surfels, rays, self.config.returns, num_threads)
+            self.noise = sensor_noise(surfels, rays, self.config.returns, self._num_threads)
             self._noise_of = scans
 
 
 def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:
     """The rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
-    static = [slice(None) if scan.standing is None else scan.standing for scan in scans]
-    intensities = [
-        scan.intensities[own] for scan, own in zip(scans, static, strict=True) if scan.intensities is not None
-    ]
+    static = [scan.static for scan in scans]
     return prepare(
-        [scan.points[own] for scan, own in zip(scans, static, strict=True)],
-        np.stack([scan.pose for scan in scans]),
-        intensities or None,
+        [scan.points for scan in static],
+        np.stack([scan.pose for scan in static]),
+        [scan.intensities for scan in static if scan.intensities is not None] or None,
         origin=origin,
         whole=False,
         **config.preparation,

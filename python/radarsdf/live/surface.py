@@ -19,41 +19,45 @@ from radarsdf.fitting.average import (
     normals_at,
     returns_of_means,
 )
-from radarsdf.live.ghosts import GrowingGhosts, means_of, surfels_of
 from radarsdf.live.regions import (
     NO_KEYS,
     REGION_BITS,
     Keys,
     RegionTable,
+    Rows,
     cubes_near,
     regions_near,
     regions_of,
     shifted,
     steps_near,
 )
-from radarsdf.live.triangles import GrowingTriangles
+from radarsdf.map import queries
 from radarsdf.map.contents import WholeMap
-from radarsdf.map.mesh import Surface
-from radarsdf.returns.evidence import BLOCK_BITS, Looks, bridged, sums_round
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
+from radarsdf.map.mesh import Surface, local
+from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks, bridged, sums_round
+from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, planes_round, support_round
-from radarsdf.returns.sums import MeanRays, ScanSums, merged_keys
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, planes_round, support_round
+from radarsdf.returns.sums import MeanRays, ScanSums, lattice_of, merged_keys
+from radarsdf.threads import resolve_num_threads
 
 _BLOCK_CELLS, _LARGE_CELLS = 8, 16  # edges of cubes, in which distances from changes are counted
 
 
 class GrowingSurface:
-    """What follows from sums over scans: planes, ghosts, distances, triangles. :meth:`update` derives again what changes reach.
+    """Planes, ghosts, distances and triangles of sums over scans. :meth:`update` derives again what changes reach.
 
-    All is a function of the sums, the visibility counts and the noise: however they came about, it has the same bits. One
-    thread at a time. `config`: of a quick fit; `origin` (3,): of the local frame, world, m.
+    All is a function of the sums, the visibility counts and the noise: however they came about, it has the same bits. Planes
+    and distances take most of the time, and are kept by region. Ghosts and triangles are found again for the whole map.
     """
 
     def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
-        self._config = config
+        self._config = config  # of a quick fit
+        self._origin = origin  # (3,) of the local frame, world, m
         self._noise: SensorNoise | None = None
         vector, number = np.full((1, 3), np.nan, np.float32), np.zeros(1, np.float32)
-        # Leaf cells with returns: mean rays, normals, and whether the ray crosses a plane.
+        # Leaf cells with returns: mean rays and normals.
         self._leaves = RegionTable(
             points=vector,
             directions=vector,
@@ -61,7 +65,6 @@ class GrowingSurface:
             scans=np.zeros(1, np.uint32),
             ranges_m=number,
             normals=vector,
-            crosses=np.zeros(1, bool),
         )
         # Cells of surfels. Planes (centre, normal, variances) are NaN without support.
         self._cells = RegionTable(
@@ -69,13 +72,9 @@ class GrowingSurface:
             moments=np.zeros((1, 13)),
             support=np.zeros(1),
             planes=np.full((1, 9), np.nan),
-            opaque=np.zeros(1, bool),
-            behind=np.zeros(1),
-            ghosts=np.zeros(1, bool),
         )
-        self._ghosts = GrowingGhosts(self._leaves, self._cells, config.leaf_size_m)
-        # Of each region: returns in cells with planes, in those with flat ones, and in all, and the number of these.
-        self._counts: dict[int, tuple[float, float, float, int]] = {}
+        self._surfels = self._surfels_of(self._cells.gather())  # of all cells
+        self._ghosts = NO_KEYS  # of the cells of surfels that hold ghosts, ascending
         self._crossed = RegionTable()  # leaf cells that rays cross near their returns
         # These, and those that bridge gaps between them: distances at the corners, m, whether they change sign, evidence.
         self.distances = RegionTable(
@@ -84,49 +83,63 @@ class GrowingSurface:
             information=np.zeros(1, np.float32),
             detections=np.zeros(1, np.uint32),
         )
-        self._visibility = RegionTable(scans=np.zeros(1, np.uint32))  # by the first leaf cells of blocks
-        self._triangles = GrowingTriangles(config, origin)
 
     @property
     def num_bytes(self) -> int:
         """Memory of all that is kept, bytes."""
-        tables = (self._leaves, self._cells, self._crossed, self.distances, self._visibility)
-        return sum(table.num_bytes for table in tables) + self._triangles.num_bytes
+        return sum(table.num_bytes for table in (self._leaves, self._cells, self._crossed, self.distances))
 
-    def update(
-        self, blocks: Keys, sums: ScanSums, seen: Keys, looks: Looks, noise: SensorNoise, num_threads: int
-    ) -> Keys:
+    def update(self, blocks: Keys, sums: ScanSums, noise: SensorNoise, num_threads: int) -> Keys:
         """Derives again what changes reach. Returns the keys of the regions with other distances, ascending.
 
-        `blocks` (B,) and `seen` (L,): keys of the blocks whose sums and visibility counts changed, ascending; `sums` and
-        `looks`: all of the regions of these.
+        `blocks` (B,): keys of the blocks whose sums changed, ascending; `sums`: all of the regions of these.
         """
-        seen = regions_of(seen << BLOCK_BITS)
-        self._visibility.put(seen, {"keys": looks.keys << BLOCK_BITS, "scans": looks.scans})
         changed = self._put_sums(blocks, sums)
         if noise != self._noise:  # ghosts and evidence depend on it everywhere
             self._noise = noise
-            changed = np.union1d(changed, self._leaves.gather(self._leaves.regions)["keys"])
-        redone = NO_KEYS
-        if len(changed):
-            of_rays = regions_of(changed)
-            of_planes = np.union1d(of_rays, self._fit_planes(changed, num_threads))
-            if self._config.returns.drop_ghosts:
-                ghosts = self._ghosts.update(of_rays, of_planes, noise, num_threads)
-                near = self._leaves.gather(np.unique(self._cells.regions_of(ghosts)))["keys"]
-                changed = np.union1d(changed, near[np.isin(merged_keys(near), ghosts)])
-            changed = np.union1d(changed, self._find_normals(of_planes, num_threads))
-            redone = self._derive_distances(changed, noise, num_threads)
-        stale = regions_near(np.union1d(seen, redone), 1)
-        self._triangles.cut(stale, self.distances, self._visibility, num_threads)
-        return redone
+            changed = np.union1d(changed, self._leaves.gather()["keys"])
+        if len(changed) == 0:
+            return NO_KEYS
+        of_planes = np.union1d(regions_of(changed), self._fit_planes(changed, num_threads))
+        self._surfels = self._surfels_of(self._cells.gather())
+        if self._config.returns.drop_ghosts:
+            changed = np.union1d(changed, self._find_ghosts(noise, num_threads))
+        changed = np.union1d(changed, self._find_normals(of_planes, num_threads))
+        return self._derive_distances(changed, noise, num_threads)
 
-    def surface(self) -> tuple[WholeMap, Surface]:
-        """All triangles, with the evidence of their vertices."""
-        counts = np.array([*self._counts.values(), (0.0, 0.0, 0.0, 0)]).sum(axis=0)
-        on_planes, on_flat, returns, cells = counts.tolist()
-        clutter_ratio = 1 - on_flat / on_planes if on_planes else 0.0
-        return self._triangles.joined(clutter_ratio, returns / max(cells, 1), self.distances.num_rows)
+    def surface(self, looks: Looks) -> tuple[WholeMap, Surface]:
+        """All triangles, with the evidence of their vertices. `looks`: of all blocks."""
+        num_threads = resolve_num_threads(self._config.num_threads)
+        surfels, leaf_m = self._surfels, self._config.leaf_size_m
+        scene = WholeMap(self._origin, self._config, surfels.rough_share(), surfels.returns_per_cell())
+        rows = self.distances.gather()
+        crossed = rows["crossed"]
+        cells = lattice_of(rows["keys"][crossed]).astype(np.int32)
+        _, corners, of_cells = sparse_lattice(cells, num_threads=num_threads)
+        values = np.zeros(len(corners), np.float32)
+        values[of_cells] = rows["values"][crossed][np.lexsort(cells.T[::-1])]  # in the order of the lattice
+        vertices, faces = extract_cells(
+            corners, values, of_cells, spacing=[leaf_m] * 3, num_threads=num_threads
+        )
+        evidence = Evidence(rows["information"], rows["detections"], looks.at(rows["keys"]))
+        # By way of the world's coordinates, as those who query the mesh's own vertices do.
+        at = queries.interpolated(evidence, rows["keys"], leaf_m, local(scene, vertices + self._origin))
+        return scene, Surface.told_by(scene, vertices, faces, at, len(rows["keys"]))
+
+    def _surfels_of(self, rows: Rows) -> Surfels:
+        cell_of_plane = np.flatnonzero(rows["support"] >= MIN_SUPPORT)
+        planes = rows["planes"][cell_of_plane]
+        return Surfels(
+            cell_size_m=LEAVES_PER_SURFEL * self._config.leaf_size_m,
+            keys=rows["keys"],
+            blocks=CellBlocks(rows["keys"]),
+            counts=rows["moments"][:, 0].copy(),
+            support=rows["support"],
+            cell_of_plane=cell_of_plane,
+            centres=planes[:, :3].copy(),
+            normals=planes[:, 3:6].copy(),
+            variances=planes[:, 6:].copy(),
+        )
 
     def _put_sums(self, blocks: Keys, sums: ScanSums) -> Keys:
         """Takes sums in. Returns the keys of the leaf cells in changed blocks that have returns, or had some."""
@@ -155,18 +168,23 @@ class GrowingSurface:
         cells["planes"][rows] = np.concatenate([centres, normals, variances], axis=1)
         own = np.isin(self._cells.regions_of(keys), regions)
         self._cells.put(regions, {name: column[own] for name, column in cells.items()})
-        for region in regions:
-            surfels = surfels_of(self._cells.gather(region[None]), self._config.leaf_size_m)
-            returns = surfels.counts[surfels.cell_of_plane]
-            on_planes, on_flat = float(returns.sum()), float(returns[surfels.is_flat()].sum())
-            self._counts[int(region)] = on_planes, on_flat, float(surfels.counts.sum()), len(surfels.keys)
         return regions
+
+    def _find_ghosts(self, noise: SensorNoise, num_threads: int) -> Keys:
+        """Finds ghosts again. Returns the keys of the leaf cells that became ghosts, or are none any more."""
+        leaves = self._leaves.gather()
+        found = find_ghosts(self._surfels, _means_of(leaves), noise, num_threads)
+        before, self._ghosts = self._ghosts, self._surfels.keys[found]
+        differs: Keys = leaves["keys"][
+            np.isin(merged_keys(leaves["keys"]), np.setxor1d(before, self._ghosts))
+        ]
+        return differs
 
     def _find_normals(self, regions: Keys, num_threads: int) -> Keys:
         """Finds the normals of the leaf cells in these regions. Returns the keys of those that differ from before."""
         leaves = self._leaves.gather(regions)
-        surfels = surfels_of(self._cells.gather(regions), self._config.leaf_size_m)
-        normals = normals_at(means_of(leaves), surfels, num_threads)
+        surfels = self._surfels_of(self._cells.gather(regions))
+        normals = normals_at(_means_of(leaves), surfels, num_threads)
         differs = (normals != leaves["normals"]).any(axis=1)
         self._leaves.put(regions, leaves | {"normals": normals})
         found: Keys = leaves["keys"][differs]
@@ -183,9 +201,9 @@ class GrowingSurface:
         centre = regions_of(reached)
         # Bridges depend on medians of blocks of 32 cells, and on their two ends.
         own, around = regions_near(centre, 2), regions_near(centre, 3)
-        leaves, cells = self._leaves.gather(around), self._cells.gather(around)
-        is_true = ~cells["ghosts"][CellBlocks(cells["keys"]).rows(merged_keys(leaves["keys"]), 1)]
-        means, normals = means_of(leaves).select(is_true), leaves["normals"][is_true]
+        leaves = self._leaves.gather(around)
+        is_true = ~np.isin(merged_keys(leaves["keys"]), self._ghosts)
+        means, normals = _means_of(leaves).select(is_true), leaves["normals"][is_true]
         before = self.distances.gather(around)["keys"]
         rays = means.select(np.isin(means.keys >> REGION_BITS, regions_near(centre, 1)))
         keys = rays.leaf_keys(config.leaf_size_m, config.metres(BAND_CELLS), num_threads)
@@ -222,3 +240,9 @@ class GrowingSurface:
         }
         self.distances.put(redone, rows)
         return redone
+
+
+def _means_of(rows: Rows) -> MeanRays:
+    """The mean rays of leaf cells with these columns."""
+    names = ("keys", "points", "directions", "counts", "scans", "ranges_m")
+    return MeanRays(**{name: rows[name] for name in names})

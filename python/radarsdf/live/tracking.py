@@ -27,9 +27,7 @@ _STEPS = 100  # of the motion so far, from which the usual motion is learnt
 _START = 8  # scans of a start, all of which are placed again once 2, 4 and 8 are there
 _KNOWN_STEPS = 2  # before a start that make it none: how the sensor moves is known
 _CLEAR = 5.0  # standard errors by which more returns agree if the Doppler has the other sign
-_CHANCE = (
-    0.25  # share of the returns of a sparse radar that agree at a wrong pose, at most about: 0.13 to 0.27
-)
+_CHANCE = 0.25  # share of a sparse radar's returns that agree at a wrong pose, about: 0.13 to 0.27
 _MOVES = 5.0  # standard deviations of a velocity that is not zero
 _TOLD_STEPS = 10  # over which returns alone must tell how the sensor moves
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
@@ -59,15 +57,7 @@ class Step:
     @property
     def scan(self) -> Floats:
         """(N, 3) static returns, sensor frame, m."""
-        points, static = self.logged.points, self.logged.standing
-        return np.ascontiguousarray(points if static is None else points[static], np.float64)
-
-    @property
-    def covariance(self) -> Floats:
-        """(3, 3) of the velocity, m²/s²."""
-        assert self.velocity is not None
-        covariance: Floats = self.velocity.covariance + LEAST_MPS**2 * np.eye(3)
-        return covariance
+        return np.ascontiguousarray(self.logged.static.points, np.float64)
 
     @cached_property
     def moves(self) -> bool:
@@ -75,7 +65,7 @@ class Step:
         if self.velocity is None:
             return True
         v = self.velocity.velocity_mps
-        return float(v @ np.linalg.solve(self.covariance, v)) > _MOVES**2
+        return float(v @ np.linalg.solve(_covariance(self.velocity), v)) > _MOVES**2
 
 
 @dataclass
@@ -83,7 +73,6 @@ class Follower:
     """Tracks the sensor. The map owns the poses: they are read before each scan. A scan that is refused leaves no trace."""
 
     config: FitConfig
-    num_threads: int
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
     _rates: deque[tuple[Rate, Rate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
     _given: deque[tuple[ScanId, LoggedScan]] = field(default_factory=lambda: deque(maxlen=WINDOW))
@@ -100,24 +89,22 @@ class Follower:
                 msg = "the map has scans, but none with a time to go on from: give the pose of the scan, and its time"
                 raise Lost(msg)
             return [new]
-        last = self._steps[-1]
-        if not new.time_s > last.time_s:
-            msg = f"a scan without a pose must be later than the one before it: {new.time_s:.6f} s is not after {last.time_s:.6f} s"
+        if not new.time_s > self._steps[-1].time_s:
+            msg = f"a scan without a pose must be later than the one before it, at {self._steps[-1].time_s:.6f} s"
             raise ValueError(msg)
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
-        needed = "give its pose"
-        if logged.doppler_mps is None:
-            needed += ", or its Doppler (doppler_mps)"
-        elif not by_doppler:
-            needed += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
-        if any(step.found.piece for step in found):
-            msg = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near, or in several places: {needed}"
-            raise Lost(msg)
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
-        if not by_doppler and len(observed) == _TOLD_STEPS and np.median(observed) < LEAST_OBSERVED:
-            msg = f"the returns alone do not tell how the sensor moves: {needed}"
+        why = ""
+        if any(step.found.piece for step in found):
+            why = f"the scan at {new.time_s:.6f} s agrees nowhere near, or in several places"
+        elif not by_doppler and len(observed) == _TOLD_STEPS and np.median(observed) < LEAST_OBSERVED:
+            why = "the returns alone do not tell how the sensor moves"
+        if why:
+            msg = f"{why}: give its pose, or its Doppler (doppler_mps)"
+            if logged.doppler_mps is not None and not by_doppler:
+                msg += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
             raise Lost(msg)
         return found
 
@@ -149,7 +136,7 @@ class Follower:
     def _begin(self, steps: Sequence[Step]) -> None:
         """As if only these scans had come."""
         size_m = LEAVES_PER_SURFEL * self.config.leaf_size_m
-        self._tracker = Tracker(size_m, self.config.returns, self.num_threads)
+        self._tracker = Tracker(size_m, self.config.returns, self.config.num_threads)
         self._steps.clear()
         self._rates.clear()
         for i, step in enumerate(steps):
@@ -196,14 +183,14 @@ class Follower:
         """By their Doppler. None: one of the last two gives none."""
         if any(step.velocity is None for step in steps[-2:]):
             return None
-        none = np.zeros(3), np.eye(3)
         each = [
-            none if one.velocity is None else (one.velocity.velocity_mps, one.covariance) for one in steps
+            (np.zeros(3), np.eye(3)) if one is None else (one.velocity_mps, _covariance(one))
+            for one in (step.velocity for step in steps)
         ]
         mean, covariance, _ = upright(*(np.array(columns) for columns in zip(*each, strict=True)))
-        known = [step for step in [*self._steps, steps[-1]] if step.velocity is not None]
-        speeds = np.array([step.velocity.velocity_mps for step in known if step.velocity is not None])
-        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (known[-1].time_s - known[0].time_s)
+        known = [(one.time_s, one.velocity.velocity_mps) for one in [*self._steps, steps[-1]] if one.velocity]
+        times_s, speeds = (np.array(columns) for columns in zip(*known, strict=True))
+        change = np.square(np.diff(speeds, axis=0)).sum(axis=0) / (times_s[-1] - times_s[0])
         static = [np.ones(len(step.scan), bool) for step in steps]
         found = np.ones(len(steps), bool)
         return _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
@@ -225,15 +212,13 @@ class Follower:
             return [self._next(new, sign)]
         frame = steps[first].found.pose
         both = np.kron(np.eye(2), frame[:3, :3])
-
-        def placed(found: Tracked) -> Tracked:
-            return dataclasses.replace(
-                found, pose=frame @ found.pose, covariance=both @ found.covariance @ both.T
-            )
-
+        placed = [
+            dataclasses.replace(one, pose=frame @ one.pose, covariance=both @ one.covariance @ both.T)
+            for one in tracked[1:]
+        ]
         return [
-            dataclasses.replace(step, found=placed(found), sign=sign)
-            for step, found in zip(steps[first + 1 :], tracked[1:], strict=True)
+            dataclasses.replace(step, found=found, sign=sign)
+            for step, found in zip(steps[first + 1 :], placed, strict=True)
         ]
 
     def _followed(self, steps: list[Step], sign: int) -> tuple[int, list[Tracked]]:
@@ -248,7 +233,9 @@ class Follower:
 
         def by(sign: int) -> list[Tracked]:
             signed = None if velocities is None else _signed(velocities, sign)
-            return followed(dataclasses.replace(drive, velocities=signed), self.config, self.num_threads)[1]
+            return followed(
+                dataclasses.replace(drive, velocities=signed), self.config, self.config.num_threads
+            )[1]
 
         if sign or velocities is None:
             return sign, by(sign)
@@ -265,6 +252,12 @@ class Follower:
         if clear and max(a, b) > _CHANCE:
             return (1, ahead) if a > b else (-1, back)
         return 0, max(ahead, back, by(0), key=share)
+
+
+def _covariance(velocity: SensorVelocity) -> Floats:
+    """(3, 3) m²/s²."""
+    covariance: Floats = velocity.covariance + LEAST_MPS**2 * np.eye(3)
+    return covariance
 
 
 def _now(step: Step, log: ScanLog) -> Step | None:

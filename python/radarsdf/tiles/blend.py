@@ -40,9 +40,8 @@ class Share(NamedTuple):
 
     def at(self, points: Tensor, chosen: NDArray[np.bool_]) -> Share:
         """The share at some (M,) of its positions, of which the local `points` (M, 3) are these."""
-        return self._replace(
-            rows=self.rows[chosen], weights=self.weights[chosen], local=points[torch.from_numpy(chosen)]
-        )
+        local = points[torch.from_numpy(chosen)]
+        return self._replace(rows=self.rows[chosen], weights=self.weights[chosen], local=local)
 
 
 class TileBlend(Map):
@@ -52,17 +51,16 @@ class TileBlend(Map):
         self.folder = Path(folder)
         self.plan = Plan.load(self.folder)
         self.memory_bytes = positive(memory_bytes, "memory_bytes")
-        self._known: dict[Tile, bool] = {}
         self._held: OrderedDict[Tile, tuple[MapContents, int]] = OrderedDict()
         self._lock = threading.Lock()
         if not self.tiles:
             msg = f"no tile of {self.folder} is done: radarsdf tiles fit {self.folder} makes them"
             raise ValueError(msg)
 
-    @property
+    @cached_property
     def tiles(self) -> list[TilePlan]:
-        """The tiles that are done."""
-        return [tile for tile in self.plan.tiles if self.has(tile.tile)]
+        """The tiles that were done when they were first asked for."""
+        return [tile for tile in self.plan.tiles if is_done(self.folder, self.plan, tile)]
 
     @property
     def missing(self) -> dict[str, str]:
@@ -71,12 +69,13 @@ class TileBlend(Map):
             tile.name: failure_of(self.folder, tile) for tile in self.plan.tiles if not self.has(tile.tile)
         }
 
+    @cached_property
+    def _done(self) -> set[Tile]:
+        return {tile.tile for tile in self.tiles}
+
     def has(self, tile: Tile) -> bool:
-        """Whether there is such a tile, and it is done. What was found stays so for this object."""
-        if tile not in self._known:
-            planned = self.plan.by_tile.get(tile)
-            self._known[tile] = planned is not None and is_done(self.folder, self.plan, planned)
-        return self._known[tile]
+        """Whether there is such a tile, and it is done."""
+        return tile in self._done
 
     @cached_property
     def contents_of_any(self) -> MapContents:
@@ -129,8 +128,8 @@ class TileBlend(Map):
     def _seen(self, world: _Floats) -> NDArray[np.bool_]:
         """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border.
 
-        The tile that a position lies in decides, because tiles disagree: which returns are ghosts depends on surfaces before
-        them, of which a neighbour may have few returns. In the place of one that is not done, its neighbours do.
+        Tiles disagree, because ghosts depend on surfaces before them. The tile that a position lies in decides; in the place
+        of one that is not done, its neighbours do.
         """
         found = np.zeros(len(world), bool)
         for share in self._shares(world):
@@ -182,8 +181,8 @@ class TileBlend(Map):
         def of_tile(share: Share) -> Tensor:
             return torch.stack(list(queries.evidence(share.contents, share.local)), 1)
 
-        found = _averages(self._shares(positions), len(positions), of_tile, columns=3)
-        return queries.EvidenceAt(*torch.from_numpy(np.nan_to_num(found).astype(np.float32)).unbind(1))
+        found = np.nan_to_num(_averages(self._shares(positions), len(positions), of_tile, columns=3))
+        return queries.EvidenceAt(*torch.from_numpy(found).float().unbind(1))
 
     def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
         """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, numbered from the lattice's first corner.

@@ -4,31 +4,38 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
-from collections.abc import Iterable
-from concurrent.futures import Executor
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from radarsdf.checks import instance, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
+from radarsdf.extras import require
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import take_lock, write_whole
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
+from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
 from radarsdf.tiles.planning import SCANS_FILE, CheckedScans, make_plan, read_rays
-from radarsdf.tiles.tasks import run_tasks
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
 _HALO_CELLS = 64  # half of it counts; see docs/tiles.md
 _LOCK = "plan.lock"
+_POLL_S = 2.0  # how often the executor itself is checked
+_NO_SCHEDULER = "the scheduler is gone: call again, what is done is kept"
+_CONNECT_S = 10.0
 _OURS = {PLAN, _LOCK, TILES, SCANS_FILE}
 
 
@@ -45,7 +52,7 @@ def fit_tiles(
     """Fit a map in tiles. Neither all returns nor all of the map are ever in memory.
 
     If `out` holds a plan of the same scans and settings, tiles that are done are kept: call it again after anything went
-    wrong. The result has the same bits with any executor, if ``config.num_threads`` is given.
+    wrong. With ``config.num_threads``, the result has the same bits with any executor.
 
     Parameters
     ----------
@@ -54,10 +61,10 @@ def fit_tiles(
     out : path-like
         A folder, which is made.
     tile_size : float, optional
-        Edge of a tile, m, moved to the next multiple of a block of ``config.lattice``. Default: 512 leaf cells.
+        Edge of a tile, m, rounded to blocks of ``config.lattice``. Default: 512 leaf cells.
     halo : float, optional
-        Width of the margin round each tile whose returns it is fitted to, m, moved to a multiple of a block. Tiles overlap in
-        half of it. Default: 64 leaf cells.
+        Width of the margin round each tile whose returns it is fitted to, m, rounded to blocks. Tiles overlap in half of it.
+        Default: 64 leaf cells.
     executor : concurrent.futures.Executor, optional
         What runs the fits: processes, or that of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
         By default one after another in this process.
@@ -73,19 +80,11 @@ def fit_tiles(
 
     Raises
     ------
-    ValueError
-        If a scan is invalid, `out` holds something else or another plan, or all tiles failed.
-    OSError
-        If `out` cannot be written, or another process makes its plan.
+    ValueError, OSError
+        If a scan is invalid, `out` holds something else or another plan, cannot be written, or all tiles failed.
     """
-    plan_tiles(
-        scans,
-        out,
-        tile_size=tile_size,
-        halo=halo,
-        config=config,
-        threads=None if executor is None else 1,
-    )
+    threads = None if executor is None else 1
+    plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=threads)
     return run_fits(out, executor=executor, progress=progress)
 
 
@@ -98,10 +97,7 @@ def plan_tiles(
     config: FitConfig | None = None,
     threads: int | None = None,
 ) -> Plan:
-    """The first step of :func:`fit_tiles`: writes the plan and the rays of each tile, in one pass over the scans.
-
-    `threads`: of each fit, if the configuration does not say. Default: as many as PyTorch uses.
-    """
+    """Writes the plan and the rays of each tile, in one pass over the scans. `threads`: of a fit, if `config` names none."""
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
@@ -127,16 +123,11 @@ def plan_tiles(
 def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: CheckedScans) -> Plan:
     """The plan in a folder. Raises a ValueError if it is of other scans or settings."""
     plan = Plan.load(folder)
-    if config.num_threads not in (0, plan.config.num_threads):
-        msg = f"{folder} was planned for {plan.config.num_threads} threads a tile, not {config.num_threads}"
-        raise ValueError(msg)
-    found = {
-        name: getattr(plan.config.returns, name)
-        for name in NOISE_SETTINGS
-        if getattr(config.returns, name) is None
-    }
+    unknown = [name for name in NOISE_SETTINGS if getattr(config.returns, name) is None]
+    found = {name: getattr(plan.config.returns, name) for name in unknown}
     ours, theirs = (settings_of_results(own) for own in (config.override(returns=found), plan.config))
     different = [name for name in ours if ours[name] != theirs[name]]
+    different += ["num_threads"] * (config.num_threads not in (0, plan.config.num_threads))
     different += ["tile_size"] * (grid.tile_m != plan.tile_m) + ["halo"] * (grid.halo_m != plan.halo_m)
     if not different:
         for _ in given:
@@ -176,8 +167,8 @@ def run_fits(
     return TiledMap(root)
 
 
-def fit_tile(folder: str, name: str, run: str = "") -> None:  # noqa: ARG001 - see run_tasks
-    """Fits the tile of this name, unless its map is there. A task takes names, so that it can run anywhere."""
+def fit_tile(folder: str, name: str) -> None:
+    """Fits a tile, unless its map is there. A task takes names, so that it can run anywhere."""
     root = Path(folder)
     plan = Plan.load(root)
     (tile,) = (planned for planned in plan.tiles if planned.name == name)
@@ -204,16 +195,77 @@ def fit_tile(folder: str, name: str, run: str = "") -> None:  # noqa: ARG001 - s
 def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> TileGrid:
     lattice = config.lattice
 
-    def blocks(value: float | None, default: float, name: str) -> float:
-        wanted = default if value is None else positive(value, name)
+    def blocks(value: float | None, cells: int, name: str) -> float:
+        wanted = cells * lattice.cell_m if value is None else positive(value, name)
         return lattice.block_m * max(1, round(wanted / lattice.block_m))
 
-    grid = TileGrid(
-        tile_m=blocks(tile_size, _TILE_CELLS * lattice.cell_m, "tile_size"),
-        halo_m=blocks(halo, _HALO_CELLS * lattice.cell_m, "halo"),
-        corner_m=float(lattice.position(0)),
-    )
-    if grid.halo_m > grid.tile_m:
-        msg = f"the halo, {grid.halo_m:g} m, is larger than the tile, {grid.tile_m:g} m: use larger tiles"
+    tile_m, halo_m = blocks(tile_size, _TILE_CELLS, "tile_size"), blocks(halo, _HALO_CELLS, "halo")
+    if halo_m > tile_m:
+        msg = f"the halo, {halo_m:g} m, is larger than the tile, {tile_m:g} m: use larger tiles"
         raise ValueError(msg)
-    return grid
+    return TileGrid(tile_m, halo_m, corner_m=float(lattice.position(0)))
+
+
+def run_tasks(
+    task: Callable[..., Any],
+    arguments: Sequence[tuple[Any, ...]],
+    executor: Executor | None,
+    *,
+    progress: bool | None = None,
+) -> dict[int, str]:
+    """Calls ``task(*arguments[i])`` for each i. Returns what went wrong, by i; the other tasks are done."""
+    failed: dict[int, str] = {}
+    futures: dict[Future[Any], int] = {}
+    with tqdm(total=len(arguments), desc="fit", unit="tile", disable=hides_bar(progress)) as bar:
+
+        def note(i: int, result: Callable[[], Any]) -> None:
+            try:
+                result()
+            except (BrokenExecutor, CancelledError):
+                failed[i] = "a worker was killed: call again, what is done is kept"
+            except Exception as error:  # noqa: BLE001 - of any kind: the other tiles do not depend on this one
+                failed[i] = str(error) or type(error).__name__
+            bar.update()
+
+        if executor is None:
+            for i, own in enumerate(arguments):
+                note(i, lambda own=own: task(*own))  # type: ignore[misc]
+            return failed
+        try:
+            futures = {executor.submit(task, *own): i for i, own in enumerate(arguments)}
+            waiting = set(futures)
+            while waiting:
+                done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+                for future in done:
+                    note(futures[future], future.result)
+                # Futures of dask.distributed are never done once their client is cut off.
+                if getattr(getattr(executor, "_client", None), "status", None) == "closed":
+                    return failed | {futures[future]: _NO_SCHEDULER for future in waiting}
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+    return failed
+
+
+@contextmanager
+def cluster_executor(address: str, memory_bytes: int) -> Iterator[Executor]:
+    """The executor of the cluster of dask.distributed at an address, such as ``tcp://host:8786``.
+
+    Each worker runs a task for each of its threads, so it should have one. Raises a MemoryError if no worker may take
+    `memory_bytes`, an OSError if there is no cluster.
+    """
+    distributed = require("distributed", what="a cluster needs")
+    with distributed.Client(address, timeout=_CONNECT_S) as client:
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        largest = max((worker["memory_limit"] or math.inf for worker in workers), default=math.inf)
+        if memory_bytes > largest:
+            msg = f"a tile takes about {memory_bytes / 1e6:.0f} MB and no worker has more than {largest / 1e6:.0f}: make the plan with smaller tiles"
+            raise MemoryError(msg)
+        # pure: a second task with the same arguments would get the first one's result, although its file may be gone.
+        executor = client.get_executor(pure=False)
+        try:
+            yield executor
+        finally:
+            if client.status == "running":
+                executor.shutdown(wait=False)  # what an error or Ctrl-C left in work is cancelled

@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -38,13 +38,7 @@ if TYPE_CHECKING:
 _ON_LATTICE = 1e-4  # voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # in the file of a part
 _Floats = NDArray[np.float64]
-
-
-class PartSettings(NamedTuple):
-    """What the triangles of a tile depend on; what a mesh leaves out depends on the other tiles, too."""
-
-    voxels_per_cell: int  # along the edge of a leaf cell
-    box: NDArray[np.float64] | None  # (2, 3) lower and upper corner, world, m
+_Box = NDArray[np.float64] | None  # (2, 3) lower and upper corner, world, m
 
 
 @dataclass(frozen=True)
@@ -81,38 +75,38 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _parts_of(
+def parts_of(
     city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
-) -> tuple[list[Path], Limits]:
-    """Meshes all tiles: the files of the parts, and the limits of a mesh of them, as `wanted` of :meth:`Map.mesh`."""
+) -> tuple[list[Path], Limits, Threshold]:
+    """Meshes all tiles: the files of the parts, the limits of a mesh of them (`wanted`), and what these come to."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
     leaf_m = city.config.leaf_size_m
     steps = round(leaf_m / voxel_size) if voxel_size <= leaf_m else 0
     if steps < 1 or not math.isclose(steps * voxel_size, leaf_m, rel_tol=1e-9):
         msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as those of tiles must: use {leaf_m / 2:g} or {leaf_m:g}"
         raise ValueError(msg)
-    settings = PartSettings(steps, None if box is None else check_box(box))
+    corners = None if box is None else check_box(box)
     paths = []
     for planned in tqdm(city.tiles, "mesh", unit="tile", disable=hides_bar(progress)):
         # The same settings of the same plan and neighbours give the same file.
         done = [other for other in neighbours(planned.tile) if city.has(other)]
-        text = repr((city.plan.digest, settings, done))
+        text = repr((city.plan.digest, steps, corners, done))
         key = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         path = folder_of(city.folder, planned.tile) / f"mesh-{key}.npz"
         if not path.is_file():
-            write_arrays(path, vars(_part_of(city, planned.tile, settings)))
+            write_arrays(path, vars(_part_of(city, planned.tile, steps, corners)))
         paths.append(path)
-    return paths, limits
+    tally = sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS))
+    return paths, limits, Tally.of_sums(tally).threshold(limits.min_confidence)
 
 
-def _part_of(city: TileBlend, tile: Tile, settings: PartSettings) -> Part:
-    """The triangles near returns in the leaf cells of a tile."""
-    config, steps = city.config, settings.voxels_per_cell
-    position = config.lattice.position
+def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
+    """The triangles near returns in the leaf cells of a tile, of `steps` voxels along their edges."""
+    config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
     cells = _cells_in(city, tile)
-    if settings.box is not None:
-        lower, upper = settings.box
+    if box is not None:
+        lower, upper = box
         cells = cells[((position(cells + 1) >= lower) & (position(cells) <= upper)).all(axis=1)]
     found = len(cells)
     if steps > 1:
@@ -123,7 +117,7 @@ def _part_of(city: TileBlend, tile: Tile, settings: PartSettings) -> Part:
         ).astype(np.int64)
     inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     voxels = (cells[:, None, :] * steps + inside).reshape(-1, 3)
-    if settings.box is not None:
+    if box is not None:
         centres = position((voxels + 0.5) / steps)
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     _, corners, voxel_corners = sparse_lattice(voxels, num_threads=threads)
@@ -168,36 +162,28 @@ def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np
     return vertices, one_for_equal(vertices, _on_borders(city, vertices))[faces]
 
 
-def _allowed(
-    faces: NDArray[np.int32],
-    confidence: NDArray[np.float32],
-    uncertainty_m: NDArray[np.float32],
-    least: float,
-    limits: Limits,
-) -> NDArray[np.bool_]:
-    certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= limits.max_uncertainty
-    return with_all(certain & (confidence >= least), faces)
+def _allowed(part: Part, min_confidence: float, limits: Limits) -> NDArray[np.bool_]:
+    """(F,) which faces are within the limits."""
+    certain = np.nan_to_num(part.uncertainty_m, nan=np.inf) <= limits.max_uncertainty
+    return with_all(certain & (part.confidence >= min_confidence), part.faces)
 
 
 def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
     """See :meth:`TiledMap.mesh`."""
-    paths, found = _parts_of(city, voxel_size, progress, **limits)
-    size = sum(path.stat().st_size for path in paths)
-    check_triangles(size // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
-    threshold = _tally_of(paths).threshold(found.min_confidence)
+    paths, found, threshold = parts_of(city, voxel_size, progress, **limits)
+    file_bytes = sum(path.stat().st_size for path in paths)
+    check_triangles(file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
     parts = [Part(**_read(path)) for path in paths]
     vertices, faces = _welded(city, parts)
-    confidence = np.concatenate([part.confidence for part in parts])
-    uncertainty_m = np.concatenate([part.uncertainty_m for part in parts])
-    faces = faces[_allowed(faces, confidence, uncertainty_m, threshold.min_confidence, found)]
+    faces = faces[np.concatenate([_allowed(part, threshold.min_confidence, found) for part in parts])]
     labels, sizes = mesh_components(faces, len(vertices))
     used, faces = renumbered(len(vertices), faces[sizes[labels] >= found.min_component_triangles])
     leaf_cells, cells_searched = np.sum([part.cells for part in parts], axis=0).tolist()
     return described_mesh(
         vertices[used],
         faces,
-        confidence[used],
-        uncertainty_m[used],
+        np.concatenate([part.confidence for part in parts])[used],
+        np.concatenate([part.uncertainty_m for part in parts])[used],
         leaf_cells=leaf_cells,
         leaf_cells_searched=cells_searched,
         **threshold.metadata,
@@ -210,8 +196,8 @@ def export_mesh(
     """See :meth:`TiledMap.export`. What cannot be written is noticed before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
         content_folder(Path(path))
-        paths, found = _parts_of(city, voxel_size, progress, **limits)
-        return write_tileset(city, Path(path), _separate(city, paths, found))
+        parts = parts_of(city, voxel_size, progress, **limits)
+        return write_tileset(city, Path(path), _separate(city, *parts))
     check_mesh_path(path)
     check_outputs([path])
     mesh = mesh_of(city, voxel_size, progress, **limits)
@@ -220,13 +206,12 @@ def export_mesh(
 
 
 def _separate(
-    city: TileBlend, paths: Sequence[Path], limits: Limits
+    city: TileBlend, paths: Sequence[Path], limits: Limits, threshold: Threshold
 ) -> Iterator[tuple[_Floats, NDArray[np.int32]]]:
     """Vertices (V, 3), world, m, and faces (F, 3) of one tile after another. Components that reach a border stay."""
-    least = _tally_of(paths).threshold(limits.min_confidence).min_confidence
     for path in paths:
         part = Part(**_read(path))
-        faces = part.faces[_allowed(part.faces, part.confidence, part.uncertainty_m, least, limits)]
+        faces = part.faces[_allowed(part, threshold.min_confidence, limits)]
         labels, sizes = mesh_components(faces, len(part.vertices))
         on_border = np.zeros(len(part.vertices), bool)
         on_border[_on_borders(city, part.vertices)] = True
@@ -236,22 +221,12 @@ def _separate(
         yield part.vertices[used], faces
 
 
-def threshold_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> Threshold:
-    """See :meth:`TiledMap.threshold`."""
-    paths, found = _parts_of(city, voxel_size, progress, **limits)
-    return _tally_of(paths).threshold(found.min_confidence)
-
-
-def _tally_of(paths: Iterable[Path]) -> Tally:
-    return Tally.of_sums(sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS)))
-
-
 def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     """What views need of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(city.plan.origin_cells(tiles[0]))
-    vertices, faces = _welded(city, [_part_of(city, tile, PartSettings(1, None)) for tile in tiles])
+    vertices, faces = _welded(city, [_part_of(city, tile) for tile in tiles])
     used, faces = renumbered(len(vertices), faces)
 
     def evidence(points: _Floats) -> EvidenceAt:

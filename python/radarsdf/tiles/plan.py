@@ -57,16 +57,15 @@ class TileGrid:
 
     def tiles_of(self, positions: NDArray[Any]) -> NDArray[np.int64]:
         """(N, 2) the tile that each position (N, 3), world, m, belongs to."""
-        tiles: NDArray[np.int64] = np.floor(self._along(positions) / self.tile_m).astype(np.int64)
-        return tiles
+        return _floor(self._along(positions) / self.tile_m)
 
     def crossed(
         self, ends: _Floats, others: _Floats
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Rows (M,) of segments between `ends` and `others` (N, 3), world, m, and the tiles (M, 2) whose halos they enter, once each."""
         a, b = self._along(ends), self._along(others)
-        first = np.floor((np.minimum(a, b) - self.halo_m) / self.tile_m).astype(np.int64)
-        last = np.floor((np.maximum(a, b) + self.halo_m) / self.tile_m).astype(np.int64)
+        first = _floor((np.minimum(a, b) - self.halo_m) / self.tile_m)
+        last = _floor((np.maximum(a, b) + self.halo_m) / self.tile_m)
         most = (last - first).max(axis=0, initial=-1)
         for step in itertools.product(range(most[0] + 1), range(most[1] + 1)):
             rows = np.flatnonzero((first + step <= last).all(axis=1))
@@ -76,22 +75,19 @@ class TileGrid:
 
     def _meets(self, a: _Floats, b: _Floats, tiles: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether segments, from the corner of tile (0, 0), meet the boxes of their tiles, all (M, 2), by slabs."""
-        lower = tiles * self.tile_m - self.halo_m
-        upper = (tiles + 1) * self.tile_m + self.halo_m
-        extent = b - a
+        lower, extent = tiles * self.tile_m - self.halo_m, b - a
         with np.errstate(divide="ignore", invalid="ignore"):
-            near, far = (lower - a) / extent, (upper - a) / extent
-        enter, leave = np.minimum(near, far), np.maximum(near, far)
-        along = extent == 0  # parallel to the slab, and within: the tiles are those of its own limits
-        enter, leave = np.where(along, -np.inf, enter), np.where(along, np.inf, leave)
-        meets: NDArray[np.bool_] = np.maximum(enter.max(axis=1), 0) <= np.minimum(leave.min(axis=1), 1)
+            ends = np.stack([lower - a, lower + self.tile_m + 2 * self.halo_m - a]) / extent
+        # Parallel to a slab, a segment is within: the tiles are those of its own limits.
+        enter = np.where(extent == 0, -np.inf, ends.min(axis=0)).max(axis=1)
+        leave = np.where(extent == 0, np.inf, ends.max(axis=0)).min(axis=1)
+        meets: NDArray[np.bool_] = np.maximum(enter, 0) <= np.minimum(leave, 1)
         return meets
 
     def weights(self, tile: Tile, positions: _Floats) -> _Floats:
         """(N,) weights of a tile at positions (N, 3), world, m. Those of all tiles add up to one.
 
-        They rise smoothly within half a halo around each edge: the outer half of a halo, where a tile knows less than its
-        owner, does not count.
+        They rise smoothly within half a halo around each edge. The outer half, where a tile knows less, does not count.
         """
         beyond_lower = self._along(positions) - np.array(tile) * self.tile_m
         factors = np.ones((len(positions), 2))
@@ -113,6 +109,11 @@ class TileGrid:
         return along
 
 
+def _floor(numbers: _Floats) -> NDArray[np.int64]:
+    found: NDArray[np.int64] = np.floor(numbers).astype(np.int64)
+    return found
+
+
 def neighbours(tile: Tile) -> list[Tile]:
     """A tile and its eight neighbours, in ascending order."""
     return [(tile[0] + dx, tile[1] + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
@@ -125,9 +126,7 @@ class TilePlan:
     tile: Annotated[tuple[_Number, _Number], _FromList]
     returns: _Count  # in the tile itself
     rays: Annotated[_Count, Field(ge=1)]  # that cross it or its halo
-    origin_cells: Annotated[
-        tuple[_Number, _Number, _Number], _FromList
-    ]  # of its map, a block's corner; lattice
+    origin_cells: Annotated[tuple[_Number, _Number, _Number], _FromList]  # of its map, in the lattice
     memory_bytes: _Count = 0  # estimates of what its fit takes
     seconds: Annotated[float, Field(ge=0)] = 0.0
 
@@ -139,14 +138,9 @@ class TilePlan:
 
 @settings
 class Plan:
-    """What the tasks have in common, and the tiles. A tile's map is a pure function of its plan and its rays.
+    """What the tasks have in common, and the tiles. Folders are named by its numbers, so their types are checked."""
 
-    Folders are named by these numbers, so their types are checked: nothing else must come in from a file.
-    """
-
-    config: (
-        FitConfig  # of all fits, with the sensor's noise and the number of threads, on which bits may depend
-    )
+    config: FitConfig  # of all fits, with the sensor's noise and the number of threads
     tile_m: _Length
     halo_m: _Length
     intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, sensor units
@@ -189,7 +183,7 @@ class Plan:
 
     @cached_property
     def digest(self) -> str:
-        """Of all that is in the plan: results of another plan are not taken for results of this one."""
+        """Of all that is in the plan. Results of another plan are not taken for results of this one."""
         return hashlib.blake2b(self._to_json(), digest_size=16).hexdigest()
 
     def _to_json(self) -> bytes:
@@ -243,11 +237,10 @@ def failure_path(folder: Path, tile: TilePlan) -> Path:
 
 def failure_of(folder: Path, tile: TilePlan) -> str:
     """Why the fit of a tile failed, as one line of letters; empty if it was not tried, or was killed."""
-    path = failure_path(folder, tile)
-    if not path.is_file():
+    try:
+        text = failure_path(folder, tile).read_bytes()[:_MAX_REASON_BYTES].decode(errors="replace")
+    except OSError:
         return ""
-    with path.open("rb") as file:
-        text = file.read(_MAX_REASON_BYTES).decode(errors="replace")
     return "".join(letter if letter.isprintable() else " " for letter in text).strip()
 
 

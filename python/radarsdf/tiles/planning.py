@@ -89,16 +89,14 @@ def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGr
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
     """Lists of consecutive scans, in which whole groups are accumulated."""
     chunk: list[Scan] = []
-    returns = 0
     for scan in scans:
         if chunk and len(chunk) % together == 0:
-            first, here = (np.asarray(one.T_world_sensor)[:3, 3] for one in (chunk[0], scan))
-            is_near = (np.abs(here - first) < _CHUNK_M).all()
-            if len(chunk) >= _CHUNK_SCANS or returns >= _CHUNK_RETURNS or not is_near:
+            way = np.asarray(scan.T_world_sensor)[:3, 3] - np.asarray(chunk[0].T_world_sensor)[:3, 3]
+            is_far, returns = (np.abs(way) >= _CHUNK_M).any(), sum(map(len, chunk))
+            if is_far or len(chunk) >= _CHUNK_SCANS or returns >= _CHUNK_RETURNS:
                 yield chunk
-                chunk, returns = [], 0
+                chunk = []
         chunk.append(scan)
-        returns += len(scan)
     if chunk:
         yield chunk
 
@@ -121,7 +119,7 @@ class _Planner:
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
             if self._with_intensities not in (None, has):
-                msg = f"scan {number} has {'' if has else 'no '}intensities, and those before it have {'none' if has else 'some'}"
+                msg = f"either all scans have intensities, or none has: scan {number} is not like those before it"
                 raise ValueError(msg)
             self._with_intensities = has
             if number % self._every == 0:
@@ -139,14 +137,10 @@ class _Planner:
             self._intensities.add(rays.intensities)
         points, sensors = rays.in_world()
         owner = self._grid.tiles_of(points)
-        pairs = list(self._grid.crossed(points, sensors))
-        rows = np.concatenate([pair[0] for pair in pairs])
-        tiles = np.concatenate([pair[1] for pair in pairs])
-        order = np.lexsort((rows, tiles[:, 1], tiles[:, 0]))
-        rows, tiles = rows[order], tiles[order]
-        starts = np.flatnonzero((tiles[1:] != tiles[:-1]).any(axis=1)) + 1
-        for (i, j), own in zip(tiles[np.append(0, starts)].tolist(), np.split(rows, starts), strict=True):
-            tile = (i, j)
+        pairs = zip(*self._grid.crossed(points, sensors), strict=True)
+        rows, tiles = (np.concatenate(parts) for parts in pairs)
+        for i, j in np.unique(tiles, axis=0).tolist():
+            tile, own = (i, j), np.sort(rows[(tiles == (i, j)).all(axis=1)])
             path = rays_path(self._folder, tile)
             if tile not in self._origins:
                 middle = self._grid.lower_corner(tile) + self._grid.tile_m / 2
@@ -163,12 +157,10 @@ class _Planner:
 
     def _rays(self, scans: list[Scan], first: int) -> Rays:
         """Static returns, checked, in a frame of their own."""
-        held = scans_in_memory(scans)
+        held, given = scans_in_memory(scans), self._config.preparation
         try:
             static = Standing.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
-            return prepare(
-                static.points, held.poses, static.intensities, whole=False, **self._config.preparation
-            )
+            return prepare(static.points, held.poses, static.intensities, whole=False, **given)
         except (ValueError, TypeError) as error:
             msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
             raise ValueError(msg) from error
@@ -224,13 +216,14 @@ class _Planner:
             cost = estimate_rays(rays, plan.config, inside)
             seconds = round(cost.seconds, 3)
             tiles.append(dataclasses.replace(tile, memory_bytes=cost.peak_memory_bytes, seconds=seconds))
-            if len(noises) < _SAMPLED_TILES:
-                with Workers(plan.config.num_threads) as workers:
-                    surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
-                noises.append(surface.noise)
-                clutter += surface.surfels.rough_share() * len(rays)
-                returns += len(rays)
-                cells += len(surface.surfels.keys)
+            if len(noises) == _SAMPLED_TILES:
+                continue
+            with Workers(plan.config.num_threads) as workers:
+                surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
+            noises.append(surface.noise)
+            clutter += surface.surfels.rough_share() * len(rays)
+            returns += len(rays)
+            cells += len(surface.surfels.keys)
         noise = SensorNoise.median(noises)
         return dataclasses.replace(
             plan,
@@ -260,12 +253,8 @@ def rays_path(folder: Path, tile: Tile) -> Path:
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
     """The rays that cross a tile, in the frame of its map, and which of their returns (N,) are in it or its halo."""
     path = rays_path(folder, tile.tile)
-    if not path.exists():
-        msg = f"{path} is gone, as after radarsdf tiles clean: fit the scans again in a new folder"
-        raise ValueError(msg)
-    found = path.stat().st_size / _RECORD.itemsize
-    if found != tile.rays:
-        msg = f"{path} has {found:g} rays instead of {tile.rays}: make the plan again"
+    if not path.exists() or path.stat().st_size != tile.rays * _RECORD.itemsize:
+        msg = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean: fit in a new folder"
         raise ValueError(msg)
     rows = np.fromfile(path, _RECORD)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)

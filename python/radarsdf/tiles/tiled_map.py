@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One map that answers from many tiles, of which few are in memory."""
+"""One map that answers from many tiles."""
 
 from __future__ import annotations
 
@@ -46,10 +46,8 @@ class TiledMap(TileBlend):
 
     Raises
     ------
-    ValueError
-        If the plan is damaged, or no tile is done.
-    OSError
-        If it cannot be read.
+    ValueError, OSError
+        If the plan is damaged, no tile is done, or it cannot be read.
     """
 
     _viewed: tuple[list[Tile], ViewedMap] | None = None
@@ -80,14 +78,8 @@ class TiledMap(TileBlend):
         ----------
         voxel_size : float
             Edge of a voxel, m. It must divide the edge of a leaf cell.
-        box : (2, 3) array_like, optional
-            Lower and upper corner, world, m. Only voxels with their centre inside are meshed.
-        viewpoint : (3,) array_like, optional
-            Sensor position, world, m, for which intensities are predicted at the vertices.
-        progress : bool, optional
-            Whether to show a progress bar. Default: only on a terminal.
-        **limits
-            `min_confidence`, `max_uncertainty` and `min_component_triangles` of :meth:`Map.mesh`.
+        box, viewpoint, progress, **limits
+            As of :meth:`Map.mesh`.
 
         Returns
         -------
@@ -96,10 +88,8 @@ class TiledMap(TileBlend):
 
         Raises
         ------
-        ValueError
-            If an argument is out of range, or a tile could not be meshed.
-        MemoryError
-            If memory cannot hold the mesh: :meth:`export` writes 3D Tiles one after another.
+        ValueError, MemoryError
+            If an argument is out of range, or memory cannot hold the mesh: :meth:`export` writes 3D Tiles one after another.
         """
         return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
 
@@ -169,9 +159,7 @@ class TiledMap(TileBlend):
             ``NAME.json``: 3D Tiles 1.1, a GLB file for each tile in a folder ``NAME`` next to it, in the frame of the world. To
             place it on the earth, set the ``transform`` of its root. Small components that reach into the next tile stay.
             Another suffix: one file, as of :func:`radarsdf.io.write_mesh`.
-        voxel_size : float
-            Edge of a voxel, m. It must divide the edge of a leaf cell.
-        progress, **limits
+        voxel_size, progress, **limits
             As of :meth:`mesh`; also its `box`.
 
         Returns
@@ -181,12 +169,8 @@ class TiledMap(TileBlend):
 
         Raises
         ------
-        ValueError
-            If an argument is out of range, the suffix is another, or there is no surface for 3D Tiles.
-        OSError
-            If a file cannot be written.
-        MemoryError
-            If memory cannot hold the mesh of one file.
+        ValueError, MemoryError, OSError
+            As of :meth:`mesh`, or if the suffix is another, there is no surface for 3D Tiles, or a file cannot be written.
         """
         from radarsdf.tiles.mesh import export_mesh  # noqa: PLC0415 - as above
 
@@ -199,11 +183,7 @@ class TiledMap(TileBlend):
 
         Parameters
         ----------
-        voxel_size : float
-            Edge of a voxel, m.
-        progress : bool, optional
-            Whether to show a progress bar. Default: only on a terminal.
-        **limits
+        voxel_size, progress, **limits
             As of :meth:`mesh`; also its `box`.
 
         Returns
@@ -211,17 +191,17 @@ class TiledMap(TileBlend):
         Threshold
             The confidence that :meth:`mesh` applies, and the shares that its ``metadata`` holds.
         """
-        from radarsdf.tiles.mesh import threshold_of  # noqa: PLC0415 - as above
+        from radarsdf.tiles.mesh import parts_of  # noqa: PLC0415 - as above
 
-        return threshold_of(self, voxel_size, progress, **limits)
+        return parts_of(self, voxel_size, progress, **limits)[2]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Copy the plan and the maps of the tiles that are done to a new folder, without the rays of the tiles.
+        """Copy the plan and the maps of the tiles that are done to a new folder, which :func:`radarsdf.load` reads.
 
         Parameters
         ----------
         path : path-like
-            The folder. :func:`radarsdf.load` reads it; its results have the same bits.
+            The folder. The rays of the tiles are not copied.
 
         Raises
         ------
@@ -239,8 +219,7 @@ class TiledMap(TileBlend):
     @property
     def origin(self) -> _Floats:
         """(3,) that of the tile in the middle, world, m, for those who need coordinates near zero."""
-        tiles = self.tiles
-        return self.config.lattice.position(tiles[len(tiles) // 2].origin_cells)
+        return self.config.lattice.position(self.tiles[len(self.tiles) // 2].origin_cells)
 
     @cached_property
     def report(self) -> dict[str, Any]:
@@ -249,21 +228,18 @@ class TiledMap(TileBlend):
         `missing_tiles`: names.
         """
         reports = [report_of(self.folder, tile) for tile in self.tiles]
+        timed = [
+            name for name, value in reports[0].items() if name.endswith("_s") and isinstance(value, float)
+        ]
         return {
             "tiles": len(reports),
             "missing_tiles": list(self.missing),
             "scans": self.plan.scans,
             "returns": sum(tile.returns for tile in self.plan.tiles),
             "leaf_cells": self.num_cells,
-            **{name: value for name, value in reports[0].items() if name == "noise"},
-            "skipped": list(
-                dict.fromkeys(words for report in reports for words in report.get("skipped", []))
-            ),
-            **{
-                step: sum(report.get(step, 0.0) for report in reports)
-                for step, seconds in reports[0].items()
-                if step.endswith("_s") and isinstance(seconds, float)
-            },
+            "noise": reports[0].get("noise"),
+            "skipped": list(dict.fromkeys(step for report in reports for step in report.get("skipped", []))),
+            **{name: sum(report.get(name, 0.0) for report in reports) for name in timed},
         }
 
     @cached_property
@@ -300,10 +276,8 @@ def load(path: str | PathLike[str]) -> Map:
 
     Raises
     ------
-    ValueError
-        If it is no radarsdf map, is damaged, or comes from another version.
-    OSError
-        If it cannot be read.
+    ValueError, OSError
+        If it is no radarsdf map, is damaged, comes from another version, or cannot be read.
     """
     path = path_of(path, "path")
     return TiledMap(path) if path.is_dir() else load_file(path)
