@@ -9,7 +9,6 @@ Each reader states where the scans, the poses and the pose of the radar on its p
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_pose
 from radarsdf.io.bag_messages import bags_in
@@ -148,24 +146,12 @@ def _delft_pose(
 _SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
 
 # The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source:
-# matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m of github.com/snail-radar/dataset_tools, 2f82c2c.
+# matlab/Body_T_Xt32.m and Body_T_Oculii.m ("refined") of github.com/snail-radar/dataset_tools, 2f82c2c.
 _BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
                            [-0.019750133, 0.999429818, 0.027385610, 0.0],
                            [0.009808698, -0.027195946, 0.999581997, -0.115],
                            [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
-_ARS548_POSITION_M = (0.0, 0.0, 0.07)
-# Its orientation, qx qy qz qw, was set anew several times: from this day on. Afternoons and evenings are half a day later.
-_ARS548_ORIENTATIONS = (
-    (20231104.0, (0.004112068, -0.127365674, -0.006945404, 0.991822987)),
-    (20231105.5, (-0.001244648, 0.001010494, -0.018245103, 0.999832259)),
-    (20231109.0, (-0.008126773, 0.001224424, -0.024923832, 0.999655570)),
-    (20231201.0, (-0.002238636, -0.013322733, -0.022325986, 0.999659464)),
-    (20231208.0, (-0.002173148, -0.012493422, -0.022981144, 0.999655470)),
-    (20231213.0, (-0.003973179, -0.011377850, -0.020249871, 0.999722312)),
-    (20240113.0, (-0.001835193, -0.014938248, -0.025422503, 0.999563493)),
-)
-_DAY = re.compile(r"(\d{8})(_aft|_eve)?$")
 
 
 def _snail_parts(folder: Path) -> tuple[Path, str] | None:
@@ -183,32 +169,16 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
     found = _snail_parts(folder)
     assert found is not None
     sequence, radar = found
-    others = [other for other in _SNAIL_RADARS if other != radar and (sequence / other).is_dir()]
-    if others and folder.resolve() == sequence:
-        request.notes.add(f"{radar} is read; {' and '.join(others)} are read as folders of their own")
     if request.poses is None:
         path = sequence / "utm50r_T_xt32.txt"
         check(path.is_file(), f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
         request = replace(request, poses=path)
     if request.extrinsic is None:
-        T_body_radar = _body_T_ars548(sequence) if radar.startswith("ars548") else _BODY_T_OCULII
-        request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ T_body_radar)
+        what = "the calibration of the ARS548 depends on the day: give extrinsic, T_xt32_ars548"
+        check(not radar.startswith("ars548"), f"{sequence}: {what}")
+        request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ _BODY_T_OCULII)
     files = sorted((sequence / radar).glob("*.pcd"), key=natural)
     return read_files(files, sequence, request, partial(lidar_map, sequence))
-
-
-def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
-    """The published calibration of the day."""
-    name = sequence.parent.name
-    found = _DAY.match(name)
-    day = float(found[1]) + 0.5 * (found[2] is not None) if found else 0.0
-    known = [orientation for first, orientation in _ARS548_ORIENTATIONS if first <= day]
-    what = f"the day, which is the name of the folder above, such as 20231105_aft, but that is {name}: give extrinsic"
-    check(known, f"{sequence}: the calibration of the ARS548 depends on {what}")
-    T_body_ars548 = np.eye(4)
-    T_body_ars548[:3, :3] = Rotation.from_quat(known[-1]).as_matrix()
-    T_body_ars548[:3, 3] = _ARS548_POSITION_M
-    return T_body_ars548
 
 
 # The first that fits a folder reads it.

@@ -111,11 +111,8 @@ class Fields:
         )
         return replace(self, in_degrees=in_degrees)
 
-    def note_use(self, names: Iterable[str], notes: Notes) -> None:
-        """Notes which fields are not used, and intensities that would be better in dB."""
-        intensity = self.names.get("intensity", "")
-        if plain_name(intensity)[1] == "linear":
-            notes.add(f"{intensity} is taken as intensity as it is: 10 log10 of it, dB, gives a better map")
+    def note_unused(self, names: Iterable[str], notes: Notes) -> None:
+        """Notes which fields are not used."""
         if unused := [name for name in names if name and name not in self.names.values()]:
             listed = ", ".join(unused)
             notes.add(f"fields that are not used: {listed}; fields={{role: name}} or --field chooses others")

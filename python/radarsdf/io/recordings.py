@@ -152,20 +152,9 @@ def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields]
     if layout not in layouts:
         fields = Fields.of(list(columns), request.fields).judged(columns, notes)
         if not request.fields and topic not in {known for known, *_ in layouts}:
-            fields.note_use(columns, notes)
-        for others in layouts.values():
-            _note_differences(fields.names, others.names, notes)
+            fields.note_unused(columns, notes)
         layouts[layout] = fields
     return layouts[layout]
-
-
-def _note_differences(names: Mapping[str, str], others: Mapping[str, str], notes: Notes) -> None:
-    for role in ("intensity", "doppler", "sigma_range"):
-        if (role in names) != (role in others):
-            notes.add(f"some scans have {role}, others have none: not used where all must have it")
-    own, other = names.get("intensity"), others.get("intensity")
-    if own and other and own != other:
-        notes.add(f"intensities of some scans are {other}, of others {own}: they are taken as of one unit")
 
 
 def scan_poses(
@@ -229,10 +218,11 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     reads = [partial(read_columns, path, columns) for path in files]
     names = [str(path) for path in files]
     if len(files) == 1:
-        parts, times_s, known = _split(files[0], columns, times_s, known, notes)
+        parts, table_s = _split(files[0], columns, notes)
         if parts:
             reads = [partial(dict, part) for part in parts]
             names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
+            times_s = table_s
     matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
     stamps = [None] * len(reads) if known_s is None else known_s
     raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
@@ -305,30 +295,25 @@ def _time_in(stem: str) -> float | None:
     return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
 
 
-def _split(
-    path: Path, columns: Any, times_s: Sequence[float] | None, poses: Poses, notes: Notes
-) -> tuple[list[Columns], Sequence[float] | None, Poses]:
-    """The scans in the one table of a recording, by a column with their numbers; none if it is one scan."""
+def _split(path: Path, columns: Any, notes: Notes) -> tuple[list[Columns], Sequence[float] | None]:
+    """The scans in the one table of a recording, by a column with their numbers, and their times; none if it is one scan."""
     try:
         table = read_columns(path, columns)
     except ValueError:  # which is noted when the scan is read
-        return [], times_s, poses
+        return [], None
     plain = {plain_name(name)[0]: name for name in reversed(table)}
     key = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
     if key is None or table[key].dtype.kind not in "biuf":
-        return [], times_s, poses
-    rows = np.flatnonzero(np.isfinite(table[key]))
-    values, first, part = np.unique(table[key][rows], return_index=True, return_inverse=True)
-    if len(values) < 2:
-        return [], times_s, poses
-    left_out = len(table[key]) - len(rows)
-    without = f"; {left_out} rows left out, whose {key} is not a number" if left_out else ""
-    notes.add(f"{path.name} is read as {len(values)} scans, by its field {key}{without}")
+        return [], None
+    values, part = np.unique(table[key], return_inverse=True)
+    numbers = np.flatnonzero(np.isfinite(values))  # rows of no scan are left out
+    if len(numbers) < 2:
+        return [], None
+    notes.add(f"{path.name} is read as {len(numbers)} scans, by its field {key}")
+    rows = [np.flatnonzero(part == number) for number in numbers]
     time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
+    times_s = None
     if time is not None and table[time].dtype.kind in "iuf":
-        scale = SCALES.get(plain_name(time)[1], 1.0)
-        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
-    if isinstance(poses, np.ndarray) and 0 <= values[0] <= values[-1] < len(poses) > len(values):
-        poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
-    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
-    return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses
+        first = table[time][[of_scan[0] for of_scan in rows]].astype(np.float64)
+        times_s = in_seconds(first * SCALES.get(plain_name(time)[1], 1.0), path.name, notes).tolist()
+    return [{name: table[name][of_scan] for name in table if name != key} for of_scan in rows], times_s
