@@ -93,9 +93,6 @@ def _given(
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
         return lambda _: numbered_poses
     if poses is UNPOSED:
-        if len(frames) > 1:
-            listed = ", ".join(frames)
-            request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
         return lambda _: poses
     return transforms_in(paths, request).attach(poses, frames[0], request)
 
@@ -119,10 +116,7 @@ def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
         listed = _listed(fitting.values())
         msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {listed}"
         raise ValueError(msg)
-    unread = [t for t in topics.values() if t.name not in fitting and _RADAR.search(t.message_type)]
-    what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that"
-    check(not unread or _is_radar(chosen[0]), f"{about}: {what}")
-    if others := {*fitting.values(), *unread} - set(chosen):
+    if others := set(fitting.values()) - set(chosen):
         request.notes.add(f"scans: those of {_listed(chosen)}; not read: {_listed(others)}")
     return chosen
 

@@ -136,14 +136,13 @@ def _delft_pose(
     return T_map_radar
 
 
-# SNAIL-Radar, snail-radar.github.io: two radars, and the poses of its lidar in UTM zone 50R, which is the world frame.
+# The Oculii Eagle of SNAIL-Radar, snail-radar.github.io. The poses are those of its lidar in UTM zone 50R, the world frame.
 #
 #     eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
-#     ars548/points/1706001762.429354169.pcd      ARS548 frame (forward, left, up); intensity: RCS + 128
 #     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
 #     lidar.pcd or lidar.ply                      optional: ground truth
 
-_SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
+_SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl")  # the first that is there is read
 
 # The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source:
 # matlab/Body_T_Xt32.m and Body_T_Oculii.m ("refined") of github.com/snail-radar/dataset_tools, 2f82c2c.
@@ -154,36 +153,26 @@ _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
                            [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
 
 
-def _snail_parts(folder: Path) -> tuple[Path, str] | None:
-    """The sequence and the radar that a folder means: ``data3``, or in it ``ars548`` or ``ars548/points``."""
-    here = folder.resolve()
-    for sequence in (here, *here.parents[:2]):
-        for radar in _SNAIL_RADARS:
-            if (sequence / radar).is_dir() and (sequence / radar).is_relative_to(here):
-                return sequence, radar
-    return None
+def _snail_points(folder: Path) -> Path | None:
+    return next((folder / radar for radar in _SNAIL_RADARS if (folder / radar).is_dir()), None)
 
 
 def _snail_radar(folder: Path, request: Request) -> Scans:
-    """A sequence, or one radar of it."""
-    found = _snail_parts(folder)
-    assert found is not None
-    sequence, radar = found
+    """A sequence, such as ``data3``."""
+    points = _snail_points(folder)
+    assert points is not None
     if request.poses is None:
-        path = sequence / "utm50r_T_xt32.txt"
-        check(path.is_file(), f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
+        path = folder / "utm50r_T_xt32.txt"
+        check(path.is_file(), f"{folder} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
         request = replace(request, poses=path)
     if request.extrinsic is None:
-        what = "the calibration of the ARS548 depends on the day: give extrinsic, T_xt32_ars548"
-        check(not radar.startswith("ars548"), f"{sequence}: {what}")
         request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ _BODY_T_OCULII)
-    files = sorted((sequence / radar).glob("*.pcd"), key=natural)
-    return read_files(files, sequence, request, partial(lidar_map, sequence))
+    return read_files(sorted(points.glob("*.pcd"), key=natural), folder, request, partial(lidar_map, folder))
 
 
 # The first that fits a folder reads it.
 DATASETS = (
-    Dataset("SNAIL-Radar", lambda f: _snail_parts(f) is not None, _snail_radar),
+    Dataset("SNAIL-Radar", lambda f: _snail_points(f) is not None, _snail_radar),
     Dataset("View-of-Delft", lambda f: _delft_parts(f) is not None, _view_of_delft),
     Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
     Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),

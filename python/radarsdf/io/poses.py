@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -165,10 +164,10 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
 
 
-def poses_of(poses: Any, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
+def poses_of(poses: Any, notes: Notes) -> Poses:
     """Poses as a user gives them: an array (F, 4, 4), poses by time, or a file for :func:`read_poses`."""
     if isinstance(poses, (str, PathLike)):
-        return read_poses(Path(poses), notes, calibration)
+        return read_poses(Path(poses), notes)
     if isinstance(poses, (Trajectory, TransformChain)):
         return poses
     matrices = real_array(poses, "poses")
@@ -176,14 +175,13 @@ def poses_of(poses: Any, notes: Notes, calibration: Sequence[Path] = ()) -> Pose
     return rigid_or_nan(matrices, "the given array", notes)
 
 
-def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
+def read_poses(path: Path, notes: Notes) -> Poses:
     """Poses by time, or (F, 4, 4) in the order of the scans, of a file of one of these kinds.
 
     - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, qx, qy, qz and
       qw, as in files of EuRoC, evo and ``rostopic echo -p``. Without a time it is in order.
     - TUM: ``time x y z qx qy qz qw``, s and m.
-    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in one of the files `calibration`,
-      T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
+    - KITTI: lines of twelve numbers, the first three rows of a matrix.
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
 
     Times may be in ms, µs or ns since 1970, or in the unit of their name.
@@ -203,13 +201,7 @@ def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Po
     if width == 12:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
-        P = rigid_or_nan(poses, str(path), notes)
-        for file in calibration:
-            if file.is_file() and (Tr := read_calibration(file)) is not None:
-                notes.add(f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr")
-                return np.linalg.inv(Tr) @ P @ Tr
-        notes.add(f"{path.name} has KITTI poses, no calibration Tr: they are taken as T_world_sensor")
-        return P
+        return rigid_or_nan(poses, str(path), notes)
     if width == 16 or (width == 4 and len(values) % 4 == 0):
         return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
     msg = (

@@ -22,7 +22,7 @@ from radarsdf.io.fields import SIGMA
 from radarsdf.io.files import check
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, StampedPoses, poses_of, rigid_or_nan
+from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, Poses, StampedPoses, poses_of, rigid_or_nan
 from radarsdf.io.recordings import RawScan, Request, Truth, posed, read_files, read_folder, scan_poses
 from radarsdf.io.scans import Columns, Notes, Scan, Scans
 
@@ -55,9 +55,9 @@ def read(
         One of
 
         - our ``.npz`` (see :func:`read_scans`);
-        - a folder with one file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
-          file, which a column such as frame or scan_id splits into scans. Files are read in natural order, or in the order
-          of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
+        - a folder with a file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ, in natural
+          order or that of the times in their names, and with ``lidar.pcd`` or ``lidar.ply`` as ground truth; or one such
+          file, which a column such as frame or scan_id splits into scans;
         - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
@@ -69,8 +69,8 @@ def read(
     topic : str or sequence of str, optional
         In a bag, the topics of the scans, merged by time. By default the radar's, if there is one.
     pose_topic : str, optional
-        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one; of several, the only
-        one whose child frame leads to that of the scans, or else TF. Goals, plans and initial poses are never used.
+        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one whose child frame does
+        not move against that of the scans, or else TF, or else the only one.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
@@ -184,24 +184,20 @@ def _npz(path: Path, request: Request) -> Scans:
     named = request.fields is None and request.columns is None
     check(named, f"{path} has arrays of known names: fields and columns are not used for .npz files")
     scans = read_scans(path)
-    truth = scans.ground_truth
+    truth: Truth = request.truth or (lambda: scans.ground_truth)
     if others is None:
-        poses: Any = rigid_or_nan(scans.poses, str(path), notes)
+        poses: Poses = rigid_or_nan(scans.poses, str(path), notes)
     else:
         poses = poses_of(others, notes)
-        of = others if isinstance(others, (str, PathLike)) else "those given"
-        notes.add(f"poses: {of}, in place of those in {path.name}")
-        if truth is not None and request.truth is None:
-            notes.add(f"the ground truth of {path.name} is left out: it lies in the world of the poses there")
-        truth = None
+        notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
+        truth = request.truth or (lambda: None)
     times_s = None if scans.times_s is None else scans.times_s.tolist()
     matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
     raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    source = posed(lambda: raw, lambda _: matched, request)
-    found = Scans.of_source(source, notes, request.truth or (lambda: truth), lambda: imu)
+    found = Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, truth, lambda: imu)
     found.truth_kind = scans.truth_kind
     return found
 

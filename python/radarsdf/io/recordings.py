@@ -12,7 +12,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -198,15 +197,12 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
     if poses is None:
         poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
-        if poses is not None and poses.parent != folder:  # which is easily overlooked
-            notes.add(f"poses: of {poses}")
+        notes.add(f"poses: of {poses}")
     if poses is None:
         what = files[0] if len(files) == 1 else folder
         msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
         raise NoPoses(msg)
-    if isinstance(poses, (str, PathLike)):
-        places = list(dict.fromkeys((Path(poses).parent, *places)))
-    known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
+    known = poses_of(poses, notes)
     files, times_s, known = _in_order_of_time(files, known, notes)
     if T_base_sensor is None:
         T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
@@ -310,7 +306,8 @@ def _split(path: Path, columns: Any, notes: Notes) -> tuple[list[Columns], Seque
     if len(numbers) < 2:
         return [], None
     notes.add(f"{path.name} is read as {len(numbers)} scans, by its field {key}")
-    rows = [np.flatnonzero(part == number) for number in numbers]
+    by_number = np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1])
+    rows = [by_number[i] for i in numbers]
     time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
     times_s = None
     if time is not None and table[time].dtype.kind in "iuf":
