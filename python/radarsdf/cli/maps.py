@@ -77,7 +77,8 @@ def mesh(given: Namespace, results: Results) -> None:
         msg = f"{given.map} has no surface here: nothing written"
         raise ValueError(msg)
     line = f"{vertices} vertices and {triangles} triangles"
-    results.add_file(line, out, write_mesh(out, found), vertices=vertices, triangles=triangles)
+    write_mesh(out, found)
+    results.add_file(line, out, vertices=vertices, triangles=triangles)
     results.add_threshold(Threshold.of_mesh(found.metadata))
     if drawing is not None:
         picture.save_picture(drawing, found, scalar=found.vertex_attributes.get("intensity"))

@@ -44,10 +44,9 @@ class Results:
         """Add the confidence from which on a mesh was kept, and what that costs."""
         self.add(str(threshold), **threshold.metadata)
 
-    def add_file(self, what: str, path: Path, origin: Any = None, **values: Any) -> None:
-        """Add what was written to a file, and the origin of its frame, if that is not the world."""
-        local = "" if origin is None else f", in a local frame, whose origin is in {path.name}.origin.json"
-        self.add(f"{what} written to {path}{local}", out=path, origin=origin, **values)
+    def add_file(self, what: str, path: Path, **values: Any) -> None:
+        """Add what was written to a file."""
+        self.add(f"{what} written to {path}", out=path, **values)
 
     def end(self) -> None:
         """Print the object, if it is for programs, once. A number that is not finite is null."""

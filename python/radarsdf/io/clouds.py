@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import path_of
 from radarsdf.extras import require
-from radarsdf.interrupts import whole_import
 from radarsdf.io.fields import Fields, names_of
-from radarsdf.io.files import check, check_regular_file, origin_of, reading
+from radarsdf.io.files import check, check_regular_file, reading
 from radarsdf.io.scans import Columns, Notes
 from radarsdf.io.text import read_table
 
@@ -69,8 +68,8 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     Returns
     -------
     (M, 3) float64 ndarray
-        Frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places the points; the world's, if
-        :func:`write_cloud` wrote an origin next to it. Points that are not finite are left out.
+        Frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places the points. Points that are not finite are
+        left out.
 
     Raises
     ------
@@ -90,8 +89,7 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     if file.suffix.lower() == ".pcd":
         T_world_sensor = read_viewpoint(file)
         points = points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
-    origin = origin_of(path)
-    return points if origin is None else points + origin
+    return points
 
 
 # Files .bin: float32, x, y, z, intensity, as KITTI has them, or as many columns as a user says.
@@ -143,8 +141,8 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
     table = read_table(path)
     width = table.values.shape[1]
     # CloudCompare writes names of columns after a comment sign.
-    named = (head for head in table.heads if {"x", "y", "z"} <= {word.lower() for word in head})
-    names = table.header or next(named, None) or names_of(width or 3, columns)
+    named = [head for head in table.heads if len(head) == width and not any(map(str.isdecimal, head))]
+    names = named[-1] if named else names_of(width or 3, columns)
     values = table.values if len(table.values) else np.zeros((0, len(names)))
     fits = values.shape[1] == len(names) == len(set(names))
     check(fits, f"its header has {len(names)} names for {width} columns, or a name twice")
@@ -223,8 +221,7 @@ def has_faces(path: Path) -> bool:
 
 def _ply(path: Path, _: GivenColumns) -> Columns:
     """The columns of the vertices."""
-    with whole_import():
-        import trimesh  # noqa: PLC0415 - takes long, and few files need it
+    import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
     # Without materials: a PLY file may name an image, which is then not looked for.
     loaded: Any = trimesh.load(ply_bytes(path), file_type="ply", process=False, skip_materials=True)

@@ -99,14 +99,12 @@ class Fields:
     def judged(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in a cloud."""
         names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
-        unit_of = {name: unit for name in names if (unit := plain_name(name)[1])}
-        if len(unit_of) == len(names):
+        if all(plain_name(name)[1] for name in names):
             return self
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
-        in_degrees = are_degrees(azimuth, elevation, next(iter(unit_of.values()), ""))
-        by = f"as {next(iter(unit_of))} is" if unit_of else "by their numbers"
+        in_degrees = are_degrees(azimuth, elevation)
         notes.add(
-            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
+            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} by their numbers, azimuth positive to the left; "
             "names such as azimuth_deg or azimuth_rad decide"
         )
         return replace(self, in_degrees=in_degrees)

@@ -142,10 +142,7 @@ def read(
         truth=_truth(ground_truth),
         notes=Notes(str(path) if one else "the bags"),
     )
-    found = _read(paths[0], request) if one else read_bags(paths, request)
-    if request.truth is not None:
-        found.truth_kind = "given"
-    return found
+    return _read(paths[0], request) if one else read_bags(paths, request)
 
 
 def _read(path: Path, request: Request) -> Scans:
@@ -197,9 +194,7 @@ def _npz(path: Path, request: Request) -> Scans:
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    found = Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, truth, lambda: imu)
-    found.truth_kind = scans.truth_kind
-    return found
+    return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, truth, lambda: imu)
 
 
 def _columns(scan: Scan) -> Columns:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,6 @@ _ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a s
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """(N,) each, by name."""
-
-TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
-"""Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +130,6 @@ class Scans:
         As `Scan.doppler_mps` and `Scan.sigma`.
     times_s : (F,) ndarray, optional
         When the scans were taken, s.
-    truth_kind : {"lidar", "simulated", "given"}
-        Where the ground truth comes from.
     imu : Imu, optional
         What an IMU measured meanwhile.
     """
@@ -149,7 +144,6 @@ class Scans:
         doppler_mps: Sequence[NDArray[Any]] | None = None,
         times_s: NDArray[np.float64] | None = None,
         sigmas: Sequence[NDArray[Any]] | None = None,
-        truth_kind: TruthKind = "lidar",
         imu: Imu | None = None,
     ) -> None:
         self._arrays: dict[str, list[NDArray[Any]] | None] | None = {
@@ -162,8 +156,6 @@ class Scans:
         self._notes = Notes()
         self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
         self._imu: Callable[[], Imu | None] = lambda: imu
-        self.truth_kind: TruthKind = truth_kind
-        """Where the ground truth comes from."""
 
     @classmethod
     def of_source(
