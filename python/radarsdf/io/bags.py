@@ -75,8 +75,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     recorded = by_recording[scan_topics[0].name]
     imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
-    truth = request.truth or (lambda: None)
-    return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
+    return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
 
 def _given(

@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check_pose
-from radarsdf.io.bag_messages import bags_in
-from radarsdf.io.bags import read_bags
 from radarsdf.io.files import check, reading
-from radarsdf.io.poses import pose_matrices_of, read_calibration, read_transform, trajectory_of
-from radarsdf.io.recordings import BASE_T_RADAR, Request, lidar_map, natural, read_files
+from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
+from radarsdf.io.recordings import Request, lidar_map, natural, read_files
 from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text
 
@@ -39,26 +37,6 @@ class Dataset(NamedTuple):
 def find(folder: Path) -> Dataset | None:
     """The data set whose shape a folder has; None if it has none."""
     return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
-
-
-def _bags(folder: Path) -> list[Path]:
-    return [path for path in bags_in(folder) if path.stem != "gt_odom"]  # ground truth of NTU4DRadLM
-
-
-def _ntu4dradlm(folder: Path, request: Request) -> Scans:
-    """Bags and ``gt_odom.txt`` (TUM) of the platform; the calibration is given by `extrinsic`."""
-    if request.extrinsic is None:
-        what = "the poses of gt_odom.txt are taken as those of the radar; the data set has a calibration"
-        request.notes.add(f"NTU4DRadLM: no extrinsic is given, so {what}")
-    poses = folder / "gt_odom.txt" if request.poses is None else request.poses
-    return read_bags(_bags(folder), replace(request, poses=poses))
-
-
-def _viking_hill(folder: Path, request: Request) -> Scans:
-    """Bags with ``/hugin_raf_1/radar_data`` and ``/icp_odom``, and the pose of the radar on the platform."""
-    if request.extrinsic is None:
-        request = replace(request, extrinsic=read_transform(folder / BASE_T_RADAR, np.eye(4)))
-    return read_bags(_bags(folder), request)
 
 
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
@@ -92,20 +70,9 @@ def _coloradar(folder: Path, request: Request) -> Scans:
     return read_files(sorted(files, key=natural), folder, replace(request, columns=request.columns or 5))
 
 
-def _delft_parts(folder: Path) -> tuple[Path, Path] | None:
-    """The training folders of the radar, and of the poses."""
-    folder = folder.resolve()
-    for radar, poses in ((folder / "radar", folder / "lidar"), (folder, folder.parent / "lidar")):
-        if (radar / "training/velodyne").is_dir() and (poses / "training/pose").is_dir():
-            return radar / "training", poses / "training"
-    return None
-
-
 def _view_of_delft(folder: Path, request: Request) -> Scans:
-    """View-of-Delft, whole or one of its radar folders: a calibration and a pose for each frame."""
-    parts = _delft_parts(folder)
-    assert parts is not None
-    radar, lidar = parts
+    """View-of-Delft: a calibration and a pose for each frame."""
+    radar, lidar = folder / "radar/training", folder / "lidar/training"
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
@@ -173,9 +140,7 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
 # The first that fits a folder reads it.
 DATASETS = (
     Dataset("SNAIL-Radar", lambda f: _snail_points(f) is not None, _snail_radar),
-    Dataset("View-of-Delft", lambda f: _delft_parts(f) is not None, _view_of_delft),
+    Dataset("View-of-Delft", lambda f: (f / "radar/training/velodyne").is_dir(), _view_of_delft),
     Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
     Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
-    Dataset("NTU4DRadLM", lambda f: (f / "gt_odom.txt").exists() and bool(_bags(f)), _ntu4dradlm),
-    Dataset("Viking Hill", lambda f: (f / BASE_T_RADAR).exists() and bool(_bags(f)), _viking_hill),
 )

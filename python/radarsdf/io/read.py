@@ -11,19 +11,29 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import check_pose, path_of, positions, positive
+from radarsdf.checks import check_pose, path_of, positive
 from radarsdf.io import datasets
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
-from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
+from radarsdf.io.clouds import CLOUD_SUFFIXES
 from radarsdf.io.fields import SIGMA
 from radarsdf.io.files import check
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, Poses, StampedPoses, poses_of, rigid_or_nan
-from radarsdf.io.recordings import RawScan, Request, Truth, posed, read_files, read_folder, scan_poses
+from radarsdf.io.poses import (
+    MAX_GAP_S,
+    POSE_FILES,
+    UNPOSED,
+    Poses,
+    StampedPoses,
+    poses_of,
+    read_transform,
+    rigid_or_nan,
+)
+from radarsdf.io.recordings import BASE_T_RADAR, RawScan, Request, posed, read_files, read_folder, scan_poses
 from radarsdf.io.scans import Columns, Notes, Scan, Scans
 
 
@@ -41,7 +51,6 @@ def read(
     fields: Mapping[str, Any] | None = None,
     columns: int | Sequence[str] | None = None,
     max_gap_s: float = MAX_GAP_S,
-    ground_truth: str | PathLike[str] | ArrayLike | None = None,
 ) -> Scans:
     """Reads scans with poses from a file, a folder or bags.
 
@@ -89,8 +98,6 @@ def read(
         float32 x, y, z, intensity.
     max_gap_s : float
         Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
-    ground_truth : path-like or (M, 3) array_like, optional
-        Lidar points, world frame, m.
 
     Returns
     -------
@@ -122,8 +129,7 @@ def read(
     check(stamps in (None, "header", "record"), f'stamps must be "header" or "record", not {stamps!r:.50}')
     one = isinstance(path, (str, PathLike))
     paths = [path_of(part, "path") for part in ([path] if one or not isinstance(path, Iterable) else path)]
-    files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
-    for file in (*paths, *map(Path, files)):
+    for file in (*paths, *([Path(poses)] if isinstance(poses, (str, PathLike)) else [])):
         if not file.exists():  # many readers would not name it
             msg = f"{file} does not exist"
             raise FileNotFoundError(msg)
@@ -139,7 +145,6 @@ def read(
         fields=fields,
         columns=columns,
         max_gap_s=positive(max_gap_s, "max_gap_s"),
-        truth=_truth(ground_truth),
         notes=Notes(str(path) if one else "the bags"),
     )
     return _read(paths[0], request) if one else read_bags(paths, request)
@@ -152,7 +157,10 @@ def _read(path: Path, request: Request) -> Scans:
     if path.is_dir():
         if (dataset := datasets.find(path)) is not None:
             return dataset.read(path, request)
-        if bags := bags_in(path):
+        if bags := bags_in(path):  # NTU4DRadLM and Viking Hill have files beside them
+            if request.extrinsic is None and (path / BASE_T_RADAR).is_file():
+                T_base_radar = read_transform(path / BASE_T_RADAR, np.eye(4))
+                request = dataclasses.replace(request, extrinsic=T_base_radar)
             file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
             if file is not None and request.poses is None and request.pose_topic is None:
                 request.notes.add(f"poses: of {file.name}")
@@ -181,20 +189,20 @@ def _npz(path: Path, request: Request) -> Scans:
     named = request.fields is None and request.columns is None
     check(named, f"{path} has arrays of known names: fields and columns are not used for .npz files")
     scans = read_scans(path)
-    truth: Truth = request.truth or (lambda: scans.ground_truth)
+    truth = scans.ground_truth
     if others is None:
         poses: Poses = rigid_or_nan(scans.poses, str(path), notes)
     else:
         poses = poses_of(others, notes)
         notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
-        truth = request.truth or (lambda: None)
+        truth = None
     times_s = None if scans.times_s is None else scans.times_s.tolist()
     matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
     raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, truth, lambda: imu)
+    return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu)
 
 
 def _columns(scan: Scan) -> Columns:
@@ -202,12 +210,3 @@ def _columns(scan: Scan) -> Columns:
     columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
     columns |= dict(zip(SIGMA, () if scan.sigma is None else scan.sigma.T, strict=False))
     return {name: values for name, values in columns.items() if values is not None}
-
-
-def _truth(ground_truth: Any) -> Truth | None:
-    if ground_truth is None:
-        return None
-    if isinstance(ground_truth, (str, PathLike)):
-        return partial(read_points, ground_truth)
-    points = positions(ground_truth, "ground_truth")
-    return lambda: points

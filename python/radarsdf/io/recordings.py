@@ -71,7 +71,6 @@ class Request:
     max_gap_s: float = MAX_GAP_S
     stamps: str | None = None
     world_frame: str | None = None
-    truth: Truth | None = None  # None: what lies next to the scans
     notes: Notes = field(default_factory=Notes)
 
 
@@ -190,7 +189,7 @@ def read_folder(folder: Path, request: Request) -> Scans:
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
     """The scans of files with the poses of the request, or those that are found in or near the folder.
 
-    The files hold one scan each, or the only one the table of a recording. `truth` counts if the request has none.
+    The files hold one scan each, or the only one the table of a recording.
     """
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
@@ -223,7 +222,7 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     stamps = [None] * len(reads) if known_s is None else known_s
     raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
     source = posed(lambda: raw_scans, lambda _: matched, request)
-    return Scans.of_source(source, notes, request.truth or truth)
+    return Scans.of_source(source, notes, truth)
 
 
 def cloud_files(folder: Path) -> list[Path]:
