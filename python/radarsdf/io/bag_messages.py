@@ -233,12 +233,8 @@ CLOUD_TYPES, POSE_TYPES, TRANSFORM_TYPES = tuple(_CLOUDS), tuple(_POSES), tuple(
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path is a bag by its name, or a folder that is a ROS 2 bag, whose files were not renamed."""
-    if path.suffix.lower() in BAG_SUFFIXES or not (path / _METADATA).is_file():
-        return path.suffix.lower() in BAG_SUFFIXES
-    listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
-    files = [file.name for file in path.iterdir() if file.suffix.lower() in BAG_SUFFIXES]
-    return not files or any(name in listed for name in files)
+    """Whether the path is a bag by its name, or the folder of a ROS 2 bag."""
+    return path.suffix.lower() in BAG_SUFFIXES or (path / _METADATA).is_file()
 
 
 def bags_in(folder: Path) -> list[Path]:

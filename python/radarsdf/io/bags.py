@@ -35,7 +35,7 @@ from radarsdf.io.files import check
 from radarsdf.io.imu import Imu
 from radarsdf.io.poses import UNPOSED, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
-from radarsdf.io.scans import Notes, Scans
+from radarsdf.io.scans import Scans
 
 # Topics of radars in data sets, and of the poses there. They are preferred to others.
 KNOWN_TOPICS = {
@@ -157,13 +157,9 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
 
 
 def _read_imu(
-    paths: list[Path], topic: str | None, sensor_frame: str, recorded_scans: bool, request: Request
+    paths: list[Path], topic: str | None, sensor_frame: str, recorded: bool, request: Request
 ) -> Imu | None:
-    """What the topic holds; None if it has no gyroscope.
-
-    `recorded_scans`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
-    from stamp to record, because messages of an IMU are recorded several at a time.
-    """
+    """What the topic holds, at the times of its header, or when it was `recorded`; None if it has no gyroscope."""
     if topic is None:
         return None
     numbers, frame = array("d"), ""
@@ -178,10 +174,7 @@ def _read_imu(
     table = table[np.isfinite(table[:, :5]).all(axis=1)]
     if len(table) == 0:
         return None
-    stamps, recorded = table[:, 0], table[:, 1]
-    times_s = recorded
-    if not by_record(stamps, topic, None, Notes(log=False) if recorded_scans else request.notes):
-        times_s = stamps + np.median(recorded - stamps) if recorded_scans else stamps
+    times_s = table[:, int(recorded or by_record(table[:, 0], topic, None, request.notes))]
     order = np.argsort(times_s, kind="stable")
     forces = table[order, 5:]
     has_force = np.isfinite(forces).all() and forces.any()

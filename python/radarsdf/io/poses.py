@@ -204,10 +204,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
         return rigid_or_nan(poses, str(path), notes)
     if width == 16 or (width == 4 and len(values) % 4 == 0):
         return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
-    msg = (
-        f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
-        "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
-    )
+    msg = f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
     raise ValueError(msg)
 
 

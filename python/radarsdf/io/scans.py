@@ -59,12 +59,11 @@ class Scan:
 def finite_returns(scan: Scan, notes: Notes) -> Scan:
     """The returns of a scan whose coordinates and intensity are finite. The others are counted."""
     points, intensities = scan.points, scan.intensities
-    # All at once first: that is usual, and row by row takes twenty times as long.
-    if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
-        return scan
     finite = np.isfinite(points).all(axis=1)
     if intensities is not None:
         finite &= np.isfinite(intensities)
+    if finite.all():
+        return scan
     what = "returns left out: a coordinate or the intensity is not a finite number"
     notes.count(what, int((~finite).sum()))
     optional = (intensities, scan.doppler_mps, scan.sigma)
@@ -75,10 +74,9 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
 class Notes:
     """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``."""
 
-    def __init__(self, about: str = "the scans", *, log: bool = True) -> None:
+    def __init__(self, about: str = "the scans") -> None:
         self.about = about  # what is read, for messages
         self.lines: list[str] = []
-        self._log = log
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
 
@@ -86,8 +84,7 @@ class Notes:
         """Keeps a sentence, and logs it if it is new."""
         if line not in self.lines:
             self.lines.append(line)
-            if self._log:
-                _LOG.warning(line)
+            _LOG.warning(line)
 
     def ending(self) -> str:
         """All sentences, to end an error with."""

@@ -24,7 +24,6 @@ _SAMPLES = 1_000_000
 _MATCH_M = 0.4  # a vertex farther from the truth is an outlier, not a surface with an error
 _MIN_MATCHES = 100
 _MAX_RETURNS = 100_000  # evenly spread; more would change no plot
-_ANGLE_EDGES_DEG = np.arange(0, 97.5, 7.5)
 
 
 def error_values(subject: Subject) -> dict[str, Any] | None:
@@ -106,7 +105,6 @@ def intensity_values(subject: Subject) -> dict[str, Any] | None:
         "left_out": {"outliers": len(every_ray) - len(usable), "in no tile": len(rows) - len(rays)},
         "errors": {"This map": (metrics["mae"], metrics["medae"]), **_baselines(subject, rays, measured)},
         "density": plots.predicted_over_measured(measured, found),
-        "by_angle": _by_angle(subject, rays, measured, found),
     }
 
 
@@ -122,11 +120,3 @@ def _baselines(subject: Subject, rays: Rays, measured: _Floats) -> dict[str, tup
         errors["Nearest neighbours"] = (metrics["mae"], metrics["medae"])
     deviation = np.abs(measured - np.median(measured))
     return errors | {"Median of all returns": (float(deviation.mean()), float(np.median(deviation)))}
-
-
-def _by_angle(subject: Subject, rays: Rays, measured: _Floats, found: _Floats) -> bytes:
-    normal = np.asarray(subject.radar_map.gradient(rays.in_world()[0], extrapolate=True), np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        cosine = np.abs((normal * rays.directions).sum(axis=1)) / np.linalg.norm(normal, axis=1)
-    angle_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
-    return plots.intensities_by(_ANGLE_EDGES_DEG, angle_deg, measured, found, "angle of incidence, °")

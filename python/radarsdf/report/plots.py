@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from radarsdf.render.figures import new_figure, png_of
 _Floats = NDArray[np.float64]
 
 _FIRST, _SECOND = "#0072b2", "#d55e00"  # distinguishable by colour-blind readers
-_MIN_BIN = 20  # values in a bin that is drawn
 
 
 def _subplots(*height_ratios: float, height_in: float = 3.3, sharex: bool = True) -> tuple[Any, Any]:
@@ -33,17 +31,6 @@ def _png(figure: Any) -> bytes:
             ax.grid(alpha=0.3)
             ax.spines[["top", "right"]].set_visible(False)
     return png_of(figure, metadata={"Software": None})
-
-
-def losses(history: Mapping[str, Mapping[str, Sequence[float]]]) -> bytes:
-    """Each loss over training time. `history`: ``seconds`` and ``losses`` by name."""
-    figure, (ax,) = _subplots(1)
-    for (name, loss), color in zip(history.items(), (_FIRST, _SECOND), strict=False):
-        ax.plot(loss["seconds"], loss["losses"], color=color, linewidth=1.5, label=name)
-    ax.set(xlabel="training time, s", ylabel="loss", yscale="log")
-    ax.set_xlim(left=0)
-    ax.legend(frameon=False)
-    return _png(figure)
 
 
 def reliability(predicted_m: Sequence[float], measured_m: Sequence[float]) -> bytes:
@@ -70,31 +57,6 @@ def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
     ax.set(xlabel="measured intensity", ylabel="predicted intensity", xlim=(low, high), ylim=(low, high))
     ax.legend(frameon=False, loc="upper left")
     figure.colorbar(drawn, label="returns", pad=0.02)
-    return _png(figure)
-
-
-def intensities_by(edges: _Floats, x: _Floats, measured: _Floats, predicted: _Floats, label: str) -> bytes:
-    """Medians of measured and predicted intensities (N,) in bins of `x` (N,), and the mean error below.
-
-    The band holds the middle two thirds of the measured ones.
-    """
-    figure, (medians, errors) = _subplots(2, 1, height_in=4.45)
-    rows = []
-    for low, high in itertools.pairwise(edges):
-        inside = (x >= low) & (x < high)
-        if inside.sum() >= _MIN_BIN:
-            m, p = measured[inside], predicted[inside]
-            band = np.percentile(m, [17, 50, 83])
-            rows.append([(low + high) / 2, high - low, *band, np.median(p), np.abs(p - m).mean()])
-    if rows:
-        middle, width, low, median, high, found, error = np.array(rows).T
-        medians.fill_between(middle, low, high, color=_FIRST, alpha=0.2, linewidth=0)
-        medians.plot(middle, median, "o-", color=_FIRST, markersize=3, label="measured")
-        medians.plot(middle, found, "s--", color=_SECOND, markersize=3, label="predicted")
-        medians.legend(frameon=False)
-        errors.bar(middle, error, 0.9 * width, color="gray")
-    medians.set(ylabel="median intensity")
-    errors.set(xlabel=label, ylabel="mean error", xlim=(edges[0], edges[-1]))
     return _png(figure)
 
 
