@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -191,6 +192,16 @@ def flag(value: Any, name: str) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise _wrong_type(name, "True or False", value)
     return bool(value)
+
+
+def hides_bar(progress: bool | None) -> bool | None:
+    """tqdm's `disable`, where a bar is asked for (True), not wanted (False), or for a terminal alone (None).
+
+    A service, or a command after ``2>&-``, has no standard error: then there is never a bar.
+    """
+    if sys.stderr is None or getattr(sys.stderr, "closed", False):
+        return True
+    return None if progress is None else not flag(progress, "progress")
 
 
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:

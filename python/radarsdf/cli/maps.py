@@ -4,15 +4,17 @@
 
 from __future__ import annotations
 
+import platform
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from radarsdf import evaluation
+from radarsdf import _core, evaluation
 from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import is_map, load_map, mesh_limits, read_scans, split
 from radarsdf.cli.results import Results
@@ -32,10 +34,22 @@ from radarsdf.render import picture
 from radarsdf.render.figures import save_view_picture
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.tiles.tiled_map import predicted
-from radarsdf.versions import versions
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
+
+
+def versions() -> dict[str, str]:
+    """Version, compiler, instruction set and threads of each part, in words."""
+    openmp = _core.openmp_version()
+    return {
+        "radarsdf": _core.__version__,
+        "python": f"{platform.python_version()} on {platform.platform()}",
+        "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
+        "compiler": _core.compiler(),
+        "openmp": f"{openmp}, {_core.num_threads()} threads" if openmp else "none: the core is serial",
+        "instruction set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
+    }
 
 
 def info(given: Namespace, results: Results) -> None:
@@ -121,11 +135,9 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
     every_ray, known = (rays_as_measured(scans, radar_map.config) for scans in (test, train))
     tested, known = (rays.select(rays.with_intensity) for rays in (every_ray, known))
     inside, found = predicted(radar_map, tested)
-    outliers, outside = len(every_ray) - len(tested), len(tested) - len(inside)
-    results.add(wild_intensities=outliers, in_no_tile=outside)
-    for count, why in ((outliers, "are outliers"), (outside, "are in no tile")):
-        if count:
-            results.add(f"{count} of {len(every_ray)} held-out returns {why}, and are not compared")
+    left_out = len(every_ray) - len(inside)
+    line = f"{left_out} of {len(every_ray)} held-out returns are outliers or in no tile, and are not compared"
+    results.add(line if left_out else None, not_compared=left_out)
     (x, sensors), measured = inside.in_world(), inside.intensities
     assert measured is not None
     assert known.intensities is not None

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from radarsdf.checks import path_of
+from radarsdf.checks import hides_bar, path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
 from radarsdf.io.files import check, check_fits_float32, whole_file
 from radarsdf.io.scans import Columns, Scan, Scans
-from radarsdf.progress import hides_bar
 
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back
 _LAS_SCALE_M = 1e-4

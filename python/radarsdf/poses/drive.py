@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
+from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope
@@ -18,7 +19,6 @@ from radarsdf.poses.motion import ExpectedStep, Motion, MotionPrior, Rate
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector
 from radarsdf.poses.tracking import Tracked, Tracker
-from radarsdf.progress import hides_bar
 
 # What a drive begins with. Its own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
 # scans were lost, up to 9 degrees.

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
+from radarsdf.checks import hides_bar
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.motion import Motion
 from radarsdf.poses.planes import Groups, PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, moved
-from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import SensorNoise
 
 # Of scans in short windows, the drift is small beside a cell. So each window may be twice as long as the one before.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.imu import Imu
 from radarsdf.io.scans import Scan, Scans, scans_in_memory
@@ -31,7 +32,6 @@ from radarsdf.poses.rigid import (
     placed,
     steps,
 )
-from radarsdf.progress import hides_bar
 
 _NOWHERE = -1  # piece of a scan that has no pose
 

@@ -18,7 +18,6 @@ from radarsdf.report.errors import error_values, intensity_values, uncertainty_v
 from radarsdf.report.page import fixed, require_extras, write_page
 from radarsdf.report.subject import Subject
 from radarsdf.report.surface import surface_values
-from radarsdf.versions import versions
 
 _COUNTS = {
     "tiles": "Tiles",
@@ -62,7 +61,6 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
         durations=[(name, fixed(report[key], 2, "s")) for key, name in _DURATIONS.items() if key in report],
         skipped=_skipped(report),
         configuration=_configuration(subject.radar_map.config),
-        versions=versions(),
     )
 
 

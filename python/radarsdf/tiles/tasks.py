@@ -13,8 +13,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from radarsdf.checks import hides_bar
 from radarsdf.extras import require
-from radarsdf.progress import hides_bar
 
 _POLL_S = 2.0  # how often the executor itself is checked
 _NO_SCHEDULER = "the scheduler is gone: call again, what is done is kept"

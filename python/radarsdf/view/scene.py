@@ -191,11 +191,6 @@ class ScanClouds:
             self._draw("measured", world, self._colors_of(scan))
             self._draw("predicted", view.world_points, np.full((len(view), 3), PREDICTED_COLOR, np.uint8))
         text = f"scan {index}: {len(scan)} returns measured, {len(view)} predicted"
-        if scan.intensities is not None and self._map.has_intensity:
-            found = self._map.intensity(world, scan.T_world_sensor[:3, 3], extrapolate=True)
-            errors = np.abs(found - np.asarray(scan.intensities, np.float64))
-            errors = errors[np.isfinite(errors)]
-            text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
         self._text.content = text
 
     def _colors_of(self, scan: Scan) -> NDArray[np.uint8]:
