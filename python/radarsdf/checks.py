@@ -92,13 +92,9 @@ def check_scan_shape(scan: NDArray[Any], number: int) -> None:
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
     """Refuse values that are not arrays (N,) for scans (N, 3)."""
-    check_equal_numbers(len(values), len(scans), name)
+    _require(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
         check_values_of_scan(value, scan, name, i)
-
-
-def check_equal_numbers(num_values: int, num_scans: int, name: str) -> None:
-    _require(num_values == num_scans, f"{name} holds {num_values} scans, points {num_scans}")
 
 
 def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, number: int) -> None:

@@ -23,7 +23,7 @@ from radarsdf.io.bag_messages import is_bag
 from radarsdf.io.cloud_writing import write_cloud
 from radarsdf.io.files import check_outputs, check_regular_file
 from radarsdf.io.meshes import check_mesh_path, read_ground_truth, read_mesh, write_mesh
-from radarsdf.io.npz import holds_scans, write_scans
+from radarsdf.io.npz import arrays_of, write_scans
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
 from radarsdf.io.scans import Notes, Scans
 from radarsdf.map.map import Map
@@ -153,7 +153,8 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
 
 def _holds_scans(path: Path) -> bool:
     """Whether the truth is scans, and not a file of points or a surface."""
-    return path.is_dir() or is_bag(path) or (path.suffix.lower() == ".npz" and holds_scans(path))
+    has_poses = path.suffix.lower() == ".npz" and bool(arrays_of(path, ["poses"]))
+    return path.is_dir() or is_bag(path) or has_poses
 
 
 def render(given: Namespace, results: Results) -> None:

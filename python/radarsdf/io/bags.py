@@ -148,10 +148,9 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     fitting = sorted(topics_with([IMU], topics))
     listed = ", ".join(fitting)
     wanted, about = request.imu_topic, request.notes.about
-    known = wanted is None or wanted in fitting
-    check(known, f"{about} has no inertial measurements in {wanted}: there are {listed or 'none'}")
+    check(wanted in (None, *fitting), f"{about} has no inertial measurements in {wanted}: there are {listed}")
     if wanted is None and len(fitting) > 1:
-        request.notes.add(f"there are several IMUs, none is used: say by imu_topic which, of {listed}")
+        request.notes.add(f"of several IMUs, none is used: say by imu_topic which, of {listed}")
         return None
     return wanted or next(iter(fitting), None)
 

@@ -80,7 +80,6 @@ def _view_of_delft(folder: Path, request: Request) -> Scans:
     posed = [path for path in files if (lidar / "pose" / f"{path.stem}.json").is_file()]
     if len(posed) < len(files):
         request.notes.add(f"{len(files) - len(posed)} scans left out: they have no file of a pose")
-    request.notes.add("the scans have no times; the world is the map frame of View-of-Delft")
     poses = np.array([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed])
     return read_files(posed, folder, replace(request, poses=poses, extrinsic=np.eye(4)))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import path_of, positions
 from radarsdf.io.cloud_writing import face_records, ply_header, records
-from radarsdf.io.clouds import CLOUD_SUFFIXES, has_faces, ply_bytes, read_points
+from radarsdf.io.clouds import has_faces, ply_bytes, read_points
 from radarsdf.io.files import check, check_fits_float32, check_regular_file, write_whole
 from radarsdf.io.npz import arrays_of
 from radarsdf.io.scans import Columns
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
-_TRUTH_ARRAYS = ("lidar_points", "points", "xyz", "arr_0")  # of which the first that a file has counts
+_TRUTH_ARRAYS = ("lidar_points", "points")  # of which the first that a file has counts
 _SAMPLES = 1_000_000  # on a surface: a triangle of a building may be 20 m long
 
 
@@ -143,8 +143,6 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
         check(arrays, f"{path} has no ground truth: it lacks an array {' or '.join(_TRUTH_ARRAYS)}")
         name, points = next(iter(arrays.items()))
         return positions(points, f"{path}: {name}")
-    kinds = dict.fromkeys((*CLOUD_SUFFIXES, ".npz", *MESH_SUFFIXES))
-    check(suffix in CLOUD_SUFFIXES, f"{path} is no ground truth: that ends in {', '.join(kinds)}")
     return read_points(file)
 
 

@@ -141,11 +141,6 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     write_arrays(named, arrays, compressed=True)
 
 
-def holds_scans(path: str | PathLike[str]) -> bool:
-    """Whether an ``.npz`` file has poses. Raises as :func:`read_scans`."""
-    return bool(arrays_of(path, ["poses"]))
-
-
 def array_in(path: Path) -> NDArray[Any]:
     """The array of an ``.npy`` file, as a memory map: a header that claims more than the file holds is refused."""
     check_regular_file(path)

@@ -152,15 +152,14 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    why = f"not finite, not unit quaternions, or of a time that repeats; the first: pose {np.argmin(kept)}"
-    remark = f"{name}: {(~kept).sum()} of {len(table)} poses left out, which are {why}"
+    left_out = f"{name}: {(~kept).sum()} of {len(table)} poses left out, not finite, not unit quaternions or of a repeated time"
     if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
-        msg = f"{name} holds {len(times_s)} poses at different times; at least two poses are needed"
-        raise ValueError(msg if kept.all() else f"{msg}; {remark}")
+        msg = (
+            f"{name} holds {len(times_s)} poses at different times; at least two poses are needed; {left_out}"
+        )
+        raise ValueError(msg)
     if notes is not None and not kept.all():
-        notes.add(remark)
-    if notes is not None and (np.diff(first) < 0).any():
-        notes.add(f"{name}: its poses are not in the order of their times, and sorted")
+        notes.add(f"{left_out}; the first: pose {np.argmin(kept)}")
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
 
 
@@ -252,13 +251,12 @@ def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.flo
     return np.where(bad[:, None, None], np.nan, matrices)
 
 
-def read_transform(path: Path, default: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rigid transform (4, 4) of a text file, or the default if there is no file."""
+def read_transform(path: Path) -> NDArray[np.float64] | None:
+    """Rigid transform (4, 4) of a text file, if there is one."""
     if not path.is_file():
-        return default
-    matrix = read_numbers(path, 4)
+        return None
     with reading(path, "a rigid transform"):
-        return check_pose(matrix, "the matrix")
+        return check_pose(read_numbers(path, 4), "the matrix")
 
 
 def read_calibration(path: Path) -> NDArray[np.float64] | None:

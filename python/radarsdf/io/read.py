@@ -11,7 +11,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import check_pose, path_of, positive
@@ -158,9 +157,8 @@ def _read(path: Path, request: Request) -> Scans:
         if (dataset := datasets.find(path)) is not None:
             return dataset.read(path, request)
         if bags := bags_in(path):  # NTU4DRadLM and Viking Hill have files beside them
-            if request.extrinsic is None and (path / BASE_T_RADAR).is_file():
-                T_base_radar = read_transform(path / BASE_T_RADAR, np.eye(4))
-                request = dataclasses.replace(request, extrinsic=T_base_radar)
+            if request.extrinsic is None:
+                request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
             file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
             if file is not None and request.poses is None and request.pose_topic is None:
                 request.notes.add(f"poses: of {file.name}")
@@ -186,8 +184,6 @@ def _npz(path: Path, request: Request) -> Scans:
     others = None if request.poses is UNPOSED else request.poses
     what = "has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
     check(others is not None or request.extrinsic is None, f"{path} {what}")
-    named = request.fields is None and request.columns is None
-    check(named, f"{path} has arrays of known names: fields and columns are not used for .npz files")
     scans = read_scans(path)
     truth = scans.ground_truth
     if others is None:

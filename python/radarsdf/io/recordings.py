@@ -204,7 +204,7 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     known = poses_of(poses, notes)
     files, times_s, known = _in_order_of_time(files, known, notes)
     if T_base_sensor is None:
-        T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
+        T_base_sensor = read_transform(folder / BASE_T_RADAR)
     columns = request.columns
     if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
         with reading(notes.about, "points of KITTI"):
@@ -273,10 +273,8 @@ def _in_order_of_time(
         check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
         times = in_seconds(numbers, listed.name, notes).tolist()
     order = np.argsort(times, kind="stable")
-    if listed is not None and (np.diff(order) < 0).any():
-        notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
-        if isinstance(poses, np.ndarray) and len(poses) == len(files):
-            poses = poses[order]
+    if listed is not None and isinstance(poses, np.ndarray) and len(poses) == len(files):
+        poses = poses[order]
     return [files[i] for i in order], [times[i] for i in order], poses
 
 

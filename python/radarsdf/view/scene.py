@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: MIT
 """What a viewer's page shows: the surface and one scan. A thread draws the newest state that controls asked for.
 
-A page would be blank between two meshes, so what is shown stays until the page has drawn the new one.
+A page would be blank between two meshes, so the old one stays for a moment.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import threading
+import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,9 +21,10 @@ from radarsdf.io.scans import Scan, Scans
 from radarsdf.map.map import Map
 from radarsdf.view.glb import glb, shaded
 from radarsdf.view.quantities import Position, Quantity, Scale
-from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
+from radarsdf.view.serving import WAIT_STEP_S
 from radarsdf.view.surface import ShownSurface
 
+_DRAWN_S = 0.3  # that a page takes to draw a mesh
 SETTLED_S = 0.25  # the mesh is drawn after nothing has changed for so long
 PATH_COLOR = (40, 44, 52)
 MEASURED_COLOR = (0, 72, 140)  # without intensities
@@ -137,7 +139,7 @@ class Canvas:
             return
         rows, faces = self._surface.part(self._surface.kept(*state.limits))
         colors = self._colors(rows, state)
-        if superseded():
+        if superseded():  # nobody waits for it
             return
         old, self._meshes = self._meshes, []
         if len(faces):
@@ -146,14 +148,11 @@ class Canvas:
             name = f"/surface/mesh {self.sent}"
             self._meshes = [self._server.scene.add_glb(name, data, cast_shadow=False, receive_shadow=False)]
         self.faces = rows[faces].astype(np.int32)
-        wait_until_drawn(self._server, superseded)
-        if superseded():
-            self._meshes = old + self._meshes
-            return
+        time.sleep(_DRAWN_S)
         with self._server.atomic():
             for mesh in old:
                 mesh.remove()
-            self._drawn = drawn
+        self._drawn = drawn
         self._shown(state)
 
     def _colors(self, rows: NDArray[np.int64], state: State) -> NDArray[np.uint8]:

@@ -46,17 +46,14 @@ class Viewer(Page):
         *,
         voxel_size: float = 0.1,
         box: ArrayLike | None = None,
-        max_vertices: int = 500_000,
         host: str = "127.0.0.1",
         port: int | None = None,
         progress: bool | None = None,
         **limits: Any,
     ) -> None:
         super().__init__(host, port)
-        self._map, self._voxel_size = radar_map, voxel_size
-        self.surface = ShownSurface.of(
-            radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
-        )
+        self._map = radar_map
+        self.surface = ShownSurface.of(radar_map, voxel_size, box=box, progress=progress, **limits)
         self._start()
         try:
             self._fill(scans)
@@ -229,15 +226,6 @@ class Viewer(Page):
             range_m = float(np.linalg.norm(self._clicked - sensor))
             rows["intensity"] = f"{self._map.intensity(x, sensor)[0]:.1f} from {range_m:.1f} m"
         self._answer.content = table(rows)
-
-    @property
-    def notes(self) -> list[str]:
-        """What is shown more coarsely than it is, in words."""
-        shown, spacing_m = len(self.surface.vertices), self.surface.spacing_m
-        thinned = (
-            f"the mesh is thinned to {shown} vertices, {spacing_m:.2g} m apart: --max-vertices allows more"
-        )
-        return [thinned] if spacing_m > self._voxel_size else []
 
 
 def _aspect(camera: Any) -> float:
