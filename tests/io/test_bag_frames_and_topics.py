@@ -174,18 +174,6 @@ def test_of_two_parents_the_one_with_poses_counts(tmp_path, other):
     assert any("several parents in TF" in note and "odom is used" in note for note in scans.notes)
 
 
-def test_a_world_that_is_corrected_rarely_is_passed_over(tmp_path):
-    def corrections(bag):
-        for time_s, shift_m in ((START_S - 0.5, 3.0), (START_S + 0.5, 4.0), (START_S + 1.5, 5.0)):
-            bag.write("/tf", bag.transforms(time_s, {("map", "odom"): pose([shift_m, 0, 0])}), time_s)
-
-    path = bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), corrections, clouds)
-    scans = read(path)
-    assert_allclose(scans.poses, [straight(t) @ MOUNTING for t in TIMES_S], atol=1e-6)
-    assert any("TF above odom is passed over" in note for note in scans.notes)
-    assert_allclose(read(path, world_frame="map", max_gap_s=1.1).poses[0, 0, 3], 4.0)
-
-
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 @pytest.mark.parametrize("number", [0, 6])
 def test_a_damaged_message_is_left_out_and_named(tmp_path, kind, number):

@@ -218,7 +218,9 @@ def _tracks_and_tree(
         options = [track for track in tracks.values() if len(track.table)]
         if options:
             wanted = (request.world_frame or "").lstrip("/")
-            edges[child] = max(options, key=lambda t: (t.parent == wanted, not t.constant, len(t.table)))
+            edges[child] = max(
+                options, key=lambda t: (t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1))
+            )
         if len(options) > 1:
             listed = ", ".join(f"{track.parent} ({len(track.table)} transforms)" for track in options)
             request.notes.add(f"{child} has several parents in TF, {listed}: {edges[child].parent} is used")

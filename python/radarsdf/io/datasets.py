@@ -70,9 +70,15 @@ def _coloradar(folder: Path, request: Request) -> Scans:
     return read_files(sorted(files, key=natural), folder, replace(request, columns=request.columns or 5))
 
 
+def _delft_radar(folder: Path) -> Path:
+    inner = "training" if (folder / "training/velodyne").is_dir() else "radar/training"
+    return folder.resolve() / inner
+
+
 def _view_of_delft(folder: Path, request: Request) -> Scans:
-    """View-of-Delft: a calibration and a pose for each frame."""
-    radar, lidar = folder / "radar/training", folder / "lidar/training"
+    """View-of-Delft, whole or one of its radar folders: a calibration and a pose for each frame."""
+    radar = _delft_radar(folder)
+    lidar = radar.parents[1] / "lidar/training"
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
@@ -139,7 +145,11 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
 # The first that fits a folder reads it.
 DATASETS = (
     Dataset("SNAIL-Radar", lambda f: _snail_points(f) is not None, _snail_radar),
-    Dataset("View-of-Delft", lambda f: (f / "radar/training/velodyne").is_dir(), _view_of_delft),
+    Dataset(
+        "View-of-Delft",
+        lambda f: (_delft_radar(f).parents[1] / "lidar/training/pose").is_dir(),
+        _view_of_delft,
+    ),
     Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
     Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
 )

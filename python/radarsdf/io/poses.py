@@ -180,7 +180,8 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, qx, qy, qz and
       qw, as in files of EuRoC, evo and ``rostopic echo -p``. Without a time it is in order.
     - TUM: ``time x y z qx qy qz qw``, s and m.
-    - KITTI: lines of twelve numbers, the first three rows of a matrix.
+    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in ``calib.txt`` beside it,
+      T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
 
     Times may be in ms, µs or ns since 1970, or in the unit of their name.
@@ -200,7 +201,16 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     if width == 12:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
-        return rigid_or_nan(poses, str(path), notes)
+        P = rigid_or_nan(poses, str(path), notes)
+        calibration = path.with_name("calib.txt")
+        Tr = read_calibration(calibration) if calibration.is_file() else None
+        found = (
+            "are camera poses, by Tr of calib.txt"
+            if Tr is not None
+            else "are taken as T_world_sensor: no calib.txt"
+        )
+        notes.add(f"{path.name}: KITTI poses {found}")
+        return P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
     if width == 16 or (width == 4 and len(values) % 4 == 0):
         return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
     msg = f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
