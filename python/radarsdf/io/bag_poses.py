@@ -222,8 +222,7 @@ def _tracks_and_tree(
                 options, key=lambda t: (t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1))
             )
         if len(options) > 1:
-            listed = ", ".join(f"{track.parent} ({len(track.table)} transforms)" for track in options)
-            request.notes.add(f"{child} has several parents in TF, {listed}: {edges[child].parent} is used")
+            request.notes.add(f"{child} has several parents in TF: {edges[child].parent} is used")
     moving = {n: track for n, track in by_topic.items() if len(np.unique(track.table[:, :2], axis=0)) > 1}
     return moving, TransformTree(edges)
 

@@ -34,8 +34,8 @@ def check_cloud_path(path: str | PathLike[str]) -> None:
 def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | None = False) -> int:
     """Writes all returns of scans as one point cloud, whole or not at all.
 
-    The cloud has x, y, z in the world frame, m; intensity in sensor units and doppler in m/s where the first scan has
-    them; scan, the number of the scan; and time, s, where the first scan has one. What a later scan lacks is NaN.
+    The cloud has x, y, z in the world frame, m; intensity in sensor units, doppler in m/s and time, s, where all scans have
+    them; and scan, the number of the scan.
     Coordinates are float64. LAS and LAZ round them to 0.1 mm, and have the other columns as extra dimensions. PCD holds
     float32, since most programs read no other.
 
@@ -67,11 +67,8 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
     # Of an iterator: the number of scans is not known before the first pass through their files.
     bar = tqdm(iter(scans), desc="convert", unit="scan", disable=hides_bar(progress))
     parts = [_columns(number, scan) for number, scan in enumerate(bar)]
-    missing = [np.full(len(part["scan"]), np.nan, np.float32) for part in parts]
-    columns = {
-        name: np.concatenate([part.get(name, nan) for part, nan in zip(parts, missing, strict=True)])
-        for name in parts[0]
-    }
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
     for name in {"intensity", "doppler"} & set(columns):
         columns[name] = columns[name].astype(np.float32)
     if suffix == ".pcd":
@@ -151,12 +148,9 @@ def face_records(faces: NDArray[np.integer[Any]]) -> NDArray[Any]:
     return rows
 
 
-def ply_header(
-    dtype: np.dtype[Any], count: int, num_faces: int | None = None, comment: str | None = None
-) -> bytes:
+def ply_header(dtype: np.dtype[Any], count: int, num_faces: int | None = None) -> bytes:
     """The header of a binary PLY file of `count` such records, and of triangles if it is a mesh."""
     lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [] if comment is None else [f"comment {comment}"]
     lines += ["comment radarsdf: world frame, m", f"element vertex {count}"]
     lines += [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
     if num_faces is not None:

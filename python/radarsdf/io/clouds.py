@@ -19,6 +19,7 @@ from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.io.fields import Fields, names_of
 from radarsdf.io.files import check, check_regular_file, reading
+from radarsdf.io.npz import array_in
 from radarsdf.io.scans import Columns, Notes
 from radarsdf.io.text import read_table
 
@@ -128,8 +129,7 @@ def _variance(numbers: NDArray[np.float32], width: int) -> float:
 
 
 def _npy(path: Path, columns: GivenColumns) -> Columns:
-    # A memory map: a header that claims more than the file holds is refused before anything is allocated.
-    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    array = array_in(path)
     if array.dtype.names is not None and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names}
     rows = array.ndim == 2 and array.dtype.kind in "iuf"
@@ -161,9 +161,14 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
     dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for kind, size, count in fields]
-    readers = {"binary": _pcd_binary, "ascii": _pcd_ascii}
-    check(header["DATA"][0] in readers, f"its DATA is {header['DATA'][0]}: save it as binary")
-    columns = readers[header["DATA"][0]](body, dtypes, points)
+    if header["DATA"][0] == "binary":
+        record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
+        cloud = np.frombuffer(body, record, points)
+        columns = [cloud[name][:, 0] for name in record.names or ()]
+    else:
+        check(header["DATA"][0] == "ascii", f"its DATA is {header['DATA'][0]}: save it as binary")
+        table = np.array(body.split(), np.float64).reshape(points, sum(counts))
+        columns = [table[:, i] for i in np.cumsum([0, *counts[:-1]])]
     # The name _ means padding, and several fields may have it.
     return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
 
@@ -192,18 +197,6 @@ def _pcd_header(file: BinaryIO) -> dict[str, list[str]]:
         if "DATA" in header:
             break
     return header
-
-
-def _pcd_binary(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
-    record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
-    cloud = np.frombuffer(body, record, points)
-    return [cloud[name][:, 0] for name in record.names or ()]
-
-
-def _pcd_ascii(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
-    widths = [dtype.shape[0] for dtype in dtypes]
-    table = np.array(body.split(), np.float64).reshape(points, sum(widths))
-    return [table[:, i] for i in np.cumsum([0, *widths[:-1]])]
 
 
 def ply_bytes(path: Path) -> io.BytesIO:

@@ -183,11 +183,6 @@ class Scans:
         """Number of scans."""
         return len(self.poses)
 
-    def __repr__(self) -> str:
-        """What is known without reading files."""
-        known = f"{len(self._poses)} scans" if self._poses is not None else "scans that are not yet read"
-        return f"<Scans: {known}>"
-
     @property
     def points(self) -> list[NDArray[Any]]:
         """F arrays (N_i, 3), sensor frame, m."""

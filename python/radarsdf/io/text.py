@@ -130,9 +130,7 @@ def unit_since_1970(time: float) -> tuple[str, float]:
 def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
     """Times (N,) of the file `name`, s. They may be in ms, µs or ns since 1970, which is noted."""
     check(np.isfinite(times).all(), f"{name} holds a time that is not finite")
-    units = {unit_since_1970(time) for time in times[times != 0].tolist()} or {_SINCE_1970[0]}
-    check(len(units) == 1, f"{name} holds times of different units, such as s and ns")
-    ((unit, scale),) = units
+    unit, scale = unit_since_1970(float(np.median(times)) if len(times) else 0.0)
     if unit != "s":
         notes.add(f"times of {name} are taken as {unit} since 1970")
     return times * scale
