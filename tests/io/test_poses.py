@@ -39,15 +39,15 @@ def test_kitti_with_calibration(tmp_path):
         "P0: " + " ".join(["0"] * 12) + "\nTr: " + " ".join(map(repr, TR[:3].ravel().tolist())) + "\n"
     )
     notes = Notes()
-    assert_allclose(read_poses(path, notes, [tmp_path / "calib.txt"]), truth, atol=1e-12)
-    assert len(notes.lines) == 1
-    assert "T_world_sensor = inv(Tr) P Tr" in notes.lines[0]
+    assert_allclose(read_poses(path, notes), truth, atol=1e-12)
+    assert "by Tr of calib.txt" in notes.lines[0]
+    (tmp_path / "calib.txt").unlink()
     notes = Notes()
-    assert_allclose(read_poses(path, notes, [tmp_path / "none.txt"]), camera, atol=1e-12)
-    assert "no calibration Tr" in notes.lines[0]
+    assert_allclose(read_poses(path, notes), camera, atol=1e-12)
+    assert "no calib.txt" in notes.lines[0]
     (tmp_path / "calib.txt").write_text("Tr: 1 2 3\n")
     with pytest.raises(ValueError, match=r"calib\.txt is not a KITTI calibration"):
-        read_poses(path, Notes(), [tmp_path / "calib.txt"])
+        read_poses(path, Notes())
 
 
 @pytest.mark.parametrize("separator", [" ", ", ", ","])

@@ -105,7 +105,6 @@ def test_each_scan_keeps_its_pose_where_times_do_not_ascend(folder):
         scans = read(folder, poses)
         assert pairs(scans) == [(2, 20), (3, 30), (1, 10), (4, 40)]
         assert scans.times_s.tolist() == [0.1, 0.2, 0.3, 0.4]
-        assert "times.txt is not ascending: scans are read in the order of their times" in scans.notes
     (folder / "times.txt").write_text("0.1\n0.2\n0.3\n0.4\n")
     assert not any("times.txt" in note for note in read(folder).notes)
 
@@ -121,23 +120,3 @@ def test_times_may_be_in_other_units(folder):
     (folder / "poses.txt").write_text(tum.replace(" ", "000 ", 1))
     with pytest.raises(ValueError, match=r"poses\.txt holds times of different units"):
         read(folder)
-
-
-@pytest.mark.parametrize(
-    ("first", "later", "role"),
-    [
-        ("x,y,z\n1,0,0\n", "x,y,z,power\n2,0,0,5\n", "intensity"),
-        ("x,y,z,power\n1,0,0,5\n", "x,y,z,power,doppler\n2,0,0,5,1\n", "doppler"),
-        ("x,y,z,power\n1,0,0,5\n", "x,y,z\n2,0,0\n", "intensity"),
-    ],
-)
-def test_a_column_that_not_all_scans_have_is_said(folder, first, later, role):
-    for i in range(4):
-        (folder / f"{i}.csv").write_text(first if i == 0 else later)
-    scans = read(folder)
-    assert len(scans) == 4
-    assert any(f"some scans have {role}, others have none" in note for note in scans.notes)
-    assert {"intensity": scans.intensities, "doppler": scans.doppler_mps}[role] is None
-    left_out = read(folder, fields={role: None})
-    assert len(left_out) == 4
-    assert not any(role in note for note in left_out.notes)

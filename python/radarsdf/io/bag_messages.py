@@ -136,6 +136,14 @@ def _point_cloud2(message: Any) -> Columns:
     return columns
 
 
+def _point_cloud(message: Any) -> Columns:
+    columns = {axis: _column(message.points, axis) for axis in "xyz"}
+    for channel in message.channels:
+        if len(channel.values) == len(message.points):
+            columns.setdefault(channel.name, channel.values)
+    return columns
+
+
 def _radar_scan(message: Any) -> Columns:
     names = {"range": "range", "azimuth": "azimuth_rad", "elevation": "elevation_rad",
              "doppler_velocity": "doppler_velocity", "amplitude": "amplitude"}  # fmt: skip
@@ -215,6 +223,7 @@ IMU = "sensor_msgs/msg/Imu"
 
 _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
+    "sensor_msgs/msg/PointCloud": _point_cloud,
     "radar_msgs/msg/RadarScan": _radar_scan,
     "continental_msgs/msg/ContinentalArs548DetectionList": _ars548_list,
     "ars548_messages/msg/DetectionList": _ars548_list,
@@ -233,8 +242,12 @@ CLOUD_TYPES, POSE_TYPES, TRANSFORM_TYPES = tuple(_CLOUDS), tuple(_POSES), tuple(
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path is a bag by its name, or the folder of a ROS 2 bag."""
-    return path.suffix.lower() in BAG_SUFFIXES or (path / _METADATA).is_file()
+    """Whether the path is a bag by its name, or a folder that is a ROS 2 bag, whose files were not renamed."""
+    if path.suffix.lower() in BAG_SUFFIXES or not (path / _METADATA).is_file():
+        return path.suffix.lower() in BAG_SUFFIXES
+    listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
+    files = [file.name for file in path.iterdir() if file.suffix.lower() in BAG_SUFFIXES]
+    return not files or any(name in listed for name in files)
 
 
 def bags_in(folder: Path) -> list[Path]:

@@ -183,16 +183,20 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
                 raise
             one = len(tracks) == 1
             listed = ", ".join(sorted(tracks))
-            check(one, f"{notes.about} has several topics with poses: say by pose_topic which, of {listed}")
+            check(
+                one,
+                f"{notes.about} has several topics with poses: say by pose_topic which one counts, of {listed}",
+            )
             (name,) = tracks
         else:
-            notes.add("poses: TF")
+            for other in sorted(fitting):
+                notes.add(f"poses of {other} are passed over; pose_topic chooses them")
             return find
     check(name in tracks, f"{paths[0]}: {name} holds no poses")
     trajectory = tracks[name].trajectory(name, request)
-    others = ", ".join(sorted(fitting - {name}))
-    passed_over = f"; those of {others} are passed over; pose_topic chooses them" if others else ""
-    notes.add(f"poses: {len(trajectory.times_s)} of {name}{passed_over}")
+    for other in sorted(fitting - {name}):
+        notes.add(f"poses of {other} are passed over; pose_topic chooses them")
+    notes.add(f"poses: {len(trajectory.times_s)} of {name}")
     base = sensor if request.extrinsic is not None else _base(tracks[name].child, name, tree, sensor, notes)
     return tree.attach(trajectory, base, request)
 
@@ -278,4 +282,5 @@ def _of_tree(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     if poses is None:
         msg = f"{about}: a transform between {world} and {base} has a single pose"
         raise ValueError(msg)
+    request.notes.add(f"poses: TF, {' -> '.join(reversed(chain[: chain.index(world) + 1]))}")
     return find if request.extrinsic is None else tree.attach(poses, sensor, request)

@@ -115,7 +115,10 @@ def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
         listed = _listed(fitting.values())
         msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {listed}"
         raise ValueError(msg)
-    if others := set(fitting.values()) - set(chosen):
+    unread = [t for t in topics.values() if t.name not in fitting and _RADAR.search(t.message_type)]
+    what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that"
+    check(not unread or _is_radar(chosen[0]), f"{about}: {what}")
+    if others := {*fitting.values(), *unread} - set(chosen):
         request.notes.add(f"scans: those of {_listed(chosen)}; not read: {_listed(others)}")
     return chosen
 
@@ -158,7 +161,11 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
 def _read_imu(
     paths: list[Path], topic: str | None, sensor_frame: str, recorded: bool, request: Request
 ) -> Imu | None:
-    """What the topic holds, at the times of its header, or when it was `recorded`; None if it has no gyroscope."""
+    """What the topic holds; None if it has no gyroscope.
+
+    Where scans have the times when they were `recorded`, each measurement has its stamp plus the median time from stamp to
+    record, because messages of an IMU are recorded several at a time.
+    """
     if topic is None:
         return None
     numbers, frame = array("d"), ""
@@ -173,7 +180,11 @@ def _read_imu(
     table = table[np.isfinite(table[:, :5]).all(axis=1)]
     if len(table) == 0:
         return None
-    times_s = table[:, int(recorded or by_record(table[:, 0], topic, None, request.notes))]
+    times_s, recorded_s = table[:, 0], table[:, 1]
+    if by_record(times_s, topic, None, request.notes):
+        times_s = recorded_s
+    elif recorded:
+        times_s = times_s + np.median(recorded_s - times_s)
     order = np.argsort(times_s, kind="stable")
     forces = table[order, 5:]
     has_force = np.isfinite(forces).all() and forces.any()

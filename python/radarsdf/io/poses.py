@@ -152,14 +152,14 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    left_out = f"{name}: {(~kept).sum()} of {len(table)} poses left out, not finite, not unit quaternions or of a repeated time"
+    left_out = f"{name}: {(~kept).sum()} of {len(table)} poses left out, not finite, not unit quaternions or of a repeated time; the first: pose {np.argmin(kept)}"
     if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
         msg = (
             f"{name} holds {len(times_s)} poses at different times; at least two poses are needed; {left_out}"
         )
         raise ValueError(msg)
     if notes is not None and not kept.all():
-        notes.add(f"{left_out}; the first: pose {np.argmin(kept)}")
+        notes.add(left_out)
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
 
 

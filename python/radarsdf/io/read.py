@@ -65,7 +65,7 @@ def read(
         - our ``.npz`` (see :func:`read_scans`);
         - a folder with a file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ, in natural
           order or that of the times in their names, and with ``lidar.pcd`` or ``lidar.ply`` as ground truth; or one such
-          file, which a column such as frame or scan_id splits into scans;
+          file;
         - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
-from radarsdf.io.fields import Fields, plain_name
+from radarsdf.io.fields import Fields
 from radarsdf.io.files import check, reading
 from radarsdf.io.poses import (
     FIND_POSES,
@@ -33,7 +33,7 @@ from radarsdf.io.poses import (
     read_transform,
 )
 from radarsdf.io.scans import Columns, Notes, Scan, Scans
-from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970
+from radarsdf.io.text import in_seconds, read_numbers, unit_since_1970
 
 BASE_T_RADAR = "base_T_radar.txt"
 """A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
@@ -44,8 +44,6 @@ SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD
 _CALIBRATIONS = ("calib.txt", "calibration.txt")
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
-_SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "sweep", "sweep_id")
-_TIME_FIELDS = ("time", "timestamp", "stamp", "t")
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
@@ -189,14 +187,15 @@ def read_folder(folder: Path, request: Request) -> Scans:
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
     """The scans of files with the poses of the request, or those that are found in or near the folder.
 
-    The files hold one scan each, or the only one the table of a recording.
+    The files hold one scan each.
     """
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
     places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
     if poses is None:
         poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
-        notes.add(f"poses: of {poses}")
+        if poses is not None and poses.parent != folder:
+            notes.add(f"poses: of {poses}")
     if poses is None:
         what = files[0] if len(files) == 1 else folder
         msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
@@ -212,12 +211,6 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
         columns = 4
     reads = [partial(read_columns, path, columns) for path in files]
     names = [str(path) for path in files]
-    if len(files) == 1:
-        parts, table_s = _split(files[0], columns, notes)
-        if parts:
-            reads = [partial(dict, part) for part in parts]
-            names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
-            times_s = table_s
     matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
     stamps = [None] * len(reads) if known_s is None else known_s
     raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
@@ -286,28 +279,3 @@ def _time_in(stem: str) -> float | None:
     if found is None:
         return None
     return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
-
-
-def _split(path: Path, columns: Any, notes: Notes) -> tuple[list[Columns], Sequence[float] | None]:
-    """The scans in the one table of a recording, by a column with their numbers, and their times; none if it is one scan."""
-    try:
-        table = read_columns(path, columns)
-    except ValueError:  # which is noted when the scan is read
-        return [], None
-    plain = {plain_name(name)[0]: name for name in reversed(table)}
-    key = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
-    if key is None or table[key].dtype.kind not in "biuf":
-        return [], None
-    values, part = np.unique(table[key], return_inverse=True)
-    numbers = np.flatnonzero(np.isfinite(values))  # rows of no scan are left out
-    if len(numbers) < 2:
-        return [], None
-    notes.add(f"{path.name} is read as {len(numbers)} scans, by its field {key}")
-    by_number = np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1])
-    rows = [by_number[i] for i in numbers]
-    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
-    times_s = None
-    if time is not None and table[time].dtype.kind in "iuf":
-        first = table[time][[of_scan[0] for of_scan in rows]].astype(np.float64)
-        times_s = in_seconds(first * SCALES.get(plain_name(time)[1], 1.0), path.name, notes).tolist()
-    return [{name: table[name][of_scan] for name in table if name != key} for of_scan in rows], times_s

@@ -71,11 +71,14 @@ def _values(rows: list[str]) -> NDArray[np.float64]:
     words = [row.rstrip(",; \t").split(separator) for row in rows]
     width = Counter(map(len, words)).most_common(1)[0][0]
     table = np.full((len(words), width), np.nan)
-    for row, parts in zip(table, words, strict=True):
+    known = np.zeros(table.shape, bool)
+    for row, parts in enumerate(words):
         if len(parts) == width:
-            row[:] = [float(part) if _is_number(part) else np.nan for part in parts]
-    damaged = np.isnan(table).all(axis=1)
-    most = 2 * damaged.sum() > len(rows)
+            known[row] = [_is_number(part) for part in parts]
+            table[row, known[row]] = [float(part) for part in parts if _is_number(part)]
+    of_words = ~known.any(axis=0)  # a column of labels is no damage
+    damaged = ~known[:, ~of_words].all(axis=1)
+    most = of_words.all() or 2 * damaged.sum() > len(words)
     check(not most, f"a line is no row of {width} numbers: {rows[int(np.argmax(damaged))]!r:.50}")
     return table
 
