@@ -90,7 +90,6 @@ def test_several_topics_are_merged_by_time(tmp_path, poses):
     assert_allclose(np.array(seen(scans))[::2, 0], 5 + 0.1 * np.arange(10), atol=1e-3)
     assert_allclose(np.array(seen(scans))[1::2, 0], 0.1 * np.arange(10) + 0.03 - 5, atol=1e-3)
     assert [scan.intensities is None for scan in scans][:2] == [True, False]
-    assert any("some scans have doppler, others have none" in note for note in scans.notes)
     with pytest.raises(ValueError, match="no topic /up"):
         read(path, topic=["/front", "/up"])
 
@@ -111,7 +110,7 @@ def test_what_somebody_wants_is_no_pose_of_the_sensor(tmp_path, topic):
     assert_allclose(scans.poses[0], MOUNTING, atol=1e-9)
     assert any(note.startswith(f"poses of {topic} are passed over") for note in scans.notes)
     assert read(path, pose_topic=topic).poses[0, 0, 3] == 50.5  # what is asked for is read
-    with pytest.raises(NoPoses, match=f"{topic} is passed over"):
+    with pytest.raises(NoPoses, match="has no poses"):
         read(bag_of(tmp_path, clouds, goals, kind="ros1"))
 
 

@@ -29,7 +29,6 @@ from radarsdf.io.scans import Notes, Scans
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
 from radarsdf.map.view import View, scans_of_views
-from radarsdf.memory import check_views
 from radarsdf.render import picture
 from radarsdf.render.figures import save_view_picture
 from radarsdf.returns.moving import rays_as_measured
@@ -169,9 +168,6 @@ def render(given: Namespace, results: Results) -> None:
     check_outputs([out], [given.map])
     radar_map = load_map(given.map)
     rng = np.random.default_rng(given.seed)
-    wanted = radar_map.sensor.returns_per_scan if given.returns is None else given.returns
-    # There are about as many patches as cells, and each has one return at most.
-    check_views(None, returns=len(poses) * min(wanted, radar_map.num_cells))
     views: Iterable[View] = (
         radar_map.render(T, returns=given.returns, noise=given.noise, seed=rng) for T in poses
     )

@@ -144,5 +144,5 @@ def convert(given: Namespace, results: Results) -> None:
         write_scans(out, scans)
         returns = sum(map(len, scans.points))
     else:
-        returns = write_cloud(out, scans, progress=results.progress)
+        returns = write_cloud(out, scans)
     results.add_file(f"{returns} returns of {len(scans)} scans", out, returns=returns, scans=len(scans))

@@ -11,9 +11,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
-from radarsdf.checks import hides_bar, path_of
+from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
 from radarsdf.io.files import check, check_fits_float32, whole_file
@@ -31,7 +30,7 @@ def check_cloud_path(path: str | PathLike[str]) -> None:
     check(known, f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}")
 
 
-def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | None = False) -> int:
+def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
     """Writes all returns of scans as one point cloud, whole or not at all.
 
     The cloud has x, y, z in the world frame, m; intensity in sensor units, doppler in m/s and time, s, where all scans have
@@ -45,8 +44,6 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
         It ends in .ply, .pcd, .las, .laz, .npy or .csv. NumPy's file holds one record a return.
     scans : Scans
         They are read once.
-    progress : bool, optional
-        Whether to show a progress bar. None: on a terminal.
 
     Returns
     -------
@@ -64,9 +61,7 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
     """
     check_cloud_path(path)
     suffix = Path(path).suffix.lower()
-    # Of an iterator: the number of scans is not known before the first pass through their files.
-    bar = tqdm(iter(scans), desc="convert", unit="scan", disable=hides_bar(progress))
-    parts = [_columns(number, scan) for number, scan in enumerate(bar)]
+    parts = [_columns(number, scan) for number, scan in enumerate(scans)]
     names = [name for name in parts[0] if all(name in part for part in parts)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
     for name in {"intensity", "doppler"} & set(columns):

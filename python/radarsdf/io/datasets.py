@@ -41,8 +41,6 @@ def find(folder: Path) -> Dataset | None:
 
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
     """PCD files, and ``timestamp_radar.txt`` with lines of a number, seconds and nanoseconds. It has no poses."""
-    what = "MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
-    check(request.poses is not None, f"{folder}: {what}")
     return read_files(sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural), folder, request)
 
 
