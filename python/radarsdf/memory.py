@@ -30,7 +30,7 @@ def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 
     """Raises a MemoryError if views of a map need more memory than there is.
 
     `cells`: leaf cells of a map whose surface has yet to be made for views; `patches` of that surface; `beams` of one
-    view; `returns` of all views that are kept.
+    view.
     """
     of_map = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN
     needed = of_map + beams * _PER_BEAM

@@ -184,7 +184,10 @@ def test_ntu4dradlm(tmp_path):
     check(scans, POSES)
     scans = read(folder, extrinsic=MOUNTING)
     check(scans, POSES @ MOUNTING)
-    assert [note.partition(" (")[0] for note in scans.notes] == ["scans: those of /radar_enhanced_pcl"]
+    assert [note.partition(" (")[0] for note in scans.notes] == [
+        "poses: of gt_odom.txt",
+        "scans: those of /radar_enhanced_pcl",
+    ]
 
 
 def test_viking_hill(tmp_path):

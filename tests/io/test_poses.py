@@ -114,7 +114,7 @@ def test_one_bad_pose_is_left_out_and_named(tmp_path):
     (tmp_path / "a.tum").write_text("# mine\n" + "\n".join([*rows, rows[9], "10 1 2"]))
     notes = Notes()
     assert read_poses(tmp_path / "a.tum", notes).times_s.tolist() == [0, 1, 3, 5, 7, 8, 9]
-    assert "5 of 12 poses left out" in notes.lines[0]
+    assert "5 of 12 poses are left out" in notes.lines[0]
     assert notes.lines[0].endswith("the first: pose 2")
     notes = Notes()
     poses = np.tile(np.eye(4), (5, 1, 1))

@@ -37,7 +37,6 @@ _MAX_POSITION_M, _FEW = 1e7, 0.02  # of the numbers may be damaged
 _LESS, _ENOUGH_ROWS = 0.8, 30  # of the variance within four columns is left by another number of them
 
 GivenColumns: TypeAlias = int | Sequence[str] | None
-"""The columns of files without names, as a user gives them: how many numbers a point has, or their names."""
 
 
 def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
@@ -298,7 +297,5 @@ READERS: dict[str, Callable[[Path, GivenColumns], Columns]] = {
     ".npy": _npy,
     **dict.fromkeys(TEXT_SUFFIXES, _text),
 }
-"""Reads a file as named columns (N,), by its suffix. What a user says of the columns helps where a format names none."""
 
 CLOUD_SUFFIXES = tuple(READERS)
-"""What :func:`read_columns` reads."""

@@ -49,10 +49,8 @@ def _coloradar(folder: Path, request: Request) -> Scans:
     if request.poses is None:
         truth = folder / "groundtruth"
         with reading(truth, "a folder with a time for each pose"):
-            stamps, table = (
-                read_numbers(truth / "timestamps.txt", 1),
-                read_numbers(truth / "groundtruth_poses.txt", 7),
-            )
+            stamps = read_numbers(truth / "timestamps.txt", 1)
+            table = read_numbers(truth / "groundtruth_poses.txt", 7)
             poses = trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
         request = replace(request, poses=poses)
     if request.extrinsic is None:

@@ -152,14 +152,17 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    left_out = f"{name}: {(~kept).sum()} of {len(table)} poses left out, not finite, not unit quaternions or of a repeated time; the first: pose {np.argmin(kept)}"
+    what = "are left out, not finite, not unit quaternions or of a repeated time"
+    left_out = (
+        ""
+        if kept.all()
+        else f"{(~kept).sum()} of {len(table)} poses {what}; the first: pose {np.argmin(kept)}"
+    )
     if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
-        msg = (
-            f"{name} holds {len(times_s)} poses at different times; at least two poses are needed; {left_out}"
-        )
+        msg = f"{name} holds {len(times_s)} poses at different times; at least two are needed; {left_out}"
         raise ValueError(msg)
-    if notes is not None and not kept.all():
-        notes.add(left_out)
+    if notes is not None and left_out:
+        notes.add(f"{name}: {left_out}")
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
 
 

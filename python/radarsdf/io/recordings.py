@@ -41,8 +41,7 @@ BASE_T_RADAR = "base_T_radar.txt"
 # With a time, s, for each scan, one a line; of three columns, the last two are seconds and nanoseconds.
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.txt")
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
-_CALIBRATIONS = ("calib.txt", "calibration.txt")
-_NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
+_NOT_SCANS = {*POSE_FILES, *TIME_FILES, "calib.txt", BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
