@@ -49,7 +49,7 @@ def test_held_out_intensities_without_their_outliers(map_file, scene, tmp_path, 
     assert "lidar points" in refusal(capsys, tmp_path, "eval", map_file, path)
     found = values(capsys, "eval", map_file, path, "--holdout", 3)  # the scans 0 and 3
     assert "surface" not in found
-    assert (found["wild_intensities"], found["held_out"]["num_returns"], found["knn"]["num_returns"]) == (
+    assert (found["not_compared"], found["held_out"]["num_returns"], found["knn"]["num_returns"]) == (
         30,
         2970,
         2970,

@@ -109,7 +109,6 @@ class TransformChain:
 
 
 StampedPoses: TypeAlias = Trajectory | TransformChain
-"""Poses by time."""
 
 Poses: TypeAlias = StampedPoses | NDArray[np.float64]
 """By time, or (F, 4, 4) in the order of the scans."""

@@ -50,7 +50,6 @@ Truth = Callable[[], NDArray[np.float64] | None]
 """Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
 
 FindPoses = Callable[[str], Poses | None]
-"""The poses of the scans of a frame; None: none are known."""
 
 
 @dataclass(frozen=True, eq=False)
