@@ -35,8 +35,8 @@ _MARK_COLOR = (0, 190, 255)  # not on the colour scale
 class Viewer(Page):
     """Serves a map, and scans to browse, in the browser until it is stopped.
 
-    The surface is recoloured where the sensor is held still. The page computes in float32 in the map's local frame, but displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for
-    :meth:`Map.mesh`, with its errors.
+    The surface is recoloured where the sensor is held still. The page computes in float32 in the map's local frame, but
+    displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for :meth:`Map.mesh`, with its errors.
     """
 
     def __init__(
