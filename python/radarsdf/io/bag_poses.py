@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -127,7 +127,7 @@ class TransformTree:
 
         return find
 
-    def finder(self, world: str, request: Request) -> FindPoses:
+    def finder(self, world: str, request: Request) -> Callable[[str], TransformChain | None]:
         """Poses of the frames below the world."""
 
         @cache

@@ -104,8 +104,7 @@ class Fields:
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
         in_degrees = are_degrees(azimuth, elevation)
         notes.add(
-            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} by their numbers, azimuth positive to the left; "
-            "names such as azimuth_deg or azimuth_rad decide"
+            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} by their numbers; names such as azimuth_deg or azimuth_rad decide"
         )
         return replace(self, in_degrees=in_degrees)
 
