@@ -48,7 +48,7 @@ def test_sections_links_and_pictures(written):
     assert [found["id"] for found in page.all("section")] == SECTIONS
     assert [found["href"] for found in page.all("a")] == [f"#{name}" for name in SECTIONS]
     assert all(len(page.sections[name]) > 50 for name in SECTIONS)
-    assert len(page.all("img")) == 8
+    assert len(page.all("img")) == 6
     assert all(len(found["alt"]) > 20 for found in page.all("img"))
     assert page.all("iframe")[0]["title"]
 

@@ -103,9 +103,8 @@ class Fields:
             return self
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
         in_degrees = are_degrees(azimuth, elevation)
-        notes.add(
-            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} by their numbers; names such as azimuth_deg or azimuth_rad decide"
-        )
+        unit = "degrees" if in_degrees else "rad"
+        notes.add(f"{' and '.join(names)} are taken as {unit} by their numbers: azimuth_deg or azimuth_rad would decide")
         return replace(self, in_degrees=in_degrees)
 
     def note_unused(self, names: Iterable[str], notes: Notes) -> None:
