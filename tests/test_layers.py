@@ -13,7 +13,7 @@ import radarsdf
 
 ROOT = Path(radarsdf.__file__).parent
 BASE = [
-    "_core", "checks", "extras", "interrupts", "lattice", "memory", "products", "progress", "settings", "threads", "versions",
+    "_core", "checks", "extras", "interrupts", "lattice", "memory", "products", "settings", "threads",
 ]  # fmt: skip
 # From the lowest to the highest. A subpackage may import itself and those before it; `io` is below all that saves itself.
 METHOD = ["config", "io", "returns", "field", "map", "fitting"]

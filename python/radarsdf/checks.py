@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -91,13 +92,9 @@ def check_scan_shape(scan: NDArray[Any], number: int) -> None:
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
     """Refuse values that are not arrays (N,) for scans (N, 3)."""
-    check_equal_numbers(len(values), len(scans), name)
+    _require(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
         check_values_of_scan(value, scan, name, i)
-
-
-def check_equal_numbers(num_values: int, num_scans: int, name: str) -> None:
-    _require(num_values == num_scans, f"{name} holds {num_values} scans, points {num_scans}")
 
 
 def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, number: int) -> None:
@@ -191,6 +188,16 @@ def flag(value: Any, name: str) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise _wrong_type(name, "True or False", value)
     return bool(value)
+
+
+def hides_bar(progress: bool | None) -> bool | None:
+    """tqdm's `disable`, where a bar is asked for (True), not wanted (False), or for a terminal alone (None).
+
+    A service, or a command after ``2>&-``, has no standard error: then there is never a bar.
+    """
+    if sys.stderr is None or getattr(sys.stderr, "closed", False):
+        return True
+    return None if progress is None else not flag(progress, "progress")
 
 
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:

@@ -33,12 +33,3 @@ def deferred_interrupts() -> Iterator[Callable[[], bool]]:
     finally:
         if in_main_thread and signal.getsignal(signal.SIGINT) is remember:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@contextmanager
-def whole_import() -> Iterator[None]:
-    """Delay Ctrl-C until an import is complete: trimesh takes any exception meanwhile for a missing optional module."""
-    with deferred_interrupts() as pressed:
-        yield
-    if pressed():
-        raise KeyboardInterrupt

@@ -13,7 +13,6 @@ _PER_TRIANGLE = 320.0  # of a welded mesh and its normals: measured on hugin in 
 _PER_CELL_TRACED = 300.0  # the surface that rays meet, made once for a map
 _PER_PATCH_SEEN = 100.0
 _PER_BEAM = 100.0
-_PER_RETURN_SEEN = 50.0  # of all views that are kept
 
 
 def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> None:
@@ -27,16 +26,14 @@ def check_triangles(count: int, max_memory_bytes: int | None) -> None:
     _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, way_out)
 
 
-def check_views(
-    max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0, returns: float = 0
-) -> None:
+def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0) -> None:
     """Raises a MemoryError if views of a map need more memory than there is.
 
     `cells`: leaf cells of a map whose surface has yet to be made for views; `patches` of that surface; `beams` of one
-    view; `returns` of all views that are kept.
+    view.
     """
     of_map = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN
-    needed = of_map + beams * _PER_BEAM + returns * _PER_RETURN_SEEN
+    needed = of_map + beams * _PER_BEAM
     way_out = "ask for fewer poses or returns, or make the map of a part of the scans"
     _check("these views", needed, max_memory_bytes, way_out)
 

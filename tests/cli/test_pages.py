@@ -57,7 +57,6 @@ def test_a_report_of_a_map_and_scans(map_file, scans_file, tmp_path, capsys):
         (["--port", 70000], "port"),
         (["--host", "192.0.2.1"], "--host"),
         (["--box", 900, 900, 900, 901, 901, 901], "no surface"),
-        (["--max-vertices", 2], "max_vertices"),
         (["absent.npz"], "absent.npz"),
     ],
 )

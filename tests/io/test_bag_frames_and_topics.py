@@ -90,7 +90,6 @@ def test_several_topics_are_merged_by_time(tmp_path, poses):
     assert_allclose(np.array(seen(scans))[::2, 0], 5 + 0.1 * np.arange(10), atol=1e-3)
     assert_allclose(np.array(seen(scans))[1::2, 0], 0.1 * np.arange(10) + 0.03 - 5, atol=1e-3)
     assert [scan.intensities is None for scan in scans][:2] == [True, False]
-    assert any("some scans have doppler, others have none" in note for note in scans.notes)
     with pytest.raises(ValueError, match="no topic /up"):
         read(path, topic=["/front", "/up"])
 
@@ -111,7 +110,7 @@ def test_what_somebody_wants_is_no_pose_of_the_sensor(tmp_path, topic):
     assert_allclose(scans.poses[0], MOUNTING, atol=1e-9)
     assert any(note.startswith(f"poses of {topic} are passed over") for note in scans.notes)
     assert read(path, pose_topic=topic).poses[0, 0, 3] == 50.5  # what is asked for is read
-    with pytest.raises(NoPoses, match=f"{topic} is passed over"):
+    with pytest.raises(NoPoses, match="has no poses"):
         read(bag_of(tmp_path, clouds, goals, kind="ros1"))
 
 
@@ -172,18 +171,6 @@ def test_of_two_parents_the_one_with_poses_counts(tmp_path, other):
     scans = read(bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), second, clouds))
     assert_allclose(scans.poses, [straight(t) @ MOUNTING for t in TIMES_S], atol=1e-6)
     assert any("several parents in TF" in note and "odom is used" in note for note in scans.notes)
-
-
-def test_a_world_that_is_corrected_rarely_is_passed_over(tmp_path):
-    def corrections(bag):
-        for time_s, shift_m in ((START_S - 0.5, 3.0), (START_S + 0.5, 4.0), (START_S + 1.5, 5.0)):
-            bag.write("/tf", bag.transforms(time_s, {("map", "odom"): pose([shift_m, 0, 0])}), time_s)
-
-    path = bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), corrections, clouds)
-    scans = read(path)
-    assert_allclose(scans.poses, [straight(t) @ MOUNTING for t in TIMES_S], atol=1e-6)
-    assert any("TF above odom is passed over" in note for note in scans.notes)
-    assert_allclose(read(path, world_frame="map", max_gap_s=1.1).poses[0, 0, 3], 4.0)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])

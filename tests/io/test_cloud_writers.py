@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
 from radarsdf.io.clouds import read_columns, read_points
-from radarsdf.io.files import origin_path
 from radarsdf.io.scans import Notes, Scan, Scans
 
 UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
@@ -66,15 +65,17 @@ def test_the_same_numbers_come_back(tmp_path, suffix, origin):
         pytest.skip("laspy is not installed")
     scans, reads = lazily(origin)
     path = tmp_path / f"cloud{suffix}"
-    written = write_cloud(path, scans)
-    assert (written.returns, written.scans, reads) == (sum(COUNTS), len(COUNTS), [1])
+    if suffix == ".pcd" and origin[0] > 0:
+        with pytest.raises(ValueError, match="float32"):
+            write_cloud(path, scans)
+        return
+    assert (write_cloud(path, scans), reads) == (sum(COUNTS), [1])
     columns, right = read_columns(path), expected(origin)
     for name in ("intensity", "doppler", "scan", "time"):
         np.testing.assert_array_equal(columns[name].astype(right[name].dtype), right[name])
     tolerance_m = {".las": 6e-5, ".laz": 6e-5, ".pcd": 1e-5}.get(suffix, 0)
     world = np.stack([right[axis] for axis in "xyz"], axis=1)
     np.testing.assert_allclose(read_points(path), world, rtol=0, atol=tolerance_m)
-    assert origin_path(path).exists() == (suffix == ".pcd" and origin[0] > 0)
 
 
 def test_columns_that_scans_lack(tmp_path):
@@ -83,9 +84,7 @@ def test_columns_that_scans_lack(tmp_path):
     assert list(read_columns(tmp_path / "cloud.ply")) == ["x", "y", "z", "scan"]
     mixed = Scans.of_source(lambda: iter([one_scan(0, 0.0), one_scan(1, 0.0, optional=False)]), Notes())
     write_cloud(tmp_path / "mixed.csv", mixed)
-    np.testing.assert_array_equal(
-        np.isnan(read_columns(tmp_path / "mixed.csv")["intensity"]), [False, False, False, True]
-    )
+    assert "intensity" not in read_columns(tmp_path / "mixed.csv")
 
 
 def test_a_source_that_fails_leaves_the_old_file(tmp_path):

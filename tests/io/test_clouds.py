@@ -113,20 +113,6 @@ def test_viewpoint(tmp_path):
         read(tmp_path / "0.pcd")
 
 
-@pytest.mark.parametrize("name", ["frame", "Scan_ID", "scalar_scan"])
-def test_a_table_of_several_scans(tmp_path, name):
-    (tmp_path / "a.csv").write_text(f"{name},time,x,y,z\n3,0.3,1,0,0\n1,0.1,2,0,0\n3,0.3,4,0,0\n")
-    poses = np.tile(IDENTITY, (4, 1, 1))
-    poses[:, 0, 3] = [0, 10, 20, 30]
-    for given in (poses, poses[[1, 3]]):  # scans without returns have poses, or none
-        scans = read(tmp_path / "a.csv", given)
-        assert [scan.points[:, 0].tolist() for scan in scans] == [[2], [1, 4]]
-        assert scans.poses[:, 0, 3].tolist() == [10, 30]
-        assert scans.times_s.tolist() == [0.1, 0.3]
-    with pytest.raises(ValueError, match="2 scans but 1 poses"):
-        read(tmp_path / "a.csv", IDENTITY)
-
-
 def test_ply(tmp_path):
     header = "".join(
         f"property {kind} {name}\n"

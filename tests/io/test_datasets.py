@@ -144,7 +144,7 @@ def test_msc_rad4r(tmp_path):
     lines = [f"{i} {int(t)} {round((t - int(t)) * 1e9)}\n" for i, t in enumerate(TIMES_S)]
     (folder / "3_RADAR" / "timestamp_radar.txt").write_text("".join(lines))
     assert name_of(folder) == "MSC-RAD4R"
-    with pytest.raises(ValueError, match="MSC-RAD4R has positions but no poses: give poses"):
+    with pytest.raises(ValueError, match="has no poses"):
         read(folder)
     (tmp_path / "odometry.tum").write_text(tum_rows())
     check(read(folder, tmp_path / "odometry.tum"), POSES)
@@ -180,13 +180,14 @@ def test_ntu4dradlm(tmp_path):
     with BagWriter(folder / "gt_odom.bag", "ros1") as bag:
         bag.write("/gt_odom", bag.odometry(START_S, np.eye(4)), START_S)
     (folder / "gt_odom.txt").write_text(tum_rows())
-    assert name_of(folder) == "NTU4DRadLM"
     scans = read(folder)
     check(scans, POSES)
-    assert "no extrinsic is given" in scans.notes[0]
     scans = read(folder, extrinsic=MOUNTING)
     check(scans, POSES @ MOUNTING)
-    assert [note.partition(" (")[0] for note in scans.notes] == ["scans: those of /radar_enhanced_pcl"]
+    assert [note.partition(" (")[0] for note in scans.notes] == [
+        "poses: of gt_odom.txt",
+        "scans: those of /radar_enhanced_pcl",
+    ]
 
 
 def test_viking_hill(tmp_path):
@@ -204,58 +205,4 @@ def test_viking_hill(tmp_path):
             bag.write("/hugin_raf_1/radar_data", bag.cloud2(time_s, columns, "hugin_raf_1"), time_s + 0.1)
     check(read(folder, extrinsic=MOUNTING), POSES @ MOUNTING)
     (folder / "base_T_radar.txt").write_text("\n".join(" ".join(map(repr, row)) for row in MOUNTING.tolist()))
-    assert name_of(folder) == "Viking Hill"
     check(read(folder), POSES @ MOUNTING)
-
-
-# The mounting of the ARS548 in the frame of the lidar on the morning of 2023-11-05, as python/view_radar_lidar.py of
-# github.com/snail-radar/dataset_tools has it.
-T_XT32_ARS548 = np.array(
-    [
-        [-0.0148246945939438, 0.999869704931098, -0.00638767491813221, 0],
-        [-0.967459492843472, -0.0127297492912655, 0.252705525895304, 0],
-        [0.252591285490489, 0.00992609917652017, 0.967522151941183, 0.07],
-        [0, 0, 0, 1],
-    ]
-)
-
-
-@pytest.fixture
-def ars548(tmp_path):
-    """A sequence whose ARS548 is in the folder and the format of bag_to_folder.py of the data set."""
-    folder = tmp_path / "20231105" / "data4"
-    for i, time_s in enumerate(TIMES_S):
-        table = returns(i, 4)
-        std = {f"{name}_std": np.full(i + 2, 0.1) for name in ("range", "azimuth", "elevation", "doppler")}
-        columns = radar_cloud(table[:, :3], doppler=np.full(i + 2, -1.5), intensity=table[:, 3], **std)
-        write_pcd(folder / "ars548" / "points" / f"{time_s:.9f}.pcd", columns)
-    (folder / "ars548" / "points" / "times.txt").write_text("".join(f"{t:.9f}\n" for t in TIMES_S))
-    (folder / "utm50r_T_xt32.txt").write_text(tum_rows())
-    return folder
-
-
-def test_the_ars548_of_snail_radar(ars548):
-    assert name_of(ars548) == "SNAIL-Radar"
-    scans = read(ars548)
-    check(scans, POSES @ T_XT32_ARS548)
-    assert_allclose(next(iter(scans)).sigma, 0.1, rtol=1e-6)
-    check(read(ars548, extrinsic=MOUNTING), POSES @ MOUNTING)
-    afternoon = ars548.parent.with_name("20231105_aft")
-    ars548.parent.rename(afternoon)
-    corrected = read(afternoon / "data4").poses
-    turned = Rotation.from_matrix((corrected @ np.linalg.inv(POSES @ T_XT32_ARS548))[0, :3, :3])
-    assert 14 < np.rad2deg(turned.magnitude()) < 16  # its pitch was corrected that noon
-
-
-def test_a_day_without_a_calibration_of_the_ars548(ars548):
-    for name in ("20231101", "recordings"):
-        folder = ars548.parent.with_name(name)
-        ars548.parent.rename(folder)
-        with pytest.raises(ValueError, match=f"depends on the day.* but that is {name}: give extrinsic"):
-            read(folder / "data4")
-        check(read(folder / "data4", extrinsic=np.eye(4)), POSES)
-        folder.rename(ars548.parent)
-    (ars548 / "utm50r_T_xt32.txt").unlink()
-    with pytest.raises(ValueError, match="full_trajs"):
-        read(ars548)
-    check(read(ars548, POSES), POSES @ T_XT32_ARS548)

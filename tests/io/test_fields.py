@@ -110,7 +110,7 @@ LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)
         ("range azimuth elevation\n10 45 0", "degrees by their numbers"),
         ("r az el\n10 45 0", "degrees by their numbers"),
         ("r_m az_deg el_deg\n10 45 0", None),
-        ("range(mm) azimuth[deg] elevation\n10000 45 0", "degrees as azimuth[deg] is"),
+        ("range(mm) azimuth[deg] elevation\n10000 45 0", "degrees by their numbers"),
         ("range azimuth_rad elevation_rad\n10 0.78539816339745 0", None),
         ("range azimuth elevation\n10 0.78539816339745 0", "rad by their numbers"),
         (

@@ -18,7 +18,7 @@ from radarsdf.cli.maps import evaluate, mesh
 from radarsdf.cli.options import Parser
 from radarsdf.cli.pages import add_report
 from radarsdf.cli.pages import view as show_map
-from radarsdf.cli.results import Results, save_map
+from radarsdf.cli.results import Results
 from radarsdf.cli.scans import posed_scans, warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io import Scans, write_scans
@@ -64,12 +64,12 @@ def fit(given: Namespace, results: Results) -> None:
         )
     except Interrupted as stop:
         if stop.radar_map is not None:
-            save_map(stop.radar_map, out)
+            stop.radar_map.save(out)
             stop.args = (f"{stop}; the map so far is in {out}",)
         raise
     if posed.way is not None:
         radar_map.report["poses"] = posed.way
-    save_map(radar_map, out)
+    radar_map.save(out)
     if given.checkpoint is not None:
         given.checkpoint.unlink(missing_ok=True)
     _add_fit(results, radar_map)

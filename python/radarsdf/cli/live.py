@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import check_address, inputs_of, scans_or_unposed
-from radarsdf.cli.results import Results, save_map, until_stopped
+from radarsdf.cli.results import Results, until_stopped
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
 from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
@@ -111,7 +111,8 @@ def live(given: Namespace, results: Results) -> None:
         done = replay(growing, scans, with_poses=not unposed, rate=given.rate, on_scan=shown)
         _add_rates(results, done, len(scans))
         if out is not None:
-            save_map(growing.map() if given.quick else growing.finish(progress=results.progress), out)
+            made = growing.map() if given.quick else growing.finish(progress=results.progress)
+            made.save(out)
             results.add(f"map {out}", out=out)
         if trajectory is not None:
             times_s = None if scans.times_s is None else scans.times_s[done.rows]

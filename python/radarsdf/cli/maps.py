@@ -4,15 +4,17 @@
 
 from __future__ import annotations
 
+import platform
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from radarsdf import evaluation
+from radarsdf import _core, evaluation
 from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import is_map, load_map, mesh_limits, read_scans, split
 from radarsdf.cli.results import Results
@@ -21,21 +23,32 @@ from radarsdf.io.bag_messages import is_bag
 from radarsdf.io.cloud_writing import write_cloud
 from radarsdf.io.files import check_outputs, check_regular_file
 from radarsdf.io.meshes import check_mesh_path, read_ground_truth, read_mesh, write_mesh
-from radarsdf.io.npz import holds_scans, write_scans
+from radarsdf.io.npz import arrays_of, write_scans
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
 from radarsdf.io.scans import Notes, Scans
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
 from radarsdf.map.view import View, scans_of_views
-from radarsdf.memory import check_views
 from radarsdf.render import picture
 from radarsdf.render.figures import save_view_picture
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.tiles.tiled_map import predicted
-from radarsdf.versions import versions
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")
 _MAX_PICTURES = 20
+
+
+def versions() -> dict[str, str]:
+    """Version, compiler, instruction set and threads of each part, in words."""
+    openmp = _core.openmp_version()
+    return {
+        "radarsdf": _core.__version__,
+        "python": f"{platform.python_version()} on {platform.platform()}",
+        "torch": f"{torch.__version__}, {torch.get_num_threads()} threads",
+        "compiler": _core.compiler(),
+        "openmp": f"{openmp}, {_core.num_threads()} threads" if openmp else "none: the core is serial",
+        "instruction set": f"{_core.instruction_set()} of {', '.join(_core.available_instruction_sets())}",
+    }
 
 
 def info(given: Namespace, results: Results) -> None:
@@ -77,7 +90,8 @@ def mesh(given: Namespace, results: Results) -> None:
         msg = f"{given.map} has no surface here: nothing written"
         raise ValueError(msg)
     line = f"{vertices} vertices and {triangles} triangles"
-    results.add_file(line, out, write_mesh(out, found), vertices=vertices, triangles=triangles)
+    write_mesh(out, found)
+    results.add_file(line, out, vertices=vertices, triangles=triangles)
     results.add_threshold(Threshold.of_mesh(found.metadata))
     if drawing is not None:
         picture.save_picture(drawing, found, scalar=found.vertex_attributes.get("intensity"))
@@ -120,11 +134,9 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
     every_ray, known = (rays_as_measured(scans, radar_map.config) for scans in (test, train))
     tested, known = (rays.select(rays.with_intensity) for rays in (every_ray, known))
     inside, found = predicted(radar_map, tested)
-    outliers, outside = len(every_ray) - len(tested), len(tested) - len(inside)
-    results.add(wild_intensities=outliers, in_no_tile=outside)
-    for count, why in ((outliers, "are outliers"), (outside, "are in no tile")):
-        if count:
-            results.add(f"{count} of {len(every_ray)} held-out returns {why}, and are not compared")
+    left_out = len(every_ray) - len(inside)
+    line = f"{left_out} of {len(every_ray)} held-out returns are outliers or in no tile, and are not compared"
+    results.add(line if left_out else None, not_compared=left_out)
     (x, sensors), measured = inside.in_world(), inside.intensities
     assert measured is not None
     assert known.intensities is not None
@@ -140,7 +152,8 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
 
 def _holds_scans(path: Path) -> bool:
     """Whether the truth is scans, and not a file of points or a surface."""
-    return path.is_dir() or is_bag(path) or (path.suffix.lower() == ".npz" and holds_scans(path))
+    has_poses = path.suffix.lower() == ".npz" and bool(arrays_of(path, ["poses"]))
+    return path.is_dir() or is_bag(path) or has_poses
 
 
 def render(given: Namespace, results: Results) -> None:
@@ -155,9 +168,6 @@ def render(given: Namespace, results: Results) -> None:
     check_outputs([out], [given.map])
     radar_map = load_map(given.map)
     rng = np.random.default_rng(given.seed)
-    wanted = radar_map.sensor.returns_per_scan if given.returns is None else given.returns
-    # There are about as many patches as cells, and each has one return at most.
-    check_views(None, returns=len(poses) * min(wanted, radar_map.num_cells))
     views: Iterable[View] = (
         radar_map.render(T, returns=given.returns, noise=given.noise, seed=rng) for T in poses
     )

@@ -50,7 +50,7 @@ OF_COMMANDS = {
     "mesh": "map -o --box --viewpoint --picture results surface",
     "poses": "-o --find --picture results reading settings",
     "live": "-o --trajectory --rate --find --view results reading page settings",
-    "view": "map --open --max-vertices --box --quiet reading page surface",
+    "view": "map --open --box --quiet reading page surface",
     "report": "map -o --holdout --box results reading surface",
     "eval": "what --samples --holdout --box results reading surface",
     "render": "map --pose -o --returns --noise --seed results",
@@ -167,7 +167,6 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o
     "--rate": ({"type": float, "default": 1.0},
                "multiplies the recorded speed, which is 0.1 s a scan without times; 0: as fast as possible"),
     "--open": (_SWITCH, "open the page in a browser here; default: if there is a screen"),
-    "--max-vertices": (_COUNT | {"default": 500_000}, "simplify a mesh that has more; default: 500000"),
     "--samples": (_COUNT | {"default": 10_000_000}, "points sampled on the mesh; default: 10000000"),
     "--pose": ({"nargs": "+", "action": "append", "required": True, "metavar": "P"}, ("where the sensor is, world frame: "
                "x y z, m, or x y z qx qy qz qw, or a file of poses as for radarsdf fit; may be repeated")),

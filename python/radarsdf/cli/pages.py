@@ -29,7 +29,6 @@ def view(given: Namespace, results: Results) -> None:
         read_scans(given) if given.scans else None,
         voxel_size=given.voxel,
         box=given.box,
-        max_vertices=given.max_vertices,
         host=given.host,
         port=given.port,
         progress=results.progress,
@@ -37,8 +36,6 @@ def view(given: Namespace, results: Results) -> None:
     ) as viewer:
         url = serving.url_of(viewer.host, viewer.port)
         print(f"{len(viewer.surface.vertices)} vertices on {url}; Ctrl-C ends it", flush=True)
-        for note in viewer.notes:
-            print(note, flush=True)
         if serving.has_display() if given.open is None else given.open:
             webbrowser.open(url)
         until_stopped(viewer)

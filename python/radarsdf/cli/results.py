@@ -1,18 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What commands print, as lines and tables for people or one JSON object for programs, and how they keep a map."""
+"""What commands print, as lines and tables for people or one JSON object for programs."""
 
 from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # a page of help, or of settings, needs no PyTorch
-    from radarsdf.map.radar_map import RadarMap
     from radarsdf.map.threshold import Threshold
     from radarsdf.view.serving import Page
 
@@ -44,10 +42,9 @@ class Results:
         """Add the confidence from which on a mesh was kept, and what that costs."""
         self.add(str(threshold), **threshold.metadata)
 
-    def add_file(self, what: str, path: Path, origin: Any = None, **values: Any) -> None:
-        """Add what was written to a file, and the origin of its frame, if that is not the world."""
-        local = "" if origin is None else f", in a local frame, whose origin is in {path.name}.origin.json"
-        self.add(f"{what} written to {path}{local}", out=path, origin=origin, **values)
+    def add_file(self, what: str, path: Path, **values: Any) -> None:
+        """Add what was written to a file."""
+        self.add(f"{what} written to {path}", out=path, **values)
 
     def end(self) -> None:
         """Print the object, if it is for programs, once. A number that is not finite is null."""
@@ -67,20 +64,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
-
-
-def save_map(radar_map: RadarMap, path: Path) -> None:
-    """Save a map, or if that fails, in the temporary folder: a fit is too much work to be lost for its file's name.
-
-    An OSError says where it is instead.
-    """
-    try:
-        radar_map.save(path)
-    except (OSError, ValueError) as error:  # ValueError: it is no regular file any more
-        spare = Path(tempfile.mkdtemp(prefix="radarsdf_")) / path.name
-        radar_map.save(spare)
-        msg = f"{path} cannot be written ({error}): the map was saved in {spare} instead"
-        raise OSError(msg) from error
 
 
 def until_stopped(page: Page) -> None:

@@ -130,8 +130,8 @@ def convert(given: Namespace, results: Results) -> None:
     if given.poses is None and holds_mesh(given.scans):
         check_mesh_path(out)
         mesh = read_mesh(given.scans)
-        count = len(mesh.faces)
-        results.add_file(f"{count} triangles", out, write_mesh(out, mesh), triangles=count)
+        write_mesh(out, mesh)
+        results.add_file(f"{len(mesh.faces)} triangles", out, triangles=len(mesh.faces))
         return
     suffix = out.suffix.lower()
     if suffix != ".npz":
@@ -142,9 +142,7 @@ def convert(given: Namespace, results: Results) -> None:
     scans = read_scans(given)
     if suffix == ".npz":
         write_scans(out, scans)
-        returns, origin = sum(map(len, scans.points)), None
+        returns = sum(map(len, scans.points))
     else:
-        written = write_cloud(out, scans, progress=results.progress)
-        returns, origin = written.returns, written.origin
-    line = f"{returns} returns of {len(scans)} scans"
-    results.add_file(line, out, origin, returns=returns, scans=len(scans))
+        returns = write_cloud(out, scans)
+    results.add_file(f"{returns} returns of {len(scans)} scans", out, returns=returns, scans=len(scans))

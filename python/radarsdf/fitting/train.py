@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
@@ -26,7 +27,6 @@ from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.progress import hides_bar
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import Workers

@@ -265,7 +265,7 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
                 named = isinstance(name, str) and isinstance(connection.msgtype, str)
                 check(named, f"{path} is not a whole bag: a topic has no name or no type")
                 count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
-                topics[name] = Topic(name, _type_of(connection), count)
+                topics[name] = Topic(name, connection.msgtype, count)
     return topics
 
 
@@ -308,19 +308,12 @@ def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes:
     return True
 
 
-def _type_of(connection: Any) -> str:
-    """With the encoding, where it is none of ROS, as MCAP files may have."""
-    encoding = getattr(connection.ext, "serialization_format", "cdr")
-    message_type: str = connection.msgtype
-    return message_type if encoding == "cdr" else f"{message_type} in {encoding}"
-
-
 def _stream(
     path: Path, names: set[str]
 ) -> Generator[tuple[float, Path, Any, bytes | memoryview], None, None]:
     """Record time, s, bag, connection of rosbags, and bytes of each message."""
     with _opened(path) as reader:
-        connections = [c for c in reader.connections if c.topic in names and _type_of(c) == c.msgtype]
+        connections = [c for c in reader.connections if c.topic in names]
         if not connections:  # of none, rosbags would give all messages
             return
         try:
@@ -354,7 +347,5 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
-    why = str(error) or type(error).__name__
-    cut_off = "end magic" in why or "index" in why.lower()
-    remedy = "; if its recording was cut off, mcap recover or rosbag reindex may repair it" if cut_off else ""
-    return ValueError(f"{path} is not a whole bag: {why.rstrip('.')}{remedy}")
+    remedy = "if its recording was cut off, mcap recover or rosbag reindex may repair it"
+    return ValueError(f"{path} is not a whole bag: {str(error) or type(error).__name__}; {remedy}")

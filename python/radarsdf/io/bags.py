@@ -35,7 +35,7 @@ from radarsdf.io.files import check
 from radarsdf.io.imu import Imu
 from radarsdf.io.poses import UNPOSED, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
-from radarsdf.io.scans import Notes, Scans
+from radarsdf.io.scans import Scans
 
 # Topics of radars in data sets, and of the poses there. They are preferred to others.
 KNOWN_TOPICS = {
@@ -75,8 +75,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     recorded = by_recording[scan_topics[0].name]
     imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
-    truth = request.truth or (lambda: None)
-    return Scans.of_source(posed(raw_scans, find, request), request.notes, truth, imu)
+    return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
 
 def _given(
@@ -93,9 +92,6 @@ def _given(
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
         return lambda _: numbered_poses
     if poses is UNPOSED:
-        if len(frames) > 1:
-            listed = ", ".join(frames)
-            request.notes.add(f"without poses, scans of several frames are taken as of one sensor: {listed}")
         return lambda _: poses
     return transforms_in(paths, request).attach(poses, frames[0], request)
 
@@ -155,21 +151,20 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     fitting = sorted(topics_with([IMU], topics))
     listed = ", ".join(fitting)
     wanted, about = request.imu_topic, request.notes.about
-    known = wanted is None or wanted in fitting
-    check(known, f"{about} has no inertial measurements in {wanted}: there are {listed or 'none'}")
+    check(wanted in (None, *fitting), f"{about} has no inertial measurements in {wanted}: there are {listed}")
     if wanted is None and len(fitting) > 1:
-        request.notes.add(f"there are several IMUs, none is used: say by imu_topic which, of {listed}")
+        request.notes.add(f"of several IMUs, none is used: say by imu_topic which, of {listed}")
         return None
     return wanted or next(iter(fitting), None)
 
 
 def _read_imu(
-    paths: list[Path], topic: str | None, sensor_frame: str, recorded_scans: bool, request: Request
+    paths: list[Path], topic: str | None, sensor_frame: str, recorded: bool, request: Request
 ) -> Imu | None:
     """What the topic holds; None if it has no gyroscope.
 
-    `recorded_scans`: scans have the times when they were recorded. Then each measurement has its stamp plus the median time
-    from stamp to record, because messages of an IMU are recorded several at a time.
+    Where scans have the times when they were `recorded`, each measurement has its stamp plus the median time from stamp to
+    record, because messages of an IMU are recorded several at a time.
     """
     if topic is None:
         return None
@@ -185,10 +180,11 @@ def _read_imu(
     table = table[np.isfinite(table[:, :5]).all(axis=1)]
     if len(table) == 0:
         return None
-    stamps, recorded = table[:, 0], table[:, 1]
-    times_s = recorded
-    if not by_record(stamps, topic, None, Notes(log=False) if recorded_scans else request.notes):
-        times_s = stamps + np.median(recorded - stamps) if recorded_scans else stamps
+    times_s, recorded_s = table[:, 0], table[:, 1]
+    if by_record(times_s, topic, None, request.notes):
+        times_s = recorded_s
+    elif recorded:
+        times_s = times_s + np.median(recorded_s - times_s)
     order = np.argsort(times_s, kind="stable")
     forces = table[order, 5:]
     has_force = np.isfinite(forces).all() and forces.any()

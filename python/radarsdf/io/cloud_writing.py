@@ -7,34 +7,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
-from radarsdf.io.files import check, origin_for, whole_file, write_origin
+from radarsdf.io.files import check, check_fits_float32, whole_file
 from radarsdf.io.scans import Columns, Scan, Scans
-from radarsdf.progress import hides_bar
 
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back
 _LAS_SCALE_M = 1e-4
 _LAS_FORMAT = 6  # the first of LAS 1.4, with a time
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-
-
-class CloudWritten(NamedTuple):
-    """Size and origin of a cloud that was written."""
-
-    returns: int
-    """Number of returns."""
-    scans: int
-    """Number of scans."""
-    origin: NDArray[np.float64] | None
-    """(3,) the origin that was subtracted, world, m; None where coordinates are the world's."""
 
 
 def check_cloud_path(path: str | PathLike[str]) -> None:
@@ -43,14 +30,13 @@ def check_cloud_path(path: str | PathLike[str]) -> None:
     check(known, f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}")
 
 
-def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | None = False) -> CloudWritten:
+def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
     """Writes all returns of scans as one point cloud, whole or not at all.
 
-    The cloud has x, y, z in the world frame, m; intensity in sensor units and doppler in m/s where the first scan has
-    them; scan, the number of the scan; and time, s, where the first scan has one. What a later scan lacks is NaN.
+    The cloud has x, y, z in the world frame, m; intensity in sensor units, doppler in m/s and time, s, where all scans have
+    them; and scan, the number of the scan.
     Coordinates are float64. LAS and LAZ round them to 0.1 mm, and have the other columns as extra dimensions. PCD holds
-    float32, since most programs read no other: further than 1000 m from the world's origin it is in a local frame,
-    whose origin is written beside it, as ``NAME.origin.json``.
+    float32, since most programs read no other.
 
     Parameters
     ----------
@@ -58,18 +44,16 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
         It ends in .ply, .pcd, .las, .laz, .npy or .csv. NumPy's file holds one record a return.
     scans : Scans
         They are read once.
-    progress : bool, optional
-        Whether to show a progress bar. None: on a terminal.
 
     Returns
     -------
-    CloudWritten
-        What was written.
+    int
+        Number of returns.
 
     Raises
     ------
     ValueError
-        For another suffix, if `path` is no regular file, or the scans cannot be read.
+        For another suffix, if `path` is no regular file, the scans cannot be read, or float32 has too few digits.
     OSError
         If a file cannot be read or written.
     ImportError
@@ -77,26 +61,17 @@ def write_cloud(path: str | PathLike[str], scans: Scans, *, progress: bool | Non
     """
     check_cloud_path(path)
     suffix = Path(path).suffix.lower()
-    # Of an iterator: the number of scans is not known before the first pass through their files.
-    bar = tqdm(iter(scans), desc="convert", unit="scan", disable=hides_bar(progress))
-    parts = [_columns(number, scan) for number, scan in enumerate(bar)]
-    missing = [np.full(len(part["scan"]), np.nan, np.float32) for part in parts]
-    columns = {
-        name: np.concatenate([part.get(name, nan) for part, nan in zip(parts, missing, strict=True)])
-        for name in parts[0]
-    }
+    parts = [_columns(number, scan) for number, scan in enumerate(scans)]
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
     for name in {"intensity", "doppler"} & set(columns):
         columns[name] = columns[name].astype(np.float32)
-    origin = None
+    if suffix == ".pcd":
+        check_fits_float32(path, np.stack([columns[axis] for axis in "xyz"], axis=1))
+        columns |= {axis: columns[axis].astype(np.float32) for axis in "xyz"}
     with whole_file(path) as file:
-        if suffix == ".pcd":
-            origin = origin_for(np.stack([columns[axis] for axis in "xyz"], axis=1))
-            for axis, shift in zip("xyz", np.zeros(3) if origin is None else origin, strict=True):
-                columns[axis] = (columns[axis] - shift).astype(np.float32)
         _WRITERS[suffix](file, records(columns))
-        if suffix == ".pcd":
-            write_origin(path, origin)
-    return CloudWritten(len(columns["scan"]), len(parts), origin)
+    return len(columns["scan"])
 
 
 def _columns(number: int, scan: Scan) -> Columns:
@@ -168,12 +143,9 @@ def face_records(faces: NDArray[np.integer[Any]]) -> NDArray[Any]:
     return rows
 
 
-def ply_header(
-    dtype: np.dtype[Any], count: int, num_faces: int | None = None, comment: str | None = None
-) -> bytes:
+def ply_header(dtype: np.dtype[Any], count: int, num_faces: int | None = None) -> bytes:
     """The header of a binary PLY file of `count` such records, and of triangles if it is a mesh."""
     lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [] if comment is None else [f"comment {comment}"]
     lines += ["comment radarsdf: world frame, m", f"element vertex {count}"]
     lines += [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
     if num_faces is not None:

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import path_of
 from radarsdf.extras import require
-from radarsdf.interrupts import whole_import
 from radarsdf.io.fields import Fields, names_of
-from radarsdf.io.files import check, check_regular_file, origin_of, reading
+from radarsdf.io.files import check, check_regular_file, reading
+from radarsdf.io.npz import array_in
 from radarsdf.io.scans import Columns, Notes
 from radarsdf.io.text import read_table
 
@@ -37,7 +37,6 @@ _MAX_POSITION_M, _FEW = 1e7, 0.02  # of the numbers may be damaged
 _LESS, _ENOUGH_ROWS = 0.8, 30  # of the variance within four columns is left by another number of them
 
 GivenColumns: TypeAlias = int | Sequence[str] | None
-"""The columns of files without names, as a user gives them: how many numbers a point has, or their names."""
 
 
 def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
@@ -69,8 +68,8 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     Returns
     -------
     (M, 3) float64 ndarray
-        Frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places the points; the world's, if
-        :func:`write_cloud` wrote an origin next to it. Points that are not finite are left out.
+        Frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places the points. Points that are not finite are
+        left out.
 
     Raises
     ------
@@ -90,8 +89,7 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     if file.suffix.lower() == ".pcd":
         T_world_sensor = read_viewpoint(file)
         points = points @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
-    origin = origin_of(path)
-    return points if origin is None else points + origin
+    return points
 
 
 # Files .bin: float32, x, y, z, intensity, as KITTI has them, or as many columns as a user says.
@@ -130,8 +128,7 @@ def _variance(numbers: NDArray[np.float32], width: int) -> float:
 
 
 def _npy(path: Path, columns: GivenColumns) -> Columns:
-    # A memory map: a header that claims more than the file holds is refused before anything is allocated.
-    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    array = array_in(path)
     if array.dtype.names is not None and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names}
     rows = array.ndim == 2 and array.dtype.kind in "iuf"
@@ -143,8 +140,8 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
     table = read_table(path)
     width = table.values.shape[1]
     # CloudCompare writes names of columns after a comment sign.
-    named = (head for head in table.heads if {"x", "y", "z"} <= {word.lower() for word in head})
-    names = table.header or next(named, None) or names_of(width or 3, columns)
+    named = [head for head in table.heads if len(head) == width and not any(map(str.isdecimal, head))]
+    names = named[-1] if named else names_of(width or 3, columns)
     values = table.values if len(table.values) else np.zeros((0, len(names)))
     fits = values.shape[1] == len(names) == len(set(names))
     check(fits, f"its header has {len(names)} names for {width} columns, or a name twice")
@@ -163,9 +160,14 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
     dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for kind, size, count in fields]
-    readers = {"binary": _pcd_binary, "ascii": _pcd_ascii}
-    check(header["DATA"][0] in readers, f"its DATA is {header['DATA'][0]}: save it as binary")
-    columns = readers[header["DATA"][0]](body, dtypes, points)
+    if header["DATA"][0] == "binary":
+        record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
+        cloud = np.frombuffer(body, record, points)
+        columns = [cloud[name][:, 0] for name in record.names or ()]
+    else:
+        check(header["DATA"][0] == "ascii", f"its DATA is {header['DATA'][0]}: save it as binary")
+        table = np.array(body.split(), np.float64).reshape(points, sum(counts))
+        columns = [table[:, i] for i in np.cumsum([0, *counts[:-1]])]
     # The name _ means padding, and several fields may have it.
     return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
 
@@ -196,18 +198,6 @@ def _pcd_header(file: BinaryIO) -> dict[str, list[str]]:
     return header
 
 
-def _pcd_binary(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
-    record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
-    cloud = np.frombuffer(body, record, points)
-    return [cloud[name][:, 0] for name in record.names or ()]
-
-
-def _pcd_ascii(body: bytes, dtypes: list[np.dtype[Any]], points: int) -> list[NDArray[Any]]:
-    widths = [dtype.shape[0] for dtype in dtypes]
-    table = np.array(body.split(), np.float64).reshape(points, sum(widths))
-    return [table[:, i] for i in np.cumsum([0, *widths[:-1]])]
-
-
 def ply_bytes(path: Path) -> io.BytesIO:
     """A PLY file for trimesh, without the comments of its header, which may be in any encoding."""
     head, end, body = path.read_bytes().partition(b"end_header")
@@ -223,8 +213,7 @@ def has_faces(path: Path) -> bool:
 
 def _ply(path: Path, _: GivenColumns) -> Columns:
     """The columns of the vertices."""
-    with whole_import():
-        import trimesh  # noqa: PLC0415 - takes long, and few files need it
+    import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
     # Without materials: a PLY file may name an image, which is then not looked for.
     loaded: Any = trimesh.load(ply_bytes(path), file_type="ply", process=False, skip_materials=True)
@@ -308,7 +297,5 @@ READERS: dict[str, Callable[[Path, GivenColumns], Columns]] = {
     ".npy": _npy,
     **dict.fromkeys(TEXT_SUFFIXES, _text),
 }
-"""Reads a file as named columns (N,), by its suffix. What a user says of the columns helps where a format names none."""
 
 CLOUD_SUFFIXES = tuple(READERS)
-"""What :func:`read_columns` reads."""

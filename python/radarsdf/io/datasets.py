@@ -9,7 +9,6 @@ Each reader states where the scans, the poses and the pose of the radar on its p
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,14 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check_pose
-from radarsdf.io.bag_messages import bags_in
-from radarsdf.io.bags import read_bags
 from radarsdf.io.files import check, reading
-from radarsdf.io.poses import pose_matrices_of, read_calibration, read_transform, trajectory_of
-from radarsdf.io.recordings import BASE_T_RADAR, Request, lidar_map, natural, read_files
+from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
+from radarsdf.io.recordings import Request, lidar_map, natural, read_files
 from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text
 
@@ -43,30 +39,8 @@ def find(folder: Path) -> Dataset | None:
     return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
 
 
-def _bags(folder: Path) -> list[Path]:
-    return [path for path in bags_in(folder) if path.stem != "gt_odom"]  # ground truth of NTU4DRadLM
-
-
-def _ntu4dradlm(folder: Path, request: Request) -> Scans:
-    """Bags and ``gt_odom.txt`` (TUM) of the platform; the calibration is given by `extrinsic`."""
-    if request.extrinsic is None:
-        what = "the poses of gt_odom.txt are taken as those of the radar; the data set has a calibration"
-        request.notes.add(f"NTU4DRadLM: no extrinsic is given, so {what}")
-    poses = folder / "gt_odom.txt" if request.poses is None else request.poses
-    return read_bags(_bags(folder), replace(request, poses=poses))
-
-
-def _viking_hill(folder: Path, request: Request) -> Scans:
-    """Bags with ``/hugin_raf_1/radar_data`` and ``/icp_odom``, and the pose of the radar on the platform."""
-    if request.extrinsic is None:
-        request = replace(request, extrinsic=read_transform(folder / BASE_T_RADAR, np.eye(4)))
-    return read_bags(_bags(folder), request)
-
-
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
     """PCD files, and ``timestamp_radar.txt`` with lines of a number, seconds and nanoseconds. It has no poses."""
-    what = "MSC-RAD4R has positions but no poses: give poses, such as a TUM file of lidar odometry"
-    check(request.poses is not None, f"{folder}: {what}")
     return read_files(sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural), folder, request)
 
 
@@ -75,10 +49,8 @@ def _coloradar(folder: Path, request: Request) -> Scans:
     if request.poses is None:
         truth = folder / "groundtruth"
         with reading(truth, "a folder with a time for each pose"):
-            stamps, table = (
-                read_numbers(truth / "timestamps.txt", 1),
-                read_numbers(truth / "groundtruth_poses.txt", 7),
-            )
+            stamps = read_numbers(truth / "timestamps.txt", 1)
+            table = read_numbers(truth / "groundtruth_poses.txt", 7)
             poses = trajectory_of(np.column_stack([stamps, table]), str(truth), request.notes)
         request = replace(request, poses=poses)
     if request.extrinsic is None:
@@ -94,20 +66,15 @@ def _coloradar(folder: Path, request: Request) -> Scans:
     return read_files(sorted(files, key=natural), folder, replace(request, columns=request.columns or 5))
 
 
-def _delft_parts(folder: Path) -> tuple[Path, Path] | None:
-    """The training folders of the radar, and of the poses."""
-    folder = folder.resolve()
-    for radar, poses in ((folder / "radar", folder / "lidar"), (folder, folder.parent / "lidar")):
-        if (radar / "training/velodyne").is_dir() and (poses / "training/pose").is_dir():
-            return radar / "training", poses / "training"
-    return None
+def _delft_radar(folder: Path) -> Path:
+    inner = "training" if (folder / "training/velodyne").is_dir() else "radar/training"
+    return folder.resolve() / inner
 
 
 def _view_of_delft(folder: Path, request: Request) -> Scans:
     """View-of-Delft, whole or one of its radar folders: a calibration and a pose for each frame."""
-    parts = _delft_parts(folder)
-    assert parts is not None
-    radar, lidar = parts
+    radar = _delft_radar(folder)
+    lidar = radar.parents[1] / "lidar/training"
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
@@ -115,7 +82,6 @@ def _view_of_delft(folder: Path, request: Request) -> Scans:
     posed = [path for path in files if (lidar / "pose" / f"{path.stem}.json").is_file()]
     if len(posed) < len(files):
         request.notes.add(f"{len(files) - len(posed)} scans left out: they have no file of a pose")
-    request.notes.add("the scans have no times; the world is the map frame of View-of-Delft")
     poses = np.array([_delft_pose(path.stem, radar, lidar, request.extrinsic) for path in posed])
     return read_files(posed, folder, replace(request, poses=poses, extrinsic=np.eye(4)))
 
@@ -138,85 +104,48 @@ def _delft_pose(
     return T_map_radar
 
 
-# SNAIL-Radar, snail-radar.github.io: two radars, and the poses of its lidar in UTM zone 50R, which is the world frame.
+# The Oculii Eagle of SNAIL-Radar, snail-radar.github.io. The poses are those of its lidar in UTM zone 50R, the world frame.
 #
 #     eagleg7/enhanced/1706001766.577286344.pcd   Oculii frame (forward, left, up); intensity: Power
-#     ars548/points/1706001762.429354169.pcd      ARS548 frame (forward, left, up); intensity: RCS + 128
 #     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
 #     lidar.pcd or lidar.ply                      optional: ground truth
 
-_SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl", "ars548/points")  # the first that is there is read
+_SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl")  # the first that is there is read
 
 # The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source:
-# matlab/Body_T_Xt32.m, Body_T_Oculii.m ("refined") and Body_T_Ars548.m of github.com/snail-radar/dataset_tools, 2f82c2c.
+# matlab/Body_T_Xt32.m and Body_T_Oculii.m ("refined") of github.com/snail-radar/dataset_tools, 2f82c2c.
 _BODY_T_XT32 = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
                            [-0.019750133, 0.999429818, 0.027385610, 0.0],
                            [0.009808698, -0.027195946, 0.999581997, -0.115],
                            [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
-_ARS548_POSITION_M = (0.0, 0.0, 0.07)
-# Its orientation, qx qy qz qw, was set anew several times: from this day on. Afternoons and evenings are half a day later.
-_ARS548_ORIENTATIONS = (
-    (20231104.0, (0.004112068, -0.127365674, -0.006945404, 0.991822987)),
-    (20231105.5, (-0.001244648, 0.001010494, -0.018245103, 0.999832259)),
-    (20231109.0, (-0.008126773, 0.001224424, -0.024923832, 0.999655570)),
-    (20231201.0, (-0.002238636, -0.013322733, -0.022325986, 0.999659464)),
-    (20231208.0, (-0.002173148, -0.012493422, -0.022981144, 0.999655470)),
-    (20231213.0, (-0.003973179, -0.011377850, -0.020249871, 0.999722312)),
-    (20240113.0, (-0.001835193, -0.014938248, -0.025422503, 0.999563493)),
-)
-_DAY = re.compile(r"(\d{8})(_aft|_eve)?$")
 
 
-def _snail_parts(folder: Path) -> tuple[Path, str] | None:
-    """The sequence and the radar that a folder means: ``data3``, or in it ``ars548`` or ``ars548/points``."""
-    here = folder.resolve()
-    for sequence in (here, *here.parents[:2]):
-        for radar in _SNAIL_RADARS:
-            if (sequence / radar).is_dir() and (sequence / radar).is_relative_to(here):
-                return sequence, radar
-    return None
+def _snail_points(folder: Path) -> Path | None:
+    return next((folder / radar for radar in _SNAIL_RADARS if (folder / radar).is_dir()), None)
 
 
 def _snail_radar(folder: Path, request: Request) -> Scans:
-    """A sequence, or one radar of it."""
-    found = _snail_parts(folder)
-    assert found is not None
-    sequence, radar = found
-    others = [other for other in _SNAIL_RADARS if other != radar and (sequence / other).is_dir()]
-    if others and folder.resolve() == sequence:
-        request.notes.add(f"{radar} is read; {' and '.join(others)} are read as folders of their own")
+    """A sequence, such as ``data3``."""
+    points = _snail_points(folder)
+    assert points is not None
     if request.poses is None:
-        path = sequence / "utm50r_T_xt32.txt"
-        check(path.is_file(), f"{sequence} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
+        path = folder / "utm50r_T_xt32.txt"
+        check(path.is_file(), f"{folder} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
         request = replace(request, poses=path)
     if request.extrinsic is None:
-        T_body_radar = _body_T_ars548(sequence) if radar.startswith("ars548") else _BODY_T_OCULII
-        request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ T_body_radar)
-    files = sorted((sequence / radar).glob("*.pcd"), key=natural)
-    return read_files(files, sequence, request, partial(lidar_map, sequence))
-
-
-def _body_T_ars548(sequence: Path) -> NDArray[np.float64]:
-    """The published calibration of the day."""
-    name = sequence.parent.name
-    found = _DAY.match(name)
-    day = float(found[1]) + 0.5 * (found[2] is not None) if found else 0.0
-    known = [orientation for first, orientation in _ARS548_ORIENTATIONS if first <= day]
-    what = f"the day, which is the name of the folder above, such as 20231105_aft, but that is {name}: give extrinsic"
-    check(known, f"{sequence}: the calibration of the ARS548 depends on {what}")
-    T_body_ars548 = np.eye(4)
-    T_body_ars548[:3, :3] = Rotation.from_quat(known[-1]).as_matrix()
-    T_body_ars548[:3, 3] = _ARS548_POSITION_M
-    return T_body_ars548
+        request = replace(request, extrinsic=np.linalg.inv(_BODY_T_XT32) @ _BODY_T_OCULII)
+    return read_files(sorted(points.glob("*.pcd"), key=natural), folder, request, partial(lidar_map, folder))
 
 
 # The first that fits a folder reads it.
 DATASETS = (
-    Dataset("SNAIL-Radar", lambda f: _snail_parts(f) is not None, _snail_radar),
-    Dataset("View-of-Delft", lambda f: _delft_parts(f) is not None, _view_of_delft),
+    Dataset("SNAIL-Radar", lambda f: _snail_points(f) is not None, _snail_radar),
+    Dataset(
+        "View-of-Delft",
+        lambda f: (_delft_radar(f).parents[1] / "lidar/training/pose").is_dir(),
+        _view_of_delft,
+    ),
     Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
     Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
-    Dataset("NTU4DRadLM", lambda f: (f / "gt_odom.txt").exists() and bool(_bags(f)), _ntu4dradlm),
-    Dataset("Viking Hill", lambda f: (f / BASE_T_RADAR).exists() and bool(_bags(f)), _viking_hill),
 )

@@ -99,23 +99,18 @@ class Fields:
     def judged(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
         """These fields with the unit of their angles: of their names, or else by the numbers in a cloud."""
         names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
-        unit_of = {name: unit for name in names if (unit := plain_name(name)[1])}
-        if len(unit_of) == len(names):
+        if all(plain_name(name)[1] for name in names):
             return self
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
-        in_degrees = are_degrees(azimuth, elevation, next(iter(unit_of.values()), ""))
-        by = f"as {next(iter(unit_of))} is" if unit_of else "by their numbers"
+        in_degrees = are_degrees(azimuth, elevation)
+        unit = "degrees" if in_degrees else "rad"
         notes.add(
-            f"{' and '.join(names)} are taken as {'degrees' if in_degrees else 'rad'} {by}, azimuth positive to the left; "
-            "names such as azimuth_deg or azimuth_rad decide"
+            f"{' and '.join(names)} are taken as {unit} by their numbers: azimuth_deg or azimuth_rad would decide"
         )
         return replace(self, in_degrees=in_degrees)
 
-    def note_use(self, names: Iterable[str], notes: Notes) -> None:
-        """Notes which fields are not used, and intensities that would be better in dB."""
-        intensity = self.names.get("intensity", "")
-        if plain_name(intensity)[1] == "linear":
-            notes.add(f"{intensity} is taken as intensity as it is: 10 log10 of it, dB, gives a better map")
+    def note_unused(self, names: Iterable[str], notes: Notes) -> None:
+        """Notes which fields are not used."""
         if unused := [name for name in names if name and name not in self.names.values()]:
             listed = ", ".join(unused)
             notes.add(f"fields that are not used: {listed}; fields={{role: name}} or --field chooses others")

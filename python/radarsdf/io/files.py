@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import secrets
 import socket
@@ -21,11 +20,11 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import path_of, positions
+from radarsdf.checks import path_of
 
 _MAX_NAME_BYTES = 255  # of nearly all file systems
 _MAX_STEM = 50  # characters of at most four bytes: the temporary name must not be longer than the limit
-_MAX_FLOAT32_M = 1000.0  # further from the origin, float32 resolves less than 0.06 mm
+_MAX_FLOAT32_M = 16_384.0  # further from the origin, float32 resolves less than 1 mm
 _LOCK_FLAGS = ("O_CREAT", "O_RDWR", "O_BINARY", "O_NOFOLLOW", "O_NONBLOCK")  # as far as the system has them
 _LOCKED = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
@@ -170,38 +169,10 @@ def _lock(descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-# Formats of float32 resolve half a metre at UTM coordinates. What is far from the world's origin is written to them in a
-# local frame: the world axes, with an origin subtracted that NAME.origin.json states.
-
-
-def origin_path(path: str | PathLike[str]) -> Path:
-    """Where the origin of the local frame of a file is written."""
-    return Path(path).with_name(Path(path).name + ".origin.json")
-
-
-def origin_for(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """(3,) origin to subtract from points (N, 3), m, for float32; None where they are near enough to 0."""
-    if np.abs(points).max(initial=0.0) <= _MAX_FLOAT32_M:
-        return None
-    origin: NDArray[np.float64] = np.round(points.mean(axis=0))
-    return origin
-
-
-def write_origin(path: str | PathLike[str], origin: NDArray[np.float64] | None) -> None:
-    """Writes the origin of a file; None removes the one of an older file."""
-    if origin is None:
-        origin_path(path).unlink(missing_ok=True)
-        return
-    described = {"origin": origin.tolist(), "unit": "m", "frame": "world = local + origin"}
-    write_whole(origin_path(path), json.dumps(described).encode())
-
-
-def origin_of(path: str | PathLike[str]) -> NDArray[np.float64] | None:
-    """(3,) the origin of a file in a local frame, world, m. None if none is written next to it."""
-    file = origin_path(path)
-    if not file.is_file():
-        return None
-    with reading(file, "the origin of a local frame", TypeError, KeyError, RecursionError):
-        described = json.loads(file.read_text(encoding="utf-8"))
-        origin: NDArray[np.float64] = positions([described["origin"]], "origin")[0]
-        return origin
+def check_fits_float32(path: str | PathLike[str], points: NDArray[np.float64]) -> None:
+    """Raises a ValueError if float32 would round points (N, 3), m, by more than a millimetre."""
+    near = np.abs(points).max(initial=0.0) <= _MAX_FLOAT32_M
+    check(
+        near,
+        f"{path}: its format holds float32, too few digits {_MAX_FLOAT32_M:g} m from the origin: write .ply",
+    )

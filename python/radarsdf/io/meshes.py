@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import path_of, positions
-from radarsdf.interrupts import whole_import
 from radarsdf.io.cloud_writing import face_records, ply_header, records
-from radarsdf.io.clouds import CLOUD_SUFFIXES, has_faces, ply_bytes, read_points
-from radarsdf.io.files import check, check_regular_file, origin_for, origin_of, write_origin, write_whole
+from radarsdf.io.clouds import has_faces, ply_bytes, read_points
+from radarsdf.io.files import check, check_fits_float32, check_regular_file, write_whole
 from radarsdf.io.npz import arrays_of
 from radarsdf.io.scans import Columns
 
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
-_TRUTH_ARRAYS = ("lidar_points", "points", "xyz", "arr_0")  # of which the first that a file has counts
+_TRUTH_ARRAYS = ("lidar_points", "points")  # of which the first that a file has counts
 _SAMPLES = 1_000_000  # on a surface: a triangle of a building may be 20 m long
 
 
@@ -44,13 +43,11 @@ def check_mesh_path(path: str | PathLike[str]) -> None:
     check(known, f"{path}: files of meshes end in {', '.join(MESH_SUFFIXES)}")
 
 
-def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.float64] | None:
+def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
     """Writes a mesh whole or not at all.
 
-    PLY, OBJ and OFF keep float64 coordinates. STL and GLB hold float32, which at UTM coordinates is a grid of half a
-    metre. A mesh further than 1000 m from the world's origin is written to them in a local frame: the world axes, with
-    an origin subtracted that is written beside the mesh, as ``NAME.origin.json``. GLB has its y axis up, as glTF demands,
-    by a rotation of its root.
+    PLY, OBJ and OFF keep float64 coordinates. STL and GLB hold float32. GLB has its y axis up, as glTF demands, by a rotation
+    of its root.
 
     Parameters
     ----------
@@ -59,15 +56,11 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
     mesh : trimesh.Trimesh
         World frame, m. PLY keeps its vertex attributes of one number a vertex, such as confidence, and its colours.
 
-    Returns
-    -------
-    (3,) float64 ndarray or None
-        The origin that was subtracted, world, m; None where coordinates are the world's.
-
     Raises
     ------
     ValueError
-        For another suffix, or if `path` is no regular file.
+        For another suffix, if `path` is no regular file, or if float32 has too few digits: further than 16 km from the
+        origin.
     OSError
         If it cannot be written.
     """
@@ -75,23 +68,18 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> NDArray[np.f
     suffix = Path(path).suffix.lower()
     if suffix == ".ply":
         write_whole(path, _ply(mesh))
-        return None
-    origin = origin_for(np.asarray(mesh.vertices, np.float64)) if suffix in _FLOAT32_SUFFIXES else None
-    if origin is not None:
-        mesh = mesh.copy()
-        mesh.vertices = mesh.vertices - origin
+        return
+    if suffix in _FLOAT32_SUFFIXES:
+        check_fits_float32(path, np.asarray(mesh.vertices, np.float64))
     if suffix == ".glb":
-        with whole_import():
-            import trimesh  # noqa: PLC0415 - takes long
+        import trimesh  # noqa: PLC0415 - takes long
+
         scene: Any = trimesh.Scene()
         scene.add_geometry(mesh, transform=_T_GLTF_WORLD)
         exported: Any = scene.export(file_type="glb")
     else:
         exported = mesh.export(file_type=suffix[1:])
-    if suffix in _FLOAT32_SUFFIXES:
-        write_origin(path, origin)
     write_whole(path, exported.encode() if isinstance(exported, str) else exported)
-    return origin
 
 
 def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
@@ -100,8 +88,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     Parameters
     ----------
     path : path-like
-        It ends in .ply, .obj, .off, .stl or .glb. If :func:`write_mesh` wrote an origin beside it, that is added. GLB, whose
-        y axis is up, is turned to z up.
+        It ends in .ply, .obj, .off, .stl or .glb. GLB, whose y axis is up, is turned to z up.
 
     Returns
     -------
@@ -118,8 +105,8 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     file = path_of(path, "path")
     check_regular_file(file)
     check_mesh_path(file)
-    with whole_import():
-        import trimesh  # noqa: PLC0415 - takes long
+    import trimesh  # noqa: PLC0415 - takes long
+
     ply = file.suffix.lower() == ".ply"
     try:
         source: Any = ply_bytes(file) if ply else file
@@ -134,8 +121,6 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     check(whole, f"{path}: a triangle has a corner that is none of its vertices")
     if file.suffix.lower() == ".glb":
         mesh.apply_transform(_T_GLTF_WORLD.T)
-    if (origin := origin_of(file)) is not None:
-        mesh.vertices = np.asarray(mesh.vertices, np.float64) + origin
     read: trimesh.Trimesh = mesh
     return read
 
@@ -158,8 +143,6 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
         check(arrays, f"{path} has no ground truth: it lacks an array {' or '.join(_TRUTH_ARRAYS)}")
         name, points = next(iter(arrays.items()))
         return positions(points, f"{path}: {name}")
-    kinds = dict.fromkeys((*CLOUD_SUFFIXES, ".npz", *MESH_SUFFIXES))
-    check(suffix in CLOUD_SUFFIXES, f"{path} is no ground truth: that ends in {', '.join(kinds)}")
     return read_points(file)
 
 

@@ -43,7 +43,6 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         - ``intensity`` (N,), optional: sensor units;
         - ``static`` (N,) bool, optional: only returns with True are used;
         - ``lidar_points`` (M, 3), optional: ground truth, world frame, m;
-        - ``simulated``, optional: not 0 if the ground truth is that of a simulator;
         - ``doppler`` (N,), optional: m/s;
         - ``times`` (F,), optional: when each scan was taken, s;
         - ``sigma`` (N, 3), optional: the sensor's own deviations of range, azimuth and elevation, m, rad, rad;
@@ -63,7 +62,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         If the file cannot be read.
     """
     check(path_of(path, "path").suffix == ".npz", f"{path} is not an .npz file of scans")
-    arrays = arrays_of(path, (*_SHAPES, "simulated", *_IMU))
+    arrays = arrays_of(path, (*_SHAPES, *_IMU))
     missing = sorted({"points", "frame", "poses"} - set(arrays))
     check(not missing, f"{path} lacks the arrays {', '.join(missing)}")
     with reading(path, "a file of scans"):
@@ -87,7 +86,6 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         doppler_mps=by_scan("doppler"),
         times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
         sigmas=by_scan("sigma"),
-        truth_kind="simulated" if "simulated" in arrays and arrays["simulated"].any() else "lidar",
         imu=imu,
     )
 
@@ -137,17 +135,10 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     single = {"poses": scans.poses, "times": scans.times_s, "lidar_points": scans.ground_truth}
     if scans.imu is not None:
         single |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
-    if scans.ground_truth is not None and scans.truth_kind == "simulated":
-        single["simulated"] = np.array(1, np.uint8)
     arrays |= {name: array for name, array in single.items() if array is not None}
     target = path_of(path, "path")
     named = target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz")
     write_arrays(named, arrays, compressed=True)
-
-
-def holds_scans(path: str | PathLike[str]) -> bool:
-    """Whether an ``.npz`` file has poses. Raises as :func:`read_scans`."""
-    return bool(arrays_of(path, ["poses"]))
 
 
 def array_in(path: Path) -> NDArray[Any]:

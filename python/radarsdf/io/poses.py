@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -20,7 +20,7 @@ from radarsdf.checks import are_rigid, check_pose, check_poses, path_of, pose_ma
 from radarsdf.io.files import check, check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
 from radarsdf.io.scans import Columns, Notes
-from radarsdf.io.text import SCALES, are_degrees, in_seconds, read_numbers, read_table, without_unit
+from radarsdf.io.text import SCALES, in_seconds, read_numbers, read_table, without_unit
 
 MAX_GAP_S = 0.5  # between two poses over which poses are interpolated, by default
 
@@ -35,13 +35,11 @@ _ROUNDED_S = 1e-3
 _POSITION = "(?:t|p|pos|position|trans|translation|loc|location|pose)"
 _QUATERNION = "(?:q|quat|quaternion|orientation|rot|rotation)"
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
-_EULER = ("yaw", "pitch", "roll")
 _TIMES = ("header stamp", "stamp", "timestamp", "time", "t")
 # What words, whole, mean as the name of a column.
 _ROLES = (
     (rf"(?:{_QUATERNION} .* |(?:.* )?{_QUATERNION} ?)([xyzw])", "q{}"),
     (rf"(?:{_POSITION} .* |(?:.* )?{_POSITION} ?|)([xyz])", "{}"),
-    (r"(?:.* )?(yaw|pitch|roll)", "{}"),
     (r"(?:.* )?(?:sec|secs|seconds)", "sec"),
     (r"(?:.* )?(?:nsec|nsecs|nanosec|nanosecs|nanoseconds)", "nsec"),
     (r"(?:.*? )?(header stamp|stamp|timestamp|time|t)", "{}"),
@@ -60,31 +58,32 @@ class Trajectory:
         """First and last time, for messages."""
         return f"{self.times_s[0]} to {self.times_s[-1]} s"
 
+    @cached_property
+    def _slerp(self) -> Slerp:
+        return Slerp(self.times_s, self.rotations)
+
     def poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Poses T_world_base (N, 4, 4) at times (N,), s, between the first and the last pose: linear, and by slerp."""
         poses = np.tile(np.eye(4), (len(times_s), 1, 1))
-        poses[:, :3, :3] = Slerp(self.times_s, self.rotations)(times_s).as_matrix()
+        poses[:, :3, :3] = self._slerp(times_s).as_matrix()
         for axis in range(3):
             poses[:, axis, 3] = np.interp(times_s, self.times_s, self.positions[:, axis])
         return poses
 
     def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
-        """Pose T_world_base (4, 4) at one time, s, as `poses`; None outside of them, and in longer gaps.
+        """Pose T_world_base (4, 4) at one time, s; None outside of them, and in longer gaps.
 
-        A millisecond before the first pose or after the last one, or next to one in a longer gap, is at that pose: times
-        in files are rounded.
+        A millisecond beyond the first or the last pose, or next to one in a longer gap, is at that pose: times in files are
+        rounded.
         """
         after = int(np.clip(np.searchsorted(self.times_s, time_s), 1, len(self.times_s) - 1))
-        both = slice(after - 1, after + 1)
-        first_s, last_s = self.times_s[both]
-        share = (time_s - first_s) / (last_s - first_s)
-        if not 0 <= share <= 1 or last_s - first_s > max_gap_s:
-            share = float(share > 0.5)
-            if not abs(time_s - (last_s if share else first_s)) <= _ROUNDED_S:
+        first_s, last_s = self.times_s[after - 1 : after + 1]
+        if not first_s <= time_s <= last_s or last_s - first_s > max_gap_s:
+            nearest_s = min(first_s, last_s, key=lambda known_s: abs(known_s - time_s))
+            if not abs(time_s - nearest_s) <= _ROUNDED_S:
                 return None
-        pose = np.eye(4)
-        pose[:3, :3] = Slerp([0, 1], self.rotations[both])(share).as_matrix()
-        pose[:3, 3] = (1 - share) * self.positions[after - 1] + share * self.positions[after]
+            time_s = nearest_s
+        pose: NDArray[np.float64] = self.poses(np.array([time_s]))[0]
         return pose
 
 
@@ -110,7 +109,6 @@ class TransformChain:
 
 
 StampedPoses: TypeAlias = Trajectory | TransformChain
-"""Poses by time."""
 
 Poses: TypeAlias = StampedPoses | NDArray[np.float64]
 """By time, or (F, 4, 4) in the order of the scans."""
@@ -153,22 +151,24 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    why = f"not finite, not unit quaternions, or of a time that repeats; the first: pose {np.argmin(kept)}"
-    remark = f"{name}: {(~kept).sum()} of {len(table)} poses left out, which are {why}"
+    what = "are left out, not finite, not unit quaternions or of a repeated time"
+    left_out = (
+        ""
+        if kept.all()
+        else f"{(~kept).sum()} of {len(table)} poses {what}; the first: pose {np.argmin(kept)}"
+    )
     if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
-        msg = f"{name} holds {len(times_s)} poses at different times; at least two poses are needed"
-        raise ValueError(msg if kept.all() else f"{msg}; {remark}")
-    if notes is not None and not kept.all():
-        notes.add(remark)
-    if notes is not None and (np.diff(first) < 0).any():
-        notes.add(f"{name}: its poses are not in the order of their times, and sorted")
+        msg = f"{name} holds {len(times_s)} poses at different times; at least two are needed; {left_out}"
+        raise ValueError(msg)
+    if notes is not None and left_out:
+        notes.add(f"{name}: {left_out}")
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
 
 
-def poses_of(poses: Any, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
+def poses_of(poses: Any, notes: Notes) -> Poses:
     """Poses as a user gives them: an array (F, 4, 4), poses by time, or a file for :func:`read_poses`."""
     if isinstance(poses, (str, PathLike)):
-        return read_poses(Path(poses), notes, calibration)
+        return read_poses(Path(poses), notes)
     if isinstance(poses, (Trajectory, TransformChain)):
         return poses
     matrices = real_array(poses, "poses")
@@ -176,13 +176,13 @@ def poses_of(poses: Any, notes: Notes, calibration: Sequence[Path] = ()) -> Pose
     return rigid_or_nan(matrices, "the given array", notes)
 
 
-def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Poses:
+def read_poses(path: Path, notes: Notes) -> Poses:
     """Poses by time, or (F, 4, 4) in the order of the scans, of a file of one of these kinds.
 
-    - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, and qx, qy, qz
-      and qw or roll, pitch and yaw, as in files of EuRoC, evo and ``rostopic echo -p``. Without a time it is in order.
+    - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, qx, qy, qz and
+      qw, as in files of EuRoC, evo and ``rostopic echo -p``. Without a time it is in order.
     - TUM: ``time x y z qx qy qz qw``, s and m.
-    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in one of the files `calibration`,
+    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in ``calib.txt`` beside it,
       T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
 
@@ -197,67 +197,49 @@ def read_poses(path: Path, notes: Notes, calibration: Sequence[Path] = ()) -> Po
         check(len(values), "it has no rows of numbers")
     heads = [head for head in reversed(table.heads) if len(head) == width]
     for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
-        columns, unit_of_angles = _pose_columns(names, values)
+        columns = _pose_columns(names, values)
         if columns:
-            if heads and names is _TUM:
-                notes.add(f"{path.name}: its columns are taken as {' '.join(_TUM)}: unknown names")
-            return _of_columns(columns, unit_of_angles, path, notes)
+            return _of_columns(columns, path, notes)
     if width == 12:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
         P = rigid_or_nan(poses, str(path), notes)
-        for file in calibration:
-            if file.is_file() and (Tr := read_calibration(file)) is not None:
-                notes.add(f"KITTI poses with Tr of {file.name}: T_world_sensor = inv(Tr) P Tr")
-                return np.linalg.inv(Tr) @ P @ Tr
-        notes.add(f"{path.name} has KITTI poses, no calibration Tr: they are taken as T_world_sensor")
-        return P
+        calibration = path.with_name("calib.txt")
+        Tr = read_calibration(calibration) if calibration.is_file() else None
+        found = (
+            "are camera poses, by Tr of calib.txt"
+            if Tr is not None
+            else "are taken as T_world_sensor: no calib.txt"
+        )
+        notes.add(f"{path.name}: KITTI poses {found}")
+        return P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
     if width == 16 or (width == 4 and len(values) % 4 == 0):
         return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
-    msg = (
-        f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), or 16, or four in blocks "
-        "of four lines; or name the columns in the first line, such as time,x,y,z,qw,qx,qy,qz"
-    )
+    msg = f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
     raise ValueError(msg)
 
 
-def _pose_columns(names: list[str], table: NDArray[np.float64]) -> tuple[Columns, str]:
-    """Columns by role, times in s, and the unit in the names of angles; none if the names are no pose's."""
+def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
+    """Columns by role, times in s; none if the names are no pose's."""
     found: Columns = {}
-    unit_of_angles = ""
     for name, column in zip(names, table.T, strict=True):
         bare, unit = without_unit(name)
         words = re.sub(r"[\W_]+", " ", bare).strip()
         for pattern, template in _ROLES:
             if match := re.fullmatch(pattern, words):
                 role = template.format(*match.groups())
-                unit_of_angles = unit_of_angles or (unit if role in _EULER else "")
                 found.setdefault(role, column * SCALES.get(unit, 1.0) if role in _TIMES else column)
                 break
     if {"sec", "nsec"} <= set(found):
         found["time"] = found["sec"] + 1e-9 * found["nsec"]
     elif times := [found[name] for name in (*_TIMES, "sec") if name in found]:
         found["time"] = times[0]
-    rotation = {"qx", "qy", "qz", "qw"} <= set(found) or "yaw" in found
-    is_pose = rotation and {"x", "y"} <= set(found) and ("z" in found or "yaw" in found)
-    return (found if is_pose else {}), unit_of_angles
+    return found if set(_TUM[1:]) <= set(found) else {}
 
 
-def _of_columns(columns: Columns, unit_of_angles: str, path: Path, notes: Notes) -> Poses:
+def _of_columns(columns: Columns, path: Path, notes: Notes) -> Poses:
     """Poses of named columns: by time, or in their order."""
-    zeros = np.zeros_like(columns["x"])
-    if missing := [role for role in ("z", "roll", "pitch") if "qw" not in columns and role not in columns]:
-        notes.add(f"{path.name} has no {', '.join(missing)}: taken as 0")
-    if "qw" in columns:
-        quaternions = np.stack([columns[role] for role in ("qx", "qy", "qz", "qw")], axis=1)
-    else:
-        angles = np.stack([columns.get(role, zeros) for role in _EULER], axis=1)
-        degrees = are_degrees(angles[:, 0], angles[:, 1], unit_of_angles)
-        unit, by = "degrees" if degrees else "rad", "name" if unit_of_angles else "their numbers"
-        notes.add(f"{path.name}: roll, pitch and yaw are in {unit} by {by}, R = Rz(yaw) Ry(pitch) Rx(roll)")
-        quaternions = Rotation.from_euler("ZYX", np.nan_to_num(angles), degrees=degrees).as_quat()
-        quaternions[~np.isfinite(angles).all(axis=1)] = np.nan
-    poses = np.column_stack([*(columns.get(axis, zeros) for axis in "xyz"), quaternions])
+    poses = np.column_stack([columns[role] for role in _TUM[1:]])
     if "time" not in columns:
         return rigid_or_nan(pose_matrices_of(poses), str(path), notes)
     times = columns["time"].copy()
@@ -281,13 +263,12 @@ def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.flo
     return np.where(bad[:, None, None], np.nan, matrices)
 
 
-def read_transform(path: Path, default: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rigid transform (4, 4) of a text file, or the default if there is no file."""
+def read_transform(path: Path) -> NDArray[np.float64] | None:
+    """Rigid transform (4, 4) of a text file, if there is one."""
     if not path.is_file():
-        return default
-    matrix = read_numbers(path, 4)
+        return None
     with reading(path, "a rigid transform"):
-        return check_pose(matrix, "the matrix")
+        return check_pose(read_numbers(path, 4), "the matrix")
 
 
 def read_calibration(path: Path) -> NDArray[np.float64] | None:

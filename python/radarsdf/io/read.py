@@ -13,17 +13,26 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import check_pose, path_of, positions, positive
+from radarsdf.checks import check_pose, path_of, positive
 from radarsdf.io import datasets
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
-from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
+from radarsdf.io.clouds import CLOUD_SUFFIXES
 from radarsdf.io.fields import SIGMA
 from radarsdf.io.files import check
 from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
-from radarsdf.io.poses import MAX_GAP_S, POSE_FILES, UNPOSED, StampedPoses, poses_of, rigid_or_nan
-from radarsdf.io.recordings import RawScan, Request, Truth, posed, read_files, read_folder, scan_poses
+from radarsdf.io.poses import (
+    MAX_GAP_S,
+    POSE_FILES,
+    UNPOSED,
+    Poses,
+    StampedPoses,
+    poses_of,
+    read_transform,
+    rigid_or_nan,
+)
+from radarsdf.io.recordings import BASE_T_RADAR, RawScan, Request, posed, read_files, read_folder, scan_poses
 from radarsdf.io.scans import Columns, Notes, Scan, Scans
 
 
@@ -41,7 +50,6 @@ def read(
     fields: Mapping[str, Any] | None = None,
     columns: int | Sequence[str] | None = None,
     max_gap_s: float = MAX_GAP_S,
-    ground_truth: str | PathLike[str] | ArrayLike | None = None,
 ) -> Scans:
     """Reads scans with poses from a file, a folder or bags.
 
@@ -55,9 +63,9 @@ def read(
         One of
 
         - our ``.npz`` (see :func:`read_scans`);
-        - a folder with one file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ; or one such
-          file, which a column such as frame or scan_id splits into scans. Files are read in natural order, or in the order
-          of the times in their names. Ground truth is ``lidar.pcd`` or ``lidar.ply`` in the folder;
+        - a folder with a file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ, in natural
+          order or that of the times in their names, and with ``lidar.pcd`` or ``lidar.ply`` as ground truth; or one such
+          file;
         - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
     poses : path-like, array_like or poses by time, optional
@@ -69,8 +77,8 @@ def read(
     topic : str or sequence of str, optional
         In a bag, the topics of the scans, merged by time. By default the radar's, if there is one.
     pose_topic : str, optional
-        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one; of several, the only
-        one whose child frame leads to that of the scans, or else TF. Goals, plans and initial poses are never used.
+        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one whose child frame does
+        not move against that of the scans, or else TF, or else the only one.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
@@ -89,8 +97,6 @@ def read(
         float32 x, y, z, intensity.
     max_gap_s : float
         Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
-    ground_truth : path-like or (M, 3) array_like, optional
-        Lidar points, world frame, m.
 
     Returns
     -------
@@ -122,8 +128,7 @@ def read(
     check(stamps in (None, "header", "record"), f'stamps must be "header" or "record", not {stamps!r:.50}')
     one = isinstance(path, (str, PathLike))
     paths = [path_of(part, "path") for part in ([path] if one or not isinstance(path, Iterable) else path)]
-    files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
-    for file in (*paths, *map(Path, files)):
+    for file in (*paths, *([Path(poses)] if isinstance(poses, (str, PathLike)) else [])):
         if not file.exists():  # many readers would not name it
             msg = f"{file} does not exist"
             raise FileNotFoundError(msg)
@@ -139,13 +144,9 @@ def read(
         fields=fields,
         columns=columns,
         max_gap_s=positive(max_gap_s, "max_gap_s"),
-        truth=_truth(ground_truth),
         notes=Notes(str(path) if one else "the bags"),
     )
-    found = _read(paths[0], request) if one else read_bags(paths, request)
-    if request.truth is not None:
-        found.truth_kind = "given"
-    return found
+    return _read(paths[0], request) if one else read_bags(paths, request)
 
 
 def _read(path: Path, request: Request) -> Scans:
@@ -155,7 +156,9 @@ def _read(path: Path, request: Request) -> Scans:
     if path.is_dir():
         if (dataset := datasets.find(path)) is not None:
             return dataset.read(path, request)
-        if bags := bags_in(path):
+        if bags := bags_in(path):  # NTU4DRadLM and Viking Hill have files beside them
+            if request.extrinsic is None:
+                request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
             file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
             if file is not None and request.poses is None and request.pose_topic is None:
                 request.notes.add(f"poses: of {file.name}")
@@ -181,18 +184,13 @@ def _npz(path: Path, request: Request) -> Scans:
     others = None if request.poses is UNPOSED else request.poses
     what = "has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
     check(others is not None or request.extrinsic is None, f"{path} {what}")
-    named = request.fields is None and request.columns is None
-    check(named, f"{path} has arrays of known names: fields and columns are not used for .npz files")
     scans = read_scans(path)
     truth = scans.ground_truth
     if others is None:
-        poses: Any = rigid_or_nan(scans.poses, str(path), notes)
+        poses: Poses = rigid_or_nan(scans.poses, str(path), notes)
     else:
         poses = poses_of(others, notes)
-        of = others if isinstance(others, (str, PathLike)) else "those given"
-        notes.add(f"poses: {of}, in place of those in {path.name}")
-        if truth is not None and request.truth is None:
-            notes.add(f"the ground truth of {path.name} is left out: it lies in the world of the poses there")
+        notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
         truth = None
     times_s = None if scans.times_s is None else scans.times_s.tolist()
     matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
@@ -200,10 +198,7 @@ def _npz(path: Path, request: Request) -> Scans:
     imu = scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    source = posed(lambda: raw, lambda _: matched, request)
-    found = Scans.of_source(source, notes, request.truth or (lambda: truth), lambda: imu)
-    found.truth_kind = scans.truth_kind
-    return found
+    return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu)
 
 
 def _columns(scan: Scan) -> Columns:
@@ -211,12 +206,3 @@ def _columns(scan: Scan) -> Columns:
     columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
     columns |= dict(zip(SIGMA, () if scan.sigma is None else scan.sigma.T, strict=False))
     return {name: values for name, values in columns.items() if values is not None}
-
-
-def _truth(ground_truth: Any) -> Truth | None:
-    if ground_truth is None:
-        return None
-    if isinstance(ground_truth, (str, PathLike)):
-        return partial(read_points, ground_truth)
-    points = positions(ground_truth, "ground_truth")
-    return lambda: points

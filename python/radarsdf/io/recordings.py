@@ -12,7 +12,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
-from radarsdf.io.fields import Fields, plain_name
+from radarsdf.io.fields import Fields
 from radarsdf.io.files import check, reading
 from radarsdf.io.poses import (
     FIND_POSES,
@@ -34,7 +33,7 @@ from radarsdf.io.poses import (
     read_transform,
 )
 from radarsdf.io.scans import Columns, Notes, Scan, Scans
-from radarsdf.io.text import SCALES, in_seconds, read_numbers, unit_since_1970
+from radarsdf.io.text import in_seconds, read_numbers, unit_since_1970
 
 BASE_T_RADAR = "base_T_radar.txt"
 """A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
@@ -42,11 +41,8 @@ BASE_T_RADAR = "base_T_radar.txt"
 # With a time, s, for each scan, one a line; of three columns, the last two are seconds and nanoseconds.
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.txt")
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
-_CALIBRATIONS = ("calib.txt", "calibration.txt")
-_NOT_SCANS = {*POSE_FILES, *TIME_FILES, *_CALIBRATIONS, BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
+_NOT_SCANS = {*POSE_FILES, *TIME_FILES, "calib.txt", BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
-_SCAN_FIELDS = ("frame", "scan", "scan_id", "frame_id", "scan_index", "frame_index", "sweep", "sweep_id")
-_TIME_FIELDS = ("time", "timestamp", "stamp", "t")
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
@@ -54,7 +50,6 @@ Truth = Callable[[], NDArray[np.float64] | None]
 """Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
 
 FindPoses = Callable[[str], Poses | None]
-"""The poses of the scans of a frame; None: none are known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +67,6 @@ class Request:
     max_gap_s: float = MAX_GAP_S
     stamps: str | None = None
     world_frame: str | None = None
-    truth: Truth | None = None  # None: what lies next to the scans
     notes: Notes = field(default_factory=Notes)
 
 
@@ -152,20 +146,9 @@ def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields]
     if layout not in layouts:
         fields = Fields.of(list(columns), request.fields).judged(columns, notes)
         if not request.fields and topic not in {known for known, *_ in layouts}:
-            fields.note_use(columns, notes)
-        for others in layouts.values():
-            _note_differences(fields.names, others.names, notes)
+            fields.note_unused(columns, notes)
         layouts[layout] = fields
     return layouts[layout]
-
-
-def _note_differences(names: Mapping[str, str], others: Mapping[str, str], notes: Notes) -> None:
-    for role in ("intensity", "doppler", "sigma_range"):
-        if (role in names) != (role in others):
-            notes.add(f"some scans have {role}, others have none: not used where all must have it")
-    own, other = names.get("intensity"), others.get("intensity")
-    if own and other and own != other:
-        notes.add(f"intensities of some scans are {other}, of others {own}: they are taken as of one unit")
 
 
 def scan_poses(
@@ -202,25 +185,23 @@ def read_folder(folder: Path, request: Request) -> Scans:
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
     """The scans of files with the poses of the request, or those that are found in or near the folder.
 
-    The files hold one scan each, or the only one the table of a recording. `truth` counts if the request has none.
+    The files hold one scan each.
     """
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
     places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
     if poses is None:
         poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
-        if poses is not None and poses.parent != folder:  # which is easily overlooked
+        if poses is not None and poses.parent != folder:
             notes.add(f"poses: of {poses}")
     if poses is None:
         what = files[0] if len(files) == 1 else folder
         msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
         raise NoPoses(msg)
-    if isinstance(poses, (str, PathLike)):
-        places = list(dict.fromkeys((Path(poses).parent, *places)))
-    known = poses_of(poses, notes, [place / name for place in places for name in _CALIBRATIONS])
+    known = poses_of(poses, notes)
     files, times_s, known = _in_order_of_time(files, known, notes)
     if T_base_sensor is None:
-        T_base_sensor = read_transform(folder / BASE_T_RADAR, np.eye(4))
+        T_base_sensor = read_transform(folder / BASE_T_RADAR)
     columns = request.columns
     if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
         with reading(notes.about, "points of KITTI"):
@@ -228,16 +209,11 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
         columns = 4
     reads = [partial(read_columns, path, columns) for path in files]
     names = [str(path) for path in files]
-    if len(files) == 1:
-        parts, times_s, known = _split(files[0], columns, times_s, known, notes)
-        if parts:
-            reads = [partial(dict, part) for part in parts]
-            names = [f"{files[0]}: scan {i}" for i in range(len(parts))]
     matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
     stamps = [None] * len(reads) if known_s is None else known_s
     raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
     source = posed(lambda: raw_scans, lambda _: matched, request)
-    return Scans.of_source(source, notes, request.truth or truth)
+    return Scans.of_source(source, notes, truth)
 
 
 def cloud_files(folder: Path) -> list[Path]:
@@ -288,10 +264,8 @@ def _in_order_of_time(
         check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
         times = in_seconds(numbers, listed.name, notes).tolist()
     order = np.argsort(times, kind="stable")
-    if listed is not None and (np.diff(order) < 0).any():
-        notes.add(f"{listed.name} is not ascending: scans are read in the order of their times")
-        if isinstance(poses, np.ndarray) and len(poses) == len(files):
-            poses = poses[order]
+    if listed is not None and isinstance(poses, np.ndarray) and len(poses) == len(files):
+        poses = poses[order]
     return [files[i] for i in order], [times[i] for i in order], poses
 
 
@@ -303,32 +277,3 @@ def _time_in(stem: str) -> float | None:
     if found is None:
         return None
     return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
-
-
-def _split(
-    path: Path, columns: Any, times_s: Sequence[float] | None, poses: Poses, notes: Notes
-) -> tuple[list[Columns], Sequence[float] | None, Poses]:
-    """The scans in the one table of a recording, by a column with their numbers; none if it is one scan."""
-    try:
-        table = read_columns(path, columns)
-    except ValueError:  # which is noted when the scan is read
-        return [], times_s, poses
-    plain = {plain_name(name)[0]: name for name in reversed(table)}
-    key = next((plain[name] for name in _SCAN_FIELDS if name in plain), None)
-    if key is None or table[key].dtype.kind not in "biuf":
-        return [], times_s, poses
-    rows = np.flatnonzero(np.isfinite(table[key]))
-    values, first, part = np.unique(table[key][rows], return_index=True, return_inverse=True)
-    if len(values) < 2:
-        return [], times_s, poses
-    left_out = len(table[key]) - len(rows)
-    without = f"; {left_out} rows left out, whose {key} is not a number" if left_out else ""
-    notes.add(f"{path.name} is read as {len(values)} scans, by its field {key}{without}")
-    time = next((plain[name] for name in _TIME_FIELDS if name in plain), None)
-    if time is not None and table[time].dtype.kind in "iuf":
-        scale = SCALES.get(plain_name(time)[1], 1.0)
-        times_s = in_seconds(table[time][rows][first].astype(np.float64) * scale, path.name, notes).tolist()
-    if isinstance(poses, np.ndarray) and 0 <= values[0] <= values[-1] < len(poses) > len(values):
-        poses = poses[values.astype(np.int64)]  # numbers of scans, of which some are empty
-    order = np.split(rows[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
-    return [{name: table[name][r] for name in table if name != key} for r in order], times_s, poses

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,6 @@ _ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a s
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """(N,) each, by name."""
-
-TruthKind: TypeAlias = Literal["lidar", "simulated", "given"]
-"""Where ground truth comes from: the lidar of a recording, a simulator, or the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +59,11 @@ class Scan:
 def finite_returns(scan: Scan, notes: Notes) -> Scan:
     """The returns of a scan whose coordinates and intensity are finite. The others are counted."""
     points, intensities = scan.points, scan.intensities
-    # All at once first: that is usual, and row by row takes twenty times as long.
-    if np.isfinite(points).all() and (intensities is None or np.isfinite(intensities).all()):
-        return scan
     finite = np.isfinite(points).all(axis=1)
     if intensities is not None:
         finite &= np.isfinite(intensities)
+    if finite.all():
+        return scan
     what = "returns left out: a coordinate or the intensity is not a finite number"
     notes.count(what, int((~finite).sum()))
     optional = (intensities, scan.doppler_mps, scan.sigma)
@@ -78,10 +74,9 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
 class Notes:
     """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``."""
 
-    def __init__(self, about: str = "the scans", *, log: bool = True) -> None:
+    def __init__(self, about: str = "the scans") -> None:
         self.about = about  # what is read, for messages
         self.lines: list[str] = []
-        self._log = log
         self._counts: dict[str, int] = {}
         self._first: dict[str, str] = {}
 
@@ -89,8 +84,7 @@ class Notes:
         """Keeps a sentence, and logs it if it is new."""
         if line not in self.lines:
             self.lines.append(line)
-            if self._log:
-                _LOG.warning(line)
+            _LOG.warning(line)
 
     def ending(self) -> str:
         """All sentences, to end an error with."""
@@ -133,8 +127,6 @@ class Scans:
         As `Scan.doppler_mps` and `Scan.sigma`.
     times_s : (F,) ndarray, optional
         When the scans were taken, s.
-    truth_kind : {"lidar", "simulated", "given"}
-        Where the ground truth comes from.
     imu : Imu, optional
         What an IMU measured meanwhile.
     """
@@ -149,7 +141,6 @@ class Scans:
         doppler_mps: Sequence[NDArray[Any]] | None = None,
         times_s: NDArray[np.float64] | None = None,
         sigmas: Sequence[NDArray[Any]] | None = None,
-        truth_kind: TruthKind = "lidar",
         imu: Imu | None = None,
     ) -> None:
         self._arrays: dict[str, list[NDArray[Any]] | None] | None = {
@@ -162,8 +153,6 @@ class Scans:
         self._notes = Notes()
         self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
         self._imu: Callable[[], Imu | None] = lambda: imu
-        self.truth_kind: TruthKind = truth_kind
-        """Where the ground truth comes from."""
 
     @classmethod
     def of_source(
@@ -193,11 +182,6 @@ class Scans:
     def __len__(self) -> int:
         """Number of scans."""
         return len(self.poses)
-
-    def __repr__(self) -> str:
-        """What is known without reading files."""
-        known = f"{len(self._poses)} scans" if self._poses is not None else "scans that are not yet read"
-        return f"<Scans: {known}>"
 
     @property
     def points(self) -> list[NDArray[Any]]:

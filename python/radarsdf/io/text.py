@@ -35,10 +35,9 @@ _BEYOND = 1.05  # angles that exceed a limit by rounding
 class Table(NamedTuple):
     """The R rows of numbers of a text file."""
 
-    header: list[str] | None  # the words of the line above the rows, if that has no number and is no comment
     heads: list[
         list[str]
-    ]  # the words of all lines above the rows, comments too: one of them may name the columns
+    ]  # the words of the lines above the rows, comments too: one of them may name the columns
     values: NDArray[np.float64]  # (R, W), NaN for a word that is no number, and in a row of another width
 
 
@@ -48,23 +47,21 @@ def read_table(path: Path) -> Table:
     Comments begin with ``#``, ``//`` or ``%``; decimal commas are read where semicolons separate the numbers. The first
     line with a number is the first row. Raises a ValueError if most rows have words that are no numbers.
     """
-    header: list[str] | None = None
     heads: list[list[str]] = []
     rows: list[str] = []
     for line in read_text(path).splitlines():
         bare = _COMMENT.sub("", line).strip()
         if not rows and line.strip():
             words = _words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
-            if not bare or (header is None and not any(map(_is_number, words))):
-                header = words if bare else header
+            if not bare or not any(map(_is_number, words)):
                 heads.append(words)
                 continue
         if bare:
             rows.append(bare)
-    return Table(header, heads, _values(rows, header) if rows else np.zeros((0, len(header or ()))))
+    return Table(heads, _values(rows) if rows else np.zeros((0, len(heads[-1]) if heads else 0)))
 
 
-def _values(rows: list[str], header: list[str] | None) -> NDArray[np.float64]:
+def _values(rows: list[str]) -> NDArray[np.float64]:
     """(R, W) the numbers of the rows, by NumPy at once or else, where some are damaged, row by row."""
     separator = next((sign for sign in (";", ",", "\t") if sign in rows[0]), None)
     if separator == ";":
@@ -72,7 +69,7 @@ def _values(rows: list[str], header: list[str] | None) -> NDArray[np.float64]:
     with contextlib.suppress(ValueError):
         return np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
     words = [row.rstrip(",; \t").split(separator) for row in rows]
-    width = len(header) if header else Counter(map(len, words)).most_common(1)[0][0]
+    width = Counter(map(len, words)).most_common(1)[0][0]
     table = np.full((len(words), width), np.nan)
     known = np.zeros(table.shape, bool)
     for row, parts in enumerate(words):
@@ -136,18 +133,14 @@ def unit_since_1970(time: float) -> tuple[str, float]:
 def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
     """Times (N,) of the file `name`, s. They may be in ms, µs or ns since 1970, which is noted."""
     check(np.isfinite(times).all(), f"{name} holds a time that is not finite")
-    units = {unit_since_1970(time) for time in times[times != 0].tolist()} or {_SINCE_1970[0]}
-    check(len(units) == 1, f"{name} holds times of different units, such as s and ns")
-    ((unit, scale),) = units
+    unit, scale = unit_since_1970(float(np.median(times)) if len(times) else 0.0)
     if unit != "s":
         notes.add(f"times of {name} are taken as {unit} since 1970")
     return times * scale
 
 
-def are_degrees(azimuth: NDArray[Any], elevation: NDArray[Any], unit: str = "") -> bool:
-    """Whether angles (N,) are in degrees: by the unit in their names, or else because they exceed what rad can be."""
-    if unit:
-        return SCALES.get(unit) == SCALES["deg"]
+def are_degrees(azimuth: NDArray[Any], elevation: NDArray[Any]) -> bool:
+    """Whether angles (N,) are in degrees, because they exceed what rad can be."""
     finite = np.isfinite(azimuth) & np.isfinite(elevation)
     if not finite.any():
         return False

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import vertex_areas
 from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.interrupts import whole_import
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.contents import MapContents, WholeMap
@@ -25,9 +25,6 @@ from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_l
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_mesh
 from radarsdf.returns.intensities import IntensityScale
-
-with whole_import():
-    import trimesh
 
 _MAX_VOXELS = 2**30  # with repeated ones. Lattice coordinates, and rows of corners, are int32
 # Edges of a leaf cell. A cell is left out if its corners are all farther than this from the surface, on the same side.

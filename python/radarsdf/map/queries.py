@@ -18,8 +18,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf._core import CellBlocks
+from radarsdf.checks import hides_bar
 from radarsdf.map.contents import MapContents, WholeMap
-from radarsdf.progress import hides_bar
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
 from radarsdf.returns.free_space import MOST_SCANS
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of

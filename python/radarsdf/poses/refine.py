@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.checks import MISSING_POSES, instance, usable_poses
+from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.io.scans import Scans
@@ -23,7 +23,6 @@ from radarsdf.poses.motion import Motion, unsteadiness
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, increments, moved, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
-from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.returns.rays import LeftOut

@@ -14,6 +14,7 @@ from scipy.linalg import eigh
 from tqdm import tqdm
 
 from radarsdf._core import LocalPlanes
+from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
@@ -21,7 +22,6 @@ from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import ExpectedStep, Motion, MotionPrior, Rate
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.rigid import Floats, increments, moved, rotation, rotation_vector
-from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 

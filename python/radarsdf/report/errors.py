@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.evaluation import KNNIntensity, intensity_metrics, surface_metrics, uncertainty_metrics
+from radarsdf.evaluation import intensity_metrics, surface_metrics, uncertainty_metrics
 from radarsdf.report import plots
 from radarsdf.report.subject import Subject
 from radarsdf.report.surface import colored, picture
 from radarsdf.returns.moving import rays_as_measured
-from radarsdf.returns.rays import Rays
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 
@@ -24,7 +23,6 @@ _SAMPLES = 1_000_000
 _MATCH_M = 0.4  # a vertex farther from the truth is an outlier, not a surface with an error
 _MIN_MATCHES = 100
 _MAX_RETURNS = 100_000  # evenly spread; more would change no plot
-_ANGLE_EDGES_DEG = np.arange(0, 97.5, 7.5)
 
 
 def error_values(subject: Subject) -> dict[str, Any] | None:
@@ -99,34 +97,15 @@ def intensity_values(subject: Subject) -> dict[str, Any] | None:
     assert rays.intensities is not None
     measured = rays.intensities.astype(np.float64)
     metrics = intensity_metrics(found, measured)
+    deviation = np.abs(measured - np.median(measured))
     return {
         "held_out": subject.held_out is not None,
         "scans": len(scans),
         "returns": len(rays),
         "left_out": {"outliers": len(every_ray) - len(usable), "in no tile": len(rows) - len(rays)},
-        "errors": {"This map": (metrics["mae"], metrics["medae"]), **_baselines(subject, rays, measured)},
+        "errors": {
+            "This map": (metrics["mae"], metrics["medae"]),
+            "Median of all returns": (float(deviation.mean()), float(np.median(deviation))),
+        },
         "density": plots.predicted_over_measured(measured, found),
-        "by_angle": _by_angle(subject, rays, measured, found),
     }
-
-
-def _baselines(subject: Subject, rays: Rays, measured: _Floats) -> dict[str, tuple[float, float]]:
-    """Mean and median error of simpler predictors, by name."""
-    errors = {}
-    if subject.held_out is not None and subject.scans is not None:
-        known = rays_as_measured(subject.scans, subject.radar_map.config)
-        known = known.select(known.with_intensity)
-        assert known.intensities is not None
-        neighbours = KNNIntensity.chosen(*known.in_world(), known.intensities, known.scans)
-        metrics = intensity_metrics(neighbours.predict(*rays.in_world()), measured)
-        errors["Nearest neighbours"] = (metrics["mae"], metrics["medae"])
-    deviation = np.abs(measured - np.median(measured))
-    return errors | {"Median of all returns": (float(deviation.mean()), float(np.median(deviation)))}
-
-
-def _by_angle(subject: Subject, rays: Rays, measured: _Floats, found: _Floats) -> bytes:
-    normal = np.asarray(subject.radar_map.gradient(rays.in_world()[0], extrapolate=True), np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        cosine = np.abs((normal * rays.directions).sum(axis=1)) / np.linalg.norm(normal, axis=1)
-    angle_deg = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
-    return plots.intensities_by(_ANGLE_EDGES_DEG, angle_deg, measured, found, "angle of incidence, °")

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,15 +15,12 @@ from radarsdf.render.figures import new_figure, png_of
 _Floats = NDArray[np.float64]
 
 _FIRST, _SECOND = "#0072b2", "#d55e00"  # distinguishable by colour-blind readers
-_MIN_BIN = 20  # values in a bin that is drawn
 
 
-def _subplots(*height_ratios: float, height_in: float = 3.3, sharex: bool = True) -> tuple[Any, Any]:
-    """A figure, and its axes from top to bottom. It is small, so that text stays legible on a phone."""
-    figure = new_figure(figsize=(4.4, height_in), dpi=180, layout="constrained", facecolor="white")
-    rows = len(height_ratios)
-    axes = figure.subplots(rows, 1, sharex=sharex, squeeze=False, height_ratios=height_ratios)
-    return figure, axes[:, 0]
+def _subplots() -> tuple[Any, Any]:
+    """A figure and its axes. It is small, so that text stays legible on a phone."""
+    figure = new_figure(figsize=(4.4, 3.3), dpi=180, layout="constrained", facecolor="white")
+    return figure, figure.subplots()
 
 
 def _png(figure: Any) -> bytes:
@@ -35,20 +31,9 @@ def _png(figure: Any) -> bytes:
     return png_of(figure, metadata={"Software": None})
 
 
-def losses(history: Mapping[str, Mapping[str, Sequence[float]]]) -> bytes:
-    """Each loss over training time. `history`: ``seconds`` and ``losses`` by name."""
-    figure, (ax,) = _subplots(1)
-    for (name, loss), color in zip(history.items(), (_FIRST, _SECOND), strict=False):
-        ax.plot(loss["seconds"], loss["losses"], color=color, linewidth=1.5, label=name)
-    ax.set(xlabel="training time, s", ylabel="loss", yscale="log")
-    ax.set_xlim(left=0)
-    ax.legend(frameon=False)
-    return _png(figure)
-
-
 def reliability(predicted_m: Sequence[float], measured_m: Sequence[float]) -> bytes:
     """RMS error over predicted uncertainty, in bins."""
-    figure, (ax,) = _subplots(1)
+    figure, ax = _subplots()
     most = 1.1 * max(*predicted_m, *measured_m)
     ax.plot([0, most], [0, most], color="gray", linestyle="--", linewidth=1, label="ideal")
     ax.plot(predicted_m, measured_m, "o-", color=_FIRST, markersize=4, label="this map")
@@ -61,7 +46,7 @@ def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
     """Density of predicted over measured intensities (N,), with the diagonal."""
     from matplotlib.colors import LogNorm  # noqa: PLC0415 - an extra
 
-    figure, (ax,) = _subplots(1)
+    figure, ax = _subplots()
     low, high = np.percentile(np.concatenate([measured, predicted]), [0.2, 99.8])
     high = max(high, low + 1e-6)
     bins = np.linspace(low, high, 61)
@@ -73,45 +58,16 @@ def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
     return _png(figure)
 
 
-def intensities_by(edges: _Floats, x: _Floats, measured: _Floats, predicted: _Floats, label: str) -> bytes:
-    """Medians of measured and predicted intensities (N,) in bins of `x` (N,), and the mean error below.
-
-    The band holds the middle two thirds of the measured ones.
-    """
-    figure, (medians, errors) = _subplots(2, 1, height_in=4.45)
-    rows = []
-    for low, high in itertools.pairwise(edges):
-        inside = (x >= low) & (x < high)
-        if inside.sum() >= _MIN_BIN:
-            m, p = measured[inside], predicted[inside]
-            band = np.percentile(m, [17, 50, 83])
-            rows.append([(low + high) / 2, high - low, *band, np.median(p), np.abs(p - m).mean()])
-    if rows:
-        middle, width, low, median, high, found, error = np.array(rows).T
-        medians.fill_between(middle, low, high, color=_FIRST, alpha=0.2, linewidth=0)
-        medians.plot(middle, median, "o-", color=_FIRST, markersize=3, label="measured")
-        medians.plot(middle, found, "s--", color=_SECOND, markersize=3, label="predicted")
-        medians.legend(frameon=False)
-        errors.bar(middle, error, 0.9 * width, color="gray")
-    medians.set(ylabel="median intensity")
-    errors.set(xlabel=label, ylabel="mean error", xlim=(edges[0], edges[-1]))
-    return _png(figure)
-
-
 def trajectory(before: _Floats | None, after: _Floats) -> bytes:
-    """Positions (N, 3) from above, and their height along the trajectory. `before`: input positions of the same scans."""
-    figure, (above, height) = _subplots(3, 1, height_in=5.2, sharex=False)
-    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(after, axis=0), axis=1))])
+    """Positions (N, 3) from above. `before`: input positions of the same scans."""
+    figure, above = _subplots()
     paths = [("after", after, _FIRST, 1.5)]
     if before is not None:
         paths.insert(0, ("before", before, _SECOND, 2.5))
     for name, path, color, width in paths:
         above.plot(path[:, 0], path[:, 1], color=color, linewidth=width, label=name)
         above.plot(*path[0, :2], "o", color=color, markersize=4)
-        height.plot(along_m, path[:, 2], color=color, linewidth=width)
     above.set(xlabel="x, m", ylabel="y, m")
     above.set_aspect("equal", adjustable="datalim")
-    height.set(xlabel="distance travelled, m", ylabel="z, m")
-    if before is not None:
-        above.legend(frameon=False)
+    above.legend(frameon=False)
     return _png(figure)

@@ -83,14 +83,10 @@ def views(mesh: Any, colors: _Colors) -> dict[str, bytes]:
 
 def picture(mesh: Any, colors: _Colors, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
     """JPEG picture of a mesh with vertex colours (V, 3), seen as :func:`eye_around` says."""
-    return jpeg(mesh, colors, eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg))
-
-
-def jpeg(mesh: Any, colors: _Colors, viewpoint: _Floats) -> bytes:
-    """JPEG picture of a mesh with vertex colours (V, 3) from a viewpoint (3,), m."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
-    pixels = render(mesh, colors, width=_WIDTH, height=_HEIGHT, viewpoint=viewpoint)
+    eye = eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg)
+    pixels = render(mesh, colors, width=_WIDTH, height=_HEIGHT, viewpoint=eye)
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format="jpeg", quality=82, optimize=True)
     return file.getvalue()

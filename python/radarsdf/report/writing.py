@@ -18,7 +18,6 @@ from radarsdf.report.errors import error_values, intensity_values, uncertainty_v
 from radarsdf.report.page import fixed, require_extras, write_page
 from radarsdf.report.subject import Subject
 from radarsdf.report.surface import surface_values
-from radarsdf.versions import versions
 
 _COUNTS = {
     "tiles": "Tiles",
@@ -58,12 +57,10 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
         errors=error_values(subject),
         uncertainty=uncertainty_values(subject),
         intensity=intensity_values(subject),
-        losses=_loss_plot(report.get("loss_history", {})),
         training=_training(report),
         durations=[(name, fixed(report[key], 2, "s")) for key, name in _DURATIONS.items() if key in report],
         skipped=_skipped(report),
         configuration=_configuration(subject.radar_map.config),
-        versions=versions(),
     )
 
 
@@ -99,12 +96,6 @@ def _skipped(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         (name, "–" if seconds is None else f"about {seconds:.1f} s")
         for name, seconds in itertools.zip_longest(names, saved_s)
     ]
-
-
-def _loss_plot(history: Mapping[str, Any]) -> bytes | None:
-    names = {"sdf": "surface", "intensity": "intensity"}
-    trained = {names[key]: loss for key, loss in history.items() if key in names and loss["losses"]}
-    return plots.losses(trained) if trained else None
 
 
 def _configuration(config: FitConfig) -> dict[str, Any]:

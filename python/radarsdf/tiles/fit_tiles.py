@@ -17,14 +17,13 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from radarsdf.checks import instance, path_of, positive
+from radarsdf.checks import hides_bar, instance, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.extras import require
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import take_lock, write_whole
 from radarsdf.io.read import read
 from radarsdf.io.scans import Scan, Scans
-from radarsdf.progress import hides_bar
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
 from radarsdf.tiles.planning import SCANS_FILE, CheckedScans, make_plan, read_rays

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from radarsdf.checks import check_box, path_of, positive
+from radarsdf.checks import check_box, hides_bar, path_of, positive
 from radarsdf.io.files import check_outputs
 from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
@@ -27,7 +27,6 @@ from radarsdf.map.queries import EvidenceAt
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
-from radarsdf.progress import hides_bar
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import Tile, folder_of, neighbours
 from radarsdf.tiles.tileset import content_folder, write_tileset

@@ -10,15 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
-from radarsdf.interrupts import whole_import
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.products import turned
 from radarsdf.tiles.blend import TileBlend
-
-with whole_import():
-    import trimesh
 
 # Viewers open a node when its error is larger than about 16 pixels: here, from nearer than about three of its edges.
 _ERROR_OF_EDGE = 1 / 16
