@@ -20,8 +20,8 @@ from radarsdf.evaluation import holdout
 from radarsdf.io import read
 from radarsdf.io.datasets import find
 from radarsdf.io.npz import read_scans
-from radarsdf.io.scans import Scans
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.scans import Scans
 from radarsdf.simulate import SCENES, Simulation
 from scipy.spatial import cKDTree
 

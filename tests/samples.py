@@ -23,9 +23,9 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import Training
 from radarsdf.io.npz import write_scans
-from radarsdf.io.scans import Scans
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.scans import Scans
 from radarsdf.threads import Workers
 
 _CONFIG = FitConfig(num_threads=1).override(

@@ -13,10 +13,10 @@ import radarsdf
 
 ROOT = Path(radarsdf.__file__).parent
 BASE = [
-    "_core", "checks", "extras", "interrupts", "lattice", "memory", "products", "settings", "threads",
+    "_core", "checks", "extras", "imu", "interrupts", "lattice", "memory", "products", "scans", "settings", "threads",
 ]  # fmt: skip
-# From the lowest to the highest. A subpackage may import itself and those before it; `io` is below all that saves itself.
-METHOD = ["config", "io", "returns", "field", "map", "fitting"]
+# From the lowest to the highest. A subpackage may import itself and those before it; `io` is below `map`, which saves itself.
+METHOD = ["config", "returns", "field", "io", "map", "fitting"]
 USES = ["poses", "checking", "live", "tiles", "grids", "changes", "evaluation", "simulate"]
 EDGES = ["render", "view", "report", "cli"]
 LEVEL = dict.fromkeys(BASE, 0) | {name: 1 + i for i, name in enumerate(METHOD + USES + EDGES)}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from radarsdf.io.npz import write_scans
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 from bench.scenes import load_scene
 

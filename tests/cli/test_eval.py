@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from radarsdf.io.cloud_writing import write_cloud
 from radarsdf.io.npz import read_scans, write_scans
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 from .calls import call, refusal, values
 

@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 from radarsdf.cli.live import replay
 from radarsdf.io.npz import write_scans
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 from ..conftest import ground_and_wall
 from .calls import refusal, values

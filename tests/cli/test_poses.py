@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io.npz import read_scans, write_scans
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 from radarsdf.simulate import drifted, measured_motion
 
 from ..poses.drift import first, position_error_m

@@ -14,8 +14,8 @@ from radarsdf.cli import main
 from radarsdf.fitting import estimate
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.io.npz import write_scans
-from radarsdf.io.scans import Scans
 from radarsdf.returns.rays import prepare
+from radarsdf.scans import Scans
 
 from bench.estimates import peak_of_a_fit
 

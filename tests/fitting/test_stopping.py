@@ -18,7 +18,7 @@ from radarsdf import Diverged, FitConfig, Interrupted, _core
 from radarsdf.fitting.optimiser import Adam
 from radarsdf.interrupts import deferred_interrupts
 from radarsdf.io.npz import write_scans
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 from ..conftest import ground_and_wall
 

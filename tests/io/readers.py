@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 from radarsdf.io import read
 from radarsdf.io.poses import read_poses
-from radarsdf.io.scans import Notes
+from radarsdf.scans import Notes
 
 from .bag_writing import BagWriter
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
 from radarsdf.io.clouds import read_columns, read_points
-from radarsdf.io.scans import Notes, Scan, Scans
+from radarsdf.scans import Notes, Scan, Scans
 
 UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
 COUNTS = (3, 1, 250)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io.fields import Fields
-from radarsdf.io.scans import Notes
+from radarsdf.scans import Notes
 
 CLOUDS = {
     "Sensrad Hugin": ["x", "y", "z", "range", "doppler", "power"],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from radarsdf.io.poses import Trajectory, TransformChain, poses_of, read_poses
-from radarsdf.io.scans import Notes
+from radarsdf.scans import Notes
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose

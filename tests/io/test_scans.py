@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from radarsdf.io.npz import read_scans, write_scans
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 from ..conftest import pose
 

@@ -10,8 +10,8 @@ from numpy.testing import assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds import read_columns
 from radarsdf.io.poses import read_poses, trajectory_of
-from radarsdf.io.scans import Notes
 from radarsdf.io.text import read_numbers
+from radarsdf.scans import Notes
 
 ROWS = np.array([[1.5, -2, 3, 40.25], [4, 5.125, 6, 70], [7, 8, 9e-2, 10]])
 TUM = np.array([[10.0, 1, 2, 3, 0, 0, 0, 1], [10.25, 2, 2, 3, 0, 0, 1, 0], [10.5, 3, 2, 3, 0, 0, 0, 1]])

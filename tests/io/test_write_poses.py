@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from radarsdf.io import write_poses
 from radarsdf.io.poses import read_poses
-from radarsdf.io.scans import Notes
+from radarsdf.scans import Notes
 
 from ..poses.drift import trajectory
 

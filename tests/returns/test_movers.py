@@ -9,8 +9,8 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
-from radarsdf.io.scans import Scans
 from radarsdf.returns.moving import Movers, Standing
+from radarsdf.scans import Scans
 
 from tests.conftest import recorded_scans
 

@@ -29,9 +29,9 @@ from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_passages
-from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
 from radarsdf.map.mesh import renumbered
+from radarsdf.scans import Scans
 
 _PROBABLE = 0.5  # more likely than not
 _LEVEL = np.cos(np.pi / 4)  # least part of a level surface's normal that is upright

@@ -15,8 +15,8 @@ from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
 from radarsdf.checks import MISSING_POSES, are_rigid, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.io.scans import Scans, filled
 from radarsdf.returns.rays import measured
+from radarsdf.scans import Scans, filled
 
 
 def check(

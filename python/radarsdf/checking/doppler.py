@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_scans
-from radarsdf.io.scans import Scans
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
+from radarsdf.scans import Scans
 
 _STILL_MPS = 0.3  # slower, the direction of a velocity is noise
 _MIN_SCANS = 4

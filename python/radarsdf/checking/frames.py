@@ -27,7 +27,7 @@ from radarsdf.checking.agreement import (
 )
 from radarsdf.checking.recording import Finding, FloatArray, Severity, ascending_times_s, some_points
 from radarsdf.io.poses import Trajectory
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 # A hypothesis is noted if the scans agree better by this: of the mean logarithm of distances, and of its standard error. It
 # must agree better than standing still by as much, too: any pattern of the sensor's cells agrees with itself if it stands still.

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from radarsdf.checking.recording import Finding, FloatArray, some_scans
-from radarsdf.io.scans import Scans
 from radarsdf.returns.intensities import Plausible
+from radarsdf.scans import Scans
 
 _SOME, _MANY = 0.005, 0.05  # share of the returns at the highest value
 _ABOVE_NEXT = 5.0  # times the share at each of the next values

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import check_extent, estimate_rays
-from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.refine import refine_poses
 from radarsdf.returns.noise import SensorNoise, sensor_noise, variances_across
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.scans import Scans
 
 _FEW_RETURNS = 100
 _FLAT = 1e-5  # thickness of the plane of the returns over its extent: float32 rounds to 1e-7

@@ -20,7 +20,7 @@ from radarsdf.checks import (
     real_array,
     refuse_masked,
 )
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 FloatArray = NDArray[np.float64]
 

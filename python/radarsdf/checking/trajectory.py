@@ -14,9 +14,9 @@ from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, rela
 from radarsdf.checking.frames import FULL, Effort
 from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points
 from radarsdf.checks import are_rigid
-from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.rigid import step_vectors, steps
+from radarsdf.scans import Scans
 
 # No radar that gives points sees most of them from farther away, and none has most of them at its own housing.
 _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2

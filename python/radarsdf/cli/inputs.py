@@ -12,9 +12,9 @@ from radarsdf.cli.app import refuse_if, warn
 from radarsdf.evaluation import holdout
 from radarsdf.io.poses import UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
-from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers
 from radarsdf.map.map import Map
+from radarsdf.scans import Scans
 from radarsdf.tiles.tiled_map import lacking, load
 from radarsdf.view.serving import free_port, require_viser
 

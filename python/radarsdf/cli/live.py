@@ -20,9 +20,9 @@ from radarsdf.cli.results import Results, until_stopped
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
 from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
-from radarsdf.io.scans import Scans
 from radarsdf.live.live_map import LiveMap
 from radarsdf.live.tracking import Lost
+from radarsdf.scans import Scans
 from radarsdf.view.pages import GrowingView
 from radarsdf.view.serving import url_of
 

@@ -25,13 +25,13 @@ from radarsdf.io.files import check_outputs, check_regular_file
 from radarsdf.io.meshes import check_mesh_path, read_ground_truth, read_mesh, write_mesh
 from radarsdf.io.npz import arrays_of, write_scans
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
-from radarsdf.io.scans import Notes, Scans
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import Threshold
 from radarsdf.map.view import View, scans_of_views
 from radarsdf.render import picture
 from radarsdf.render.figures import save_view_picture
 from radarsdf.returns.moving import rays_as_measured
+from radarsdf.scans import Notes, Scans
 from radarsdf.tiles.tiled_map import predicted
 
 _VIEW_SUFFIXES = (".npz", ".ply", ".png")

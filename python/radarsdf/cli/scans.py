@@ -25,9 +25,9 @@ from radarsdf.io.files import check_outputs
 from radarsdf.io.meshes import check_mesh_path, holds_mesh, read_mesh, write_mesh
 from radarsdf.io.npz import write_scans
 from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
-from radarsdf.io.scans import Scans
 from radarsdf.poses.posed import Posed
 from radarsdf.render.figures import save_trajectory_picture
+from radarsdf.scans import Scans
 
 
 def check(given: Namespace, results: Results) -> int:

@@ -18,7 +18,7 @@ from radarsdf.cli.results import Results
 from radarsdf.cli.scans import warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
-from radarsdf.io.scans import Notes, Scans, scans_in_memory
+from radarsdf.scans import Notes, Scans, scans_in_memory
 from radarsdf.tiles.fit_tiles import cluster_executor, plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, failure_of, is_done
 from radarsdf.tiles.tiled_map import TiledMap

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from radarsdf.checks import MISSING_POSES, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput, fit_rays
-from radarsdf.io.scans import Scans, filled
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.moving import Standing
 from radarsdf.returns.rays import prepare
+from radarsdf.scans import Scans, filled
 
 
 def fit(

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: MIT
 """Reads and writes files of scans, poses, point clouds and meshes."""
 
+from radarsdf.imu import Imu
 from radarsdf.io.cloud_writing import write_cloud
 from radarsdf.io.clouds import read_points
-from radarsdf.io.imu import Imu
 from radarsdf.io.meshes import read_mesh, write_mesh
 from radarsdf.io.npz import read_scans, write_scans
 from radarsdf.io.poses import UNPOSED, NoPoses, write_poses
 from radarsdf.io.read import read
-from radarsdf.io.scans import Scan, Scans
+from radarsdf.scans import Scan, Scans
 
 __all__ = [
     "UNPOSED",

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from radarsdf.extras import require
 from radarsdf.io.files import check, check_regular_file
-from radarsdf.io.scans import Columns, Notes
+from radarsdf.scans import Columns, Notes
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"

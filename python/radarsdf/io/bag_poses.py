@@ -35,7 +35,7 @@ from radarsdf.io.poses import (
     trajectory_of,
 )
 from radarsdf.io.recordings import FindPoses, Request
-from radarsdf.io.scans import Notes
+from radarsdf.scans import Notes
 
 # In the names of topics with poses that somebody wants or assumes: no sensor was there.
 _WANTED_POSE = re.compile(

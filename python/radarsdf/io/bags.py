@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from radarsdf.imu import Imu
 from radarsdf.io.bag_messages import (
     CLOUD_TYPES,
     IMU,
@@ -32,10 +33,9 @@ from radarsdf.io.bag_messages import (
 )
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
 from radarsdf.io.files import check
-from radarsdf.io.imu import Imu
 from radarsdf.io.poses import UNPOSED, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 # Topics of radars in data sets, and of the poses there. They are preferred to others.
 KNOWN_TOPICS = {

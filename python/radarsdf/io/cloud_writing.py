@@ -16,7 +16,7 @@ from radarsdf.checks import path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
 from radarsdf.io.files import check, check_fits_float32, whole_file
-from radarsdf.io.scans import Columns, Scan, Scans
+from radarsdf.scans import Columns, Scan, Scans
 
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back
 _LAS_SCALE_M = 1e-4

@@ -20,8 +20,8 @@ from radarsdf.extras import require
 from radarsdf.io.fields import Fields, names_of
 from radarsdf.io.files import check, check_regular_file, reading
 from radarsdf.io.npz import array_in
-from radarsdf.io.scans import Columns, Notes
 from radarsdf.io.text import read_table
+from radarsdf.scans import Columns, Notes
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
 LAS_INTENSITY = "radar_intensity"  # an extra dimension: LAS's own are whole numbers from 0 to 65535

@@ -22,8 +22,8 @@ from radarsdf.checks import check_pose
 from radarsdf.io.files import check, reading
 from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
 from radarsdf.io.recordings import Request, lidar_map, natural, read_files
-from radarsdf.io.scans import Scans
 from radarsdf.io.text import read_numbers, read_text
+from radarsdf.scans import Scans
 
 
 class Dataset(NamedTuple):

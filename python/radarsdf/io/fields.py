@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.files import check
-from radarsdf.io.scans import Notes, Scan, finite_returns
 from radarsdf.io.text import SCALES, are_degrees, without_unit
+from radarsdf.scans import Notes, Scan, finite_returns
 
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")

@@ -16,7 +16,7 @@ from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.clouds import has_faces, ply_bytes, read_points
 from radarsdf.io.files import check, check_fits_float32, check_regular_file, write_whole
 from radarsdf.io.npz import arrays_of
-from radarsdf.io.scans import Columns
+from radarsdf.scans import Columns
 
 if TYPE_CHECKING:
     import trimesh

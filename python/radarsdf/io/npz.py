@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance, path_of
+from radarsdf.imu import Imu
 from radarsdf.io.files import check, check_regular_file, reading, whole_file
-from radarsdf.io.imu import Imu
-from radarsdf.io.scans import Scans
+from radarsdf.scans import Scans
 
 # Measurements are mostly noise and compress by a factor of 2 to 5. Some kilobytes could unpack to gigabytes.
 _MAX_COMPRESSION = 100

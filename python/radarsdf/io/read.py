@@ -14,13 +14,13 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import check_pose, path_of, positive
+from radarsdf.imu import checked_rotation
 from radarsdf.io import datasets
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import CLOUD_SUFFIXES
 from radarsdf.io.fields import SIGMA
 from radarsdf.io.files import check
-from radarsdf.io.imu import checked_rotation
 from radarsdf.io.npz import read_scans
 from radarsdf.io.poses import (
     MAX_GAP_S,
@@ -33,7 +33,7 @@ from radarsdf.io.poses import (
     rigid_or_nan,
 )
 from radarsdf.io.recordings import BASE_T_RADAR, RawScan, Request, posed, read_files, read_folder, scan_poses
-from radarsdf.io.scans import Columns, Notes, Scan, Scans
+from radarsdf.scans import Columns, Notes, Scan, Scans
 
 
 def read(

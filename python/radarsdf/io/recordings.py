@@ -32,8 +32,8 @@ from radarsdf.io.poses import (
     poses_of,
     read_transform,
 )
-from radarsdf.io.scans import Columns, Notes, Scan, Scans
 from radarsdf.io.text import in_seconds, read_numbers, unit_since_1970
+from radarsdf.scans import Columns, Notes, Scan, Scans
 
 BASE_T_RADAR = "base_T_radar.txt"
 """A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""

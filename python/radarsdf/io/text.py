@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.io.files import check, reading
-from radarsdf.io.scans import Notes
+from radarsdf.scans import Notes
 
 _COMMENT = re.compile("(#|//|%).*")
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from radarsdf._core import SurfaceTracer, cell_keys
 from radarsdf.checks import flag, number, whole_number
-from radarsdf.io.scans import Scan, Scans
 from radarsdf.map import queries
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.mesh import Surface
@@ -22,6 +21,7 @@ from radarsdf.map.threshold import Limits, across_triangles
 from radarsdf.memory import check_views
 from radarsdf.products import turned
 from radarsdf.returns.sensor import Sensor
+from radarsdf.scans import Scan, Scans
 from radarsdf.threads import resolve_num_threads
 
 _Floats = NDArray[np.float64]

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import MAX_TIME_S, real_array
-from radarsdf.io.scans import Scans, filled
 from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
+from radarsdf.scans import Scans, filled
 
 _MOST_M = 500.0  # median range, m. Imaging radars reach 300 m
 _INTERVALS_S = 0.002, 20.0  # median between scans: from 500 Hz to what the overlap of moving scans allows

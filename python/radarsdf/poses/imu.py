@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.io.imu import Imu
+from radarsdf.imu import Imu
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.motion import Rate
 from radarsdf.poses.rigid import Floats, covariance_in, nearest_rotation, rotation

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.io.imu import Imu
-from radarsdf.io.scans import Scans
+from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, doppler_sign
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
@@ -25,6 +24,7 @@ from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats
 from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed
 from radarsdf.returns.rays import within_ranges
+from radarsdf.scans import Scans
 from radarsdf.threads import Workers
 
 # Share of the variance of a step's rotation that the returns must remove. Over the scans whose planes are kept, this adds up to

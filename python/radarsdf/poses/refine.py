@@ -16,7 +16,6 @@ from tqdm import tqdm
 from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.io.scans import Scans
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
 from radarsdf.poses.motion import Motion, unsteadiness
@@ -26,6 +25,7 @@ from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.returns.rays import LeftOut
+from radarsdf.scans import Scans
 from radarsdf.threads import Workers
 
 # The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf.checking.recording import Finding
-from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
+from radarsdf.scans import Scans
 from radarsdf.view.surface import thinned
 
 MAX_VERTICES = 160_000  # of the mesh in the 3D scene and the pictures; a larger one is thinned for them

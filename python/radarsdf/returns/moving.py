@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.io.scans import Scans
 from radarsdf.products import normal_matrix, product
 from radarsdf.returns.rays import Rays, check_scans, prepare
+from radarsdf.scans import Scans
 
 FloatArray = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from radarsdf.checks import check_poses, positive, real_array
-from radarsdf.io.imu import Imu, checked_rotation
+from radarsdf.imu import Imu, checked_rotation
 from radarsdf.poses.rigid import moved, steps
 
 from .radar import generator

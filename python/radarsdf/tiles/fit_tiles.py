@@ -23,8 +23,8 @@ from radarsdf.extras import require
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import take_lock, write_whole
 from radarsdf.io.read import read
-from radarsdf.io.scans import Scan, Scans
 from radarsdf.returns.noise import NOISE_SETTINGS
+from radarsdf.scans import Scan, Scans
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
 from radarsdf.tiles.planning import SCANS_FILE, CheckedScans, make_plan, read_rays
 from radarsdf.tiles.tiled_map import TiledMap

@@ -22,13 +22,13 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.average import SurfaceReturns
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
-from radarsdf.io.scans import Scan, scans_in_memory
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import Standing
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
+from radarsdf.scans import Scan, scans_in_memory
 from radarsdf.threads import Workers
 from radarsdf.tiles.plan import Plan, Tile, TileGrid, TilePlan, folder_of
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.scans import Scan, Scans
 from radarsdf.map.map import Map
+from radarsdf.scans import Scan, Scans
 from radarsdf.view.glb import glb, shaded
 from radarsdf.view.quantities import Position, Quantity, Scale
 from radarsdf.view.serving import WAIT_STEP_S

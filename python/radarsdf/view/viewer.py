@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.io.scans import Scans
 from radarsdf.map.map import Map
+from radarsdf.scans import Scans
 from radarsdf.view.framing import FOV_RAD, look_at_all
 from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
 from radarsdf.view.scene import (

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import MISSING_POSES, one_for_each_scan
-from radarsdf.io.imu import Imu
+from radarsdf.imu import Imu
 
 _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
