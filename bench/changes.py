@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 _SIZES_M = (0.3, 0.6, 1.0, 2.0, 3.0)
 _CHANGES = ("put in", "taken out", "moved")
-_REPAINTED = ("repainted", "patch repainted")
+_REPAINTED = ("reflectance_changed", "patch repainted")
 _STRONGER_DB = 6.0
 _PATCH_M = 0.02  # half the thickness of a patch, of which half is above the ground
 _ON_M, _NEAR_M = 0.2, 0.5
@@ -121,14 +121,14 @@ def cubes(drive: Simulation, rng: np.random.Generator) -> list[Change]:
                 elsewhere = centre + way * np.array([np.cos(angle), np.sin(angle), 0.0])
                 moved = Box(elsewhere, cube.half_extents, cube.yaw_rad, cube.material)
                 pairs = {"put in": (None, cube), "taken out": (cube, None), "moved": (cube, moved)}
-                pair = pairs[kind] if kind in pairs else repainted(kind, cube, ground, rng)
+                pair = pairs[kind] if kind in pairs else reflectance_changed(kind, cube, ground, rng)
                 centres.append((centre, size))
                 found.append(Change(kind, size, *pair))
                 break
     return found
 
 
-def repainted(kind: str, cube: Box, ground: float, rng: np.random.Generator) -> tuple[Box, Box]:
+def reflectance_changed(kind: str, cube: Box, ground: float, rng: np.random.Generator) -> tuple[Box, Box]:
     """A cube, or a patch of asphalt below it, before and after."""
     if kind == "patch repainted":
         x, y, _ = cube.half_extents
@@ -152,7 +152,7 @@ def compare(
         scene = Scene(solids, drive.scene.terrain)
         scans = simulate(scene, drive.sensor, poses, name=drive.name, seed=seed + 1000 * day)
         given = drifted(poses, drift[0], np.deg2rad(drift[1]), seed + day) if any(drift) else poses
-        config = radarsdf.FitConfig.quick(returns={"passages": True})
+        config = radarsdf.FitConfig.quick(returns={"free_space": True})
         if options.refine:
             refined = radarsdf.refine_poses(scans.points, given)
             sigma_m, sigma_rad = pose_sigmas(refined.covariance)

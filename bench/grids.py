@@ -103,7 +103,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         rng = np.random.default_rng(options.seed)
         config = radarsdf.FitConfig(num_threads=threads)
         if options.quick:
-            config = radarsdf.FitConfig.quick(num_threads=threads, returns={"passages": True})
+            config = radarsdf.FitConfig.quick(num_threads=threads, returns={"free_space": True})
         with timed() as fitting:
             radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
         box = box_of(drive)

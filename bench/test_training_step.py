@@ -19,7 +19,7 @@ from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import Training
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import prepare
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 from .conftest import surface_points
 
@@ -77,14 +77,14 @@ def test_whole(benchmark, stage, rays, leaf_keys):
 
     def setup():
         field.requires_grad_(True)  # a training freezes all parameters at its end
-        return (Training(field, rays, rays, scale, schedule, config, workers),), {}
+        return (Training(field, rays, rays, scale, schedule, config, pool),), {}
 
     def run(training):
         training.run(progress=False)
         losses.append(training.losses["intensity" if stage == "intensity" else "sdf"])
 
     benchmark.group = group(stage)
-    with Workers(1) as workers:
+    with ThreadPool(1) as pool:
         benchmark.pedantic(run, setup=setup, rounds=10, warmup_rounds=1)
         while len(losses) < 5:  # with --benchmark-disable there is one round
             run(*setup()[0])
@@ -128,7 +128,7 @@ def test_matrix_products(benchmark, stage, leaf_keys):
             result = [torch.mm(a, b) for a, b in operands]
         return result
 
-    with Workers(1):
+    with ThreadPool(1):
         found = benchmark.pedantic(run, rounds=10, warmup_rounds=1)
     for product, (a, b) in zip(found, operands, strict=True):
         expected = a.double().sum(0) @ b.double().sum(1)

@@ -112,7 +112,7 @@ def changes(frames: int, path: Path) -> None:
         box = Box(np.array(center), np.full(3, 0.5), 0.3, CONCRETE)
         scene = Scene([*first.scene.solids, box], first.scene.terrain)
         drive = simulate(scene, first.sensor, poses, name="wall", seed=day)
-        config = radarsdf.FitConfig.quick(returns={"passages": True})
+        config = radarsdf.FitConfig.quick(returns={"free_space": True})
         maps.append(radarsdf.fit(drive.points, drive.poses, config=config))
     mesh = radarsdf.compare(*maps, box=ROUND_BOXES).mesh()
     figure = new_figure(figsize=(12, 5.6), facecolor="white")

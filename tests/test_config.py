@@ -57,7 +57,7 @@ REAL = {
 }
 TRUTH = [
     "train",
-    *(f"returns.{name}" for name in ("drop_movers", "drop_ghosts", "passages", "onto_planes")),
+    *(f"returns.{name}" for name in ("drop_moving", "drop_ghosts", "free_space", "onto_planes")),
     *(f"networks.{name}" for name in ("dropout", "normals", "view_direction", "log_range")),
     "training.intensity_in_free_space",
 ]
@@ -237,9 +237,9 @@ def test_lengths_go_with_the_cells():
 
 PUBLISHED = {
     "returns.accumulate_scans": 5,
-    "returns.drop_movers": False,
+    "returns.drop_moving": False,
     "returns.drop_ghosts": False,
-    "returns.passages": False,
+    "returns.free_space": False,
     "returns.onto_planes": False,
     "encoding.bridge_cells": 0,
     "encoding.fourier_count": 16,
@@ -266,8 +266,8 @@ def test_presets():
     default, paper = (flat_settings(config.to_dict()) for config in (FitConfig(), FitConfig.paper()))
     assert {name: value for name, value in paper.items() if value != default[name]} == PUBLISHED
     quick = FitConfig.quick(seed=4)
-    assert (quick.train, quick.seed, quick.returns.passages) == (False, 4, False)
-    assert quick.override(train=True, seed=0, returns={"passages": True}) == FitConfig()
+    assert (quick.train, quick.seed, quick.returns.free_space) == (False, 4, False)
+    assert quick.override(train=True, seed=0, returns={"free_space": True}) == FitConfig()
     assert quick.closes_intensity
     assert not quick.trains_intensity
     assert FitConfig().trains_intensity

@@ -84,7 +84,7 @@ def test_pickles_and_copies_are_the_same_map(radar_map):
             assert other.has_intensity == original.has_intensity
             for name, column in dataclasses.asdict(original.evidence).items():
                 np.testing.assert_array_equal(getattr(other.evidence, name), column)
-            assert other.rough_share == original.rough_share
+            assert other.clutter_ratio == original.clutter_ratio
             assert other.origin.tolist() == original.origin.tolist()
 
 

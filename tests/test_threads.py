@@ -11,7 +11,7 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
-from radarsdf.threads import Workers, resolve_num_threads
+from radarsdf.threads import ThreadPool, resolve_num_threads
 
 QUICK = FitConfig(
     num_threads=2, training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024}
@@ -28,9 +28,9 @@ def two_threads():
 
 
 def test_torch_has_one_thread_inside_and_its_own_number_after():
-    with Workers(3) as workers:
+    with ThreadPool(3) as pool:
         assert torch.get_num_threads() == 1
-        assert set(workers.map(lambda _: torch.get_num_threads(), range(8))) == {1}
+        assert set(pool.map(lambda _: torch.get_num_threads(), range(8))) == {1}
     assert torch.get_num_threads() == 2
 
 
@@ -42,19 +42,19 @@ def test_an_error_on_a_worker_arrives_and_restores():
         return item
 
     for threads in (1, 2):
-        with Workers(threads) as workers, pytest.raises(LookupError, match="item 5"):
-            list(workers.map(fail, range(100)))
+        with ThreadPool(threads) as pool, pytest.raises(LookupError, match="item 5"):
+            list(pool.map(fail, range(100)))
         assert torch.get_num_threads() == 2
 
 
 def test_blocks_nest():
-    with Workers(2):
-        with Workers() as inner:
+    with ThreadPool(2):
+        with ThreadPool() as inner:
             assert inner.num_threads == 2  # not the 1 that the outer block has set
             assert torch.get_num_threads() == 1
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == 2
-    with pytest.raises(KeyError), Workers(2), Workers(2):
+    with pytest.raises(KeyError), ThreadPool(2), ThreadPool(2):
         raise KeyError
     assert torch.get_num_threads() == 2
 
@@ -66,8 +66,8 @@ def test_blocks_of_several_threads(first_in_is_first_out):
 
     def other():
         torch.set_num_threads(2)
-        with Workers(0) as workers:
-            seen["workers"] = workers.num_threads
+        with ThreadPool(0) as pool:
+            seen["pool"] = pool.num_threads
             entered.set()
             leave.wait(10)
             seen["inside"] = torch.get_num_threads()
@@ -75,7 +75,7 @@ def test_blocks_of_several_threads(first_in_is_first_out):
 
     thread = threading.Thread(target=other)
     try:
-        with Workers(2):
+        with ThreadPool(2):
             thread.start()
             assert entered.wait(10)
             if not first_in_is_first_out:
@@ -86,7 +86,7 @@ def test_blocks_of_several_threads(first_in_is_first_out):
     finally:
         leave.set()
         thread.join()
-    assert seen == {"workers": 2, "inside": 1, "after": 2}
+    assert seen == {"pool": 2, "inside": 1, "after": 2}
     # PyTorch's number is each thread's own: it must be back in all of them.
     assert torch.get_num_threads() == 2
     fresh = []
@@ -102,23 +102,23 @@ def test_results_keep_the_order_of_the_items(num_threads):
         time.sleep(0.01 * (5 - item))
         return item, threading.current_thread().name
 
-    with Workers(num_threads) as workers:
-        results = list(workers.map(late_first, range(5)))
-        assert list(workers.map(str, [])) == []
-        assert list(workers.map(str, [7])) == ["7"]
+    with ThreadPool(num_threads) as pool:
+        results = list(pool.map(late_first, range(5)))
+        assert list(pool.map(str, [])) == []
+        assert list(pool.map(str, [7])) == ["7"]
     assert [item for item, _ in results] == list(range(5))
     assert len({name for _, name in results}) == num_threads
 
 
 def test_grad_mode_is_each_threads_own():
-    with torch.no_grad(), Workers(2) as workers:
-        assert list(workers.map(lambda _: torch.is_grad_enabled(), range(2))) == [True, True]
+    with torch.no_grad(), ThreadPool(2) as pool:
+        assert list(pool.map(lambda _: torch.is_grad_enabled(), range(2))) == [True, True]
 
 
 def test_zero_threads_are_as_many_as_torch_has():
     assert resolve_num_threads(0) == 2
     assert resolve_num_threads(7) == 7
-    with Workers(5):
+    with ThreadPool(5):
         assert resolve_num_threads(0) == 2
 
 

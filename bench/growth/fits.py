@@ -15,7 +15,7 @@ import radarsdf
 import radarsdf.fitting.fit
 import radarsdf.poses.refine  # like fitting.fit: else the first call would import it, in what is measured
 from radarsdf import FitConfig, RadarMap
-from radarsdf._core import count_looks
+from radarsdf._core import count_visibility
 from radarsdf.fitting.average import near_leaf_keys
 from radarsdf.poses.rigid import steps, turned_by
 from radarsdf.returns.ghosts import find_ghosts
@@ -170,14 +170,14 @@ def surfel_row(returns: int, threads: int) -> Row:
         is_ghost = find_ghosts(surfels, rays, noise, threads)[surfels.cells_at(rays.points, threads)]
     leaf_keys = near_leaf_keys(rays.select(~is_ghost), config, threads)
     columns = rays.points, rays.directions, rays.ranges_m, rays.scans
-    with measured() as of_looks:
-        counts = count_looks(leaf_keys, config.leaf_size_m, *columns, threads)
+    with measured() as of_visibility:
+        counts = count_visibility(leaf_keys, config.leaf_size_m, *columns, threads)
     # A tenth of the returns within 70 m are ghosts, and every cell is near a return.
     if not 0.02 * returns < is_ghost.sum() < 0.15 * returns or not (counts > 0).mean() > 0.9:
         msg = f"{is_ghost.sum()} ghosts of {returns} returns, {(counts > 0).mean():.0%} of the cells seen"
         raise RuntimeError(msg)
     row: Row = {"ghosts": int(is_ghost.sum()), "leaf_cells": len(leaf_keys)}
-    for name, taken in (("ghosts", of_ghosts), ("looks", of_looks)):
+    for name, taken in (("ghosts", of_ghosts), ("visibility", of_visibility)):
         row |= {f"{name}_{key}": value for key, value in asdict(taken).items()}
     return row
 

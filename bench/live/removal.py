@@ -75,4 +75,6 @@ def _times(items: Iterable[int], act: Callable[[int], Any]) -> list[float]:
 def state(live: LiveMap) -> list[bytes]:
     """The bits of all sums."""
     keys = live._state.sums.block_keys()
-    return [array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.looks_of(keys))]
+    return [
+        array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.visibility_of(keys))
+    ]

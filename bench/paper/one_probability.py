@@ -148,8 +148,8 @@ def judged(example: Example, others: list[Example]) -> list[str]:
     """A row of the table: the mesh as it is, and by what is learnt on others."""
     of_truth, of_added = models(others)
     surface, p = example.surface, confidence(example, of_truth)
-    detections = surface.evidence.detections.double().numpy()
-    tally = Tally.of(example.areas_m2, p, example.predicted(of_added), example.reach, detections)
+    hits = surface.evidence.hits.double().numpy()
+    tally = Tally.of(example.areas_m2, p, example.predicted(of_added), example.reach, hits)
     learnt_surface = replace(surface, confidence=p.astype(np.float32), tally=tally)
     limits = Limits.of(example.voxel_m)
     scores = [example.f_score(s.kept(limits)) for s in (surface, learnt_surface)]

@@ -41,7 +41,7 @@ COLUMNS = {
     "deg_per_m": Column("°/m"),
     "nees": Column("NEES / 3"),
     "taken": Column("taken"),
-    "pieces": Column("segments"),
+    "segments": Column("segments"),
     "seconds": Column("s"),
 }
 
@@ -102,10 +102,10 @@ def _odometry_rows(scene: Scene, seed: int, options: argparse.Namespace) -> Iter
         except ValueError as error:
             yield {"poses": name, "why_not": str(error)}
             continue
-        row: Row = {"poses": name, "seconds": taken.wall_s, "pieces": float(found.report["pieces"])}
-        part = found.longest_piece()
+        row: Row = {"poses": name, "seconds": taken.wall_s, "segments": float(found.report["segments"])}
+        part = found.longest_segment()
         row |= _trajectory_errors(found.poses[part], scene.poses[part], "found", found.covariance[part])
-        if found.report["pieces"] == 1:
+        if found.report["segments"] == 1:
             row |= _map_errors(scene, aligned(found.poses, scene.poses), "found", options)
         yield row
 
@@ -185,10 +185,10 @@ def stale(poses: Poses) -> Poses:
     return poses[np.arange(len(poses)) // 2 * 2]
 
 
-def late(poses: Poses, late_s: float) -> Poses:
+def late(poses: Poses, time_offset_s: float) -> Poses:
     """The poses of a clock that is late, of scans ten times a second."""
     times = _STEP_S * np.arange(len(poses))
-    asked = np.clip(times - late_s, 0, times[-1])
+    asked = np.clip(times - time_offset_s, 0, times[-1])
     found = poses.copy()
     found[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(asked).as_matrix()
     for axis in range(3):

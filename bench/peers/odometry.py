@@ -139,8 +139,8 @@ def _errors(poses: NDArray[np.float64], true: NDArray[np.float64]) -> tuple[floa
 
 
 def _best(found: list[tuple[float, float, float] | str]) -> str:
-    told = [errors for errors in found if not isinstance(errors, str)]
-    return _words(min(told)) if told else str(found[0])
+    observed = [errors for errors in found if not isinstance(errors, str)]
+    return _words(min(observed)) if observed else str(found[0])
 
 
 def _words(errors: tuple[float, float, float]) -> str:

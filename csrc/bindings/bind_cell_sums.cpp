@@ -36,7 +36,7 @@ void bind_cell_sums(py::module_& m) {
           },
           "keys"_a.noconvert(), "num_threads"_a = 0, "Row of each key (N,) int32, -1 where there is no such cell.")
       .def(
-          "sum_round",
+          "neighbour_sums",
           [](const CellBlocks& cells, const Array<std::uint64_t>& keys, const Array<double>& values, double weight,
              int num_threads) {
             const std::int64_t count = check_column(keys, "keys");
@@ -48,7 +48,7 @@ void bind_cell_sums(py::module_& m) {
             double* result = sums.mutable_data();
             {
               const py::gil_scoped_release release;
-              sum_round(cells, k, count, v, static_cast<int>(columns), weight, result, num_threads);
+              neighbour_sums(cells, k, count, v, static_cast<int>(columns), weight, result, num_threads);
             }
             return sums;
           },

@@ -9,7 +9,7 @@
 #include <variant>
 #include <vector>
 
-#include "bindings/held_crew.hpp"
+#include "bindings/held_thread_pool.hpp"
 #include "bindings/layer_arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "field/field_loss.hpp"
@@ -80,11 +80,11 @@ class AnyFieldLoss {
     return *arrays;
   }
 
-  std::pair<double, double> finish(HeldCrew& crew) {
+  std::pair<double, double> finish(HeldThreadPool& pool) {
     const FieldLosses losses = std::visit(
         [&](auto& arrays) {
           auto& loss = arrays.loss();
-          return crew.finish([&](Crew& own) { return loss.finish(own); });
+          return pool.finish([&](ThreadPool& own) { return loss.finish(own); });
         },
         arrays_);
     return {losses.sdf, losses.intensity};
@@ -162,17 +162,17 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
   cls.def(
       "begin_sdf",
       [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, double weight,
-         Array<std::int32_t>& located, Array<T>& interpolated_grad, HeldCrew& crew) {
+         Array<std::int32_t>& located, Array<T>& interpolated_grad, HeldThreadPool& pool) {
         FieldLoss<T>& loss = self.of<T>().loss();
         const LossBatch<T> batch = points_of(points, sdf_m, parts);
         const FeatureGradients<T> gradients = by_features(loss, points.shape(0), located, interpolated_grad);
-        loss.begin_sdf(batch, weight, gradients, crew.crew());
-        crew.hold(py::make_tuple(py::cast(&self), points, sdf_m, located, interpolated_grad));
+        loss.begin_sdf(batch, weight, gradients, pool.pool());
+        pool.hold(py::make_tuple(py::cast(&self), points, sdf_m, located, interpolated_grad));
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "weight"_a, "located"_a.noconvert(),
-      "interpolated_grad"_a.noconvert(), "crew"_a,
+      "interpolated_grad"_a.noconvert(), "pool"_a,
       "Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads "
-      "of `crew` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many "
+      "of `pool` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many "
       "samples, and how many of these have labels of intensities. Their gradients are added in their order, so the "
       "threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is "
       "interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) "
@@ -181,28 +181,28 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       "begin_joint",
       [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, const Rows<T>& rays,
          const std::vector<Drop>& dropout, const std::pair<double, double>& weights, Array<std::int32_t>& located,
-         Array<T>& interpolated_grad, HeldCrew& crew) {
+         Array<T>& interpolated_grad, HeldThreadPool& pool) {
         FieldLoss<T>& loss = self.of<T>().loss();
         const LossBatch<T> batch = rays_of(points, sdf_m, parts, rays, dropout);
         const FeatureGradients<T> gradients = by_features(loss, points.shape(0), located, interpolated_grad);
-        loss.begin_joint(batch, {weights.first, weights.second}, gradients, crew.crew());
-        crew.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays, located, interpolated_grad));
+        loss.begin_joint(batch, {weights.first, weights.second}, gradients, pool.pool());
+        pool.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays, located, interpolated_grad));
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "rays"_a.noconvert(), "dropout"_a, "weights"_a,
-      "located"_a.noconvert(), "interpolated_grad"_a.noconvert(), "crew"_a,
+      "located"_a.noconvert(), "interpolated_grad"_a.noconvert(), "pool"_a,
       "Like `begin_sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
       "`rays` (N, 8) are the samples' rays. `dropout` has up to two pairs, of the encodings of cells and positions: "
       "the seed of `random_bytes` (samples seen, columns), and the number below which a byte keeps its column.");
   cls.def(
       "begin_intensity",
       [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, const Rows<T>& rays,
-         const std::vector<Drop>& dropout, double weight, HeldCrew& crew) {
+         const std::vector<Drop>& dropout, double weight, HeldThreadPool& pool) {
         FieldLoss<T>& loss = self.of<T>().loss();
         const LossBatch<T> batch = rays_of(points, sdf_m, parts, rays, dropout);
-        loss.begin_intensity(batch, weight, crew.crew());
-        crew.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays));
+        loss.begin_intensity(batch, weight, pool.pool());
+        pool.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays));
       },
-      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "rays"_a.noconvert(), "dropout"_a, "weight"_a, "crew"_a,
+      "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "rays"_a.noconvert(), "dropout"_a, "weight"_a, "pool"_a,
       "Like `begin_joint`, of the intensities alone while the SDF network and the features are frozen: writes to "
       "`intensity_gradients` only.");
 }
@@ -216,8 +216,9 @@ void bind_field_loss(py::module_& m) {
       "them. One thread at a time may use an object.");
   bind_methods<float>(cls);
   bind_methods<double>(cls);
-  cls.def("finish", &AnyFieldLoss::finish, py::arg("crew"),
-          "Helps the crew with the batch that was begun. Gives both mean losses, 0 for one that was not asked for.");
+  cls.def(
+      "finish", &AnyFieldLoss::finish, py::arg("pool"),
+      "Helps the thread pool with the batch that was begun. Gives both mean losses, 0 for one that was not asked for.");
   cls.def_property_readonly("sdf_gradients", &AnyFieldLoss::sdf_gradients,
                             "By weights and biases of each layer of the SDF network in turn, as the last call that "
                             "trained it wrote them.");

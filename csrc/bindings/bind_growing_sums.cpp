@@ -42,8 +42,9 @@ void bind_growing_sums(py::module_& m) {
       .def(
           "block_keys", [](const SumsChange& change) { return to_array(change.block_keys()); },
           "Keys of the blocks that it may change, uint64, ascending.");
-  py::class_<GrowingSums>(m, "GrowingSums",
-                          "Sums over scans in cells, and looks at blocks of 8 x 8 x 8 cells, in a table that grows.")
+  py::class_<GrowingSums>(
+      m, "GrowingSums",
+      "Sums over scans in cells, and visibility counts of blocks of 8 x 8 x 8 cells, in a table that grows.")
       .def(py::init<>())
       .def_property_readonly("num_cells", &GrowingSums::num_cells)
       .def_property_readonly("num_blocks", &GrowingSums::num_blocks)
@@ -56,10 +57,11 @@ void bind_growing_sums(py::module_& m) {
               const py::gil_scoped_release release;
               changed = sums.apply(change);
             }
-            return py::make_tuple(to_array(std::move(changed.returns)), to_array(std::move(changed.looks)));
+            return py::make_tuple(to_array(std::move(changed.returns)), to_array(std::move(changed.visibility)));
           },
           "change"_a,
-          "Makes a change, whole or not at all. Gives the keys of the blocks whose sums and whose looks are others: "
+          "Makes a change, whole or not at all. Gives the keys of the blocks whose sums and whose visibility counts "
+          "are others: "
           "two "
           "uint64 arrays, ascending.")
       .def(
@@ -82,10 +84,10 @@ void bind_growing_sums(py::module_& m) {
           "Of the blocks with these keys (B,), ascending: Morton keys (C,) of the leaf cells with returns, their sums "
           "(C, 14) int64, and numbers of scans (C,) uint32.")
       .def(
-          "looks_of",
+          "visibility_of",
           [](const GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
-            LooksOfBlocks found = sums.looks_of(block_keys.data(), check_column(block_keys, "block_keys"));
-            return py::make_tuple(to_array(std::move(found.keys)), to_array(std::move(found.looks)));
+            VisibilityOfBlocks found = sums.visibility_of(block_keys.data(), check_column(block_keys, "block_keys"));
+            return py::make_tuple(to_array(std::move(found.keys)), to_array(std::move(found.visibility)));
           },
           "block_keys"_a.noconvert(),
           "Of those of the blocks with these keys (B,), ascending, that are there: keys, and numbers of scans that "
@@ -93,26 +95,28 @@ void bind_growing_sums(py::module_& m) {
       .def(
           "insert",
           [](GrowingSums& sums, const Array<std::uint64_t>& keys, const Array<std::int64_t>& of_cells,
-             const Array<std::uint32_t>& scans, const Array<std::uint64_t>& look_keys,
-             const Array<std::uint32_t>& looks) {
-            const std::int64_t cells = check_column(keys, "keys"), blocks = check_column(look_keys, "look_keys");
+             const Array<std::uint32_t>& scans, const Array<std::uint64_t>& visibility_keys,
+             const Array<std::uint32_t>& visibility) {
+            const std::int64_t cells = check_column(keys, "keys"),
+                               blocks = check_column(visibility_keys, "visibility_keys");
             check_shape(of_cells, cells, kSums, "sums");
-            if (check_column(scans, "scans") != cells || check_column(looks, "looks") != blocks) {
+            if (check_column(scans, "scans") != cells || check_column(visibility, "visibility") != blocks) {
               throw std::invalid_argument("scans must be one for each cell, looks one for each block");
             }
             sums.insert({{keys.data(), keys.data() + cells},
                          {of_cells.data(), of_cells.data() + kSums * cells},
                          {scans.data(), scans.data() + cells}},
-                        {{look_keys.data(), look_keys.data() + blocks}, {looks.data(), looks.data() + blocks}});
+                        {{visibility_keys.data(), visibility_keys.data() + blocks},
+                         {visibility.data(), visibility.data() + blocks}});
           },
-          "keys"_a.noconvert(), "sums"_a.noconvert(), "scans"_a.noconvert(), "look_keys"_a.noconvert(),
-          "looks"_a.noconvert(), "Puts in what `sums_of` and `looks_of` gave.")
+          "keys"_a.noconvert(), "sums"_a.noconvert(), "scans"_a.noconvert(), "visibility_keys"_a.noconvert(),
+          "visibility"_a.noconvert(), "Puts in what `sums_of` and `visibility_of` gave.")
       .def(
           "erase",
           [](GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
             sums.erase(block_keys.data(), check_column(block_keys, "block_keys"));
           },
-          "block_keys"_a.noconvert(), "Takes blocks away, with their sums and looks.");
+          "block_keys"_a.noconvert(), "Takes blocks away, with their sums and visibility counts.");
 }
 
 }  // namespace radarsdf

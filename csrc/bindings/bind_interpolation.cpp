@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: MIT
 #include <optional>
 
-#include "bindings/held_crew.hpp"
+#include "bindings/held_thread_pool.hpp"
 #include "bindings/subjects.hpp"
 #include "bindings/table_arrays.hpp"
 #include "field/encodings.hpp"
@@ -94,14 +94,14 @@ void bind_kernels(py::class_<VertexTable>& cls) {
   cls.def(
       "scatter",
       [](const VertexTable& table, const Array<T>& points, const Located& located, const Rows<T>& out_grad,
-         Array<T>& features_grad, HeldCrew& crew) {
+         Array<T>& features_grad, HeldThreadPool& pool) {
         scatter_by(table, points, located, Directions(), out_grad, features_grad, [&](const auto&... arguments) {
-          crew.crew().run(num_level_tasks(table),
+          pool.pool().run(num_level_tasks(table),
                           [&](std::int64_t task) { scatter_task(table, arguments..., level_task(table, task)); });
         });
       },
       "points"_a.noconvert(), "located"_a.noconvert(), "out_grad"_a.noconvert(), "features_grad"_a.noconvert(),
-      "crew"_a, "The same by the threads of a crew, without directions.");
+      "pool"_a, "The same by the threads of a thread pool, without directions.");
 
   cls.def(
       "coordinate_gradient",

@@ -4,7 +4,7 @@
 #include <tuple>
 #include <vector>
 
-#include "bindings/held_crew.hpp"
+#include "bindings/held_thread_pool.hpp"
 #include "bindings/subjects.hpp"
 #include "bindings/table_arrays.hpp"
 #include "field/optimiser.hpp"
@@ -20,7 +20,7 @@ void bind_adam(VertexTableClass& cls) {
       "begin_adam_step",
       [](const VertexTable& table, const std::vector<std::tuple<Array<T>, Located, Rows<T>>>& batches,
          Array<T>& features, Array<T>& moments, Located& marks, const Array<T>& decays, std::int32_t step,
-         double learning_rate, double epsilon, HeldCrew& crew) {
+         double learning_rate, double epsilon, HeldThreadPool& pool) {
         const std::int64_t rows = table.num_rows();
         check_features(table, features);
         check_shape(moments, rows, 2 * kFeatureDim, "moments");
@@ -46,15 +46,15 @@ void bind_adam(VertexTableClass& cls) {
                                static_cast<T>(learning_rate / (1 - static_cast<double>(powers[2 * step]))),
                                static_cast<T>(1 / (1 - static_cast<double>(powers[2 * step + 1]))),
                                static_cast<T>(epsilon)};
-        crew.crew().begin(num_level_tasks(table), [&table, points, grads, strides, adam](std::int64_t task) {
+        pool.pool().begin(num_level_tasks(table), [&table, points, grads, strides, adam](std::int64_t task) {
           adam_task(table, points, grads, strides, adam, level_task(table, task));
         });
-        crew.hold(py::make_tuple(py::cast(&table), batches, features, moments, marks, decays));
+        pool.hold(py::make_tuple(py::cast(&table), batches, features, moments, marks, decays));
       },
       "batches"_a, "features"_a.noconvert(), "moments"_a.noconvert(), "marks"_a.noconvert(), "decays"_a.noconvert(),
-      "step"_a, "learning_rate"_a, "epsilon"_a, "crew"_a,
+      "step"_a, "learning_rate"_a, "epsilon"_a, "pool"_a,
       "Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums "
-      "their gradients: the other threads of `crew` begin, and its `finish` is the end. `moments` (num_rows, 16) and "
+      "their gradients: the other threads of `pool` begin, and its `finish` is the end. `moments` (num_rows, 16) and "
       "`marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than "
       "step, 2) the powers of both betas.");
 }

@@ -8,7 +8,7 @@
 #include <exception>
 
 #include "bindings/arrays.hpp"
-#include "bindings/held_crew.hpp"
+#include "bindings/held_thread_pool.hpp"
 #include "bindings/subjects.hpp"
 #include "field/field_loss.hpp"
 #include "kernels/fourier_kernels.hpp"
@@ -68,12 +68,13 @@ void bind_system(py::module_& m) {
   terminate_before = std::set_terminate(&wait_or_terminate);
 #endif
   using namespace py::literals;
-  py::class_<HeldCrew>(m, "Crew",
-                       "Threads for short pieces of work, the calling one among them. They end with the object. One "
-                       "thread at a time may use it.")
+  py::class_<HeldThreadPool>(
+      m, "ThreadPool",
+      "Threads for short pieces of work, the calling one among them. They end with the object. One "
+      "thread at a time may use it.")
       .def(py::init<int>(), "num_threads"_a)
       .def(
-          "finish", [](HeldCrew& crew) { crew.finish([](Crew& own) { own.finish(); }); },
+          "finish", [](HeldThreadPool& pool) { pool.finish([](ThreadPool& own) { own.finish(); }); },
           "Helps with what was begun, and returns at its end.");
   m.def(
       "random_bytes",

@@ -20,8 +20,8 @@ PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
   radarsdf::bind_cell_means(m);
   radarsdf::bind_cell_sums(m);
   radarsdf::bind_growing_sums(m);
-  radarsdf::bind_looks(m);
-  radarsdf::bind_passages(m);
+  radarsdf::bind_visibility(m);
+  radarsdf::bind_free_space(m);
   radarsdf::bind_poses(m);
   radarsdf::bind_surface_crossings(m);
   radarsdf::bind_ray_tracing(m);

@@ -74,24 +74,24 @@ struct FieldLoss<T>::Job {
 
 template <typename T>
 void FieldLoss<T>::begin_sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features,
-                             Crew& crew) {
-  begin(batch, {weight, 0}, by_features, true, false, crew);
+                             ThreadPool& pool) {
+  begin(batch, {weight, 0}, by_features, true, false, pool);
 }
 
 template <typename T>
 void FieldLoss<T>::begin_joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
-                               Crew& crew) {
-  begin(batch, weights, by_features, true, true, crew);
+                               ThreadPool& pool) {
+  begin(batch, weights, by_features, true, true, pool);
 }
 
 template <typename T>
-void FieldLoss<T>::begin_intensity(const LossBatch<T>& batch, double weight, Crew& crew) {
-  begin(batch, {0, weight}, {nullptr, nullptr}, false, true, crew);
+void FieldLoss<T>::begin_intensity(const LossBatch<T>& batch, double weight, ThreadPool& pool) {
+  begin(batch, {0, weight}, {nullptr, nullptr}, false, true, pool);
 }
 
 template <typename T>
 void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
-                         bool trains, bool sees, Crew& crew) {
+                         bool trains, bool sees, ThreadPool& pool) {
   if (sees && parameters_.intensity.empty()) throw std::invalid_argument("there is no intensity network");
   if (job_) throw std::logic_error("the batch before this one is not finished");
   const auto job = std::make_shared<Job>();
@@ -123,7 +123,7 @@ void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const F
     to.located = job->located.get();
   }
   const FieldLosses shares{weights.sdf * job->means.sdf, weights.intensity * job->means.intensity};
-  crew.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to, shares](std::int64_t task) {
+  pool.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to, shares](std::int64_t task) {
     const auto i = static_cast<std::size_t>(task);
     const PassInput<T>& part = job->parts[i];
     const PassRequest<T> request{shares,
@@ -137,10 +137,10 @@ void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const F
 }
 
 template <typename T>
-FieldLosses FieldLoss<T>::finish(Crew& crew) {
+FieldLosses FieldLoss<T>::finish(ThreadPool& pool) {
   if (!job_) throw std::logic_error("no batch was begun");
   const std::shared_ptr<Job> job = std::move(job_);
-  crew.finish();
+  pool.finish();
   FieldLosses losses{0, 0};
   for (const FieldLosses& sum : job->sums) {
     losses.sdf += sum.sdf * job->means.sdf;

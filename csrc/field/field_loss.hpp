@@ -12,7 +12,7 @@
 #include "field/encodings.hpp"
 #include "field/mlp.hpp"
 #include "lattice/vertex_table.hpp"
-#include "util/crew.hpp"
+#include "util/thread_pool.hpp"
 
 namespace radarsdf {
 
@@ -112,20 +112,21 @@ class FieldLoss {
   const FieldParameters<T>& parameters() const { return parameters_; }
 
   // The loss of the signed distances alone.
-  void begin_sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features, Crew& crew);
+  void begin_sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features, ThreadPool& pool);
   // Both losses.
-  void begin_joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features, Crew& crew);
+  void begin_joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
+                   ThreadPool& pool);
   // The loss of the intensities, by the intensity network alone: features and SDF network are frozen.
-  void begin_intensity(const LossBatch<T>& batch, double weight, Crew& crew);
-  // Helps the crew. A loss that was not asked for is 0.
-  FieldLosses finish(Crew& crew);
+  void begin_intensity(const LossBatch<T>& batch, double weight, ThreadPool& pool);
+  // Helps the thread pool. A loss that was not asked for is 0.
+  FieldLosses finish(ThreadPool& pool);
 
  private:
   struct Job;
 
   // `trains`: features and SDF network, by the first loss. `sees`: there is a loss of intensities.
   void begin(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features, bool trains,
-             bool sees, Crew& crew);
+             bool sees, ThreadPool& pool);
   NetworkGradients<T> of_part(std::size_t part);  // from 1 on
 
   FieldParameters<T> parameters_;

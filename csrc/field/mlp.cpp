@@ -15,8 +15,8 @@ namespace {
 
 constexpr std::int64_t kTile = 64;         // rows that go through all layers together
 constexpr std::int64_t kMinRows = 512;     // that are worth waking a thread for
-constexpr std::int64_t kPieceRows = 2048;  // that are summed together; then the sums of the pieces are added
-constexpr std::int64_t kMaxPieces = 16;
+constexpr std::int64_t kChunkRows = 2048;  // that are summed together; then the sums of the chunks are added
+constexpr std::int64_t kMaxChunks = 16;
 
 template <typename T>
 constexpr T kOne = 1;
@@ -264,14 +264,14 @@ void mlp_backward(const std::vector<Layer<T>>& layers, const std::vector<Columns
                   const std::vector<Columns<T>>& input_grads, int num_threads) {
   const bool by_layers = !layer_grads.empty();
   const Backward<T> backward(layers, inputs, hidden, out_grad, input_grads, by_layers);
-  const std::int64_t pieces = std::clamp<std::int64_t>((count + kPieceRows - 1) / kPieceRows, 1, kMaxPieces);
-  std::vector<T> sums = zeros<T>(by_layers ? pieces * backward.num_sums() : 0);
-  parallel_tasks(pieces, num_threads, [&](std::int64_t piece) {
-    T* own = by_layers ? sums.data() + piece * backward.num_sums() : nullptr;
-    backward.rows(count * piece / pieces, count * (piece + 1) / pieces, own);
+  const std::int64_t chunks = std::clamp<std::int64_t>((count + kChunkRows - 1) / kChunkRows, 1, kMaxChunks);
+  std::vector<T> sums = zeros<T>(by_layers ? chunks * backward.num_sums() : 0);
+  parallel_tasks(chunks, num_threads, [&](std::int64_t chunk) {
+    T* own = by_layers ? sums.data() + chunk * backward.num_sums() : nullptr;
+    backward.rows(count * chunk / chunks, count * (chunk + 1) / chunks, own);
   });
   if (!by_layers) return;
-  for (std::int64_t i = backward.num_sums(); i < pieces * backward.num_sums(); ++i) {
+  for (std::int64_t i = backward.num_sums(); i < chunks * backward.num_sums(); ++i) {
     sums[i % backward.num_sums()] += sums[i];
   }
   for (std::size_t i = 0; i < layers.size(); ++i) {

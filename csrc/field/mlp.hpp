@@ -35,7 +35,7 @@ void mlp(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>
          T* hidden, T* out, int num_threads);
 
 // Gradients of (out . out_grad), all of them overwritten: by the weights and biases of each layer unless these are
-// null, and by the inputs. Sums over rows are made in pieces that do not depend on the number of threads.
+// null, and by the inputs. Sums over rows are made in chunks that do not depend on the number of threads.
 template <typename T>
 struct LayerGradients {
   T* weights;

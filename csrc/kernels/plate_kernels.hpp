@@ -1,9 +1,10 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// One iteration of returns/smooth_distances.cpp, compiled once for each instruction set (see interpolation_kernels.hpp).
-// Vertices lie in blocks of 4 x 4 x 4, x fastest, so that neighbours along an axis are neighbours in memory. Places that
-// no vertex takes up are 0 throughout, as is one more block, which stands for those that are missing.
+// One iteration of returns/smooth_distances.cpp, compiled once for each instruction set (see
+// interpolation_kernels.hpp). Vertices lie in blocks of 4 x 4 x 4, x fastest, so that neighbours along an axis are
+// neighbours in memory. Places that no vertex takes up are 0 throughout, as is one more block, which stands for those
+// that are missing.
 #pragma once
 
 #include <cstdint>
@@ -11,8 +12,9 @@
 namespace radarsdf {
 
 constexpr int kPlateVertices = 64;  // of a block
-// Second differences along an axis that reach into a block. Along x: for each of 16 rows from its place -1 to 4, and two
-// more that count nowhere. Along y and z: for each of six layers, from -1 to 4, 16 places, of which x is the fastest.
+// Second differences along an axis that reach into a block. Along x: for each of 16 rows from its place -1 to 4, and
+// two more that count nowhere. Along y and z: for each of six layers, from -1 to 4, 16 places, of which x is the
+// fastest.
 constexpr int kBendsAlongX = 128, kBendsAlongYZ = 96, kPlateBends = kBendsAlongX + 2 * kBendsAlongYZ;
 
 struct PlateSweep {

@@ -104,8 +104,8 @@ class BlocksRound {
 constexpr std::int64_t kManyKeys = 5;
 
 // sums: (64, columns), in Morton order, of the values in the 27 cells round each of a block's. `cube` is scratch.
-void sum_round_block(const BlocksRound& round, const double* values, int columns, std::vector<double>& cube,
-                     double* sums) {
+void neighbour_sums_of_block(const BlocksRound& round, const double* values, int columns, std::vector<double>& cube,
+                             double* sums) {
   constexpr std::int32_t kPlaces = kWide * kWide * kWide;
   cube.assign(static_cast<std::size_t>(kPlaces * columns), 0.0);
   round.for_each([&](std::int32_t row, std::int32_t place) {
@@ -165,8 +165,8 @@ void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std
   });
 }
 
-void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
-               int columns, double weight, double* sums, int num_threads) {
+void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
+                    int columns, double weight, double* sums, int num_threads) {
   const double weights[4] = {1, weight, std::pow(weight, 2), std::pow(weight, 3)};
   std::fill(sums, sums + columns * count, 0.0);
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
@@ -179,7 +179,7 @@ void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t 
         block_key = CellBlocks::block_key(keys[i]);
         round.move_to(block_key);
         add_up_block = weight == 1 && in_crowd(keys, count, i);
-        if (add_up_block) sum_round_block(round, values, columns, cube, block_sums.data());
+        if (add_up_block) neighbour_sums_of_block(round, values, columns, cube, block_sums.data());
       }
       if (add_up_block) {
         const double* own = block_sums.data() + columns * static_cast<std::int64_t>(keys[i] & 63);

@@ -48,8 +48,8 @@ void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std
 // sums: (count, columns), for each key those over its cell and the 26 round it of values, (cells.size(), columns). A
 // cell that shares a face with the key's counts `weight` times, one that shares an edge weight^2, a corner weight^3.
 // Many keys of a block are best given one after another, as they are in ascending order.
-void sum_round(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
-               int columns, double weight, double* sums, int num_threads);
+void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
+                    int columns, double weight, double* sums, int num_threads);
 
 // interpolated: (count, columns), of values (cells.size(), columns) that belong to the centres of cells of this size,
 // trilinear at points (count, 3), local frame, m; 0 where there is no cell. Throws std::invalid_argument for points

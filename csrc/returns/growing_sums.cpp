@@ -14,7 +14,7 @@ namespace {
 
 constexpr const char* kNeverAdded = "a scan that was never added cannot be taken out";
 
-std::uint64_t block_of(std::uint64_t leaf_key) { return leaf_key >> (3 * kLookLevels); }
+std::uint64_t block_of(std::uint64_t leaf_key) { return leaf_key >> (3 * kVisibilityLevels); }
 
 // Where the cell's bit is: the word of the mask, and the bit in it.
 std::size_t word_of(std::uint64_t leaf_key) { return (leaf_key & (kCellsOfBlock - 1)) >> 6; }
@@ -69,18 +69,18 @@ void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
       cell.last = scan;
       cell.scans += sign;
     }
-    visit_looks(point, direction, rays.ranges_m[i], leaf_size_m_, passed, [&](std::uint64_t cube) {
-      const auto number = static_cast<std::int32_t>(looks_.size());
-      if (number_of_look_.insert(cube, number)) looks_.push_back({cube, 0});
-      looks_[static_cast<std::size_t>(number_of_look_.find(cube))].looks += sign;
+    visit_visible_cubes(point, direction, rays.ranges_m[i], leaf_size_m_, passed, [&](std::uint64_t cube) {
+      const auto number = static_cast<std::int32_t>(visibility_.size());
+      if (number_of_cube_.insert(cube, number)) visibility_.push_back({cube, 0});
+      visibility_[static_cast<std::size_t>(number_of_cube_.find(cube))].visibility += sign;
     });
   }
 }
 
 std::vector<std::uint64_t> SumsChange::block_keys() const {
   std::vector<std::uint64_t> keys;
-  keys.reserve(looks_.size() + cells_.size());
-  for (const Look& look : looks_) keys.push_back(look.key);
+  keys.reserve(visibility_.size() + cells_.size());
+  for (const Visibility& visibility : visibility_) keys.push_back(visibility.key);
   for (const Cell& cell : cells_) keys.push_back(block_of(cell.key));
   std::sort(keys.begin(), keys.end());
   keys.erase(std::unique(keys.begin(), keys.end()), keys.end());
@@ -98,16 +98,16 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
     new_cells += place < 0 ? 1 : 0;
     new_blocks += place < 0 && number_of_block_.find(block_of(cell.key)) < 0 ? 1 : 0;
   }
-  for (const SumsChange::Look& look : change.looks_) {
-    const std::int32_t place = number_of_block_.find(look.key);
-    const std::int64_t there = place < 0 ? 0 : blocks_[static_cast<std::size_t>(place)].looks;
-    if (there + look.looks < 0) throw std::invalid_argument(kNeverAdded);
+  for (const SumsChange::Visibility& visibility : change.visibility_) {
+    const std::int32_t place = number_of_block_.find(visibility.key);
+    const std::int64_t there = place < 0 ? 0 : blocks_[static_cast<std::size_t>(place)].visibility;
+    if (there + visibility.visibility < 0) throw std::invalid_argument(kNeverAdded);
     new_blocks += place < 0 ? 1 : 0;
   }
   // From here on nothing fails: a change is made whole, or not at all.
   ChangedBlocks changed;
   changed.returns.reserve(change.cells_.size());
-  changed.looks.reserve(change.looks_.size());
+  changed.visibility.reserve(change.visibility_.size());
   reserve(new_cells, new_blocks);
   for (const SumsChange::Cell& cell : change.cells_) {
     if (cell.scans == 0 && std::all_of(cell.sums, cell.sums + kSums, [](std::int64_t sum) { return sum == 0; }))
@@ -129,13 +129,13 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
     there.scans = static_cast<std::uint32_t>(there.scans + cell.scans);
     if (there.sums[0] == 0) drop_cell(cell.key, block);
   }
-  for (const SumsChange::Look& look : change.looks_) {
-    if (look.looks == 0) continue;
-    Block& block = block_at(look.key);
-    block.looks = static_cast<std::uint32_t>(block.looks + look.looks);
-    changed.looks.push_back(look.key);
+  for (const SumsChange::Visibility& visibility : change.visibility_) {
+    if (visibility.visibility == 0) continue;
+    Block& block = block_at(visibility.key);
+    block.visibility = static_cast<std::uint32_t>(block.visibility + visibility.visibility);
+    changed.visibility.push_back(visibility.key);
   }
-  for (std::vector<std::uint64_t>* keys : {&changed.returns, &changed.looks}) {
+  for (std::vector<std::uint64_t>* keys : {&changed.returns, &changed.visibility}) {
     std::sort(keys->begin(), keys->end());
     keys->erase(std::unique(keys->begin(), keys->end()), keys->end());
     for (const std::uint64_t key : *keys) drop_if_empty(key);
@@ -174,25 +174,25 @@ SumsOfCells GrowingSums::sums_of(const std::uint64_t* block_keys, std::int64_t c
   return found;
 }
 
-LooksOfBlocks GrowingSums::looks_of(const std::uint64_t* block_keys, std::int64_t count) const {
-  LooksOfBlocks found;
+VisibilityOfBlocks GrowingSums::visibility_of(const std::uint64_t* block_keys, std::int64_t count) const {
+  VisibilityOfBlocks found;
   for (std::int64_t i = 0; i < count; ++i) {
     const std::int32_t place = number_of_block_.find(block_keys[i]);
     if (place < 0) continue;
     found.keys.push_back(block_keys[i]);
-    found.looks.push_back(blocks_[static_cast<std::size_t>(place)].looks);
+    found.visibility.push_back(blocks_[static_cast<std::size_t>(place)].visibility);
   }
   return found;
 }
 
-void GrowingSums::insert(const SumsOfCells& cells, const LooksOfBlocks& looks) {
+void GrowingSums::insert(const SumsOfCells& cells, const VisibilityOfBlocks& visibility) {
   const auto there_already = [](const FlatMap& map, const std::vector<std::uint64_t>& keys) {
     return std::any_of(keys.begin(), keys.end(), [&](std::uint64_t key) { return map.find(key) >= 0; });
   };
-  if (there_already(number_of_cell_, cells.keys) || there_already(number_of_block_, looks.keys)) {
+  if (there_already(number_of_cell_, cells.keys) || there_already(number_of_block_, visibility.keys)) {
     throw std::invalid_argument("there are sums of these cells already");
   }
-  auto blocks = static_cast<std::int64_t>(looks.keys.size());
+  auto blocks = static_cast<std::int64_t>(visibility.keys.size());
   for (std::size_t i = 0; i < cells.keys.size(); ++i) {
     blocks += i == 0 || block_of(cells.keys[i]) != block_of(cells.keys[i - 1]) ? 1 : 0;
   }
@@ -206,7 +206,8 @@ void GrowingSums::insert(const SumsOfCells& cells, const LooksOfBlocks& looks) {
     cell.scans = cells.scans[i];
     block_at(block_of(key)).mask[word_of(key)] |= bit_of(key);
   }
-  for (std::size_t i = 0; i < looks.keys.size(); ++i) block_at(looks.keys[i]).looks = looks.looks[i];
+  for (std::size_t i = 0; i < visibility.keys.size(); ++i)
+    block_at(visibility.keys[i]).visibility = visibility.visibility[i];
 }
 
 void GrowingSums::erase(const std::uint64_t* block_keys, std::int64_t count) {
@@ -215,20 +216,20 @@ void GrowingSums::erase(const std::uint64_t* block_keys, std::int64_t count) {
     if (place < 0) continue;
     Block& block = blocks_[static_cast<std::size_t>(place)];
     for_each_cell(block_keys[i], Block{block}, [&](std::uint64_t key) { drop_cell(key, block); });
-    block.looks = 0;
+    block.visibility = 0;
     drop_if_empty(block_keys[i]);
   }
 }
 
 bool GrowingSums::Block::is_empty() const {
-  return looks == 0 && std::all_of(mask.begin(), mask.end(), [](std::uint64_t word) { return word == 0; });
+  return visibility == 0 && std::all_of(mask.begin(), mask.end(), [](std::uint64_t word) { return word == 0; });
 }
 
 template <typename Visit>
 void GrowingSums::for_each_cell(std::uint64_t block_key, const Block& block, const Visit& visit) const {
   for (std::size_t word = 0; word < block.mask.size(); ++word) {
     for (std::uint64_t bits = block.mask[word]; bits != 0; bits &= bits - 1) {
-      visit(block_key << (3 * kLookLevels) | word << 6 | static_cast<std::uint64_t>(lowest_bit(bits)));
+      visit(block_key << (3 * kVisibilityLevels) | word << 6 | static_cast<std::uint64_t>(lowest_bit(bits)));
     }
   }
 }

@@ -11,7 +11,7 @@
 
 #include "lattice/flat_map.hpp"
 #include "returns/cell_sums.hpp"
-#include "returns/looks.hpp"
+#include "returns/visibility.hpp"
 
 namespace radarsdf {
 
@@ -23,8 +23,8 @@ struct RaysOfScan {
   std::int64_t count;
 };
 
-// A block has 8 x 8 x 8 leaf cells: the cube in which looks are counted.
-constexpr int kCellsOfBlock = 1 << (3 * kLookLevels);
+// A block has 8 x 8 x 8 leaf cells: the cube in which visibility is counted.
+constexpr int kCellsOfBlock = 1 << (3 * kVisibilityLevels);
 
 // The contents of blocks, in Morton order.
 struct SumsOfCells {
@@ -32,9 +32,9 @@ struct SumsOfCells {
   std::vector<std::int64_t> sums;    // (keys.size(), kSums), as of sum_returns
   std::vector<std::uint32_t> scans;  // that have returns in each
 };
-struct LooksOfBlocks {
-  std::vector<std::uint64_t> keys;   // of blocks
-  std::vector<std::uint32_t> looks;  // numbers of scans with a ray through each, or to there
+struct VisibilityOfBlocks {
+  std::vector<std::uint64_t> keys;        // of blocks
+  std::vector<std::uint32_t> visibility;  // numbers of scans with a ray through each, or to there
 };
 
 // What changes if scans come or go.
@@ -53,21 +53,21 @@ class SumsChange {
     std::uint64_t key;
     std::int64_t sums[kSums], scans, last;  // last: the scan of this change that was counted
   };
-  struct Look {
+  struct Visibility {
     std::uint64_t key;
-    std::int64_t looks;
+    std::int64_t visibility;
   };
 
   double leaf_size_m_, quantum_m_;
   std::int64_t collected_ = 0;
-  FlatMap number_of_cell_, number_of_look_;
+  FlatMap number_of_cell_, number_of_cube_;
   std::vector<Cell> cells_;
-  std::vector<Look> looks_;
+  std::vector<Visibility> visibility_;
 };
 
 // Which blocks a change concerns, ascending.
 struct ChangedBlocks {
-  std::vector<std::uint64_t> returns, looks;
+  std::vector<std::uint64_t> returns, visibility;
 };
 
 class GrowingSums {
@@ -83,11 +83,11 @@ class GrowingSums {
 
   // Of the blocks with these keys, ascending. Those that are not there have nothing.
   SumsOfCells sums_of(const std::uint64_t* block_keys, std::int64_t count) const;
-  LooksOfBlocks looks_of(const std::uint64_t* block_keys, std::int64_t count) const;
+  VisibilityOfBlocks visibility_of(const std::uint64_t* block_keys, std::int64_t count) const;
 
   // Puts contents in that are not there yet, and takes blocks away with their contents. Throws std::invalid_argument,
   // and changes nothing, if a cell or a block is there already.
-  void insert(const SumsOfCells& cells, const LooksOfBlocks& looks);
+  void insert(const SumsOfCells& cells, const VisibilityOfBlocks& visibility);
   void erase(const std::uint64_t* block_keys, std::int64_t count);
 
  private:
@@ -97,7 +97,7 @@ class GrowingSums {
   };
   struct Block {
     std::array<std::uint64_t, kCellsOfBlock / 64> mask{};  // which of its cells have returns, in Morton order
-    std::uint32_t looks = 0;
+    std::uint32_t visibility = 0;
 
     bool is_empty() const;
   };

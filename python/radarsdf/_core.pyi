@@ -14,7 +14,7 @@ __all__: list[str] = [
     "CellMeans",
     "CellSet",
     "CommonPlanes",
-    "Crew",
+    "ThreadPool",
     "DIRECTION_QUANTA",
     "Encoding",
     "FEATURE_DIM",
@@ -38,9 +38,9 @@ __all__: list[str] = [
     "cell_keys",
     "cell_rows",
     "compiler",
-    "count_looks",
+    "count_visibility",
     "count_scans",
-    "find_passages",
+    "find_free_space",
     "fit_cell_means",
     "fourier",
     "gather_rows",
@@ -67,7 +67,7 @@ __all__: list[str] = [
     "vertex_areas",
 ]
 
-class Crew:
+class ThreadPool:
     """
     Threads for short pieces of work, the calling one among them. They end with the object. One thread at a time may use it.
     """
@@ -216,10 +216,10 @@ class VertexTable:
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: the other threads of `crew` begin, and its `finish` is the end. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: the other threads of `pool` begin, and its `finish` is the end. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     @typing.overload
     def begin_adam_step(
@@ -238,10 +238,10 @@ class VertexTable:
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
         epsilon: typing.SupportsFloat | typing.SupportsIndex,
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
-        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: the other threads of `crew` begin, and its `finish` is the end. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
+        Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums their gradients: the other threads of `pool` begin, and its `finish` is the end. `moments` (num_rows, 16) and `marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than step, 2) the powers of both betas.
         """
     @typing.overload
     def coordinate_gradient(
@@ -383,10 +383,10 @@ class VertexTable:
         located: numpy.typing.NDArray[numpy.int32],
         out_grad: numpy.typing.NDArray[numpy.float32],
         features_grad: numpy.typing.NDArray[numpy.float32],
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
-        The same by the threads of a crew, without directions.
+        The same by the threads of a thread pool, without directions.
         """
     @typing.overload
     def scatter(
@@ -408,10 +408,10 @@ class VertexTable:
         located: numpy.typing.NDArray[numpy.int32],
         out_grad: numpy.typing.NDArray[numpy.float64],
         features_grad: numpy.typing.NDArray[numpy.float64],
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
-        The same by the threads of a crew, without directions.
+        The same by the threads of a thread pool, without directions.
         """
     def smoothed(
         self,
@@ -494,7 +494,7 @@ class FieldLoss:
             tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
         Like `begin_joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
@@ -512,7 +512,7 @@ class FieldLoss:
             tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
         weight: typing.SupportsFloat | typing.SupportsIndex,
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
         Like `begin_joint`, of the intensities alone while the SDF network and the features are frozen: writes to `intensity_gradients` only.
@@ -534,7 +534,7 @@ class FieldLoss:
         ],
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float32],
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
         Like `begin_sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays. `dropout` has up to two pairs, of the encodings of cells and positions: the seed of `random_bytes` (samples seen, columns), and the number below which a byte keeps its column.
@@ -556,7 +556,7 @@ class FieldLoss:
         ],
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float64],
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
         Like `begin_sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the samples' rays. `dropout` has up to two pairs, of the encodings of cells and positions: the seed of `random_bytes` (samples seen, columns), and the number below which a byte keeps its column.
@@ -572,10 +572,10 @@ class FieldLoss:
         weight: typing.SupportsFloat | typing.SupportsIndex,
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float32],
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
-        Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads of `crew` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many samples, and how many of these have labels of intensities. Their gradients are added in their order, so the threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads of `pool` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many samples, and how many of these have labels of intensities. Their gradients are added in their order, so the threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
         """
     @typing.overload
     def begin_sdf(
@@ -588,14 +588,14 @@ class FieldLoss:
         weight: typing.SupportsFloat | typing.SupportsIndex,
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float64],
-        crew: Crew,
+        pool: ThreadPool,
     ) -> None:
         """
-        Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads of `crew` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many samples, and how many of these have labels of intensities. Their gradients are added in their order, so the threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
+        Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads of `pool` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many samples, and how many of these have labels of intensities. Their gradients are added in their order, so the threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) int32.
         """
-    def finish(self, crew: Crew) -> tuple[float, float]:
+    def finish(self, pool: ThreadPool) -> tuple[float, float]:
         """
-        Helps the crew with the batch that was begun. Gives both mean losses, 0 for one that was not asked for.
+        Helps the thread pool with the batch that was begun. Gives both mean losses, 0 for one that was not asked for.
         """
     @property
     def intensity_gradients(
@@ -664,7 +664,7 @@ class CellBlocks:
         """
         Row of each key (N,) int32, -1 where there is no such cell.
         """
-    def sum_round(
+    def neighbour_sums(
         self,
         keys: numpy.typing.NDArray[numpy.uint64],
         values: numpy.typing.NDArray[numpy.float64],
@@ -701,14 +701,14 @@ class SumsChange:
 
 class GrowingSums:
     """
-    Sums over scans in cells, and looks at blocks of 8 x 8 x 8 cells, in a table that grows.
+    Sums over scans in cells, and visibility counts of blocks of 8 x 8 x 8 cells, in a table that grows.
     """
     def __init__(self) -> None: ...
     def apply(
         self, change: SumsChange
     ) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.uint64]]:
         """
-        Makes a change, whole or not at all. Gives the keys of the blocks whose sums and whose looks are others: two uint64 arrays, ascending.
+        Makes a change, whole or not at all. Gives the keys of the blocks whose sums and whose visibility counts are others: two uint64 arrays, ascending.
         """
     def block_keys(self) -> numpy.typing.NDArray[numpy.uint64]:
         """
@@ -716,20 +716,20 @@ class GrowingSums:
         """
     def erase(self, block_keys: numpy.typing.NDArray[numpy.uint64]) -> None:
         """
-        Takes blocks away, with their sums and looks.
+        Takes blocks away, with their sums and visibility counts.
         """
     def insert(
         self,
         keys: numpy.typing.NDArray[numpy.uint64],
         sums: numpy.typing.NDArray[numpy.int64],
         scans: numpy.typing.NDArray[numpy.uint32],
-        look_keys: numpy.typing.NDArray[numpy.uint64],
-        looks: numpy.typing.NDArray[numpy.uint32],
+        visibility_keys: numpy.typing.NDArray[numpy.uint64],
+        visibility: numpy.typing.NDArray[numpy.uint32],
     ) -> None:
         """
-        Puts in what `sums_of` and `looks_of` gave.
+        Puts in what `sums_of` and `visibility_of` gave.
         """
-    def looks_of(
+    def visibility_of(
         self, block_keys: numpy.typing.NDArray[numpy.uint64]
     ) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.uint32]]:
         """
@@ -964,7 +964,7 @@ def compiler() -> str:
     Compiler that built the core.
     """
 
-def count_looks(
+def count_visibility(
     leaf_keys: numpy.typing.NDArray[numpy.uint64],
     leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
     points: numpy.typing.NDArray[numpy.float32],
@@ -987,7 +987,7 @@ def count_scans(
     Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each return's cell; `scans` (N,) int32, ascending.
     """
 
-def find_passages(
+def find_free_space(
     points: numpy.typing.NDArray[numpy.float32],
     directions: numpy.typing.NDArray[numpy.float32],
     ranges_m: numpy.typing.NDArray[numpy.float32],

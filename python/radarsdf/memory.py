@@ -22,8 +22,8 @@ def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> 
 
 def check_triangles(count: int, max_memory_bytes: int | None) -> None:
     """Raises a MemoryError if the mesh of a map in tiles has more triangles than memory holds."""
-    way_out = "take a part, by a box, or write 3D Tiles (radarsdf tiles mesh -o NAME.json)"
-    _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, way_out)
+    remedy = "take a part, by a box, or write 3D Tiles (radarsdf tiles mesh -o NAME.json)"
+    _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, remedy)
 
 
 def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0) -> None:
@@ -34,14 +34,14 @@ def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 
     """
     of_map = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN
     needed = of_map + beams * _PER_BEAM
-    way_out = "ask for fewer poses or returns, or make the map of a part of the scans"
-    _check("these views", needed, max_memory_bytes, way_out)
+    remedy = "ask for fewer poses or returns, or make the map of a part of the scans"
+    _check("these views", needed, max_memory_bytes, remedy)
 
 
-def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, way_out: str) -> None:
+def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, remedy: str) -> None:
     available = limit_bytes(max_memory_bytes)
     if available is not None and needed_bytes > available:
-        msg = f"{what} would take about {needed_bytes / 1e9:.2f} GB, of {available / 1e9:.2f}: {way_out}"
+        msg = f"{what} would take about {needed_bytes / 1e9:.2f} GB, of {available / 1e9:.2f}: {remedy}"
         raise MemoryError(msg)
 
 

@@ -5,7 +5,7 @@
 PyTorch splits every operation over OpenMP threads, which spin while they wait for each other. Next to another busy
 process, a fit of 1.8 s took 88 s: threads with work waited for the time slices of threads that only spun. Python threads
 sleep while they wait, synchronise once in an iteration, and are no slower on an idle machine: PyTorch and the compiled
-core release the interpreter's lock. For work of less than a millisecond, there is :attr:`Workers.crew`.
+core release the interpreter's lock. For work of less than a millisecond, there is :attr:`ThreadPool.core_threads`.
 """
 
 from __future__ import annotations
@@ -90,12 +90,12 @@ def start_vector_library() -> None:
 
 
 def resolve_num_threads(num_threads: int) -> int:
-    """`num_threads`, or if it is 0 as many as PyTorch uses, or used before a block of :class:`Workers`."""
+    """`num_threads`, or if it is 0 as many as PyTorch uses, or used before a block of :class:`ThreadPool`."""
     with _state.lock:
         return num_threads or (_state.usual_threads if _state.open_blocks else torch.get_num_threads())
 
 
-class Workers:
+class ThreadPool:
     """A pool of `num_threads` threads for a ``with`` block. 0: as many as PyTorch uses."""
 
     # PyTorch keeps its number of threads for each thread; a new thread starts with what any thread set last. So the outermost
@@ -120,7 +120,7 @@ class Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.__dict__.pop("crew", None)  # whose threads end with it
+        self.__dict__.pop("core_threads", None)  # whose threads end with it
         try:
             self._pool.shutdown(cancel_futures=True)
         finally:  # also if a second Ctrl-C interrupts the wait for the threads
@@ -131,12 +131,12 @@ class Workers:
                     torch.set_num_threads(self._threads_after)
 
     @cached_property
-    def crew(self) -> _core.Crew:
+    def core_threads(self) -> _core.ThreadPool:
         """As many threads of the core, for short work without Python: they look for work for a moment before they sleep.
 
         On two threads, an iteration of a training took 4.1 ms with the pool, which was woken ten times, and takes 2.3.
         """
-        return _core.Crew(self.num_threads)
+        return _core.ThreadPool(self.num_threads)
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
         """Like the built-in ``map``, with the items on different threads, where gradients are on.

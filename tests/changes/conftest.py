@@ -8,7 +8,7 @@ import pytest
 import radarsdf
 from radarsdf.simulate import Scene, simulate
 
-QUICK = radarsdf.FitConfig.quick(returns={"passages": True})
+QUICK = radarsdf.FitConfig.quick(returns={"free_space": True})
 
 
 def drives_past(before, after):

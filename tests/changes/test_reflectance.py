@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Two drives through one place, between which boxes are repainted."""
+"""Two drives through one place, between which boxes are of changed reflectance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.changes.changes import REPAINTED, UNSEEN
+from radarsdf.changes.changes import REFLECTANCE_CHANGED, UNSEEN
 from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
 from radarsdf.simulate.materials import CONCRETE
@@ -27,17 +27,17 @@ def box(center, more_db=0.0):
 
 @pytest.fixture(scope="module")
 def drives():
-    """A drive past a wall with three boxes, one without changes, and one after two were repainted."""
+    """A drive past a wall with three boxes, one without changes, and one after two were of changed reflectance."""
     return drives_past(*([box(STRONGER, more), box(WEAKER, -more), box(KEPT)] for more in (0.0, STRONGER_DB)))
 
 
 def on_box(surface, center):
-    """Share of a box's area that is repainted, and the median change of intensity there."""
+    """Share of a box's area that changes its reflectance, and the median change of intensity there."""
     kinds, areas = surface.of_faces()
     middle = surface.vertices[surface.faces].mean(axis=1)
     on = (np.abs(box(center).signed_distance(middle)) < 0.15) & (middle[:, 2] > 0.3)
     change = np.nanmedian(surface.intensity_change[np.unique(surface.faces[on])])
-    return areas[on & (kinds == REPAINTED)].sum() / areas[on].sum(), change
+    return areas[on & (kinds == REFLECTANCE_CHANGED)].sum() / areas[on].sum(), change
 
 
 def test_what_was_repainted_is_found_and_nothing_else(changes):
@@ -49,18 +49,18 @@ def test_what_was_repainted_is_found_and_nothing_else(changes):
     kinds, areas = changes.after.of_faces()
     middle = changes.after.vertices[changes.after.faces].mean(axis=1)
     away = np.min([box(center).signed_distance(middle) for center in (STRONGER, WEAKER)], axis=0) > 0.6
-    assert areas[away & (kinds == REPAINTED)].sum() < 0.005 * areas[away & (kinds != UNSEEN)].sum()
-    found = [region for region in changes.regions(0.5) if region.kind == "repainted"]
+    assert areas[away & (kinds == REFLECTANCE_CHANGED)].sum() < 0.005 * areas[away & (kinds != UNSEEN)].sum()
+    found = [region for region in changes.regions(0.5) if region.kind == "reflectance_changed"]
     assert len(found) == 2
     assert min(region.probability for region in found) > 0.8
     assert sum(region.area_m2 for region in found) > 2
-    every = sum(region.area_m2 for region in changes.regions() if region.kind == "repainted")
-    assert changes.report["areas_m2"]["repainted"] == pytest.approx(every)
+    every = sum(region.area_m2 for region in changes.regions() if region.kind == "reflectance_changed")
+    assert changes.report["areas_m2"]["reflectance_changed"] == pytest.approx(every)
 
 
 def test_nothing_was_repainted_between_two_drives_through_one_scene(maps):
     same = radarsdf.compare(maps[0], maps[1])
-    assert same.report["areas_m2"]["repainted"] < 0.0025 * same.report["compared_m2"]
+    assert same.report["areas_m2"]["reflectance_changed"] < 0.0025 * same.report["compared_m2"]
     assert abs(same.report["intensity_offset"]) < 0.2
 
 
@@ -72,16 +72,16 @@ def test_another_gain_and_another_frame_are_no_change(drives, maps):
     found = radarsdf.compare(maps[0], other)
     assert "moved" in found.report["alignment"]
     assert abs(found.report["intensity_offset"] - GAIN_DB) < 0.3
-    assert found.report["areas_m2"]["repainted"] < 0.0025 * found.report["compared_m2"]
+    assert found.report["areas_m2"]["reflectance_changed"] < 0.0025 * found.report["compared_m2"]
 
 
 def test_without_intensities_nothing_is_said_of_them(drives, maps):
     blind = radarsdf.fit(drives[2].points, drives[2].poses, config=QUICK)
     found = radarsdf.compare(maps[0], blind)
-    assert len(blind.echoes().counts) == 0
+    assert len(blind.view_statistics().counts) == 0
     assert found.report["intensity_offset"] is None
     assert np.isnan(found.after.intensity_change).all()
-    assert found.report["areas_m2"]["repainted"] == 0
+    assert found.report["areas_m2"]["reflectance_changed"] == 0
 
 
 @pytest.mark.parametrize(
@@ -94,5 +94,5 @@ def test_intensities_in_other_units_are_not_compared(drives, maps, units):
         found = radarsdf.compare(before, after, align_frames=False)
         assert "other units" in found.report["reflectance"]
         assert found.report["intensity_offset"] is None
-        assert found.report["areas_m2"]["repainted"] == 0
+        assert found.report["areas_m2"]["reflectance_changed"] == 0
         assert found.report["compared_m2"] > 100

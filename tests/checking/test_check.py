@@ -82,7 +82,7 @@ def test_a_drift_is_found_with_its_figures(drive):
     assert found.name == "poses_drift"
     assert found.severity == "warning"
     assert "denser where returns that took no part lie" in found.evidence
-    assert "radarsdf poses" in found.mend
+    assert "radarsdf poses" in found.fix
 
 
 def test_true_poses_do_not_drift(drive):

@@ -45,12 +45,17 @@ def test_what_is_wild_is_counted_and_named(good):
     broken[7][1:8] = 65535
     broken[3][2] = 1e9  # a single one, in a scan that no sample need hold
     found = {finding.name: finding for finding in check_cheaply(points, poses, broken)}
-    counts = {name: int(found[name].evidence.split()[0]) for name in ("intensity_sentinel", "intensity_wild")}
+    counts = {
+        name: int(found[name].evidence.split()[0]) for name in ("intensity_sentinel", "intensity_outliers")
+    }
     values = np.concatenate(broken)
-    assert counts == {"intensity_sentinel": int(np.isin(values, [-9999, 65535]).sum()), "intensity_wild": 1}
+    assert counts == {
+        "intensity_sentinel": int(np.isin(values, [-9999, 65535]).sum()),
+        "intensity_outliers": 1,
+    }
     assert f"of {len(whole)} intensities" in found["intensity_sentinel"].evidence
     assert "are -9999, 65535, far from all others" in found["intensity_sentinel"].evidence
-    assert "are 1e+09" in found["intensity_wild"].evidence
+    assert "are 1e+09" in found["intensity_outliers"].evidence
 
 
 def test_reflections_in_the_ground_are_named(good):

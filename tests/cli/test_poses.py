@@ -77,7 +77,7 @@ def test_poses_that_drift_are_refined(drive, drifted_file, tmp_path, capsys):
 def test_scans_without_poses_get_some(drive, unposed, tmp_path, capsys):
     out = tmp_path / "poses.tum"
     said = values(capsys, "poses", unposed, "-o", out)
-    assert said["poses"]["pieces"] == 1
+    assert said["poses"]["segments"] == 1
     scans = radarsdf.io.read(unposed, out)
     assert errors(scans.poses, drive.poses)[0] < 0.05
     again = ["--find", "-o", tmp_path / "again.tum"]

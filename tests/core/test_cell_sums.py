@@ -40,10 +40,10 @@ def test_sums_round_a_key(weight):
     apart = np.abs(cells[None] - asked[:, None])
     weights = np.where(apart.max(axis=2) <= 1, weight ** apart.sum(axis=2), 0.0)
     blocks = CellBlocks(keys_of(cells))
-    sums = blocks.sum_round(keys_of(asked), values, weight)
+    sums = blocks.neighbour_sums(keys_of(asked), values, weight)
     np.testing.assert_allclose(sums, weights @ values, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(sums, blocks.sum_round(keys_of(asked), values, weight, num_threads=1))
-    backwards = blocks.sum_round(np.ascontiguousarray(keys_of(asked)[::-1]), values, weight)
+    np.testing.assert_array_equal(sums, blocks.neighbour_sums(keys_of(asked), values, weight, num_threads=1))
+    backwards = blocks.neighbour_sums(np.ascontiguousarray(keys_of(asked)[::-1]), values, weight)
     np.testing.assert_array_equal(sums, backwards[::-1])
 
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf._core import cell_keys, count_looks, count_scans
+from radarsdf._core import cell_keys, count_scans, count_visibility
 
-from ..reference_looks import CUBE_CELLS, looks_at
+from ..reference_visibility import CUBE_CELLS, looks_at
 
 LEAF_M = 0.2
 CUBE_M = CUBE_CELLS * LEAF_M
@@ -70,9 +70,9 @@ def test_looks_are_those_of_a_plain_search(kind):
     expected = looks_at(cells, LEAF_M, *rays, scans)
     assert (expected == 0).mean() > 0.02
     assert expected.max() > 3
-    looks = count_looks(keys, LEAF_M, *rays, scans)
-    assert looks.dtype == np.uint32
-    np.testing.assert_array_equal(looks, expected)
+    visibility = count_visibility(keys, LEAF_M, *rays, scans)
+    assert visibility.dtype == np.uint32
+    np.testing.assert_array_equal(visibility, expected)
 
 
 def test_the_number_of_threads_changes_nothing():
@@ -82,7 +82,7 @@ def test_the_number_of_threads_changes_nothing():
     expected = looks_at(cells, LEAF_M, *rays, scans)
     assert len(np.unique(expected)) > 5
     for num_threads in THREADS:
-        np.testing.assert_array_equal(count_looks(keys, LEAF_M, *rays, scans, num_threads), expected)
+        np.testing.assert_array_equal(count_visibility(keys, LEAF_M, *rays, scans, num_threads), expected)
 
 
 def through(y_m, x_m=0.7, range_m=50.0):
@@ -97,7 +97,7 @@ def test_a_scan_counts_once_however_many_rays_it_has():
     _, keys = sorted_cells([[0, 0, 0], [-1, 0, 0], [-5, 7, 7], [-100, 3, 1]])
     for number_of_scans in (1, 2, 600):
         scans = (np.arange(600) * number_of_scans // 600).astype(np.int32)
-        assert count_looks(keys, LEAF_M, *rays, scans).tolist() == [number_of_scans] * 4
+        assert count_visibility(keys, LEAF_M, *rays, scans).tolist() == [number_of_scans] * 4
 
 
 def test_a_look_is_from_the_sensor_to_the_return():
@@ -105,12 +105,12 @@ def test_a_look_is_from_the_sensor_to_the_return():
     ray, scan = through(np.array([0.5])), np.zeros(1, np.int32)
     cells = np.array([[x, 0, 0] for x in range(-40 * CUBE_CELLS, 10 * CUBE_CELLS)])
     cells, keys = sorted_cells(cells)
-    looks = count_looks(keys, LEAF_M, *ray, scan)
+    visibility = count_visibility(keys, LEAF_M, *ray, scan)
     cubes = np.floor_divide(cells[:, 0], CUBE_CELLS)
-    np.testing.assert_array_equal(looks, (cubes >= -31) & (cubes <= 0))
+    np.testing.assert_array_equal(visibility, (cubes >= -31) & (cubes <= 0))
     # Its neighbours across the ray saw nothing.
     _, beside = sorted_cells([[-50, -1, 0], [-50, 8, 0], [-50, 0, -1], [-50, 0, 8]])
-    assert count_looks(beside, LEAF_M, *ray, scan).tolist() == [0] * 4
+    assert count_visibility(beside, LEAF_M, *ray, scan).tolist() == [0] * 4
 
 
 @pytest.mark.parametrize("num_cells", [1, 300, 40_000])

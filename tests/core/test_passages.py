@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import numpy as np
-from radarsdf._core import cell_keys, find_passages
-from radarsdf.returns.free_space import Passages
+from radarsdf._core import cell_keys, find_free_space
+from radarsdf.returns.free_space import FreeSpace
 
 LEAF_M = 0.2
 LIMIT = 10**6
@@ -26,7 +26,7 @@ def rays_of(count, scans):
 
 
 def found(rays, num_threads=1, lower=(-LIMIT,) * 3, upper=(LIMIT,) * 3):
-    return Passages(*find_passages(*rays, LEAF_M, list(lower), list(upper), num_threads))
+    return FreeSpace(*find_free_space(*rays, LEAF_M, list(lower), list(upper), num_threads))
 
 
 def searched(points, directions, ranges_m, passed_m, scans):
@@ -45,9 +45,9 @@ def searched(points, directions, ranges_m, passed_m, scans):
 
 def test_passages_are_those_of_a_plain_search():
     rays = rays_of(300, 9)
-    passages = found(rays)
-    passages.check()
-    passed, returns = passages.dense(LOWER, SHAPE)
+    free_space = found(rays)
+    free_space.check()
+    passed, returns = free_space.dense(LOWER, SHAPE)
     expected, expected_returns = searched(*rays)
     np.testing.assert_array_equal(returns, expected_returns)
     # A step misses corners of cells, and rays that come together are not followed on: few cells, of one scan each.

@@ -49,13 +49,13 @@ SumsChange change_by(const Scan& scan, std::int64_t sign) {
 struct Contents {
   std::vector<std::uint64_t> blocks;
   radarsdf::SumsOfCells cells;
-  radarsdf::LooksOfBlocks looks;
+  radarsdf::VisibilityOfBlocks visibility;
 };
 
 Contents contents_of(const GrowingSums& sums) {
   const std::vector<std::uint64_t> blocks = sums.block_keys();
   const auto count = static_cast<std::int64_t>(blocks.size());
-  return {blocks, sums.sums_of(blocks.data(), count), sums.looks_of(blocks.data(), count)};
+  return {blocks, sums.sums_of(blocks.data(), count), sums.visibility_of(blocks.data(), count)};
 }
 
 void check_same(const Contents& one, const Contents& other) {
@@ -63,8 +63,8 @@ void check_same(const Contents& one, const Contents& other) {
   CHECK(one.cells.keys == other.cells.keys);
   CHECK(one.cells.sums == other.cells.sums);
   CHECK(one.cells.scans == other.cells.scans);
-  CHECK(one.looks.keys == other.looks.keys);
-  CHECK(one.looks.looks == other.looks.looks);
+  CHECK(one.visibility.keys == other.visibility.keys);
+  CHECK(one.visibility.visibility == other.visibility.visibility);
 }
 
 }  // namespace
@@ -95,9 +95,9 @@ TEST_CASE("contents of blocks go to another table and come back as they were") {
   GrowingSums sums, other;
   sums.apply(change_by(Scan(1), 1));
   const Contents whole = contents_of(sums);
-  other.insert(whole.cells, whole.looks);
+  other.insert(whole.cells, whole.visibility);
   check_same(contents_of(other), whole);
-  CHECK_THROWS_AS(other.insert(whole.cells, whole.looks), std::invalid_argument);
+  CHECK_THROWS_AS(other.insert(whole.cells, whole.visibility), std::invalid_argument);
   check_same(contents_of(other), whole);
   other.erase(whole.blocks.data(), static_cast<std::int64_t>(whole.blocks.size()));
   CHECK((other.num_cells() == 0 && other.num_blocks() == 0));

@@ -24,18 +24,18 @@
 #include "returns/bridges.hpp"
 #include "returns/cell_means.hpp"
 #include "returns/cell_sums.hpp"
-#include "returns/looks.hpp"
 #include "returns/onto_planes.hpp"
 #include "returns/ray_average.hpp"
 #include "returns/smooth_distances.hpp"
 #include "returns/surface_crossings.hpp"
+#include "returns/visibility.hpp"
 #include "surface/marching_cubes.hpp"
 #include "surface/ray_tracing.hpp"
 #include "surface/sparse_lattice.hpp"
-#include "util/crew.hpp"
 #include "util/instruction_set.hpp"
 #include "util/parallel.hpp"
 #include "util/parallel_sort.hpp"
+#include "util/thread_pool.hpp"
 
 namespace {
 
@@ -119,8 +119,8 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   for (std::int32_t step = 1; step <= 2; ++step) {
     const radarsdf::AdamStep<T> adam{features.data(), moments.data(), marks.data(), decays.data(), step,
                                      T(0.01),         T(1),           T(1e-8)};
-    radarsdf::Crew crew(threads);
-    crew.run(radarsdf::num_level_tasks(table), [&](std::int64_t task) {
+    radarsdf::ThreadPool pool(threads);
+    pool.run(radarsdf::num_level_tasks(table), [&](std::int64_t task) {
       radarsdf::adam_task(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
                           radarsdf::level_task(table, task));
     });
@@ -183,7 +183,8 @@ void sums_and_rays(int threads, Results& results) {
                         num_cells, 1e-4, sums.data(), threads);
   const std::vector<double> values(sums.begin(), sums.end());
   std::vector<double> round(values.size());
-  radarsdf::sum_round(blocks, sorted.data(), num_cells, values.data(), radarsdf::kSums, 0.5, round.data(), threads);
+  radarsdf::neighbour_sums(blocks, sorted.data(), num_cells, values.data(), radarsdf::kSums, 0.5, round.data(),
+                           threads);
   results.add(values.data(), radarsdf::kSums * num_cells);
   results.add(round.data(), radarsdf::kSums * num_cells);
 
@@ -210,10 +211,10 @@ void sums_and_rays(int threads, Results& results) {
   along.insert_rays(points.data(), directions.data(), kPoints, 0.4, threads);
   const std::vector<std::uint64_t> leaf_keys = along.sorted_keys(threads);
   const auto num_leaves = static_cast<std::int64_t>(leaf_keys.size());
-  std::vector<std::uint32_t> looks(leaf_keys.size());
-  radarsdf::count_looks(leaf_keys.data(), num_leaves, 0.2, points.data(), directions.data(), ranges.data(),
-                        scans.data(), kPoints, looks.data(), threads);
-  results.add(looks.data(), num_leaves);
+  std::vector<std::uint32_t> visibility(leaf_keys.size());
+  radarsdf::count_visibility(leaf_keys.data(), num_leaves, 0.2, points.data(), directions.data(), ranges.data(),
+                             scans.data(), kPoints, visibility.data(), threads);
+  results.add(visibility.data(), num_leaves);
   const radarsdf::VertexTable table(leaf_keys, 0.2, 1, radarsdf::Encoding::kOctree, threads);
   std::vector<float> weights(kPoints, 1.0F), distances(static_cast<std::size_t>(table.num_rows()));
   std::vector<std::int8_t> sides(distances.size());
@@ -270,8 +271,8 @@ void before_the_training(int threads, Results& results) {
   results.add(bridged.data(), static_cast<std::int64_t>(bridged.size()));
   std::vector<double> around(keys.size());
   const std::vector<double> ones(keys.size(), 1.0);
-  radarsdf::sum_round(radarsdf::CellBlocks(keys.data(), num_keys), keys.data(), num_keys, ones.data(), 1, 1.0,
-                      around.data(), threads);
+  radarsdf::neighbour_sums(radarsdf::CellBlocks(keys.data(), num_keys), keys.data(), num_keys, ones.data(), 1, 1.0,
+                           around.data(), threads);
   results.add(around.data(), num_keys);
 
   constexpr std::int64_t kPlanes = 300, kScans = 7;

@@ -13,12 +13,12 @@
 
 #include "helpers.hpp"
 #include "util/bits.hpp"
-#include "util/crew.hpp"
 #include "util/instruction_set.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
 #include "util/parallel_sort.hpp"
 #include "util/random_bytes.hpp"
+#include "util/thread_pool.hpp"
 
 TEST_CASE("bits are counted and found as std::bitset does") {
   std::mt19937_64 generator(1);
@@ -44,16 +44,16 @@ TEST_CASE("each task runs once") {
   }
 }
 
-TEST_CASE("a crew runs each task once, job after job") {
+TEST_CASE("a thread pool runs each task once, job after job") {
   for (const int threads : {0, 1, 2, 5}) {
-    radarsdf::Crew crew(threads);
+    radarsdf::ThreadPool pool(threads);
     std::vector<std::atomic<int>> runs(50);
     for (int job = 1; job <= 300; ++job) {
       const std::int64_t tasks = job % 51;
-      crew.begin(tasks, [&](std::int64_t i) { ++runs[static_cast<std::size_t>(i)]; });
+      pool.begin(tasks, [&](std::int64_t i) { ++runs[static_cast<std::size_t>(i)]; });
       // Sometimes the others have gone to sleep.
       if (job % 100 == 0) std::this_thread::sleep_for(std::chrono::milliseconds(20));
-      crew.finish();
+      pool.finish();
       REQUIRE(std::all_of(runs.begin(), runs.begin() + tasks, [](const std::atomic<int>& n) { return n == 1; }));
       REQUIRE(std::all_of(runs.begin() + tasks, runs.end(), [](const std::atomic<int>& n) { return n == 0; }));
       for (std::atomic<int>& n : runs) n = 0;
@@ -61,24 +61,24 @@ TEST_CASE("a crew runs each task once, job after job") {
   }
 }
 
-TEST_CASE("a crew works while its caller does something else") {
-  radarsdf::Crew crew(2);
+TEST_CASE("a thread pool works while its caller does something else") {
+  radarsdf::ThreadPool pool(2);
   std::atomic<bool> done{false};
-  crew.begin(1, [&](std::int64_t) { done = true; });
+  pool.begin(1, [&](std::int64_t) { done = true; });
   const auto until = std::chrono::steady_clock::now() + std::chrono::seconds(60);
   while (!done && std::chrono::steady_clock::now() < until) std::this_thread::yield();
   CHECK(done);
-  CHECK_THROWS_AS(crew.begin(1, [](std::int64_t) {}), std::logic_error);
-  crew.finish();
-  crew.finish();  // there is nothing
+  CHECK_THROWS_AS(pool.begin(1, [](std::int64_t) {}), std::logic_error);
+  pool.finish();
+  pool.finish();  // there is nothing
 }
 
-TEST_CASE("a crew hands on what a task throws, and goes on") {
+TEST_CASE("a thread pool hands on what a task throws, and goes on") {
   for (const int threads : {1, 3}) {
-    radarsdf::Crew crew(threads);
+    radarsdf::ThreadPool pool(threads);
     for (int job = 0; job < 20; ++job) {
       std::atomic<int> runs{0};
-      CHECK_THROWS_AS(crew.run(1000,
+      CHECK_THROWS_AS(pool.run(1000,
                                [&](std::int64_t i) {
                                  ++runs;
                                  if (i == 3) throw std::runtime_error("no");
@@ -87,17 +87,17 @@ TEST_CASE("a crew hands on what a task throws, and goes on") {
                       std::runtime_error);
       CHECK(runs < 1000);
       std::atomic<int> after{0};
-      crew.run(10, [&](std::int64_t) { ++after; });
+      pool.run(10, [&](std::int64_t) { ++after; });
       CHECK(after == 10);
     }
   }
 }
 
-TEST_CASE("a crew may end before its tasks") {
+TEST_CASE("a thread pool may end before its tasks") {
   std::atomic<int> runs{0};
   {
-    radarsdf::Crew crew(3);
-    crew.begin(1000, [&](std::int64_t) {
+    radarsdf::ThreadPool pool(3);
+    pool.begin(1000, [&](std::int64_t) {
       ++runs;
       std::this_thread::sleep_for(std::chrono::milliseconds(1));
     });

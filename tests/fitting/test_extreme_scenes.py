@@ -83,7 +83,7 @@ def test_very_many_returns_in_one_cell():
     evidence = radar_map.evidence
     variance_m2 = SensorNoise(**radar_map.report["noise"]).variances_m2(np.float32([5.08])).item()
     assert evidence.information.max() == pytest.approx(len(points) / variance_m2, rel=0.01)
-    assert evidence.detections.max() == evidence.looks.max() == 100  # scans, and not returns
+    assert evidence.hits.max() == evidence.visibility.max() == 100  # scans, and not returns
     assert radar_map.confidence(points[:10]).min() > 0.97
 
 

@@ -180,4 +180,4 @@ def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
     config = config.override(returns={"drop_ghosts": False})
     without = radarsdf.fit(points, scene.poses, config=config)
     assert with_ghosts.report["leaf_cells"] == without.report["leaf_cells"]
-    assert with_ghosts.evidence.detections.tolist() == without.evidence.detections.tolist()
+    assert with_ghosts.evidence.hits.tolist() == without.evidence.hits.tolist()

@@ -14,7 +14,7 @@ from radarsdf._core import CellSet, Encoding
 from radarsdf.field import kernels
 from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.optimiser import Adam, RowAdam, Soap, Touched
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 
 def test_same_bits_as_pytorch_s():
@@ -84,13 +84,13 @@ def cells_and_points(encoding, half_m=1.0, count=500):
 def steps(cells, batches, threads, learning_rate=1e-2):
     """Features after one step for each batch, of RowAdam; the loss is the sum of interpolated features times weights."""
     adam = RowAdam(cells, learning_rate)
-    with Workers(threads) as workers:
+    with ThreadPool(threads) as pool:
         for parts in batches:
             touched = []
             for points, weights in parts:
                 gradient = weights.expand(len(points), cells.interpolated_dim)
                 touched.append(Touched(points, kernels.locate(points, cells.table), gradient))
-            adam.step(touched, workers, meanwhile=lambda: None)
+            adam.step(touched, pool, meanwhile=lambda: None)
     return cells.features.detach().clone()
 
 

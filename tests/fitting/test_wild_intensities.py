@@ -46,8 +46,8 @@ def test_their_values_do_not_matter(scans, config):
         radarsdf.fit(scans.points, scans.poses, values, config=config, progress=False)
         for values in (scans.intensities, struck(scans, -9999.0), struck(scans, 65535.0))
     )
-    assert good.report["wild_intensities"] == 0
-    assert low.report["wild_intensities"] == -(-sum(map(len, scans.points)) // 100)
+    assert good.report["intensity_outliers"] == 0
+    assert low.report["intensity_outliers"] == -(-sum(map(len, scans.points)) // 100)
     assert low.intensity_scale == good.intensity_scale
     weakest = [np.transpose(radar_map.sensor.thresholds)[1] for radar_map in (low, good)]
     np.testing.assert_allclose(*weakest, atol=2)

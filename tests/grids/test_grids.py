@@ -155,20 +155,20 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
 def test_a_map_without_passages_says_so(scene):
     quick = radarsdf.FitConfig.quick()
     radar_map = radarsdf.fit(scene.points, scene.poses, config=quick, progress=False)
-    with pytest.raises(ValueError, match=r"returns\.passages"):
+    with pytest.raises(ValueError, match=r"returns\.free_space"):
         radarsdf.grid(radar_map, BOX)
 
 
 def test_tiles_have_the_grid_of_their_cells(tmp_path):
     drive = radarsdf.simulate.wall(seed=5, frames=8)
     scans = radarsdf.io.Scans(drive.points, drive.poses, None, None)
-    config = radarsdf.FitConfig.quick(num_threads=1, returns={"passages": True})
+    config = radarsdf.FitConfig.quick(num_threads=1, returns={"free_space": True})
     whole = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
     radarsdf.fit_tiles(scans, tmp_path / "city", tile_size=12.8, halo=6.4, config=config, progress=False)
     tiles = radarsdf.load(tmp_path / "city")
     a, b = (radarsdf.grid(radar_map, whole.extent, 0.2) for radar_map in (whole, tiles))
     assert (a.occupied == b.occupied).mean() > 0.99
-    cells, of_tiles = (radar_map.cells_round(*(whole.extent + 0.05)) for radar_map in (whole, tiles))
+    cells, of_tiles = (radar_map.cells_near(*(whole.extent + 0.05)) for radar_map in (whole, tiles))
     np.testing.assert_allclose(cells.corner, of_tiles.corner)
     # Which returns are ghosts differs a little from tile to tile.
     seen = cells.passed > 0

@@ -39,7 +39,7 @@ def mesh_bits(mesh):
 def map_bits(radar_map):
     found = radar_map.evidence
     arrays = [parameter.detach().numpy() for parameter in radar_map.field.parameters()]
-    return [array.tobytes() for array in [*arrays, found.information, found.detections, found.looks]]
+    return [array.tobytes() for array in [*arrays, found.information, found.hits, found.visibility]]
 
 
 def test_random_operations_leave_a_map_of_what_is_in_it():

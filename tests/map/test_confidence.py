@@ -34,35 +34,35 @@ def radar_map(scene):
     return radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(num_threads=2), progress=False)
 
 
-def confidence(radar_map, information, detections, looks, rough_share=0.1, returns_per_cell=2.0):
-    """Of places with this evidence, in a map with this rough share, and returns in each cell that has any."""
+def confidence(radar_map, information, hits, visibility, clutter_ratio=0.1, returns_per_cell=2.0):
+    """Of places with this evidence, in a map with this clutter ratio, and returns in each cell that has any."""
     contents = dataclasses.replace(
-        radar_map._contents, rough_share=rough_share, returns_per_cell=returns_per_cell
+        radar_map._contents, clutter_ratio=clutter_ratio, returns_per_cell=returns_per_cell
     )
-    found = queries.confidence(contents, at(information, detections, looks))
+    found = queries.confidence(contents, at(information, hits, visibility))
     assert found.dtype == torch.float32
     return found.numpy()
 
 
-def at(information, detections, looks):
+def at(information, hits, visibility):
     """The evidence of places."""
-    columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in (information, detections, looks)))
+    columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in (information, hits, visibility)))
     return EvidenceAt(*(torch.from_numpy(np.atleast_1d(column).copy()) for column in columns))
 
 
-@pytest.mark.parametrize("rough_share", [0.0, 1.0])
-def test_it_is_a_probability_whatever_the_evidence(radar_map, rough_share):
+@pytest.mark.parametrize("clutter_ratio", [0.0, 1.0])
+def test_it_is_a_probability_whatever_the_evidence(radar_map, clutter_ratio):
     counts = [0.0, 1e-6, 1.0, 20.0, LARGEST_COUNT]
     evidence = itertools.product([0.0, SMALLEST, 1.0, 1e4, LARGEST], counts, counts)
-    information, detections, looks = np.array(list(evidence)).T
-    found = confidence(radar_map, information, detections, looks, rough_share)
+    information, hits, visibility = np.array(list(evidence)).T
+    found = confidence(radar_map, information, hits, visibility, clutter_ratio)
     assert np.isfinite(found).all()
     assert ((found >= 0) & (found <= 1)).all()
     assert (found[information == 0] == 0).all()
     assert (found[information == 1e4] > 0).all()
     assert found.max() > 0.99
     # Hardly one of very many scans had a return.
-    assert (found[(information == 1) & (detections <= 1) & (looks == LARGEST_COUNT)] < 0.1).all()
+    assert (found[(information == 1) & (hits <= 1) & (visibility == LARGEST_COUNT)] < 0.1).all()
 
 
 def test_it_is_0_where_nothing_was_observed(radar_map):
@@ -82,13 +82,13 @@ ERROR_OF_A_CELL = 1 / 0.2**2
 
 
 def test_what_raises_it_and_what_lowers_it(radar_map):
-    """Everything else the same: the information and the detections raise it, the looks and the rough share lower it.
+    """Everything else the same: the information and the detections raise it, the looks and the clutter ratio lower it.
 
     So do more returns elsewhere, of which more are false.
     """
     numbers = np.array([1.0, 2, 5, 20, 100, 1000])
-    for detections, looks in ((1, 1), (5, 20), (200, 1000)):
-        assert (np.diff(confidence(radar_map, numbers * ERROR_OF_A_CELL, detections, looks)) > 0).all()
+    for hits, visibility in ((1, 1), (5, 20), (200, 1000)):
+        assert (np.diff(confidence(radar_map, numbers * ERROR_OF_A_CELL, hits, visibility)) > 0).all()
     for information in (10 * ERROR_OF_A_CELL, 30 * ERROR_OF_A_CELL):
         assert (np.diff(confidence(radar_map, information, numbers, 500)) > 0).all()
         assert (np.diff(confidence(radar_map, information, 20, numbers)) < 0).all()

@@ -32,7 +32,7 @@ def moved(radar_map, origin):
             intensity_scale=radar_map.intensity_scale,
             config=radar_map.config,
             evidence=radar_map.evidence,
-            rough_share=radar_map.rough_share,
+            clutter_ratio=radar_map.clutter_ratio,
             returns_per_cell=radar_map._contents.returns_per_cell,
             sensor=radar_map.sensor,
             report={},

@@ -32,7 +32,7 @@ def fitted(scene, *, with_intensity=True, **changes):
 @pytest.fixture(scope="module")
 def saved(scene, tmp_path_factory):
     """A map with all parts, its file, and the file's parts."""
-    radar_map = fitted(scene, reflectance="both", returns={"passages": True})
+    radar_map = fitted(scene, reflectance="both", returns={"free_space": True})
     path = tmp_path_factory.mktemp("map") / "map.safetensors"
     radar_map.save(path)
     with open_tensors(path) as file:
@@ -150,20 +150,20 @@ def flat(tensor):
 TENSORS = [
     *((name, last(math.nan)) for name in ("field.cells.features", "field.sdf_network.layers.0.weight")),
     *((name, last(math.inf)) for name in ("origin", "information", "reflectance.means")),
-    *((name, last(math.nan)) for name in ("echoes.intensities",)),
+    *((name, last(math.nan)) for name in ("view_statistics.intensities",)),
     ("information", last(-1.0)),
     *(
         (name, change)
-        for name in ("information", "detections", "field.cells.features", "origin", "leaf_keys")
+        for name in ("information", "hits", "field.cells.features", "origin", "leaf_keys")
         for change in (longer, flat, torch.Tensor.half)
     ),
     ("leaf_keys", torch.Tensor.neg),
     ("reflectance.plane_keys", lambda t: t.flip(0)),
     ("reflectance.table", lambda t: t[1:]),
-    ("passages.keys", lambda t: t * 0),
-    ("echoes.counts", torch.zeros_like),
-    ("echoes.points", lambda t: t[:-1]),
-    ("echoes.directions", lambda t: t.to(torch.int16)),
+    ("free_space.keys", lambda t: t * 0),
+    ("view_statistics.counts", torch.zeros_like),
+    ("view_statistics.points", lambda t: t[:-1]),
+    ("view_statistics.directions", lambda t: t.to(torch.int16)),
 ]
 
 
@@ -176,7 +176,7 @@ def test_tensors_that_do_not_fit(saved, tmp_path, name, change):
 
 
 @pytest.mark.parametrize(
-    "name", ["information", "looks", "field.sdf_network.layers.2.bias", "passages.planes"]
+    "name", ["information", "visibility", "field.sdf_network.layers.2.bias", "free_space.planes"]
 )
 def test_a_tensor_that_is_missing_or_too_many(saved, tmp_path, name):
     _, _, tensors, metadata = saved
@@ -195,7 +195,7 @@ DAMAGE = {
     "config a list": lambda d: d.update(config=[1, 2]),
     "no report": lambda d: d.pop("report"),
     "report a number": lambda d: d.update(report=3),
-    "clutter ratio": lambda d: d.update(rough_share=1.01),
+    "clutter ratio": lambda d: d.update(clutter_ratio=1.01),
     "returns per cell": lambda d: d.update(returns_per_cell=math.nan),
     "scale of one number": lambda d: d.update(intensity_scale=[1.0]),
     "scale upside down": lambda d: d.update(intensity_scale=[2.0, 1.0]),
@@ -228,7 +228,7 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(saved, tmp_path, mo
 
 
 def test_view_statistics_are_kept_bit_for_bit(saved):
-    loaded, expected = radarsdf.load(saved[1]).echoes(), saved[0].echoes()
+    loaded, expected = radarsdf.load(saved[1]).view_statistics(), saved[0].view_statistics()
     assert len(expected.counts) > 100
     for name in ("points", "directions", "ranges_m", "intensities", "counts"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(expected, name))

@@ -114,7 +114,7 @@ def test_the_sums_of_parts_are_those_of_the_whole(of_many):
 
     def of(faces):
         scene = of_many._contents
-        return Surface.told_by(scene, surface.vertices, faces, surface.evidence, 0).tally
+        return Surface.from_triangles(scene, surface.vertices, faces, surface.evidence, 0).tally
 
     parts = [of(surface.faces[middle]), of(surface.faces[~middle])]
     assert min(part.existing_m2 for part in parts) > 3

@@ -96,8 +96,8 @@ def test_the_rougher_the_less_repetition_helps(walls):
     information = np.full_like(radar_map.evidence.information, 1e12)
     without_noise = dataclasses.replace(radar_map.evidence, information=information)
     errors_m = []
-    for rough_share in (0.0, 0.02, 0.1, 0.25):
-        rough = dataclasses.replace(contents, evidence=without_noise, rough_share=rough_share)
+    for clutter_ratio in (0.0, 0.02, 0.1, 0.25):
+        rough = dataclasses.replace(contents, evidence=without_noise, clutter_ratio=clutter_ratio)
         errors_m.append(RadarMap(rough).uncertainty([[5.0, -2.0, 0.0]])[0])
         assert RadarMap(rough).mesh().vertices[:, 0].max() > 39
     assert errors_m[0] == pytest.approx(0.05 * LEAF_M, rel=1e-4)

@@ -63,7 +63,7 @@ def test_velocities_tell_how_it_sits_there(ride, imu):
     times_s, poses, velocities = ride
     found = ImuAlignment.of(imu, velocities, times_s + LATE_S)
     assert angle(found.R_sensor_imu, R_SENSOR_IMU) < min(3, 3 * np.degrees(found.sigma_rad))
-    assert found.late_s == pytest.approx(LATE_S, abs=0.01)
+    assert found.time_offset_s == pytest.approx(LATE_S, abs=0.01)
     np.testing.assert_allclose(found.lever_m, LEVER_M, atol=0.1)
     assert tilt(poses, found.up) < 1.5
     # Rates without bias lead to the last pose.
@@ -78,7 +78,7 @@ def test_axes_that_are_given_stay(ride, imu):
     found = ImuAlignment.of(given, velocities, times_s)
     np.testing.assert_array_equal(found.R_sensor_imu, given.R_sensor_imu)
     assert found.sigma_rad == 0
-    assert abs(found.late_s) < 0.01
+    assert abs(found.time_offset_s) < 0.01
     assert tilt(poses, found.up) < 1.5
 
 
@@ -161,7 +161,7 @@ def test_a_walk_ends_where_it_began():
     assert np.linalg.norm(way) < 0.01 * found.report["length_m"]
     imu = found.report["imu"]
     # The trigger of the radar says the same, which is not read: scans are recorded 0.115 s after they were taken.
-    assert imu["late_s"] == pytest.approx(0.115, abs=0.01)
+    assert imu["time_offset_s"] == pytest.approx(0.115, abs=0.01)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 import pytest
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
-from radarsdf.poses.motion import Motion, MotionPrior, Rate
+from radarsdf.poses.motion import Motion, MotionPrior, MotionRate
 from radarsdf.poses.rigid import moved, steps, transform
 from radarsdf.simulate import drifted
 from scipy.spatial.transform import Rotation
@@ -76,7 +76,7 @@ def test_velocities_lead_from_pose_to_pose():
 
 TURNS = MotionPrior(np.array([0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.15]), True)
 MOVES = MotionPrior(np.array([20.0, 10.0, 5.0]), np.array([2.0, 1.0, 0.5]), False)
-RATE = Rate(np.array([0.3, -0.2, 0.1]), np.diag([0.01, 0.02, 0.03]))
+RATE = MotionRate(np.array([0.3, -0.2, 0.1]), np.diag([0.01, 0.02, 0.03]))
 
 
 def test_turns_come_to_what_is_usual_and_moves_stay():
@@ -91,11 +91,11 @@ def test_turns_come_to_what_is_usual_and_moves_stay():
 def test_habits_are_learnt_from_a_drive_that_has_them(habits):
     rng = np.random.default_rng(0)
     durations_s = rng.choice([0.05, 0.15], 8000)
-    rates = [Rate(np.sqrt(habits.usual) * rng.normal(size=3), np.zeros((3, 3)))]
+    rates = [MotionRate(np.sqrt(habits.usual) * rng.normal(size=3), np.zeros((3, 3)))]
     for before_s, after_s in itertools.pairwise(durations_s):
-        told = habits.after(rates[-1], (before_s + after_s) / 2)
-        noise = np.sqrt(np.diag(told.covariance)) * rng.normal(size=3)
-        rates.append(Rate(told.mean + noise, np.zeros((3, 3))))
+        observed = habits.after(rates[-1], (before_s + after_s) / 2)
+        noise = np.sqrt(np.diag(observed.covariance)) * rng.normal(size=3)
+        rates.append(MotionRate(observed.mean + noise, np.zeros((3, 3))))
     usual = np.square([rate.mean for rate in rates]).mean(axis=0)
     rates[4000:4002] = None, None  # it was lost there
     first = MotionPrior(np.full(3, 1.0), np.full(3, 1.0), habits.settles)

@@ -76,7 +76,7 @@ def test_radars_on_a_motorway_find_their_poses(name):
         )
         times_s, true = data["times_s"], data[f"{name}_poses"]
     found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
-    assert found.report["pieces"] == 1
+    assert found.report["segments"] == 1
     assert found.report["length_m"] == pytest.approx(98, abs=1)
     assert end_error_m(found, true) < 1.0
     assert np.abs(deviations(found, true)[:, :2]).max() < 4
@@ -88,7 +88,7 @@ def test_errors_of_a_narrow_radar_are_in_its_covariance(rate_rad_s):
     """Its returns say nothing of how it turns, so that a bend is known as well as assumed: 0.15 rad/s are two deviations."""
     points, doppler_mps, times_s, true = road(1, rate_rad_s)
     found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
-    assert found.report["pieces"] == 1
+    assert found.report["segments"] == 1
     assert np.abs(deviations(found, true)).max() < 4
     if rate_rad_s == 0:
         assert end_error_m(found, true) < 0.5

@@ -68,10 +68,10 @@ def test_doppler_and_returns_find_the_poses(drive, found):
     position_m, turn_rad = errors(found.poses, drive.poses)
     assert position_m < 0.003 * length_m(drive.poses)
     assert turn_rad < 0.02
-    assert found.report["pieces"] == 1
+    assert found.report["segments"] == 1
     assert found.report["length_m"] == pytest.approx(length_m(drive.poses), rel=0.01)
     assert found.report["doppler_sign"] == 1
-    assert 0.04 < found.report["movers"] / sum(map(len, drive.points)) < 0.2
+    assert 0.04 < found.report["moving"] / sum(map(len, drive.points)) < 0.2
 
 
 def test_errors_are_as_large_as_the_covariance_says(drive, found):
@@ -114,7 +114,7 @@ def test_a_gap_is_bridged(drive, motion):
     found = radarsdf.odometry(
         points, doppler_mps=[motion.doppler_mps[i] for i in rows], times_s=motion.times_s[rows]
     )
-    assert found.report["pieces"] == 1
+    assert found.report["segments"] == 1
     assert errors(found.poses, true)[0] < 0.005 * length_m(true)
 
 
@@ -126,9 +126,9 @@ def test_a_drive_that_goes_on_elsewhere_is_in_two_pieces(drive):
         doppler_mps=motions[0].doppler_mps[:12] + motions[1].doppler_mps,
         times_s=np.r_[motions[0].times_s[:12], motions[1].times_s + 60],
     )
-    assert found.pieces.tolist() == [0] * 12 + [1] * 10
-    assert "lost before the scans 12: 2 pieces" in found.report["verdict"]
-    assert found.longest_piece() == slice(0, 12)
+    assert found.segments.tolist() == [0] * 12 + [1] * 10
+    assert "lost before the scans 12: 2 segments" in found.report["verdict"]
+    assert found.longest_segment() == slice(0, 12)
     assert errors(found.poses[12:], other.poses)[0] < 0.1
 
 
@@ -192,7 +192,7 @@ def test_refined_poses_with_doppler_are_better(drive, motion):
         for speeds in (None, [-speeds for speeds in motion.doppler_mps[:24]])
     )
     assert by_doppler.improved
-    assert by_doppler.report["movers"] > 0
+    assert by_doppler.report["moving"] > 0
     assert errors(by_doppler.poses, drive.poses[:24])[0] < 0.5 * errors(plain.poses, drive.poses[:24])[0]
 
 

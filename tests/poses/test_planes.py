@@ -24,9 +24,9 @@ def test_normals_of_a_wall_do_not_point_along_it():
     )
     surfels = surfels_of(wall)
     flat = surfels.is_flat()
-    along, told = surfels.normals[flat, 1], unbiased_normals(surfels, 1)[flat, 1]
+    along, observed = surfels.normals[flat, 1], unbiased_normals(surfels, 1)[flat, 1]
     assert along.std() > 0.003
-    assert told.std() < 0.2 * along.std()
+    assert observed.std() < 0.2 * along.std()
 
 
 def test_scans_that_move_together_cost_nothing():

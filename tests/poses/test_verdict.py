@@ -11,7 +11,7 @@ import pytest
 from radarsdf import RefinedPoses
 from radarsdf.map.storage import checked_report
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.posed import way_of
+from radarsdf.poses.posed import trajectory_report
 from radarsdf.poses.verdict import Verdict
 from radarsdf.returns.noise import SensorNoise
 
@@ -68,7 +68,7 @@ def test_it_is_kept_with_the_map():
     found = refined(1201)
     given = found.poses + 0.0
     given[:, 1, 3] = 1
-    way = json.loads(json.dumps(way_of(found, given)))
+    way = json.loads(json.dumps(trajectory_report(found, given)))
     assert len(way["scans"]) == len(way["before"]) == len(way["after"]) == len(way["sigma_m"]) == 500
     assert way["after"][-1] == [1200, 0, 0]
     assert way["before"][-1] == [1200, 1, 0]

@@ -6,7 +6,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from radarsdf.changes.changes import APPEARED, COLORS, MOVED, NAMES, REPAINTED, SAME, ChangedSurface, Changes
+from radarsdf.changes.changes import (
+    APPEARED,
+    COLORS,
+    MOVED,
+    NAMES,
+    REFLECTANCE_CHANGED,
+    SAME,
+    ChangedSurface,
+    Changes,
+)
 
 from .reading import Page
 
@@ -24,17 +33,17 @@ def surface(kinds):
     faces = np.concatenate([faces + count * number for number in range(len(kinds))]).astype(np.int32)
     kind = np.repeat(np.array(kinds, np.int8), count)
     moved = np.where(kind == MOVED, 0.25, np.nan).astype(np.float32)
-    change = np.where(kind == REPAINTED, 6.5, np.nan).astype(np.float32)
+    change = np.where(kind == REFLECTANCE_CHANGED, 6.5, np.nan).astype(np.float32)
     return ChangedSurface(vertices, faces, kind, np.full(len(kind), 0.9, np.float32), moved, change)
 
 
-@pytest.mark.parametrize("kinds", [[SAME], [SAME, APPEARED, MOVED, REPAINTED]])
+@pytest.mark.parametrize("kinds", [[SAME], [SAME, APPEARED, MOVED, REFLECTANCE_CHANGED]])
 def test_each_change_is_named_listed_and_shown(kinds, tmp_path):
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     from radarsdf.report.changes import write_changes_report  # noqa: PLC0415
 
-    areas_m2 = {NAMES[kind]: 4.0 * kinds.count(kind) for kind in (APPEARED, 1, MOVED, REPAINTED)}
+    areas_m2 = {NAMES[kind]: 4.0 * kinds.count(kind) for kind in (APPEARED, 1, MOVED, REFLECTANCE_CHANGED)}
     report = {
         "alignment": "As <b>given</b>.",
         "areas_m2": areas_m2,

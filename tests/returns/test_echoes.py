@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.view_statistics import Echoes, rows_of_views
+from radarsdf.returns.view_statistics import ViewStatistics, rows_of_views
 
 LEAF_M = 0.2
 
@@ -22,13 +22,13 @@ def rays():
 
 
 @pytest.fixture(scope="module")
-def echoes(rays):
-    return Echoes.of(rays, (rays.intensities / 100).astype(np.float32), LEAF_M)
+def view_statistics(rays):
+    return ViewStatistics.of(rays, (rays.intensities / 100).astype(np.float32), LEAF_M)
 
 
-def test_they_are_the_means_of_their_returns(rays, echoes):
+def test_they_are_the_means_of_their_returns(rays, view_statistics):
     rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, LEAF_M)
-    found = echoes.in_world(rays.origin, 0.0, 100.0)
+    found = view_statistics.in_world(rays.origin, 0.0, 100.0)
     assert found.counts.sum() == len(rays)
     largest = int(np.argmax(found.counts))
     of_it = rows == largest
@@ -45,16 +45,16 @@ def test_they_are_the_means_of_their_returns(rays, echoes):
     assert count == len(found.counts)
 
 
-def test_wrong_arrays_are_refused(echoes):
-    echoes.check(LEAF_M)
-    Echoes.none().check(LEAF_M)
+def test_wrong_arrays_are_refused(view_statistics):
+    view_statistics.check(LEAF_M)
+    ViewStatistics.none().check(LEAF_M)
     for change in (
-        {"points": echoes.points[1:]},
-        {"points": echoes.points + np.float32(1e7)},
-        {"counts": np.zeros_like(echoes.counts)},
-        {"ranges_m": -echoes.ranges_m},
+        {"points": view_statistics.points[1:]},
+        {"points": view_statistics.points + np.float32(1e7)},
+        {"counts": np.zeros_like(view_statistics.counts)},
+        {"ranges_m": -view_statistics.ranges_m},
         {"sigma": np.inf},
         {"sigma": np.nan},
     ):
         with pytest.raises(ValueError, match="the echoes"):
-            dataclasses.replace(echoes, **change).check(LEAF_M)
+            dataclasses.replace(view_statistics, **change).check(LEAF_M)

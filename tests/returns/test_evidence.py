@@ -15,7 +15,7 @@ from radarsdf.returns.evidence import Evidence, ReturnsOfCells
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sums import lattice_of
 
-from ..reference_looks import looks_at
+from ..reference_visibility import looks_at
 
 LEAF_M = 0.2
 SCANS = 5
@@ -95,12 +95,12 @@ def scans_round(rays, leaf_keys):
     return within_a_cell((pairs[:, :3] + 0.5) * LEAF_M, leaf_keys).sum(axis=1)
 
 
-def looks(rays, leaf_keys):
+def visibility(rays, leaf_keys):
     return looks_at(lattice_of(leaf_keys), LEAF_M, rays.points, rays.directions, rays.ranges_m, rays.scans)
 
 
 def at(evidence, leaf_keys, point):
-    """Information, detections and looks of the leaf cell of a point."""
+    """Information, detections and visibility counts of the leaf cell of a point."""
     row = np.searchsorted(leaf_keys, cell_keys(point[None], LEAF_M)[0])
     return tuple(column[row].item() for column in dataclasses.astuple(evidence))
 
@@ -111,11 +111,11 @@ def test_sums_over_27_cells_and_scans_that_looked(rays):
     evidence = Evidence.of(returns_of(rays, variances_m2), rays, leaf_keys, LEAF_M)
     near = within_a_cell(rays.points, leaf_keys)
     np.testing.assert_allclose(evidence.information, near @ (1 / variances_m2), rtol=1e-5)
-    np.testing.assert_array_equal(evidence.detections, scans_round(rays, leaf_keys))
-    np.testing.assert_array_equal(evidence.looks, looks(rays, leaf_keys))
+    np.testing.assert_array_equal(evidence.hits, scans_round(rays, leaf_keys))
+    np.testing.assert_array_equal(evidence.visibility, visibility(rays, leaf_keys))
     dtypes = [column.dtype for column in dataclasses.astuple(evidence)]
     assert dtypes == [np.float32, np.uint32, np.uint32]
-    assert {0, 1, SCANS} <= set(evidence.looks.tolist())
+    assert {0, 1, SCANS} <= set(evidence.visibility.tolist())
     for num_threads in (1, 2, 3):
         again = Evidence.of(returns_of(rays, variances_m2), rays, leaf_keys, LEAF_M, num_threads)
         for a, b in zip(dataclasses.astuple(again), dataclasses.astuple(evidence), strict=True):
@@ -126,9 +126,9 @@ def test_many_returns_of_one_scan_are_one_detection(rays):
     leaf_keys = keys_round(rays.points)
     evidence = Evidence.of(returns_of(rays, np.full(len(rays), VARIANCE_M2)), rays, leaf_keys, LEAF_M)
     assert at(evidence, leaf_keys, CLUTTER) == (pytest.approx(6 / VARIANCE_M2), 1, SCANS)
-    _, detections, looked = at(evidence, leaf_keys, np.array([5.1, 0.1, 0.1]))
+    _, hits, looked = at(evidence, leaf_keys, np.array([5.1, 0.1, 0.1]))
     assert looked == SCANS
-    assert detections > 5 * SCANS  # of nine cells of the wall
+    assert hits > 5 * SCANS  # of nine cells of the wall
 
 
 def test_a_false_return_is_no_evidence_but_its_scan_looked(rays):
@@ -177,7 +177,7 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
     np.testing.assert_allclose(
         evidence.information, within_a_cell(own.points, leaf_keys).sum(axis=1) / VARIANCE_M2, rtol=1e-4
     )
-    np.testing.assert_array_equal(evidence.detections, scans_round(own, leaf_keys))
-    np.testing.assert_array_equal(evidence.looks, looks(rays, leaf_keys))
+    np.testing.assert_array_equal(evidence.hits, scans_round(own, leaf_keys))
+    np.testing.assert_array_equal(evidence.visibility, visibility(rays, leaf_keys))
     assert at(evidence, leaf_keys, CLUTTER)[1:] == (1, SCANS)
     assert at(evidence, leaf_keys, SIDE)[1:] == (1, 2)

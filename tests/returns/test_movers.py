@@ -9,7 +9,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
-from radarsdf.returns.moving import Movers, Standing
+from radarsdf.returns.moving import MovingReturns, StaticReturns
 from radarsdf.scans import Scans
 
 from tests.conftest import recorded_scans
@@ -35,7 +35,7 @@ def drive():
 def test_what_moves_is_found(drive):
     scans, doppler, moves = drive
     for sign in (1, -1):  # sensors differ in it
-        found = Movers.of(scans.points, [sign * values for values in doppler])
+        found = MovingReturns.of(scans.points, [sign * values for values in doppler])
         assert found.why_none is None
         told, true = np.concatenate(found.masks), np.concatenate(moves)
         assert told[true].mean() > 0.99
@@ -45,7 +45,7 @@ def test_what_moves_is_found(drive):
 
 def test_a_fit_leaves_it_out_and_says_how_many(drive):
     scans, doppler, _ = drive
-    expected = Movers.of(scans.points, doppler).count
+    expected = MovingReturns.of(scans.points, doppler).count
     for given in (
         {"points": Scans(scans.points, scans.poses, scans.intensities, doppler_mps=doppler)},
         {
@@ -56,17 +56,17 @@ def test_a_fit_leaves_it_out_and_says_how_many(drive):
         },
     ):
         report = radarsdf.fit(**given, config=FitConfig(**QUICK), progress=False).report
-        assert report["movers"] == expected
+        assert report["moving"] == expected
         assert report["returns"] == sum(map(len, scans.points))
         kept = report["returns_used"] + report["ghosts"]
         assert kept == report["returns"] - expected - _too_near(scans, doppler)
-    config = FitConfig(**QUICK, returns={"drop_movers": False})
+    config = FitConfig(**QUICK, returns={"drop_moving": False})
     kept_all = radarsdf.fit(scans.points, scans.poses, doppler_mps=doppler, config=config, progress=False)
-    assert kept_all.report["movers"] == 0
+    assert kept_all.report["moving"] == 0
 
 
 def _too_near(scans, doppler):
-    left = Movers.of(scans.points, doppler).without(scans.points)
+    left = MovingReturns.of(scans.points, doppler).without(scans.points)
     return sum(int((np.linalg.norm(points, axis=1) < 2.5).sum()) for points in left)
 
 
@@ -77,7 +77,7 @@ def test_doppler_that_is_not_understood_leaves_nothing_out(drive):
     # In half of the returns, what the sensor measured is lost: they would all seem to move.
     mostly = [np.where(rng.random(len(v)) < 0.5, v, 37.0 + rng.uniform(-20, 20, len(v))) for v in doppler]
     for values, why in ((noise, "scans agree on a velocity"), (mostly, "of the returns disagree")):
-        found = Movers.of(scans.points, values)
+        found = MovingReturns.of(scans.points, values)
         assert found.count == 0
         assert why in found.why_none
         report = radarsdf.fit(
@@ -88,9 +88,9 @@ def test_doppler_that_is_not_understood_leaves_nothing_out(drive):
 
 def test_intensities_stay_with_their_returns(drive):
     scans, doppler, _ = drive
-    standing = Standing.of(scans.points, scans.intensities, doppler, FitConfig().returns)
-    kept = [~mask for mask in Movers.of(scans.points, doppler).masks]
-    for values, all_values, mask in zip(standing.intensities, scans.intensities, kept, strict=True):
+    static = StaticReturns.of(scans.points, scans.intensities, doppler, FitConfig().returns)
+    kept = [~mask for mask in MovingReturns.of(scans.points, doppler).masks]
+    for values, all_values, mask in zip(static.intensities, scans.intensities, kept, strict=True):
         np.testing.assert_array_equal(values, all_values[mask])
 
 
@@ -99,7 +99,7 @@ def test_what_moves_in_recorded_drives_is_what_their_flags_say(name):
     with np.load(recorded_scans(name)) as file:
         rows = [np.flatnonzero(file["frame"] == i) for i in range(len(file["poses"]))]
         points, doppler, static = ([file[k][r] for r in rows] for k in ("points", "doppler", "static"))
-    found = Movers.of(points, doppler)
+    found = MovingReturns.of(points, doppler)
     wrong = np.concatenate([told == flags for told, flags in zip(found.masks, static, strict=True)])
     assert found.why_none is None
     assert wrong.mean() < 0.1

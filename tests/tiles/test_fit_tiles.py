@@ -63,7 +63,7 @@ def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
         progress=False,
     )
     np.testing.assert_array_equal(whole.field.table.leaf_keys(), part.field.table.leaf_keys())
-    np.testing.assert_array_equal(whole.evidence.looks, part.evidence.looks)
+    np.testing.assert_array_equal(whole.evidence.visibility, part.evidence.visibility)
     points = np.concatenate([s.world_points for s in drive])[::50]
     # Positions are rounded to float32 in another frame, which smoothing carries from corner to corner: 0.24 mm at most.
     error_m = np.abs(city.sdf(points) - whole.sdf(points))

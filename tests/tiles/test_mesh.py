@@ -32,7 +32,7 @@ def in_one_go(city, steps, min_triangles):
         corners, values, voxels, origin=city.config.lattice.position([0, 0, 0]), spacing=[voxel_m] * 3
     )
     evidence = city.evidence_at(torch.from_numpy(vertices))
-    surface = Surface.told_by(city.contents_of_any, vertices, faces, evidence, 0)
+    surface = Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, 0)
     good = surface.confidence >= surface.tally.threshold().min_confidence
     faces = faces[good[faces].all(axis=1)]
     labels, sizes = mesh_components(faces, len(vertices))

@@ -115,13 +115,13 @@ def test_a_copy_is_the_same_map(city, points, tmp_path):
 
 def test_echoes_of_tiles_are_those_of_one_map(drive, tmp_path):
     """Where tiles overlap, a return is in several of them, and counts once."""
-    config = CONFIG.override(returns={"passages": True})
+    config = CONFIG.override(returns={"free_space": True})
     radarsdf.fit_tiles(drive, tmp_path / "city", tile_size=TILE_M, halo=6.4, config=config, progress=False)
-    found = radarsdf.load(tmp_path / "city").echoes()
-    expected = radarsdf.fit(drive, config=config, progress=False).echoes()
+    found = radarsdf.load(tmp_path / "city").view_statistics()
+    expected = radarsdf.fit(drive, config=config, progress=False).view_statistics()
     # Means near a border may fall on either side of it. Twice as many, if all tiles counted.
     assert abs(found.counts.sum() / expected.counts.sum() - 1) < 0.03
-    weights = [echoes.counts / echoes.counts.sum() for echoes in (found, expected)]
+    weights = [view_statistics.counts / view_statistics.counts.sum() for view_statistics in (found, expected)]
     for name in ("intensities", "ranges_m"):
         means = [getattr(e, name) @ w for e, w in zip((found, expected), weights, strict=True)]
         np.testing.assert_allclose(*means, rtol=0.005)

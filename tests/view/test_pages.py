@@ -10,7 +10,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.changes.changes import APPEARED, COLORS, GONE, NAMES, REPAINTED, SAME, ChangedSurface, Changes
+from radarsdf.changes.changes import (
+    APPEARED,
+    COLORS,
+    GONE,
+    NAMES,
+    REFLECTANCE_CHANGED,
+    SAME,
+    ChangedSurface,
+    Changes,
+)
 from radarsdf.view import pages, serving
 
 FAR = np.array([4e5, 5e6, 100.0])  # UTM: float32 would round it to half a metre
@@ -55,7 +64,7 @@ def triangles(kinds, offset):
     vertices = np.concatenate([np.eye(3) + FAR + offset + [2.0 * i, 0, 0] for i in range(len(kinds))])
     kind = np.repeat(np.array(kinds, np.int8), 3)
     unknown = np.full(len(kind), np.nan, np.float32)
-    change = np.where(kind == REPAINTED, -6.0, np.nan).astype(np.float32)
+    change = np.where(kind == REFLECTANCE_CHANGED, -6.0, np.nan).astype(np.float32)
     faces = np.arange(len(kind), dtype=np.int32).reshape(-1, 3)
     return ChangedSurface(vertices, faces, kind, np.full(len(kind), 0.9, np.float32), unknown, change)
 
@@ -63,14 +72,14 @@ def triangles(kinds, offset):
 def test_changes_have_their_colours_and_a_legend(server, monkeypatch):
     meshes = []
     monkeypatch.setattr(pages, "glb", lambda *mesh: meshes.append(mesh) or b"glb")
-    after = triangles([SAME, APPEARED, REPAINTED], [0, 0, 0])
+    after = triangles([SAME, APPEARED, REFLECTANCE_CHANGED], [0, 0, 0])
     changes = Changes(triangles([GONE], [0, 3.0, 0]), after, np.eye(4), {"alignment": "As <given>."})
     with pages.ChangesView(changes, changes.regions(), 0.2, port=0):
         assert server.shown == {"/surface": b"glb"}
     ((vertices, faces, colors),) = meshes
     assert np.abs(vertices).max() < 10
     assert len(faces) == 4
-    for rows, kind in ((slice(3, 6), APPEARED), (slice(6, 9), REPAINTED), (slice(9, 12), GONE)):
+    for rows, kind in ((slice(3, 6), APPEARED), (slice(6, 9), REFLECTANCE_CHANGED), (slice(9, 12), GONE)):
         shown, fixed = colors[rows].astype(float), np.array(COLORS[kind], float)
         assert np.abs(shown / shown.max(axis=1, keepdims=True) - fixed / fixed.max()).max() < 0.1
     legend, alignment, table = server.texts

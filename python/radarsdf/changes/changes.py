@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-UNSEEN, SAME, GONE, APPEARED, MOVED, REPAINTED = -1, 0, 1, 2, 3, 4
+UNSEEN, SAME, GONE, APPEARED, MOVED, REFLECTANCE_CHANGED = -1, 0, 1, 2, 3, 4
 NAMES = {
-    UNSEEN: "unseen", SAME: "same", GONE: "gone", APPEARED: "appeared", MOVED: "moved", REPAINTED: "repainted",
+    UNSEEN: "unseen", SAME: "same", GONE: "gone", APPEARED: "appeared", MOVED: "moved", REFLECTANCE_CHANGED: "reflectance_changed",
 }  # fmt: skip
-CHANGED = (APPEARED, GONE, MOVED, REPAINTED)
+CHANGED = (APPEARED, GONE, MOVED, REFLECTANCE_CHANGED)
 # Distinguishable by colour-blind people, too (Okabe and Ito 2008).
 COLORS = {
     UNSEEN: (225, 225, 225), SAME: (165, 165, 165), GONE: (213, 94, 0), APPEARED: (0, 158, 115),
-    MOVED: (230, 159, 0), REPAINTED: (204, 121, 167),
+    MOVED: (230, 159, 0), REFLECTANCE_CHANGED: (204, 121, 167),
 }  # fmt: skip
 
 
@@ -41,7 +41,7 @@ class ChangedSurface:
     faces: NDArray[np.int32]
     """(F, 3) rows of vertices. They face free space."""
     kind: NDArray[np.int8]
-    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 repainted. Unseen: the other map does not know the place.
+    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 of changed reflectance. Unseen: the other map does not know the place.
     Repainted, on the later surface: only the reflectance changed."""
     probability: NDArray[np.float32]
     """(V,) of that change; of the likeliest one where it is the same or unseen."""
@@ -63,7 +63,7 @@ class Region:
     """A connected component of faces of one kind of change."""
 
     kind: str
-    """``appeared``, ``gone``, ``moved`` or ``repainted``."""
+    """``appeared``, ``gone``, ``moved`` or ``reflectance_changed``."""
     box: Floats
     """(2, 3) lower and upper corner, world of the earlier map, m."""
     area_m2: float
@@ -93,7 +93,7 @@ class Changes:
     before: ChangedSurface
     """The earlier surface: what is gone, and what moved."""
     after: ChangedSurface
-    """The later surface: what appeared, what moved, and what was repainted."""
+    """The later surface: what appeared, what moved, and what changed its reflectance."""
     T_before_after: Floats
     """(4, 4) from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
@@ -114,7 +114,10 @@ class Changes:
             The largest first. Each is of the faces of one kind, on one of the two surfaces.
         """
         found = []
-        for surface, kinds in ((self.before, (GONE, MOVED)), (self.after, (APPEARED, MOVED, REPAINTED))):
+        for surface, kinds in (
+            (self.before, (GONE, MOVED)),
+            (self.after, (APPEARED, MOVED, REFLECTANCE_CHANGED)),
+        ):
             of_faces, areas = surface.of_faces()
             for kind in kinds:
                 rows = np.flatnonzero(of_faces == kind)
@@ -129,7 +132,7 @@ class Changes:
                         float(areas[faces].sum()),
                         float(surface.probability[vertices].mean()),
                         _mean(surface.moved_m[vertices]) if kind == MOVED else None,
-                        _mean(surface.intensity_change[vertices]) if kind == REPAINTED else None,
+                        _mean(surface.intensity_change[vertices]) if kind == REFLECTANCE_CHANGED else None,
                     )
                     if region.area_m2 >= min_area_m2:
                         found.append(region)
@@ -141,7 +144,7 @@ class Changes:
         Returns
         -------
         trimesh.Trimesh
-            World of the earlier map, m. Green appeared, vermilion is gone, orange moved, purple was repainted, grey is the
+            World of the earlier map, m. Green appeared, vermilion is gone, orange moved, purple changed its reflectance, grey is the
             same, and light grey is unseen. ``vertex_attributes`` (V,) are `kind`, `probability`, `moved_m` and
             `intensity_change` of :class:`ChangedSurface`.
         """

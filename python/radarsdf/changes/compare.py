@@ -16,7 +16,7 @@ from radarsdf.changes.changes import (
     APPEARED,
     GONE,
     MOVED,
-    REPAINTED,
+    REFLECTANCE_CHANGED,
     SAME,
     UNSEEN,
     ChangedSurface,
@@ -28,7 +28,7 @@ from radarsdf.changes.reflectance import Differences
 from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
-from radarsdf.grids.occupancy import check_passages
+from radarsdf.grids.occupancy import check_free_space
 from radarsdf.map.map import Map
 from radarsdf.map.mesh import renumbered
 from radarsdf.scans import Scans
@@ -51,7 +51,7 @@ def compare(
     box: ArrayLike | None = None,
     progress: bool | None = None,
 ) -> Changes:
-    """Detect what appeared, disappeared, moved or was repainted between two maps of one place.
+    """Detect what appeared, disappeared, moved or changed its reflectance between two maps of one place.
 
     Unseen is not gone. A surface is gone only where rays of the later drive passed the place, and it appeared only where
     those of the earlier drive did. The probability of a change follows from the distance of the surfaces and its standard
@@ -61,7 +61,7 @@ def compare(
     Parameters
     ----------
     before : Map
-        The earlier map, fitted with ``returns.passages``, which is the default of :class:`FitConfig`.
+        The earlier map, fitted with ``returns.free_space``, which is the default of :class:`FitConfig`.
     after : Map, iterable of F arrays, or Scans
         The later map, fitted likewise; or new scans as :func:`fit` takes them, of which a quick map is made first, with the ranges,
         errors of poses and leaf cells of `before`.
@@ -86,7 +86,7 @@ def compare(
     Raises
     ------
     ValueError
-        If a map has no free-space crossings (``returns.passages``) or no surface, for wrong arguments, or if the maps do not
+        If a map has no free-space crossings (``returns.free_space``) or no surface, for wrong arguments, or if the maps do not
         fit together: they saw no surface in common, or of the level or of the steep surfaces that they have in common, more
         would have changed than agrees.
     TypeError
@@ -107,7 +107,7 @@ def compare(
         raise ValueError(msg)
     corners = None if box is None else check_box(box)
     for name, radar_map in (("before", before), ("after", after)):
-        check_passages(radar_map, name)
+        check_free_space(radar_map, name)
     placed = PlacedMap.of(before), PlacedMap.of(after)
     for name, found in zip(("before", "after"), placed, strict=True):
         if len(found.faces) == 0:
@@ -127,7 +127,7 @@ def compare(
     report: dict[str, Any] = {"alignment": alignment.words, "intensity_offset": None}
     if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
-        appeared = _repainted(appeared, differences, np.concatenate(changed))
+        appeared = _reflectance_changed(appeared, differences, np.concatenate(changed))
         report["intensity_offset"] = differences.offset
         differences = f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
     report["reflectance"] = differences
@@ -140,7 +140,7 @@ def _quick(config: FitConfig) -> FitConfig:
     """Settings of the quick map of new scans."""
     names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
     same = {name: getattr(config.returns, name) for name in names}
-    return FitConfig.quick(leaf_size_m=config.leaf_size_m, returns={"passages": True, **same})
+    return FitConfig.quick(leaf_size_m=config.leaf_size_m, returns={"free_space": True, **same})
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
@@ -174,13 +174,15 @@ def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: in
     return ChangedSurface(side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m, unknown)
 
 
-def _repainted(surface: ChangedSurface, differences: Differences, changed: Floats) -> ChangedSurface:
+def _reflectance_changed(
+    surface: ChangedSurface, differences: Differences, changed: Floats
+) -> ChangedSurface:
     """The later surface, with what changed its reflectance alone, away from places (C, 3) that `changed` otherwise."""
-    change, repainted = differences.probability(surface.vertices, surface.kind == SAME, changed)
+    change, reflectance_changed = differences.probability(surface.vertices, surface.kind == SAME, changed)
     return replace(
         surface,
-        kind=np.where(repainted > _PROBABLE, REPAINTED, surface.kind).astype(np.int8),
-        probability=np.maximum(surface.probability, repainted.astype(np.float32)),
+        kind=np.where(reflectance_changed > _PROBABLE, REFLECTANCE_CHANGED, surface.kind).astype(np.int8),
+        probability=np.maximum(surface.probability, reflectance_changed.astype(np.float32)),
         intensity_change=change.astype(np.float32),
     )
 

@@ -118,7 +118,7 @@ class PlacedMap:
             normals,
             sigma_m.double().numpy(),
             confidence.double().numpy(),
-            evidence.detections.numpy().astype(np.float64),
+            evidence.hits.numpy().astype(np.float64),
             self._passes(self.to_own(behind)),
         )
 
@@ -129,7 +129,7 @@ class PlacedMap:
         edges = np.cumsum(np.bincount(blocks))[:-1]
         for rows in np.split(np.argsort(blocks, kind="stable"), edges) if len(own) else []:
             x, margin_m = own[rows], 2 * self.leaf_m
-            cells = self.radar_map.cells_round(x.min(axis=0) - margin_m, x.max(axis=0) + margin_m)
+            cells = self.radar_map.cells_near(x.min(axis=0) - margin_m, x.max(axis=0) + margin_m)
             # The core counts up to seven scans for a cell: larger counts carry no information.
             near = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
             places = np.floor((x - cells.corner) / self.leaf_m).astype(np.int64)

@@ -64,7 +64,7 @@ class Differences:
         What both maps expect is subtracted from both days: so views may differ a little within what counts as one.
         """
         scales = [p.radar_map.intensity_scale for p in (before, after)]
-        days = [p.radar_map.echoes() for p in (before, after)]
+        days = [p.radar_map.view_statistics() for p in (before, after)]
         days = [
             replace(
                 day,
@@ -116,7 +116,7 @@ class Differences:
 
         Views near places (C, 3) that `changed` otherwise do not count. Where views of one place differ by more than their
         numbers of returns explain, on one day or in how far they changed, errors are as much larger (Birge's ratio): at edges,
-        near mirrors, in thickets. What is repainted changes alike from all views.
+        near mirrors, in thickets. What changes its reflectance changes alike from all views.
         """
         between = self.between
         if len(changed):

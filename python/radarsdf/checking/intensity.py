@@ -56,7 +56,7 @@ def _outliers(outliers: FloatArray, usual: FloatArray) -> Iterator[Finding]:
     """Values that come again and again stand for no measurement; single ones are faults."""
     levels, counts = np.unique(outliers, return_counts=True)
     total = len(outliers) + len(usual)
-    for name, chosen in (("intensity_sentinel", counts > 1), ("intensity_wild", counts == 1)):
+    for name, chosen in (("intensity_sentinel", counts > 1), ("intensity_outliers", counts == 1)):
         if chosen.any():
             most = levels[chosen][np.argsort(-counts[chosen], kind="stable")]
             named = ", ".join(f"{level:g}" for level in most[:_NAMED]) + ", …" * (len(most) > _NAMED)

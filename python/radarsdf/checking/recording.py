@@ -33,7 +33,7 @@ _LEFT_OUT = "Nothing needs to be done: a fit leaves them out."
 _FRAME = "Pass points of the sensor frame in metres, x forward, y left, z up, and T_world_sensor."
 _ANGLES = "Make the rotations of the poses anew, from angles in rad or unit quaternions x y z w."
 _NO_VALUE = "Look up in the driver what they stand for. A fit leaves them out of the reflectance."
-MENDS = {
+FIXES = {
     "returns_not_finite": _LEFT_OUT,
     "padding": _LEFT_OUT,
     "empty_scans": f"Pass the returns. {_LEFT_OUT}",
@@ -62,14 +62,14 @@ MENDS = {
     "intensity_constant": "Pass another field, or fit without intensities: the sensor does not measure this one.",
     "intensity_constant_in_scans": "Look for a fault of the driver, or fit without intensities.",
     "intensity_sentinel": _NO_VALUE,
-    "intensity_wild": _NO_VALUE,
+    "intensity_outliers": _NO_VALUE,
     "intensity_is_doppler": "Pass the field of the power or of the radar cross section as intensity.",
     "intensity_clipped": "Lower the gain of the sensor, or read a field that is not clipped.",
     "intensity_offset": "Subtract 128 for dBsm; a fit does not need it.",
     "intensity_steps": "Nothing needs to be done.",
     "doppler_without_velocity": "Pass the measured speed along the ray in m/s, not one with the sensor's motion taken out.",
     "doppler_sign": "Change the sign of the Doppler, so that it is negative where the sensor comes nearer.",
-    "moving_share": "A fit leaves them out, unless returns.drop_movers is false.",
+    "moving_share": "A fit leaves them out, unless returns.drop_moving is false.",
     "below_ground": "Leave them out if they are reflections in the ground.",
     "fit_refuses": "See the message.",
     "noise": "Nothing needs to be done: a fit estimates it anew.",
@@ -88,15 +88,15 @@ class Finding:
     """``error``: a map of these data would be nonsense. ``warning``: it would suffer. ``note``: for information."""
     evidence: str
     """One sentence with the numbers that show it."""
-    mend: str = ""
+    fix: str = ""
     """What to do, in a sentence or two. Default: that of the name."""
 
     def __post_init__(self) -> None:
         """Looks up what to do."""
-        object.__setattr__(self, "mend", self.mend or MENDS[self.name])
+        object.__setattr__(self, "fix", self.fix or FIXES[self.name])
 
     def __str__(self) -> str:
-        return f"{self.severity}: {self.name}: {self.evidence} {self.mend}"
+        return f"{self.severity}: {self.name}: {self.evidence} {self.fix}"
 
 
 def checked_input(

@@ -85,8 +85,8 @@ def fit(given: Namespace, results: Results) -> None:
 def _add_fit(results: Results, radar_map: RadarMap) -> None:
     """Add the counts of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
-    names = ("scans", "returns", "returns_used", "movers", "ghosts", "wild_intensities", "leaf_cells")
-    used, moving, ghosts = report["returns_used"], report["movers"], report["ghosts"]
+    names = ("scans", "returns", "returns_used", "moving", "ghosts", "intensity_outliers", "leaf_cells")
+    used, moving, ghosts = report["returns_used"], report["moving"], report["ghosts"]
     left_out = {
         "move by their Doppler": moving,
         "are ghosts": ghosts,
@@ -95,7 +95,7 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
     line = f"{used} of {report['returns']} returns in {report['scans']} scans make the surface"
     line += "".join(f", {count} {why}" for why, count in left_out.items() if count)
     results.add(line, **{name: report[name] for name in names})
-    if outliers := report["wild_intensities"]:
+    if outliers := report["intensity_outliers"]:
         results.add(f"{outliers} intensities are outliers, and are left out of the reflectance")
     noise, losses = report["noise"], report["losses"]
     seconds = sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s")

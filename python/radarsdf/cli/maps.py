@@ -67,7 +67,7 @@ def info(given: Namespace, results: Results) -> None:
             "origin": radar_map.origin.tolist(),
             "range_m": [round(float(range_m), 2) for range_m in radar_map.sensor.range_m],
             "intensities": None if scale is None else [scale.low, scale.high],
-            "clutter_ratio": round(radar_map.rough_share, 3),
+            "clutter_ratio": round(radar_map.clutter_ratio, 3),
         }
     results.add(**rows)
     results.table((name.replace("_", " "), str(value)) for name, value in rows.items())

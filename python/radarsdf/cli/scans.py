@@ -25,7 +25,7 @@ from radarsdf.io.files import check_outputs
 from radarsdf.io.meshes import check_mesh_path, holds_mesh, read_mesh, write_mesh
 from radarsdf.io.npz import write_scans
 from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
-from radarsdf.poses.posed import Posed
+from radarsdf.poses.posed import PosedScans
 from radarsdf.render.figures import save_trajectory_picture
 from radarsdf.scans import Scans
 
@@ -43,7 +43,7 @@ def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None
     """Print the warnings of the cheap checks before a fit. Raises a ValueError if a map of the scans would be nonsense."""
     for finding in check_cheaply(scans.points, scans.poses, intensities):
         if finding.severity == "error":
-            msg = f"{finding.name}: {finding.evidence} {finding.mend} --no-check fits the scans as they are"
+            msg = f"{finding.name}: {finding.evidence} {finding.fix} --no-check fits the scans as they are"
             raise ValueError(msg)
         if finding.severity == "warning":
             warn(str(finding))
@@ -66,8 +66,8 @@ def poses(given: Namespace, results: Results) -> None:
     )
     if as_scans:
         write_scans(out, scans)
-    elif posed.pieces > 1 and out.suffix.lower() != ".tum":
-        msg = f"there are {posed.pieces} segments, and {out} would not say which scans have poses: write .tum or .npz"
+    elif posed.segments > 1 and out.suffix.lower() != ".tum":
+        msg = f"there are {posed.segments} segments, and {out} would not say which scans have poses: write .tum or .npz"
         raise ValueError(msg)
     else:
         write_poses(out, scans.poses, scans.times_s)
@@ -87,7 +87,7 @@ def posed_scans(
     refine: bool,
     find: bool = False,
     times_for: Path | None = None,
-) -> tuple[Scans, Posed]:
+) -> tuple[Scans, PosedScans]:
     """Read scans; find their poses if there are none or `find` says so, or `refine` them.
 
     Of a trajectory in several segments, the scans of the longest are returned. `times_for`: a file of poses to be written.
@@ -98,11 +98,11 @@ def posed_scans(
     if unposed:
         found = radarsdf.odometry(scans, config=config)
         results.add(found.report["verdict"], poses=found.report)
-        posed, scans = Posed.found(found), scans.with_poses(found.poses, other_world=True)
+        posed, scans = PosedScans.found(found), scans.with_poses(found.poses, other_world=True)
         add_segments(results, posed)
-        return (scans.select(range(len(scans))[posed.rows]) if posed.pieces > 1 else scans), posed
+        return (scans.select(range(len(scans))[posed.rows]) if posed.segments > 1 else scans), posed
     if not refine:
-        return scans, Posed.as_given(scans.poses)
+        return scans, PosedScans.as_given(scans.poses)
     refined = radarsdf.refine_poses(scans, config=config)
     report = refined.report
     results.add(report["verdict"], poses=report, improved=refined.improved)
@@ -112,14 +112,14 @@ def posed_scans(
             f"they moved by {report['moved_m']:.3f} m and {moved_deg:.2f} degrees (RMS); the input's step error is "
             f"{report['sigma_m']:.3f} m and {sigma_deg:.2f} degrees"
         )
-    return scans.with_poses(refined.poses), Posed.refined(refined, scans.poses)
+    return scans.with_poses(refined.poses), PosedScans.refined(refined, scans.poses)
 
 
-def add_segments(results: Results, posed: Posed) -> None:
+def add_segments(results: Results, posed: PosedScans) -> None:
     """Add which segment of a trajectory is used, and print what was not used to find it."""
     for note in posed.notes:
         warn(f"note: {note}")
-    if posed.pieces > 1:
+    if posed.segments > 1:
         results.add(f"the scans {posed.rows.start} to {posed.rows.stop - 1} are used, the longest segment")
 
 

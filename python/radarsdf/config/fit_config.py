@@ -25,16 +25,16 @@ LATTICE_BLOCK_CELLS = 32
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
 
-QUICK: dict[str, Any] = {"train": False, "returns": {"passages": False}}
+QUICK: dict[str, Any] = {"train": False, "returns": {"free_space": False}}
 """What :meth:`FitConfig.quick` changes: stage 1 only, and nothing kept for grids and comparisons."""
 
 PAPER: dict[str, Any] = {
     "returns": {
         "accumulate_scans": 5,
-        "drop_movers": False,
+        "drop_moving": False,
         "drop_ghosts": False,
         "onto_planes": False,
-        "passages": False,
+        "free_space": False,
     },
     "encoding": {"bridge_cells": 0, "fourier_count": 16},
     "networks": {
@@ -172,7 +172,7 @@ class FitConfig:
         Parameters
         ----------
         **changes
-            Further settings, and errors, as for :meth:`override`. ``returns={"passages": True}`` keeps what
+            Further settings, and errors, as for :meth:`override`. ``returns={"free_space": True}`` keeps what
             :func:`radarsdf.grid` and :func:`radarsdf.compare` need.
         """
         return cls().override(**QUICK).override(**changes)

@@ -47,7 +47,7 @@ class ReturnsConfig:
     accumulate_scans: _Count = 1
     """So many consecutive scans are treated as seen from the position of the middle one (3QFPI: 5, since it
     trains scan by scan). Here 1 is enough: a fit trains on all scans at once."""
-    drop_movers: bool = True
+    drop_moving: bool = True
     """Whether returns are left out whose Doppler, where it is given, disagrees with a world that stands still (3QFPI:
     no). Measured: 0.1 to 8.6 points of F-score on five real drives, 5.9 on a simulated street with cars, 0.0 on one
     without."""
@@ -71,7 +71,7 @@ class ReturnsConfig:
     """Whether each return is moved towards the surfel of its cell, a plane through the returns there, if there
     is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
     up to 1 % more error of intensities."""
-    passages: bool = True
+    free_space: bool = True
     """Whether the map keeps which cells rays crossed, and mean intensities by place and view, for :func:`radarsdf.grid`
     and :func:`radarsdf.compare`. It takes about 1 µs of a processor for each return, and 0.3 kB for each block of
     8 × 8 × 8 leaf cells that rays crossed."""

@@ -193,9 +193,9 @@ def skipped_parts(
     skipped = []
     if not config.train:
         skipped.append(("training of the surface: it is averaged", surface_s - now_s))
-    if not config.returns.passages:
+    if not config.returns.free_space:
         saved_s = _S_PER_RETURN_OF_FREE_SPACE * returns
-        skipped.append(("free space, which grids and comparisons need (returns.passages)", saved_s))
+        skipped.append(("free space, which grids and comparisons need (returns.free_space)", saved_s))
     if not network:
         why = "intensities are in closed form" if with_intensity else "there are no intensities"
         skipped.append((f"the intensity network: {why}", seconds(True, train=True) - surface_s))

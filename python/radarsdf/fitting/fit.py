@@ -14,7 +14,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale
-from radarsdf.returns.moving import Standing
+from radarsdf.returns.moving import StaticReturns
 from radarsdf.returns.rays import prepare
 from radarsdf.scans import Scans, filled
 
@@ -43,10 +43,10 @@ def fit(
     intensities : iterable of F arrays, optional
         (N_i,) each, sensor units. Without them the map has no intensity network. Those that cannot belong to the others,
         such as -9999 in place of a measurement, are left out of the reflectance; the surface keeps their returns.
-        ``report["wild_intensities"]`` counts them.
+        ``report["intensity_outliers"]`` counts them.
     doppler_mps : sequence of F arrays, optional
         (N_i,) each: speed of each return along its ray, m/s; NaN where it was not measured. With them, returns that
-        move are left out; see ``config.returns.drop_movers``.
+        move are left out; see ``config.returns.drop_moving``.
     config : FitConfig, optional
         Settings of the fit. ``FitConfig.paper()`` has the published ones.
     progress : bool, optional
@@ -101,11 +101,11 @@ def fit(
         )
         if poses_ is None:
             raise ValueError(MISSING_POSES)
-        standing = Standing.of(scans, intensities_, doppler_mps_, config.returns)
-        rays = prepare(standing.points, poses_, standing.intensities, origin=origin, **config.preparation)
+        static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns)
+        rays = prepare(static.points, poses_, static.intensities, origin=origin, **config.preparation)
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
             scale = IntensityScale.between(intensity_range)
-        return FitInput(rays, scale, poses_, standing.movers, standing.why_none)
+        return FitInput(rays, scale, poses_, static.moving, static.why_none)
 
     return fit_rays(read, config, progress=progress, checkpoint=checkpoint)

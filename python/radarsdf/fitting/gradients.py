@@ -25,7 +25,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field import kernels
 from radarsdf.field.neural_field import Geometry, NeuralField, cells_width, fourier_width
 from radarsdf.fitting.sampling import Batch, Dropout, Samples
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 # Dropout of the features and of the Fourier encoding before the intensity network. If the training uses each sample n times,
 # they are multiplied by n / (n + 2.5): the more often a sample is used, the more easily the network memorises it.
@@ -75,7 +75,7 @@ class GradientBackend(ABC):
     """Losses and gradients of batches.
 
     The parameters of `field` must keep their memory. Gradients of a batch's parts are added in their order, so the threads
-    of `workers` change no bit.
+    of `pool` change no bit.
     """
 
     def __init__(
@@ -84,9 +84,9 @@ class GradientBackend(ABC):
         config: FitConfig,
         dropout_scale: float,
         generator: torch.Generator,
-        workers: Workers,
+        pool: ThreadPool,
     ) -> None:
-        self._field, self._config, self._workers = field, config, workers
+        self._field, self._config, self._pool = field, config, pool
         self._dropout_scale, self._generator = dropout_scale, generator
         self._moves_rows = config.moves_rows(field.intensity_network is not None)
 
@@ -137,11 +137,11 @@ class CoreGradients(GradientBackend):
         return min(max(batch_size // _PART, 1), _MOST_PARTS)
 
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        cells, crew, count = self._field.cells, self._workers.crew, len(batch.points)
+        cells, pool, count = self._field.cells, self._pool.core_threads, len(batch.points)
         located = torch.empty((count, cells.table.num_levels), dtype=torch.int32, device="cpu")
         touched = Touched(batch.points, located, batch.points.new_empty((count, cells.interpolated_dim)))
         arguments: dict[str, Any] = {"points": batch.points.numpy(), "sdf_m": batch.sdf_m.numpy()}
-        arguments |= {"parts": batch.parts, "crew": crew}
+        arguments |= {"parts": batch.parts, "pool": pool}
         if losses != "intensity":
             arguments |= {"located": located.numpy(), "interpolated_grad": touched.gradient.numpy()}
         if losses != "sdf":
@@ -156,7 +156,7 @@ class CoreGradients(GradientBackend):
         try:
             result = meanwhile()
         finally:
-            sdf, intensity = self._loss.finish(crew)
+            sdf, intensity = self._loss.finish(pool)
         if losses == "intensity":
             return Gradients({"intensity": intensity}, list(self._by_intensity), None), result
         found, networks = {"sdf": sdf}, list(self._by_sdf)
@@ -167,7 +167,7 @@ class CoreGradients(GradientBackend):
             return Gradients(found, networks, touched), result
         by_features = torch.zeros_like(cells.features)
         cells.table.scatter(
-            batch.points.numpy(), located.numpy(), touched.gradient.numpy(), by_features.numpy(), crew
+            batch.points.numpy(), located.numpy(), touched.gradient.numpy(), by_features.numpy(), pool
         )
         return Gradients(found, [by_features, *networks], None), result
 
@@ -182,7 +182,7 @@ class AutogradGradients(GradientBackend):
     """Losses of the field, differentiated by PyTorch. Each part is the work of one thread."""
 
     def num_parts(self, batch_size: int) -> int:
-        return min(self._workers.num_threads, batch_size)
+        return min(self._pool.num_threads, batch_size)
 
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
         parts = batch.split()
@@ -195,7 +195,7 @@ class AutogradGradients(GradientBackend):
             ]
             factors = [list(of_part) for of_part in zip(*of_encodings, strict=True)]
         of_part = functools.partial(self._of_part, losses)
-        return _sum(list(self._workers.map(of_part, list(zip(parts, factors, strict=True))))), meanwhile()
+        return _sum(list(self._pool.map(of_part, list(zip(parts, factors, strict=True))))), meanwhile()
 
     def _num_seen(self, samples: Samples) -> int:
         """Number of samples, the first ones, that the intensity network sees."""

@@ -15,7 +15,7 @@ from radarsdf._core import FEATURE_DIM
 from radarsdf.field.kernels import large_zeros, rows_view, view
 from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 _BETAS = (0.9, 0.999)
 _EPSILON = 1e-15  # 3QFP
@@ -169,7 +169,7 @@ class RowAdam:
         self.step_count = count
 
     @torch.no_grad()
-    def step(self, touched: Sequence[Touched], workers: Workers, meanwhile: Callable[[], None]) -> None:
+    def step(self, touched: Sequence[Touched], pool: ThreadPool, meanwhile: Callable[[], None]) -> None:
         """Changes the rows that batches touched. The calling thread runs `meanwhile` first, and then helps the others."""
         self.step_count += 1
         if self.step_count >= len(self._decays):
@@ -186,9 +186,9 @@ class RowAdam:
             self.step_count,
             self.learning_rate,
             _EPSILON,
-            workers.crew,
+            pool.core_threads,
         )
         try:
             meanwhile()
         finally:
-            workers.crew.finish()
+            pool.core_threads.finish()

@@ -25,14 +25,14 @@ from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import Diverged, Interrupted, Training
 from radarsdf.map.contents import MapContents
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.evidence import Evidence, Looks, ReturnsOfCells
-from radarsdf.returns.free_space import Passages
+from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
+from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import ScanSums
-from radarsdf.returns.view_statistics import Echoes
-from radarsdf.threads import Workers
+from radarsdf.returns.view_statistics import ViewStatistics
+from radarsdf.threads import ThreadPool
 
 
 @dataclass(frozen=True)
@@ -42,17 +42,17 @@ class FitInput:
     rays: Rays  # all, scan by scan
     scale: IntensityScale | None  # of their intensities
     poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans; only used without a `sensor`
-    movers: int = 0  # returns that were left out because they move
-    why_no_movers: str | None = None  # see :class:`radarsdf.returns.moving.Movers`
+    moving: int = 0  # returns that were left out because they move
+    why_none_moving: str | None = None  # see :class:`radarsdf.returns.moving.MovingReturns`
     inside: NDArray[np.bool_] | None = None
     """(N,) returns that the map is made of, whole leaf cells of them. The other rays only show what they crossed. None: all."""
-    rough_share: float | None = None  # share of the returns that lie on no thin surface
+    clutter_ratio: float | None = None  # share of the returns that lie on no thin surface
     returns_per_cell: float | None = None  # mean number in the cells of surfels
     sensor: Sensor | None = None
     box_cells: NDArray[np.int64] | None = None
     """(2, 3) leaf cells from the origin; what rays crossed outside [lower, upper) is not kept. None: all is."""
     sums: ScanSums | None = None  # over the scans of the rays, if they were kept up scan by scan
-    looks: Looks | None = None  # visibility counts, likewise
+    visibility: VisibilityCounts | None = None  # visibility counts, likewise
 
 
 def fit_rays(
@@ -65,8 +65,8 @@ def fit_rays(
     """Fits a map to what `read` returns. See :func:`radarsdf.fit`, also for errors."""
     try:
         # A map that is made in inference mode could not give gradients later.
-        with torch.inference_mode(mode=False), Workers(config.num_threads) as workers:
-            contents, stop = _fit(read, config, progress, checkpoint, workers)
+        with torch.inference_mode(mode=False), ThreadPool(config.num_threads) as pool:
+            contents, stop = _fit(read, config, progress, checkpoint, pool)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption
     radar_map = RadarMap(contents)
@@ -83,10 +83,10 @@ def _fit(
     config: FitConfig,
     progress: bool | None,
     checkpoint: str | PathLike[str] | None,
-    workers: Workers,
+    pool: ThreadPool,
 ) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
     """The contents of the map, and why the training ended early, if it did."""
-    num_threads, clock = workers.num_threads, [time.perf_counter()]
+    num_threads, clock = pool.num_threads, [time.perf_counter()]
     seconds: dict[str, float] = {}
 
     def lap(step: str) -> None:
@@ -126,7 +126,7 @@ def _fit(
     del given, surface, returns, leaf_keys  # most of the memory, of which the training makes use again
     stop: KeyboardInterrupt | Diverged | None = None
     if isinstance(field, NeuralField):
-        training = Training(field, surface_rays, learnt, scale, schedule, config, workers)
+        training = Training(field, surface_rays, learnt, scale, schedule, config, pool)
         del surface_rays, learnt  # of which the training has a copy
         if saved is not None:
             saved.resume(training)
@@ -158,28 +158,28 @@ def _contents(
 ) -> MapContents:
     """The map, with the field as it is before the training."""
     rays, scale, surfels, leaf_m = given.rays, given.scale, surface.surfels, config.leaf_size_m
-    sensor, rough_share, returns_per_cell = given.sensor, given.rough_share, given.returns_per_cell
+    sensor, clutter_ratio, returns_per_cell = given.sensor, given.clutter_ratio, given.returns_per_cell
     if sensor is None:
         assert given.poses is not None
         sensor = Sensor.of_rays(rays, given.poses, surface.noise)
-    passages, echoes = Passages.none(), Echoes.none()
-    if config.returns.passages:
+    free_space, view_statistics = FreeSpace.none(), ViewStatistics.none()
+    if config.returns.free_space:
         to_surface = rays if surface.true is None else rays.select(surface.true)
-        passages = Passages.of(to_surface, surface.noise, leaf_m, given.box_cells, num_threads)
+        free_space = FreeSpace.of(to_surface, surface.noise, leaf_m, given.box_cells, num_threads)
         known = learnt.with_intensity
         if scale is not None and known.any():
             chosen = learnt if known.all() else learnt.select(known)
             assert chosen.intensities is not None
-            echoes = Echoes.of(chosen, scale.to_unit(chosen.intensities), leaf_m)
+            view_statistics = ViewStatistics.of(chosen, scale.to_unit(chosen.intensities), leaf_m)
     return MapContents(
         field=field,
         origin=rays.origin,
         intensity_scale=scale,
         config=config,
-        evidence=Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.looks),
-        passages=passages,
-        echoes=echoes,
-        rough_share=surfels.rough_share() if rough_share is None else rough_share,
+        evidence=Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.visibility),
+        free_space=free_space,
+        view_statistics=view_statistics,
+        clutter_ratio=surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
         returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
         sensor=sensor,
         report=report,
@@ -198,17 +198,17 @@ def _report(
     cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
     sizes = {"returns": len(learnt), "cells": cells, "rows": rows}
     skipped: list[tuple[str, float | None]] = []
-    if given.why_no_movers is not None:
-        skipped.append((f"leaving out what moves: {given.why_no_movers}", None))
+    if given.why_none_moving is not None:
+        skipped.append((f"leaving out what moves: {given.why_none_moving}", None))
     skipped += skipped_parts(config, schedule, with_intensity=with_intensity, **sizes)
     outliers = 0 if learnt.intensities is None else len(learnt) - int(learnt.with_intensity.sum())
     return {
         "scans": len(given.rays.up_of_scan),
-        "returns": given.rays.num_given + given.movers,
+        "returns": given.rays.num_given + given.moving,
         "returns_used": len(surface.rays),
         "ghosts": len(learnt) - len(surface.rays),
-        "movers": given.movers,
-        "wild_intensities": outliers,
+        "moving": given.moving,
+        "intensity_outliers": outliers,
         "noise": dataclasses.asdict(surface.noise),
         "leaf_cells": cells,
         "vertices": rows,

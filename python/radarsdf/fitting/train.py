@@ -29,7 +29,7 @@ from radarsdf.interrupts import deferred_interrupts
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 _GENERATORS = 2  # random generators of a fit: for samples, for dropout
 _CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
@@ -157,9 +157,9 @@ class Training:
         scale: IntensityScale | None,
         schedule: Schedule,
         config: FitConfig,
-        workers: Workers,
+        pool: ThreadPool,
     ) -> None:
-        self._field, self._schedule, self._config, self._workers = field, schedule, config, workers
+        self._field, self._schedule, self._config, self._pool = field, schedule, config, pool
         self.iterations = schedule.iterations
         self.iterations_done = {"sdf": 0, "intensity": 0}
         self.losses: dict[str, float] = {}
@@ -168,7 +168,7 @@ class Training:
         kind = AutogradGradients if network is not None and config.networks.normals else CoreGradients
         seeds = (config.seed * _GENERATORS + i for i in range(_GENERATORS))
         self._generator, of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
-        self._backend = kind(field, config, schedule.dropout_scale, of_dropout, workers)
+        self._backend = kind(field, config, schedule.dropout_scale, of_dropout, pool)
         self._scale = None if network is None else scale
         # A sampler has its own copy of the rays: there is one at a time.
         self._sampler = self._sampler_of(surface)
@@ -191,7 +191,7 @@ class Training:
         if self._scale is not None and rays.intensities is not None:
             unit = torch.from_numpy(self._scale.to_unit(rays.intensities))
         size, neighbours = self._schedule.batch_size, self._schedule.neighbours
-        threads = self._workers.num_threads
+        threads = self._pool.num_threads
         return RaySampler(rays, self._config, size, self._generator, neighbours, unit, threads)
 
     def _draw_from_all_returns(self) -> None:
@@ -331,7 +331,7 @@ class Training:
             else:
                 assert found.touched is not None
                 rows.learning_rate = share * rows.full_rate
-                rows.step([found.touched], self._workers, meanwhile=move_networks)
+                rows.step([found.touched], self._pool, meanwhile=move_networks)
             self.losses[stage.name] = loss
             for name in counts:
                 self.iterations_done[name] = min(stage.done_before + i + 1, self.iterations[name])

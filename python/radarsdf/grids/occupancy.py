@@ -35,7 +35,7 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     Parameters
     ----------
     radar_map : Map
-        Fitted with ``returns.passages``, which :class:`FitConfig` has and ``quick()`` has not.
+        Fitted with ``returns.free_space``, which :class:`FitConfig` has and ``quick()`` has not.
     box : (2, 3) array_like
         Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world: grids
         of adjacent boxes fit together.
@@ -51,7 +51,7 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     Raises
     ------
     ValueError
-        If an argument is out of range, or the map was fitted without ``returns.passages``.
+        If an argument is out of range, or the map was fitted without ``returns.free_space``.
     MemoryError
         If the box has more than 2²⁸ voxels.
 
@@ -59,12 +59,12 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     --------
     >>> import radarsdf
     >>> drive = radarsdf.simulate.wall(frames=4)
-    >>> config = radarsdf.FitConfig.quick(returns={"passages": True})
+    >>> config = radarsdf.FitConfig.quick(returns={"free_space": True})
     >>> radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
     >>> radarsdf.grid(radar_map, [[0, -1, 0], [2, 1, 1]], 0.5).shape
     (4, 4, 2)
     """
-    check_passages(radar_map, "this map")
+    check_free_space(radar_map, "this map")
     corners = check_box(box)
     size = positive(voxel_size, "voxel_size")
     # A voxel is at most as large as a leaf cell, or is made of parts that are.
@@ -81,10 +81,10 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     return fine if parts == 1 else _coarser(fine, parts)
 
 
-def check_passages(radar_map: Map, name: str) -> None:
+def check_free_space(radar_map: Map, name: str) -> None:
     """Raise a ValueError if a map, called `name` in it, has no free-space crossings."""
-    if not radar_map.config.returns.passages:
-        msg = f"{name} does not keep what rays passed: fit it with returns.passages, which FitConfig() has and quick() has not"
+    if not radar_map.config.returns.free_space:
+        msg = f"{name} does not keep what rays passed: fit it with returns.free_space, which FitConfig() has and quick() has not"
         raise ValueError(msg)
 
 
@@ -94,7 +94,7 @@ def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: t
 
     leaf_m = radar_map.config.leaf_size_m
     upper = lower + np.array(shape) * size
-    cells = radar_map.cells_round(lower - leaf_m, upper + leaf_m)
+    cells = radar_map.cells_near(lower - leaf_m, upper + leaf_m)
     known = (cells.passed > 0) | cells.returns
     centres = [lower[axis] + (np.arange(shape[axis]) + 0.5) * size for axis in range(3)]
     places = np.ix_(
@@ -103,7 +103,7 @@ def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: t
     passed, observed = cells.passed[places], cells.observed[places]
     # An unseen surface lies where what rays passed ends. So next to the unknown, nothing is free.
     enclosed = binary_erosion(known, np.ones((3, 3, 3)))[places] & ~cells.returns[places]
-    odds = radar_map.passage_odds
+    odds = radar_map.free_space_odds
     probability = np.where(passed > 0, (odds / (1 + odds)).astype(np.float32)[passed], np.float32(np.nan))
     free = enclosed & (passed > 0) & (probability <= _FREE_TO)
     distance_m = np.full(shape, np.nan, np.float32)

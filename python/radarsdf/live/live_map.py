@@ -37,7 +37,7 @@ from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_
 from radarsdf.live.tracking import Follower
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import Limits
-from radarsdf.returns.moving import Movers
+from radarsdf.returns.moving import MovingReturns
 from radarsdf.returns.rays import check_scans
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Integrated:
     """(4, 4) T_world_sensor, m: where it was placed."""
     blocks: NDArray[np.uint64]
     """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
-    movers: int
+    moving: int
     """Number of moving returns, which were left out."""
     moved: tuple[ScanId, ...] = ()
     """Earlier scans that were placed again, as it is clear only now how the sensor moves; see :meth:`LiveMap.pose`."""
@@ -258,7 +258,7 @@ class LiveMap:
                 self._follower.keep(steps)
             else:
                 self._follower.place(scan_id, scan)
-        moving = 0 if scan.standing is None else int((~scan.standing).sum())
+        moving = 0 if scan.is_static is None else int((~scan.is_static).sum())
         return Integrated(scan_id, scan.pose.copy(), blocks, moving, again)
 
     def remove(self, scan_id: ScanId) -> Keys:
@@ -383,10 +383,10 @@ class LiveMap:
         wanted = Limits.of(self.config.leaf_size_m, **limits)
         with self._reading:
             with self._lock:
-                growing, changes, looks = self._state.changes()
+                growing, changes, visibility = self._state.changes()
             try:
                 growing.update(*changes)
-                scene, surface = growing.surface(looks)
+                scene, surface = growing.surface(visibility)
             except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
                 self._state.forget_surface()
                 raise
@@ -449,8 +449,8 @@ def _checked_scan(
     if doppler_mps is not None:
         speeds = compact(real_array(doppler_mps, "doppler_mps"))
         check_values_of_scan(speeds, scan, "doppler_mps", 0)
-        if config.drop_movers:
-            moving = Movers.of([scan], [speeds]).masks[0]
+        if config.drop_moving:
+            moving = MovingReturns.of([scan], [speeds]).masks[0]
             static = ~moving if moving.any() else None
     if time_s is not None:
         time_s = number(time_s, "time_s")

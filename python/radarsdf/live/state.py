@@ -20,7 +20,7 @@ from radarsdf.fitting.steps import FitInput
 from radarsdf.live.regions import REGION_BITS, REGION_CELLS, Keys, region_places, regions_of
 from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
 from radarsdf.live.surface import GrowingSurface
-from radarsdf.returns.evidence import BLOCK_BITS, Looks
+from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale, Plausible
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
@@ -150,7 +150,7 @@ class GrowingState:
         self._changed.update(blocks.tolist())
         return blocks
 
-    def changes(self) -> tuple[GrowingSurface, tuple[Any, ...], Looks]:
+    def changes(self) -> tuple[GrowingSurface, tuple[Any, ...], VisibilityCounts]:
         """The surface as it was derived last, the arguments of its update, and the visibility counts."""
         self._settle_noise()  # which may fail, as scans may have to be read
         if self._surface is None:
@@ -188,7 +188,9 @@ class GrowingState:
             "poses": [scan.pose.tolist() for scan in scans],
             "times_s": [scan.time_s for scan in scans],
         }
-        save_state(path, Described(**described), scans, (*self.sums.sums_of(keys), *self.sums.looks_of(keys)))
+        save_state(
+            path, Described(**described), scans, (*self.sums.sums_of(keys), *self.sums.visibility_of(keys))
+        )
 
     def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[NDArray[Any]]) -> None:
         """Makes a new state that which was saved."""
@@ -210,7 +212,7 @@ class GrowingState:
 
     def fit_input(self) -> Callable[[], FitInput]:
         """What a fit of all scans starts from, with the sums that were kept up."""
-        scans, sums, looks, origin = self.scans(), self._all_sums(), self._looks(), self.origin
+        scans, sums, visibility, origin = self.scans(), self._all_sums(), self._looks(), self.origin
 
         def read() -> FitInput:
             rays = _rays_of(scans, self.config, origin)
@@ -218,17 +220,17 @@ class GrowingState:
                 known = Plausible.of(rays.intensities).kept(rays.intensities)
                 rays = dataclasses.replace(rays, intensities=known)
             poses = np.stack([scan.pose for scan in scans])
-            moving = sum(int((~scan.standing).sum()) for scan in scans if scan.standing is not None)
+            moving = sum(int((~scan.is_static).sum()) for scan in scans if scan.is_static is not None)
             scale = IntensityScale.of(rays.intensities)
-            return FitInput(rays, scale, poses, moving, sums=sums, looks=looks)
+            return FitInput(rays, scale, poses, moving, sums=sums, visibility=visibility)
 
         return read
 
     def _all_sums(self) -> ScanSums:
         return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
 
-    def _looks(self) -> Looks:
-        return Looks(*self.sums.looks_of(self.sums.block_keys()))
+    def _looks(self) -> VisibilityCounts:
+        return VisibilityCounts(*self.sums.visibility_of(self.sums.block_keys()))
 
     def _settle_noise(self) -> None:
         """Estimates the sensor's noise, if there are twice or half as many scans as the last time."""

@@ -28,7 +28,7 @@ _KINDS = {
     "points": "f",
     "intensities": "f",
     "doppler_mps": "f",
-    "standing": "b",
+    "is_static": "b",
 }  # arrays of a scan, and their types
 
 _LOCK = "live.lock"  # also the mark of a folder that a map has used
@@ -37,8 +37,8 @@ _CELL_COLUMNS: dict[str, tuple[Any, ...]] = {
     "keys": (np.uint64, None),
     "sums": (np.int64, None, 14),
     "scans_of_cells": (np.uint32, None),
-    "look_keys": (np.uint64, None),
-    "looks": (np.uint32, None),
+    "visibility_keys": (np.uint64, None),
+    "visibility": (np.uint32, None),
 }  # in the order in which the core takes them
 
 
@@ -66,7 +66,7 @@ class LoggedScan:
     points: NDArray[Any]  # (N, 3) sensor frame, m: float32 if that holds all bits, else float64
     intensities: NDArray[np.float32] | None = None  # (N,) sensor units
     doppler_mps: NDArray[Any] | None = None  # (N,) along the ray
-    standing: NDArray[np.bool_] | None = None  # (N,) the static returns, which the map has. None: all
+    is_static: NDArray[np.bool_] | None = None  # (N,) the static returns, which the map has. None: all
     time_s: float | None = None
 
     @property
@@ -77,10 +77,10 @@ class LoggedScan:
     @property
     def static(self) -> LoggedScan:
         """With its static returns alone."""
-        if self.standing is None:
+        if self.is_static is None:
             return self
-        kept: dict[str, Any] = {name: array[self.standing] for name, array in self.arrays.items()}
-        return replace(self, **kept | {"standing": None})
+        kept: dict[str, Any] = {name: array[self.is_static] for name, array in self.arrays.items()}
+        return replace(self, **kept | {"is_static": None})
 
     @property
     def num_bytes(self) -> int:
@@ -229,7 +229,7 @@ class RegionStore:
         written = np.intersect1d(regions, region_of_block)
         for region in written.tolist():
             own = blocks[region_of_block == region]
-            columns = (*sums.sums_of(own), *sums.looks_of(own))
+            columns = (*sums.sums_of(own), *sums.visibility_of(own))
             write_arrays(self._path(region), dict(zip(_CELL_COLUMNS, columns, strict=True)))
         self._away.update(written.tolist())
         gone: Keys = blocks[np.isin(region_of_block, written)]
@@ -249,8 +249,8 @@ class RegionStore:
         for path in paths:
             with suppress(OSError):  # a file that stays harms nothing
                 path.unlink()
-        keys, _, _, look_keys, _ = columns
-        return np.union1d(look_keys, keys >> BLOCK_BITS)
+        keys, _, _, visibility_keys, _ = columns
+        return np.union1d(visibility_keys, keys >> BLOCK_BITS)
 
 
 def _sums_of(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], ...]:

@@ -35,10 +35,16 @@ from radarsdf.map import queries
 from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.mesh import Surface, local
-from radarsdf.returns.evidence import BLOCK_BITS, Evidence, Looks, bridged, sums_round
+from radarsdf.returns.evidence import BLOCK_BITS, Evidence, VisibilityCounts, bridged, evidence_sums
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, planes_round, support_round
+from radarsdf.returns.planes import (
+    LEAVES_PER_SURFEL,
+    MIN_SUPPORT,
+    Surfels,
+    neighbour_planes,
+    neighbour_support,
+)
 from radarsdf.returns.sums import MeanRays, ScanSums, lattice_of, merged_keys
 from radarsdf.threads import resolve_num_threads
 
@@ -81,7 +87,7 @@ class GrowingSurface:
             values=np.zeros((1, 8), np.float32),
             crossed=np.zeros(1, bool),
             information=np.zeros(1, np.float32),
-            detections=np.zeros(1, np.uint32),
+            hits=np.zeros(1, np.uint32),
         )
 
     @property
@@ -107,11 +113,11 @@ class GrowingSurface:
         changed = np.union1d(changed, self._find_normals(of_planes, num_threads))
         return self._derive_distances(changed, noise, num_threads)
 
-    def surface(self, looks: Looks) -> tuple[WholeMap, Surface]:
-        """All triangles, with the evidence of their vertices. `looks`: of all blocks."""
+    def surface(self, visibility: VisibilityCounts) -> tuple[WholeMap, Surface]:
+        """All triangles, with the evidence of their vertices. `visibility`: of all blocks."""
         num_threads = resolve_num_threads(self._config.num_threads)
         surfels, leaf_m = self._surfels, self._config.leaf_size_m
-        scene = WholeMap(self._origin, self._config, surfels.rough_share(), surfels.returns_per_cell())
+        scene = WholeMap(self._origin, self._config, surfels.clutter_ratio(), surfels.returns_per_cell())
         rows = self.distances.gather()
         crossed = rows["crossed"]
         cells = lattice_of(rows["keys"][crossed]).astype(np.int32)
@@ -121,10 +127,10 @@ class GrowingSurface:
         vertices, faces = extract_cells(
             corners, values, of_cells, spacing=[leaf_m] * 3, num_threads=num_threads
         )
-        evidence = Evidence(rows["information"], rows["detections"], looks.at(rows["keys"]))
+        evidence = Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         at = queries.interpolated(evidence, rows["keys"], leaf_m, local(scene, vertices + self._origin))
-        return scene, Surface.told_by(scene, vertices, faces, at, len(rows["keys"]))
+        return scene, Surface.from_triangles(scene, vertices, faces, at, len(rows["keys"]))
 
     def _surfels_of(self, rows: Rows) -> Surfels:
         cell_of_plane = np.flatnonzero(rows["support"] >= MIN_SUPPORT)
@@ -159,10 +165,10 @@ class GrowingSurface:
         keys, moments, blocks = cells["keys"], cells["moments"], CellBlocks(cells["keys"])
         rows = blocks.rows(near, num_threads)
         rows = rows[rows >= 0]
-        cells["support"][rows] = support_round(blocks, keys[rows], moments, num_threads)
+        cells["support"][rows] = neighbour_support(blocks, keys[rows], moments, num_threads)
         cells["planes"][rows] = np.nan
         rows = rows[cells["support"][rows] >= MIN_SUPPORT]
-        centres, normals, _, variances = planes_round(
+        centres, normals, _, variances = neighbour_planes(
             blocks, keys[rows], moments, LEAVES_PER_SURFEL * self._config.leaf_size_m, num_threads
         )
         cells["planes"][rows] = np.concatenate([centres, normals, variances], axis=1)
@@ -230,13 +236,13 @@ class GrowingSurface:
         distances_m = average_at_corners(table, means, weighted, normals, config, num_threads)
         own_cells = np.isin(leaf_keys >> REGION_BITS, redone)
         values = distances_m[table.leaf_vertices()[1][own_cells]]
-        information, detections = sums_round(weighted, leaf_keys[own_cells], num_threads)
+        information, hits = evidence_sums(weighted, leaf_keys[own_cells], num_threads)
         rows = {
             "keys": leaf_keys[own_cells],
             "values": values,
             "crossed": (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0),
             "information": information,
-            "detections": detections,
+            "hits": hits,
         }
         self.distances.put(redone, rows)
         return redone

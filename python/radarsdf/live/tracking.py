@@ -17,7 +17,7 @@ import numpy as np
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog
 from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
-from radarsdf.poses.motion import Rate
+from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import Floats, rotation_vector
 from radarsdf.poses.tracking import LEAST_OBSERVED, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
@@ -29,7 +29,7 @@ _KNOWN_STEPS = 2  # before a start that make it none: how the sensor moves is kn
 _CLEAR = 5.0  # standard errors by which more returns agree if the Doppler has the other sign
 _CHANCE = 0.25  # share of a sparse radar's returns that agree at a wrong pose, about: 0.13 to 0.27
 _MOVES = 5.0  # standard deviations of a velocity that is not zero
-_TOLD_STEPS = 10  # over which returns alone must tell how the sensor moves
+_OBSERVED_STEPS = 10  # over which returns alone must tell how the sensor moves
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
 
 
@@ -74,7 +74,7 @@ class Follower:
 
     config: FitConfig
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
-    _rates: deque[tuple[Rate, Rate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
+    _rates: deque[tuple[MotionRate, MotionRate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
     _given: deque[tuple[ScanId, LoggedScan]] = field(default_factory=lambda: deque(maxlen=WINDOW))
 
     def __post_init__(self) -> None:
@@ -95,11 +95,11 @@ class Follower:
         sign = next((step.sign for step in reversed(self._steps) if step.sign), 0)
         found = self._start(log, new, sign) or [self._next(new, sign)]
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
-        observed = [step.found.observed[0] for step in self._steps if not step.given][-_TOLD_STEPS:]
+        observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
         why = ""
-        if any(step.found.piece for step in found):
+        if any(step.found.segment for step in found):
             why = f"the scan at {new.time_s:.6f} s agrees nowhere near, or in several places"
-        elif not by_doppler and len(observed) == _TOLD_STEPS and np.median(observed) < LEAST_OBSERVED:
+        elif not by_doppler and len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED:
             why = "the returns alone do not tell how the sensor moves"
         if why:
             msg = f"{why}: give its pose, or its Doppler (doppler_mps)"

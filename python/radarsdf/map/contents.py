@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.free_space import Passages
+from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
-from radarsdf.returns.view_statistics import Echoes
+from radarsdf.returns.view_statistics import ViewStatistics
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class WholeMap:
 
     origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
-    rough_share: float  # clutter ratio: share of the returns that lie on no thin surface, in [0, 1]
+    clutter_ratio: float  # clutter ratio: share of the returns that lie on no thin surface, in [0, 1]
     returns_per_cell: float  # mean number of returns in the cells of surfels that hold any
 
 
@@ -39,5 +39,7 @@ class MapContents(WholeMap):
     evidence: Evidence  # what the returns tell of each leaf cell
     sensor: Sensor  # the radar, as the scans of the fit show it
     report: dict[str, Any]  # counts, losses, noise of the sensor and seconds of the fit
-    passages: Passages = dataclasses.field(default_factory=Passages.none)  # free-space crossings, or none
-    echoes: Echoes = dataclasses.field(default_factory=Echoes.none)  # view statistics of intensity, or none
+    free_space: FreeSpace = dataclasses.field(default_factory=FreeSpace.none)  # free-space crossings, or none
+    view_statistics: ViewStatistics = dataclasses.field(
+        default_factory=ViewStatistics.none
+    )  # view statistics of intensity, or none

@@ -21,7 +21,7 @@ from radarsdf.map import queries
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
-from radarsdf.returns.view_statistics import EchoesAt
+from radarsdf.returns.view_statistics import ViewStatisticsAt
 
 if TYPE_CHECKING:
     import trimesh
@@ -111,7 +111,7 @@ class Map(ABC):
             (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells near `x`, interpolated between cells, and a floor added in
             quadrature, m. σ is the noise of a return along and across the beam, see ``report["noise"]``: it grows with the
             range. The floor, which no number of returns reduces, is 0.05 leaf cells, and up to 1.1 more the higher the clutter
-            ratio (:attr:`rough_share`). NaN where there are no returns near `x`, or `x` is not finite. Errors of the poses
+            ratio (:attr:`clutter_ratio`). NaN where there are no returns near `x`, or `x` is not finite. Errors of the poses
             count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of the :class:`FitConfig` state them.
         """
         world, answer = _as_positions(x)
@@ -338,9 +338,9 @@ class Map(ABC):
         return self.intensity_scale is not None
 
     @property
-    def rough_share(self) -> float:
+    def clutter_ratio(self) -> float:
         """Clutter ratio: share of the returns that lie on no thin surface, in [0, 1]."""
-        return self._contents_of_any.rough_share
+        return self._contents_of_any.clutter_ratio
 
     @property
     @abstractmethod
@@ -365,7 +365,7 @@ class Map(ABC):
     # What grids, comparisons and views read of a map, and what each kind of map implements, at positions (N, 3), world, m.
 
     @abstractmethod
-    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
+    def cells_near(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
         """Free space and returns in the leaf cells that overlap a box of two corners (3,), world, m."""
 
     @abstractmethod
@@ -373,8 +373,8 @@ class Map(ABC):
         """The evidence of a surface at positions (N, 3), world, m."""
 
     @abstractmethod
-    def echoes(self) -> EchoesAt:
-        """View statistics of intensity. Empty without intensities, or without ``returns.passages``."""
+    def view_statistics(self) -> ViewStatisticsAt:
+        """View statistics of intensity. Empty without intensities, or without ``returns.free_space``."""
 
     @property
     @abstractmethod
@@ -382,9 +382,9 @@ class Map(ABC):
         """The parts of the map, or of one of its tiles, for what all have in common."""
 
     @cached_property
-    def passage_odds(self) -> NDArray[np.float64]:
-        """See :func:`radarsdf.map.queries.passage_odds`."""
-        return queries.passage_odds(self._contents_of_any)
+    def free_space_odds(self) -> NDArray[np.float64]:
+        """See :func:`radarsdf.map.queries.free_space_odds`."""
+        return queries.free_space_odds(self._contents_of_any)
 
     @abstractmethod
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor: ...

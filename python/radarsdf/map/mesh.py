@@ -60,10 +60,10 @@ class Surface:
         vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
         # By way of the world's coordinates, as those who query the mesh's own vertices do.
         evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
-        return cls.told_by(contents, vertices, faces, evidence, searched)
+        return cls.from_triangles(contents, vertices, faces, evidence, searched)
 
     @classmethod
-    def told_by(
+    def from_triangles(
         cls,
         scene: WholeMap,
         vertices: NDArray[np.float64],
@@ -75,7 +75,7 @@ class Surface:
         found = queries.probabilities(scene, evidence)
         confidence, uncertainty = found.confidence.float(), queries.uncertainty(scene, evidence).numpy()
         areas_m2 = vertex_areas(vertices, faces)
-        columns = confidence.double(), found.covering, found.reach, evidence.detections.double()
+        columns = confidence.double(), found.covering, found.reach, evidence.hits.double()
         tally = Tally.of(areas_m2, *(column.numpy() for column in columns))
         return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)
 
@@ -121,7 +121,7 @@ def extract_mesh(
     limits = Limits.of(voxel_size, **wanted)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)
-    return surface.mesh(contents.origin, limits, len(contents.evidence.looks))
+    return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
 
 
 def described_mesh(

@@ -23,7 +23,7 @@ from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence
 from radarsdf.returns.free_space import MOST_SCANS
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
-from radarsdf.threads import Workers, resolve_num_threads, start_vector_library
+from radarsdf.threads import ThreadPool, resolve_num_threads, start_vector_library
 
 VOXEL_M = 0.1
 """Default edge of a mesh's voxels, m."""
@@ -104,8 +104,8 @@ def evaluate(
     if len(chunks) <= 1:
         start_vector_library()  # the first queries may come from several threads at once
         return without_gradients(points)
-    with Workers() as workers:
-        results = workers.map(without_gradients, chunks)
+    with ThreadPool() as pool:
+        results = pool.map(without_gradients, chunks)
         bar = tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress))
         return torch.cat(list(bar))
 
@@ -167,8 +167,8 @@ class EvidenceAt(NamedTuple):
     """Evidence of a surface at N points, interpolated between the centres of leaf cells. 0 without cells."""
 
     information: Tensor  # (N,) sum of 1 / variance over the returns near each point, m⁻²
-    detections: Tensor  # (N,) scans with returns there
-    looks: Tensor  # (N,) scans whose rays reach there
+    hits: Tensor  # (N,) scans with returns there
+    visibility: Tensor  # (N,) scans whose rays reach there
 
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
@@ -180,7 +180,7 @@ def interpolated(
     found: Evidence, leaf_keys: NDArray[np.uint64], leaf_size_m: float, points: Tensor
 ) -> EvidenceAt:
     """The evidence of leaf cells with these keys (C,), ascending, at each point (N, 3), local frame, m."""
-    of_cells = np.stack([found.information, found.detections, found.looks], 1, dtype=np.float32)
+    of_cells = np.stack([found.information, found.hits, found.visibility], 1, dtype=np.float32)
     # Points that are too far away for a key are moved to the limit, where there are no cells.
     limit_m = MAX_CELLS_FROM_ORIGIN * leaf_size_m
     near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
@@ -197,7 +197,7 @@ def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 def roughness(contents: WholeMap) -> float:
     """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
-    return min(contents.rough_share / _ROUGH_SHARE, 1.0)
+    return min(contents.clutter_ratio / _ROUGH_SHARE, 1.0)
 
 
 def _floor_m(contents: WholeMap) -> float:
@@ -234,11 +234,11 @@ def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     there, in standard deviations, how rough the map is, and how crowded its returns are. Infinite without returns."""
     # The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
     error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
-    expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.looks.double()
-    deviations = (expected - evidence.detections.double()) / (expected + 1).sqrt()
+    expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.visibility.double()
+    deviations = (expected - evidence.hits.double()) / (expected + 1).sqrt()
     missing = (deviations + deviations.square().add(_SMOOTH**2).sqrt()) / 2  # a smooth max(0, deviations)
     of_map = (
-        math.tanh(contents.rough_share / _ROUGH_SHARE),
+        math.tanh(contents.clutter_ratio / _ROUGH_SHARE),
         contents.returns_per_cell / (contents.returns_per_cell + _CROWDED_RETURNS),
     )
     rough, crowded = (torch.full_like(error_cells, value) for value in of_map)
@@ -272,7 +272,7 @@ def dense_cells(
     contents: MapContents, lower: NDArray[np.int64], shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
     """`passed`, `returns` and `observed` of the leaf cells from `lower` (3,) on, counted from the origin of a map."""
-    passed, returns = contents.passages.dense(lower, shape)
+    passed, returns = contents.free_space.dense(lower, shape)
     cells = lattice_of(contents.field.table.leaf_keys()) - lower
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     observed = np.zeros(shape, bool)
@@ -280,7 +280,7 @@ def dense_cells(
     return passed, returns, observed
 
 
-def passage_odds(contents: MapContents) -> NDArray[np.float64]:
+def free_space_odds(contents: MapContents) -> NDArray[np.float64]:
     """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
     # Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
     # on the way to false returns.
@@ -292,7 +292,7 @@ def passage_odds(contents: MapContents) -> NDArray[np.float64]:
     # Along grazing rays the field is longer than the distance, and where returns are noisy shorter; so is its gradient.
     edge = leaf_m * np.linalg.norm(gradient(contents, centres).numpy(), axis=1)
     weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
-    passed = contents.passages.at(keys)
+    passed = contents.free_space.at(keys)
 
     sides = (distances_m < -edge, distances_m > edge)
     behind, before = (np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1 for side in sides)

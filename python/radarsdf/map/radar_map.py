@@ -21,7 +21,7 @@ from radarsdf.map.contents import MapContents
 from radarsdf.map.map import Map
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.sums import lattice_of
-from radarsdf.returns.view_statistics import EchoesAt
+from radarsdf.returns.view_statistics import ViewStatisticsAt
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,7 +68,7 @@ class RadarMap(Map):
 
         return extract_mesh(self._contents, voxel_size, **wanted)
 
-    def cells_round(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
+    def cells_near(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
         leaf_m = self.config.leaf_size_m
         first = np.floor((lower - self.origin) / leaf_m).astype(np.int64)
         count = np.floor((upper - self.origin) / leaf_m).astype(np.int64) - first + 1
@@ -79,10 +79,10 @@ class RadarMap(Map):
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
         return queries.evidence(self._contents, queries.to_local(self._contents, world))
 
-    def echoes(self) -> EchoesAt:
+    def view_statistics(self) -> ViewStatisticsAt:
         scale = self.intensity_scale
         low, high = (0, 1) if scale is None else (scale.low, scale.high)
-        return self._contents.echoes.in_world(self.origin, low, high)
+        return self._contents.view_statistics.in_world(self.origin, low, high)
 
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
         return self._viewed
@@ -108,7 +108,7 @@ class RadarMap(Map):
 
     @property
     def num_cells(self) -> int:
-        return len(self.evidence.looks)
+        return len(self.evidence.visibility)
 
     @property
     def file_bytes(self) -> int:

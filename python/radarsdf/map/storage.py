@@ -25,23 +25,23 @@ from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.evidence import Evidence
-from radarsdf.returns.free_space import Passages
+from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sensor import Sensor
-from radarsdf.returns.view_statistics import Echoes
+from radarsdf.returns.view_statistics import ViewStatistics
 from radarsdf.settings import by_name, first_wrong
 
 FORMAT = "radarsdf.map"
 FORMAT_VERSION = 13
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
-_EVIDENCE = {"information": torch.float32, "detections": torch.uint32, "looks": torch.uint32}
+_EVIDENCE = {"information": torch.float32, "hits": torch.uint32, "visibility": torch.uint32}
 # Types and numbers of dimensions of the arrays of other parts. Bits and keys are stored as int64, which all readers of
 # safetensors have; keys have at most 63 bits, as those of leaf cells.
 _PARTS = {
-    "passages": {"keys": (torch.int64, 1), "planes": (torch.int64, 3)},
-    "echoes": {
+    "free_space": {"keys": (torch.int64, 1), "planes": (torch.int64, 3)},
+    "view_statistics": {
         "points": (torch.float32, 2),
         "directions": (torch.int8, 2),
         "ranges_m": (torch.float16, 1),
@@ -128,7 +128,11 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors["origin"] = torch.from_numpy(contents.origin)
     tensors["leaf_keys"] = torch.from_numpy(field.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
-    parts = {"passages": contents.passages, "echoes": contents.echoes, "reflectance": reflectance}
+    parts = {
+        "free_space": contents.free_space,
+        "view_statistics": contents.view_statistics,
+        "reflectance": reflectance,
+    }
     for part, owner in parts.items():
         for name in _PARTS[part] if owner is not None else ():
             array = getattr(owner, name)
@@ -138,8 +142,8 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
         "network_share": None if reflectance is None else reflectance.network_share,
-        "echo_sigma": contents.echoes.sigma,
-        "rough_share": contents.rough_share,
+        "view_sigma": contents.view_statistics.sigma,
+        "clutter_ratio": contents.clutter_ratio,
         "returns_per_cell": contents.returns_per_cell,
         "sensor": contents.sensor.to_dict(),
         "report": contents.report,
@@ -154,10 +158,12 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     keys = _taken(tensors, "leaf_keys", torch.int64, (None,))
     evidence = {name: _taken(tensors, name, dtype, keys.shape) for name, dtype in _EVIDENCE.items()}
     _check((evidence["information"] >= 0).all(), "information is negative")
-    passages = Passages(**_arrays_of("passages", tensors))
-    passages.check()
-    echoes = Echoes(**_arrays_of("echoes", tensors), sigma=float(description["echo_sigma"]))
-    echoes.check(config.leaf_size_m)
+    free_space = FreeSpace(**_arrays_of("free_space", tensors))
+    free_space.check()
+    view_statistics = ViewStatistics(
+        **_arrays_of("view_statistics", tensors), sigma=float(description["view_sigma"])
+    )
+    view_statistics.check(config.leaf_size_m)
     limits = description["intensity_scale"]
     scale = None if limits is None else IntensityScale.between(limits)
     share, reflectance = description["network_share"], None
@@ -179,9 +185,9 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
         config=config,
         report=checked_report(description["report"]),
         evidence=Evidence(**evidence),
-        passages=passages,
-        echoes=echoes,
-        rough_share=_in_range("rough_share", description["rough_share"], 1),
+        free_space=free_space,
+        view_statistics=view_statistics,
+        clutter_ratio=_in_range("clutter_ratio", description["clutter_ratio"], 1),
         returns_per_cell=_in_range("returns_per_cell", description["returns_per_cell"], math.inf),
         sensor=Sensor.from_dict(description["sensor"]),
     )

@@ -96,14 +96,12 @@ class Tally:
     twice_m2: float  # … of two
 
     @classmethod
-    def of(
-        cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, detections: Floats
-    ) -> Tally:
+    def of(cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, hits: Floats) -> Tally:
         """Of a surface by its vertices: areas by ``vertex_areas`` of the core, and numbers of :mod:`queries`, (V,) each."""
         true_m2 = confidence * area_m2
         bins = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
-        scans = np.round(detections)
+        scans = np.round(hits)
 
         columns = (area_m2, true_m2, covering * area_m2)
         sums = [np.bincount(bins, values, _BINS) for values in columns]

@@ -38,8 +38,8 @@ _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
 _ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
 # Prior of the detection rate, in scans: with few scans that reached a patch, it is uncertain.
-_LOOKS_BEFORE = 2.0
-_DETECTIONS_BEFORE = 0.5
+_VISIBILITY_BEFORE = 2.0
+_HITS_BEFORE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class ViewedMap:
     def of(cls, contents: MapContents) -> ViewedMap:
         """A whole map, in voxels of a leaf cell's size, which is finer than the noise of a radar."""
         config = contents.config
-        check_views(config.max_memory_bytes, cells=len(contents.evidence.looks))
+        check_views(config.max_memory_bytes, cells=len(contents.evidence.visibility))
 
         def intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
             x = torch.from_numpy(points.astype(np.float32))
@@ -140,7 +140,7 @@ class ViewedMap:
         across, twice_m2 = across_triangles(surface.vertices, surface.faces)
         centres = surface.vertices[surface.faces].mean(axis=1)
         evidence = evidence_at(centres)
-        rates = (evidence.detections.numpy() + _DETECTIONS_BEFORE) / (evidence.looks.numpy() + _LOOKS_BEFORE)
+        rates = (evidence.hits.numpy() + _HITS_BEFORE) / (evidence.visibility.numpy() + _VISIBILITY_BEFORE)
         faces = np.ascontiguousarray(surface.faces[surface.kept(Limits.of(scene.config.leaf_size_m))])
         tracer = SurfaceTracer(surface.vertices, faces, resolve_num_threads(0))
         normals = across / np.maximum(twice_m2, 1e-12)[:, None]

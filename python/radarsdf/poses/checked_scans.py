@@ -30,7 +30,7 @@ class CheckedScans:
     times_s: Floats | None  # (F,) from the first scan on
     begin_s: float  # time of the first scan
     velocities: SensorVelocities | None  # by the Doppler. None: there is none, or it yields no velocity
-    movers: int  # number of returns that were left out, because they move
+    moving: int  # number of returns that were left out, because they move
     notes: list[str]  # sentences on what was not used
 
     @classmethod
@@ -66,9 +66,9 @@ class CheckedScans:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
-        movers = sum(int((~static).sum()) for static in velocities.static)
+        moving = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
-        return cls(standing, times_s, begin_s, velocities, movers, notes)
+        return cls(standing, times_s, begin_s, velocities, moving, notes)
 
     def check_intervals(self) -> None:
         """Raises a ValueError if the times between scans cannot be in seconds."""

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.imu import Imu
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.motion import Rate
+from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import Floats, covariance_in, nearest_rotation, rotation
 
 # Bias and noise of cheap gyroscopes, until the drive itself shows them.
@@ -38,7 +38,7 @@ _CONTRADICTED, _CONTRADICTED_SHARE = 12.0, 1.2
 
 # Of a window, at least: longer ones gave the real walk the same rotation, to 0.5 degrees.
 _WINDOW_S, _WINDOW_SCANS = 4.0, 10
-_LATEST_S, _LATE_STEP_S = 0.5, 0.02  # time offsets that are tried
+_MAX_TIME_OFFSET_S, _LATE_STEP_S = 0.5, 0.02  # time offsets that are tried
 _UNRELATED_S = 2.0  # from here on, the motions that are compared have nothing to do with each other
 _UNRELATED = 60  # such offsets that are tried: none must fit as well
 _LEFT = 4.0  # variances of what the IMU leaves of velocities, at most: 0.1 to 0.5 where it is right
@@ -80,7 +80,7 @@ class Gyroscope:
 
     turns: Floats  # (F - 1, 3) rotation vectors in the frame of the first of two scans, rad
     durations_s: Floats  # (F - 1,)
-    bias: Rate  # of the measured rate, rad/s
+    bias: MotionRate  # of the measured rate, rad/s
     noise_rad2: float = _FIRST_NOISE_RAD**2  # variance of a rotation over the median duration
 
     @classmethod
@@ -95,18 +95,18 @@ class Gyroscope:
         poses = cumulated(0.5 * (rates[1:] + rates[:-1]) * np.diff(edges)[:, None])
         poses = poses[np.searchsorted(edges, times_s)]
         turns = Rotation.from_matrix(np.einsum("fji,fjk->fik", poses[:-1], poses[1:])).as_rotvec()
-        return cls(turns, np.diff(times_s), Rate(np.zeros(3), bias_rad_s**2 * np.eye(3)))
+        return cls(turns, np.diff(times_s), MotionRate(np.zeros(3), bias_rad_s**2 * np.eye(3)))
 
     @property
     def _noise(self) -> Floats:
         """(F - 1,) variance of each component of a rotation, rad²."""
         return self.noise_rad2 * self.durations_s / max(float(np.median(self.durations_s)), 1e-9)
 
-    def step(self, i: int) -> Rate:
+    def step(self, i: int) -> MotionRate:
         """The rotation vector from scan `i` to the next, rad."""
         duration_s = self.durations_s[i]
         covariance = self.bias.covariance * duration_s**2 + self._noise[i] * np.eye(3)
-        return Rate(self.turns[i] - self.bias.mean * duration_s, covariance)
+        return MotionRate(self.turns[i] - self.bias.mean * duration_s, covariance)
 
     def learnt(self, turns: Floats, covariance: Floats) -> Gyroscope:
         """With the bias and the noise that rotations (F - 1, 3) show, with their covariance (F - 1, 3, 3). NaN: unknown.
@@ -124,7 +124,7 @@ class Gyroscope:
         bias, information, _ = _fitted_bias(off, durations_s, weights, before)
         squares = (off - bias * durations_s[:, None]) ** 2 - np.einsum("fii->fi", covariance)
         noise_rad2 = np.maximum(squares * (self.noise_rad2 / noise)[:, None], 0.0).mean()
-        fitted = Rate(bias, np.linalg.inv(information).astype(np.float64))
+        fitted = MotionRate(bias, np.linalg.inv(information).astype(np.float64))
         return dataclasses.replace(self, bias=fitted, noise_rad2=float(max(noise_rad2, 1e-10)))
 
 
@@ -198,7 +198,7 @@ class ImuAlignment:
 
     R_sensor_imu: Floats  # (3, 3)
     sigma_rad: float  # its deviation about the least certain axis. 0: it was given
-    late_s: float  # by which the times of scans are too late, in the clock of the IMU
+    time_offset_s: float  # by which the times of scans are too late, in the clock of the IMU
     lever_m: Floats  # (3,) position of the radar in the axes of the IMU
     angular_velocity: Floats  # (G, 3) rad/s, in the axes of the radar, without bias
     bias_rad_s: float  # deviation of the remaining bias, about the least certain axis
@@ -209,7 +209,7 @@ class ImuAlignment:
     def words(self) -> str:
         """What was found, in one sentence."""
         how = f"found to {np.degrees(self.sigma_rad):.1f} degrees" if self.sigma_rad > 0 else "given"
-        return f"The IMU's axes were {how}, scans are {self.late_s:.3f} s late in its clock, and its accelerometer says which way is up."
+        return f"The IMU's axes were {how}, scans are {self.time_offset_s:.3f} s late in its clock, and its accelerometer says which way is up."
 
     @classmethod
     def of(cls, imu: Imu, velocities: SensorVelocities, times_s: Floats) -> ImuAlignment | None:
@@ -264,7 +264,7 @@ def _first_guess(
         solved = np.linalg.solve(matrix + 1e-6 * np.trace(matrix) * np.eye(12), vector)
         return float((b**2).sum() - (solved * vector).sum()), solved
 
-    late = np.arange(-_LATEST_S, _LATEST_S + 1e-9, _LATE_STEP_S)
+    late = np.arange(-_MAX_TIME_OFFSET_S, _MAX_TIME_OFFSET_S + 1e-9, _LATE_STEP_S)
     fits = [fit(times_s - s) for s in late]
     best = int(np.argmin([cost for cost, _ in fits]))
     # A drive that stands still for the most part has the same rotations and velocities at many times.
@@ -286,7 +286,7 @@ def _fitted(
     window: NDArray[np.intp],
     R_first: Floats,
     gravity: Floats,
-    late_s: float,
+    time_offset_s: float,
 ) -> ImuAlignment | None:
     """By robust nonlinear least squares. None: it does not explain the velocities, or leaves the rotation open."""
     known = imu.R_sensor_imu is not None
@@ -317,7 +317,7 @@ def _fitted(
         changes = np.diff(bias, axis=0).ravel() / _BIAS_CHANGE_RAD_S
         return np.concatenate([off(x).ravel(), *prior, changes])
 
-    x = np.concatenate([np.zeros(3), gravity, np.zeros(6), [late_s], np.zeros(3 * knots)])
+    x = np.concatenate([np.zeros(3), gravity, np.zeros(6), [time_offset_s], np.zeros(3 * knots)])
     deviations = np.zeros((len(x), len(x)))
     for _ in range(_ITERATIONS):
         now = residuals(x)
@@ -334,21 +334,21 @@ def _fitted(
     # A smaller scale is no better knowledge: errors that scans have in common do not show in it.
     deviations *= max(scale, 1.0)
     sigma_rad = 0.0 if known else float(np.sqrt(np.linalg.eigvalsh(deviations[:3, :3])[-1]))
-    late_s = float(x[12])
-    if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(late_s) > 2 * _LATEST_S:
+    time_offset_s = float(x[12])
+    if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(time_offset_s) > 2 * _MAX_TIME_OFFSET_S:
         return None
     R = rotated(x)
     motion = _ImuMotion.of(imu, x[13:].reshape(-1, 3), x[6:9])
     # Against gravity, Qᵀ g in the axes of the IMU.
-    up = -np.einsum("ij,fkj,k->fi", R, motion.at(all_times_s - late_s)[1], x[3:6])
+    up = -np.einsum("ij,fkj,k->fi", R, motion.at(all_times_s - time_offset_s)[1], x[3:6])
     return ImuAlignment(
         R,
         sigma_rad,
-        late_s,
+        time_offset_s,
         x[9:12],
         np.einsum("ij,gj->gi", R, motion.rates),
         float(np.sqrt(deviations.diagonal()[13:].max())),
-        imu.times_s + late_s,
+        imu.times_s + time_offset_s,
         up / np.linalg.norm(up, axis=1, keepdims=True),
     )
 
@@ -400,7 +400,12 @@ class Inertial:
         if (found := self.alignment) is None:
             return None
         R, lever_m = found.R_sensor_imu.tolist(), found.lever_m.tolist()
-        return {"R_sensor_imu": R, "sigma_rad": found.sigma_rad, "late_s": found.late_s, "lever_m": lever_m}
+        return {
+            "R_sensor_imu": R,
+            "sigma_rad": found.sigma_rad,
+            "time_offset_s": found.time_offset_s,
+            "lever_m": lever_m,
+        }
 
 
 def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:

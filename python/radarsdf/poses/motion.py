@@ -35,17 +35,17 @@ class MotionPrior:
     # instead of 1.
     settles: bool
 
-    def after(self, rate: Rate | None, elapsed_s: float) -> Rate:
+    def after(self, rate: MotionRate | None, elapsed_s: float) -> MotionRate:
         """The rate `elapsed_s` later. None: it was not known."""
         if rate is None:
-            return Rate(np.zeros(3), np.diag(self.usual))
+            return MotionRate(np.zeros(3), np.diag(self.usual))
         if not self.settles:
-            return Rate(rate.mean, rate.covariance + np.diag(self.change) * elapsed_s)
+            return MotionRate(rate.mean, rate.covariance + np.diag(self.change) * elapsed_s)
         share = float(np.exp(-0.5 * elapsed_s * self.change.sum() / self.usual.sum()))
         covariance = share**2 * rate.covariance + (1 - share**2) * np.diag(self.usual)
-        return Rate(share * rate.mean, covariance)
+        return MotionRate(share * rate.mean, covariance)
 
-    def learnt(self, rates: Sequence[Rate | None], durations_s: Floats) -> MotionPrior:
+    def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
         """From the rates of a drive's steps, which lasted so long. None: it was lost there."""
         known = [rate.mean for rate in rates if rate is not None]
         if not known:
@@ -63,7 +63,7 @@ class MotionPrior:
 
 
 @dataclass(frozen=True)
-class Rate:
+class MotionRate:
     """A rate and how well it is known."""
 
     mean: Floats  # (3,)
@@ -80,13 +80,13 @@ def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> 
 
 
 @dataclass(frozen=True)
-class ExpectedStep:
+class PredictedStep:
     """The motion from one scan to the next, in the frame of the first, before its returns are used."""
 
-    turn: Rate  # rotation vector, rad
+    turn: MotionRate  # rotation vector, rad
     begin_mps: Floats  # (3,) velocity at the first scan, in its frame
     end_mps: Floats  # (3,) at the second scan, in the frame of that
-    way_covariance: Floats  # (3, 3) of the translation if the turn is known, m²
+    translation_covariance: Floats  # (3, 3) of the translation if the turn is known, m²
     duration_s: float
 
     def pose(self, turn: Floats | None = None) -> Floats:
@@ -101,7 +101,7 @@ class ExpectedStep:
         swept = -skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
         both = np.concatenate([swept, np.eye(3)])
         found: Floats = both @ self.turn.covariance @ both.T
-        found[:3, :3] += self.way_covariance
+        found[:3, :3] += self.translation_covariance
         return found
 
     def spread_m(self, radius_m: float) -> float:
@@ -113,7 +113,7 @@ class ExpectedStep:
     def candidates(self, capture_m: float, radius_m: float) -> tuple[Floats, Floats]:
         """Turns (K, 3) and poses (K, 4, 4) that cover what is likely, about `capture_m` apart for returns so far away."""
         turns, turn_axes = np.linalg.eigh(self.turn.covariance)
-        ways, way_axes = np.linalg.eigh(self.way_covariance)
+        ways, way_axes = np.linalg.eigh(self.translation_covariance)
         deviations = np.sqrt(np.maximum(np.concatenate([turns, ways]), 0.0))
         needed = np.maximum(1.0, _SPAN * deviations / np.repeat([capture_m / radius_m, capture_m], 3)).prod()
         count = int(np.clip(2 ** np.ceil(np.log2(needed)), _FEWEST, _MOST))

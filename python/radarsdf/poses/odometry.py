@@ -25,7 +25,7 @@ from radarsdf.poses.rigid import Floats
 from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 # Share of the variance of a step's rotation that the returns must remove. Over the scans whose planes are kept, this adds up to
 # all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
@@ -43,20 +43,20 @@ class Odometry:
     poses: Floats
     """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
     covariance: Floats
-    """(F, 6, 6) as of :class:`RefinedPoses`, relative to the scan in the middle of each piece."""
-    pieces: NDArray[np.int64]
-    """(F,) number of the piece of the drive that each scan belongs to. Where tracking was lost, mostly over a gap in time, a new
-    piece begins: its position relative to the one before is dead reckoning, and no map should join them."""
+    """(F, 6, 6) as of :class:`RefinedPoses`, relative to the scan in the middle of each segment."""
+    segments: NDArray[np.int64]
+    """(F,) number of the segment of the drive that each scan belongs to. Where tracking was lost, mostly over a gap in time, a new
+    segment begins: its position relative to the one before is dead reckoning, and no map should join them."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the trajectory; `pieces`, their number; `doppler` and `gyroscope`, whether they were used;
+    """`verdict` in words; `length_m` of the trajectory; `segments`, their number; `doppler` and `gyroscope`, whether they were used;
     `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`, rad/s; `imu`, None or its `R_sensor_imu` with
-    `sigma_rad`, `late_s`, by which the times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes;
-    `movers`, returns that were excluded; `notes` on what was not used or was assumed; `scans`, `seconds`."""
+    `sigma_rad`, `time_offset_s`, by which the times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes;
+    `moving`, returns that were excluded; `notes` on what was not used or was assumed; `scans`, `seconds`."""
 
-    def longest_piece(self) -> slice:
-        """The scans of the piece with the most scans: those to make a map of."""
-        counts = np.bincount(self.pieces)
-        first = int(np.searchsorted(self.pieces, np.argmax(counts)))
+    def longest_segment(self) -> slice:
+        """The scans of the segment with the most scans: those to make a map of."""
+        counts = np.bincount(self.segments)
+        first = int(np.searchsorted(self.segments, np.argmax(counts)))
         return slice(first, first + int(counts.max()))
 
 
@@ -117,7 +117,7 @@ def odometry(
     >>> scans = radarsdf.simulate.wall(frames=6)
     >>> motion = radarsdf.simulate.measured_motion(scans)
     >>> found = radarsdf.odometry(scans.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
-    >>> found.poses.shape, found.report["pieces"]
+    >>> found.poses.shape, found.report["segments"]
     ((6, 4, 4), 1)
     """
     begin = time.perf_counter()
@@ -135,55 +135,55 @@ def odometry(
         imu = points.imu
     inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
     limits = config.returns
-    with Workers(config.num_threads) as workers:
+    with ThreadPool(config.num_threads) as pool:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, inertial.gyroscope)
         try:
-            drive, tracked = followed(drive, config, workers.num_threads, progress)
+            drive, tracked = followed(drive, config, pool.num_threads, progress)
         except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
-            drive, tracked = followed(drive, config, workers.num_threads, progress)
+            drive, tracked = followed(drive, config, pool.num_threads, progress)
         notes = [*checked.notes, *inertial.notes]
         _check_measured(tracked, drive, notes)
-        pieces = np.array([found.piece for found in tracked])
-        poses, covariance = _together(drive, tracked, pieces, config, workers.num_threads)
+        segments = np.array([found.segment for found in tracked])
+        poses, covariance = _together(drive, tracked, segments, config, pool.num_threads)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
-    length_m = trajectory_length_m(poses, pieces)
+    length_m = trajectory_length_m(poses, segments)
     gyroscope = drive.gyroscope
     report = {
-        "verdict": _verdict(pieces, length_m, velocities is not None, inertial),
+        "verdict": _verdict(segments, length_m, velocities is not None, inertial),
         "length_m": length_m,
-        "pieces": int(pieces[-1]) + 1,
+        "segments": int(segments[-1]) + 1,
         "doppler": velocities is not None,
         "doppler_sign": sign,
         "gyroscope": gyroscope is not None,
         "gyroscope_bias": None if gyroscope is None else gyroscope.bias.mean.tolist(),
         "imu": inertial.report,
-        "movers": checked.movers,
+        "moving": checked.moving,
         "notes": notes,
         "scans": len(tracked),
         "seconds": time.perf_counter() - begin,
     }
-    return Odometry(poses, covariance, pieces, report)
+    return Odometry(poses, covariance, segments, report)
 
 
-def trajectory_length_m(poses: Floats, pieces: NDArray[np.int64]) -> float:
-    """Length of the steps within pieces of a trajectory of poses (F, 4, 4)."""
+def trajectory_length_m(poses: Floats, segments: NDArray[np.int64]) -> float:
+    """Length of the steps within segments of a trajectory of poses (F, 4, 4)."""
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    return float(lengths_m[np.diff(pieces) == 0].sum())
+    return float(lengths_m[np.diff(segments) == 0].sum())
 
 
 def _together(
-    drive: Drive, tracked: list[Tracked], pieces: NDArray[np.int64], config: FitConfig, num_threads: int
+    drive: Drive, tracked: list[Tracked], segments: NDArray[np.int64], config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats]:
-    """Poses and covariances of all scans of each piece at once."""
+    """Poses and covariances of all scans of each segment at once."""
     poses = np.stack([found.pose for found in tracked])
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
-    for piece in range(pieces[-1] + 1):
-        rows = slice(*np.searchsorted(pieces, [piece, piece + 1]).tolist())
+    for segment in range(segments[-1] + 1):
+        rows = slice(*np.searchsorted(segments, [segment, segment + 1]).tolist())
         returns = SensorReturns.of(drive.scans[rows], limits.min_range_m, limits.max_range_m)
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
@@ -220,15 +220,15 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
         )
 
 
-def _verdict(pieces: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
+def _verdict(segments: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
-    sentences = [f"{len(pieces)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]
+    sentences = [f"{len(segments)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]
     if inertial.alignment is not None:
         sentences.append(inertial.alignment.words)
-    begins = np.flatnonzero(np.diff(pieces)) + 1
+    begins = np.flatnonzero(np.diff(segments)) + 1
     if len(begins):
         before = ", ".join(map(str, begins))
         sentences.append(
-            f"The drive was lost before the scans {before}: {len(begins) + 1} pieces, which do not belong together."
+            f"The drive was lost before the scans {before}: {len(begins) + 1} segments, which do not belong together."
         )
     return " ".join(sentences)

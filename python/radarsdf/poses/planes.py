@@ -59,7 +59,7 @@ def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
         keys = merged_keys(keys)
     regions, first, region = np.unique(keys, return_index=True, return_inverse=True)
     of_regions = np.add.reduceat(sums, first)
-    of_regions = CellBlocks(regions).sum_round(regions, of_regions, NEIGHBOUR_WEIGHT, num_threads)
+    of_regions = CellBlocks(regions).neighbour_sums(regions, of_regions, NEIGHBOUR_WEIGHT, num_threads)
     spread, errors = of_regions.reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
     found = np.einsum("nij,nj->ni", reduction(spread, errors)[region], normals)
     lengths = np.sqrt(np.einsum("ni,ni->n", found, found))[:, None]

@@ -38,7 +38,9 @@ def _sigmas(covariance: Floats) -> Floats:
     return sigmas
 
 
-def way_of(found: RefinedPoses | Odometry, given: Floats | None, rows: slice = slice(None)) -> dict[str, Any]:
+def trajectory_report(
+    found: RefinedPoses | Odometry, given: Floats | None, rows: slice = slice(None)
+) -> dict[str, Any]:
     """The trajectory of the scans `rows` for the report of a fit, as values of JSON. `given` (F, 4, 4): the poses before."""
     poses = found.poses[rows]
     some = np.unique(np.linspace(0, len(poses) - 1, min(_MOST, len(poses))).astype(np.int64))
@@ -57,35 +59,35 @@ def way_of(found: RefinedPoses | Odometry, given: Floats | None, rows: slice = s
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedScans:
     """The poses of the scans that a map is made of."""
 
     poses: Floats  # (K, 4, 4) T_world_sensor, m
-    rows: slice  # the K scans among those of the drive: all, or the longest piece, if poses were found in several
+    rows: slice  # the K scans among those of the drive: all, or the longest segment, if poses were found in several
     given: Floats | None = None  # (K, 4, 4) the poses before. None: there were none
-    pieces: int = 1
+    segments: int = 1
     way: dict[str, Any] | None = None  # the trajectory for the report of a map. None: the poses are as given
     sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
     notes: tuple[str, ...] = ()  # sentences on what was not used
 
     @classmethod
-    def as_given(cls, poses: Floats) -> Posed:
+    def as_given(cls, poses: Floats) -> PosedScans:
         """Poses (F, 4, 4) that are neither refined nor found."""
         return cls(poses, slice(0, len(poses)), poses)
 
     @classmethod
-    def refined(cls, refined: RefinedPoses, given: Floats) -> Posed:
+    def refined(cls, refined: RefinedPoses, given: Floats) -> PosedScans:
         """Given poses (F, 4, 4) that were refined. Deviations are known only of poses that were not kept."""
         sigmas = pose_sigmas(refined.covariance) if refined.improved else None
         rows, notes = slice(0, len(given)), tuple(refined.report.get("notes", ()))
-        return cls(refined.poses, rows, given, 1, way_of(refined, given), sigmas, notes)
+        return cls(refined.poses, rows, given, 1, trajectory_report(refined, given), sigmas, notes)
 
     @classmethod
-    def found(cls, found: Odometry) -> Posed:
-        """The longest piece of a drive without poses."""
-        rows, report = found.longest_piece(), found.report
-        sigmas, way = pose_sigmas(found.covariance[rows]), way_of(found, None, rows)
-        return cls(found.poses[rows], rows, None, report["pieces"], way, sigmas, tuple(report["notes"]))
+    def found(cls, found: Odometry) -> PosedScans:
+        """The longest segment of a drive without poses."""
+        rows, report = found.longest_segment(), found.report
+        sigmas, way = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
+        return cls(found.poses[rows], rows, None, report["segments"], way, sigmas, tuple(report["notes"]))
 
     def config(self, config: FitConfig) -> FitConfig:
         """`config` with the errors of the poses, unless it states some itself."""

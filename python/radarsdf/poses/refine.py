@@ -26,7 +26,7 @@ from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.returns.rays import LeftOut
 from radarsdf.scans import Scans
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 # The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees
 # end with the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
@@ -62,7 +62,7 @@ class RefinedPoses:
     report: dict[str, Any]
     """`verdict` in words; `gain`, the mean increase of the log density of other scans' returns at held-out ones, and its
     `gain_error`; `sigma_m` and `sigma_rad` of a given step and its `bias`; `moved_m` and `moved_rad`, root mean square change of
-    the poses; `noise` of the sensor; `movers`, returns excluded by their Doppler; `notes` on what was not used; `scans`,
+    the poses; `noise` of the sensor; `moving`, returns excluded by their Doppler; `notes` on what was not used; `scans`,
     `returns`, `rounds`, `seconds`."""
 
 
@@ -155,10 +155,10 @@ def refine_poses(
                 "leave the poses out: radarsdf.odometry"
             )
     cell_m = LEAVES_PER_SURFEL * config.leaf_size_m
-    with Workers(config.num_threads) as workers:
+    with ThreadPool(config.num_threads) as pool:
         held = held_out(len(returns), config.seed)
         used = returns.select(~held)
-        found = PosesEstimate.of(used, given, motions, cell_m, limits, workers.num_threads, progress=progress)
+        found = PosesEstimate.of(used, given, motions, cell_m, limits, pool.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
     report |= {
@@ -170,7 +170,7 @@ def refine_poses(
         "bias": found.motions[0].bias.tolist(),
         **moved_by(given, found.poses),
         "noise": vars(found.noise).copy(),
-        "movers": checked.movers,
+        "moving": checked.moving,
         "rounds": found.rounds,
         "seconds": time.perf_counter() - begin,
     }

@@ -19,7 +19,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.imu import Gyroscope
-from radarsdf.poses.motion import ExpectedStep, Motion, MotionPrior, Rate
+from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.rigid import Floats, increments, moved, rotation, rotation_vector
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -31,7 +31,7 @@ _CELLS = (4.0, 2.0)  # edges of cells, in those of a map's surfels
 _ITERATIONS, _SETTLED = 8, 0.03  # of Gauss and Newton's method, in each cell size; in standard deviations
 _MOST_RETURNS, _SEARCHED = 2000, 250  # returns of a scan that are registered, and that a search compares
 # Deviation of an expected translation up to which a search may reach the scans before, in median ranges; and up to which a new
-# piece begins where dead reckoning leads.
+# segment begins where dead reckoning leads.
 _MOST_RADII, _MOST_RECKONED_M = 10.0, 1e4
 _FOLLOWED = 12  # best poses of a search
 _ELSEWHERE = 500  # poses that show what agrees by chance
@@ -63,12 +63,12 @@ _TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until th
 class Tracked:
     """One scan, where it was found."""
 
-    pose: Floats  # (4, 4) T_world_sensor, in the frame of its piece
+    pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
     covariance: (
         Floats  # (6, 6) of the step that led here: translation, m, and rotation vector, rad, in world axes
     )
-    agreeing: float  # share of the returns on planes of the scans before, in [0, 1]. NaN: it begins a piece
-    piece: int  # number of the piece of the drive that it is part of
+    agreeing: float  # share of the returns on planes of the scans before, in [0, 1]. NaN: it begins a segment
+    segment: int  # number of the segment of the drive that it is part of
     turn: Floats  # (3,) rotation vector of the step in the frame of the scan before, rad; may exceed half a turn
     # Share of the expected step's variance that the returns removed, of the translation and of the rotation, each in the
     # least certain direction. 0: nothing.
@@ -89,13 +89,13 @@ class Tracker:
     _variances: list[float] = field(default_factory=list)
     _scans: int = 0
 
-    def follow(self, scan: Floats, expected: ExpectedStep | None) -> Tracked:
+    def follow(self, scan: Floats, expected: PredictedStep | None) -> Tracked:
         """The next scan (N, 3), sensor frame, m, is where its returns agree, near `expected`. None: it is the first."""
         found = self.seek(scan, expected)
         self.keep(scan, found)
         return found
 
-    def seek(self, scan: Floats, expected: ExpectedStep | None) -> Tracked:
+    def seek(self, scan: Floats, expected: PredictedStep | None) -> Tracked:
         """Where :meth:`follow` would put a scan. Nothing changes."""
         if expected is None or not self._planes:
             return begun(np.eye(4))
@@ -104,11 +104,11 @@ class Tracker:
             return found
         # Nor where dead reckoning leads after a day.
         reckoned = expected.spread_m(0.0) <= _MOST_RECKONED_M
-        return begun(self.last.pose @ expected.pose() if reckoned else self.last.pose, self.last.piece + 1)
+        return begun(self.last.pose @ expected.pose() if reckoned else self.last.pose, self.last.segment + 1)
 
     def keep(self, scan: Floats, found: Tracked) -> None:
         """Adds a scan to the planes that the next ones are registered with."""
-        if not self._planes or found.piece != self.last.piece:
+        if not self._planes or found.segment != self.last.segment:
             self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
             self._recent.clear()
             self._scans = 0
@@ -132,12 +132,12 @@ class Tracker:
         surfels = Surfels.of(rays, self.cell_size_m / LEAVES_PER_SURFEL, self.num_threads)
         return sensor_noise(surfels, rays, self.config, self.num_threads)
 
-    def _sought(self, scan: Floats, expected: ExpectedStep) -> Tracked | None:
+    def _sought(self, scan: Floats, expected: PredictedStep) -> Tracked | None:
         scan = thinned(scan, _MOST_RETURNS)
         if len(scan) == 0:
             covariance = self._in_world(expected.covariance())
             pose = self.last.pose @ expected.pose()
-            return Tracked(pose, covariance, 0.0, self.last.piece, expected.turn.mean)
+            return Tracked(pose, covariance, 0.0, self.last.segment, expected.turn.mean)
         radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
         capture_m = 0.5 * _CELLS[0] * self.cell_size_m
         if expected.spread_m(radius_m) <= capture_m:
@@ -152,7 +152,7 @@ class Tracker:
         return found
 
     def _fitted(
-        self, scan: Floats, expected: ExpectedStep, turn: Floats, start: Floats | None = None
+        self, scan: Floats, expected: PredictedStep, turn: Floats, start: Floats | None = None
     ) -> Tracked:
         """By Gauss and Newton's method from `start`, with what is expected of a sensor that turned by `turn`."""
         middle = self.last.pose @ expected.pose(turn)
@@ -164,7 +164,7 @@ class Tracker:
             _removed_share(prior[:3, :3], covariance[:3, :3]),
             _removed_share(prior[3:, 3:], covariance[3:, 3:]),
         )
-        return Tracked(pose, covariance, agreeing, self.last.piece, turned, removed)
+        return Tracked(pose, covariance, agreeing, self.last.segment, turned, removed)
 
     def _normal_equations(
         self, planes: LocalPlanes, scan: Floats, pose: Floats
@@ -219,7 +219,7 @@ class Tracker:
         return pose, covariance, weight / len(scan)
 
     def _searched(
-        self, scan: Floats, expected: ExpectedStep, capture_m: float, radius_m: float
+        self, scan: Floats, expected: PredictedStep, capture_m: float, radius_m: float
     ) -> Tracked | None:
         """The best of many poses, if the returns agree there clearly better than at any other place and than by chance."""
         coarse, sample = self._planes[0], thinned(scan, _SEARCHED)
@@ -258,9 +258,9 @@ class Tracker:
         return poses
 
 
-def begun(pose: Floats, piece: int = 0) -> Tracked:
-    """A scan that a piece of the drive begins with, at this pose (4, 4)."""
-    return Tracked(pose, np.zeros((6, 6)), np.nan, piece, np.zeros(3))
+def begun(pose: Floats, segment: int = 0) -> Tracked:
+    """A scan that a segment of the drive begins with, at this pose (4, 4)."""
+    return Tracked(pose, np.zeros((6, 6)), np.nan, segment, np.zeros(3))
 
 
 def _removed_share(prior: Floats, covariance: Floats) -> float:
@@ -297,7 +297,7 @@ class Drive:
     turns: MotionPrior = _TURNS  # of the sensor, in its own frame
     moves: MotionPrior = _MOVES
 
-    def expected(self, i: int, turn: Rate | None, move: Rate | None) -> ExpectedStep:
+    def expected(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
         """The step to scan `i`, after one with these rates. None: they are unknown."""
         duration_s = float(self.times_s[i] - self.times_s[i - 1])
         before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
@@ -306,13 +306,13 @@ class Drive:
             by = self.gyroscope.step(i - 1)
         else:
             rate = self.turns.after(turn, elapsed_s)
-            by = Rate(rate.mean * duration_s, rate.covariance * duration_s**2)
+            by = MotionRate(rate.mean * duration_s, rate.covariance * duration_s**2)
         if self.velocities is not None:
             covariance = self.velocities.step_covariance(i - 1, duration_s)
             begin, end = self.velocities.mean_mps[i - 1 : i + 1]
-            return ExpectedStep(by, begin, end, covariance, duration_s)
+            return PredictedStep(by, begin, end, covariance, duration_s)
         rate = self.moves.after(move, elapsed_s)
-        return ExpectedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
+        return PredictedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
 
     @property
     def usual_turn_rad_s(self) -> float:
@@ -356,7 +356,7 @@ class Drive:
         ]
 
 
-def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rate]:
+def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRate, MotionRate]:
     """Of turning and moving, in the frame of the sensor."""
     back = before[:3, :3].T
     half = rotation(0.5 * now.turn).T @ back
@@ -365,10 +365,10 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[Rate, Rat
         matrix @ now.covariance[rows, rows] @ matrix.T / duration_s**2
         for matrix, rows in ((half, slice(0, 3)), (back, slice(3, 6)))
     )
-    return Rate(now.turn / duration_s, of_turn), Rate(way / duration_s, of_way)
+    return MotionRate(now.turn / duration_s, of_turn), MotionRate(way / duration_s, of_way)
 
 
-Rates = tuple[Rate, Rate] | tuple[None, None]  # of turning, rad/s, and moving, m/s, if known
+Rates = tuple[MotionRate, MotionRate] | tuple[None, None]  # of turning, rad/s, and moving, m/s, if known
 
 
 def _tracked(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]]:
@@ -379,7 +379,7 @@ def _tracked(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]
     for i in range(1, len(drive.scans)):
         expected = drive.expected(i, *last)
         before, now = tracked[-1], tracker.follow(drive.scans[i], expected)
-        followed = now.piece == before.piece and expected.duration_s > 0
+        followed = now.segment == before.segment and expected.duration_s > 0
         last = rates_of(before.pose, now, expected.duration_s) if followed else (None, None)
         rates.append(last)
         tracked.append(now)
@@ -396,7 +396,7 @@ def followed(
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
         tracked, rates = _tracked(drive, Tracker(cell_m, config.returns, num_threads))
         turn_prior = drive.turns
-        if i == 0 and drive.turns_slowly and tracked[-1].piece > 0:
+        if i == 0 and drive.turns_slowly and tracked[-1].segment > 0:
             # Its returns agree nowhere. The next passes search less far.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turn_prior = MotionPrior(usual, usual, True)

@@ -23,8 +23,8 @@ _COUNTS = {
     "tiles": "Tiles",
     "returns": "Returns",
     "ghosts": "Ghosts, left out of the surface",
-    "movers": "Moving returns, left out",
-    "wild_intensities": "Intensity outliers, left out of the reflectance",
+    "moving": "Moving returns, left out",
+    "intensity_outliers": "Intensity outliers, left out of the reflectance",
     "leaf_cells": "Leaf cells",
     "vertices": "Cell vertices",
 }

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, bridge_cells, count_looks
+from radarsdf._core import CellBlocks, bridge_cells, count_visibility
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
@@ -19,22 +19,22 @@ CELLS_OF_SURFACE = 9
 """A plane crosses about so many of a cell and the 26 cells round it."""
 
 BLOCK_BITS = np.uint64(9)
-"""Bits by which the key of a leaf cell is longer than that of the block whose looks are counted."""
+"""Bits by which the key of a leaf cell is longer than that of the block whose visibility is counted."""
 
 
 @dataclass(frozen=True)
 class Evidence:
     """Evidence of a surface in each leaf cell, in the order of the cells' keys.
 
-    `information` and `detections` are sums over a leaf cell and the 26 cells round it.
+    `information` and `hits` are sums over a leaf cell and the 26 cells round it.
     """
 
     information: NDArray[np.float32]  # (C,) 1 / variance of the position that the returns give together, m⁻²
     # (C,) number of scans with returns, added up over the cells. A scan of many returns in a cell counts once there: their
     # errors have causes in common.
-    detections: NDArray[np.uint32]
+    hits: NDArray[np.uint32]
     # (C,) number of scans with a ray through the cube of 8 × 8 × 8 leaf cells that the cell is in, or to there
-    looks: NDArray[np.uint32]
+    visibility: NDArray[np.uint32]
 
     @classmethod
     def of(
@@ -44,15 +44,15 @@ class Evidence:
         leaf_keys: NDArray[np.uint64],
         leaf_size_m: float,
         num_threads: int = 0,
-        looks: Looks | None = None,
+        visibility: VisibilityCounts | None = None,
     ) -> Evidence:
         """Evidence in the leaf cells with these keys (C,), ascending. `rays` are all: those to false returns also looked."""
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
-        information, detections = sums_round(returns.select(near), leaf_keys, num_threads)
-        if looks is not None:
-            return cls(information, detections, looks.at(leaf_keys))
-        counted = count_looks(leaf_keys, leaf_size_m, *rays.in_c_order(), rays.scans, num_threads)
-        return cls(information, detections, counted)
+        information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
+        if visibility is not None:
+            return cls(information, hits, visibility.at(leaf_keys))
+        counted = count_visibility(leaf_keys, leaf_size_m, *rays.in_c_order(), rays.scans, num_threads)
+        return cls(information, hits, counted)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class ReturnsOfCells:
 
 
 @dataclass(frozen=True)
-class Looks:
+class VisibilityCounts:
     """How many scans looked at each block of 8 × 8 × 8 leaf cells."""
 
     keys: NDArray[np.uint64]  # (B,) Morton keys of leaf cells without their last nine bits, ascending
@@ -94,12 +94,12 @@ class Looks:
         return np.where(self.keys[rows] == blocks, self.scans[rows], np.uint32(0))
 
 
-def sums_round(
+def evidence_sums(
     returns: ReturnsOfCells, leaf_keys: NDArray[np.uint64], num_threads: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """`information` and `detections` of :class:`Evidence`, (C,), in the leaf cells with these keys (C,), ascending."""
+    """`information` and `hits` of :class:`Evidence`, (C,), in the leaf cells with these keys (C,), ascending."""
     columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)
-    sums = CellBlocks(returns.keys).sum_round(leaf_keys, columns, 1.0, num_threads)
+    sums = CellBlocks(returns.keys).neighbour_sums(leaf_keys, columns, 1.0, num_threads)
     return sums[:, 0].astype(np.float32), sums[:, 1].astype(np.uint32)
 
 
@@ -110,7 +110,7 @@ def support_at(
     leaf_keys: NDArray[np.uint64], keys: NDArray[np.uint64], counts: NDArray[np.float64], num_threads: int = 0
 ) -> NDArray[np.float64]:
     """Support (C,) of leaf cells: returns in each and the 26 cells around it, up to 65535. `counts` (M,): of cells with `keys` (M,)."""
-    sums = CellBlocks(keys).sum_round(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
+    sums = CellBlocks(keys).neighbour_sums(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
     return np.minimum(sums[:, 0], _MOST)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import find_passages
+from radarsdf._core import find_free_space
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
@@ -26,7 +26,7 @@ _INSIDE = np.arange(BLOCK_CELLS**3, dtype=np.uint64)
 
 
 @dataclass(frozen=True)
-class Passages:
+class FreeSpace:
     """The leaf cells that rays passed, in blocks of 8 × 8 × 8."""
 
     keys: NDArray[np.uint64]  # (B,) Morton keys of the blocks' leaf cells without the last 9 bits, ascending
@@ -42,7 +42,7 @@ class Passages:
         leaf_size_m: float,
         box_cells: NDArray[np.int64] | None = None,
         num_threads: int = 0,
-    ) -> Passages:
+    ) -> FreeSpace:
         """What `rays`, without those to false returns, crossed in the box [lower, upper), (2, 3) leaf cells. None: anywhere."""
         # Up to two standard deviations before the return, and where its angles are known to one cell: beyond that, it
         # cannot be said which cell a ray crossed.
@@ -52,11 +52,11 @@ class Passages:
         lower, upper = limit if box_cells is None else box_cells.tolist()
         crossed_m, scans = np.minimum(before_m, known_m), np.ascontiguousarray(rays.scans)
         return cls(
-            *find_passages(*rays.in_c_order(), crossed_m, scans, leaf_size_m, lower, upper, num_threads)
+            *find_free_space(*rays.in_c_order(), crossed_m, scans, leaf_size_m, lower, upper, num_threads)
         )
 
     @classmethod
-    def none(cls) -> Passages:
+    def none(cls) -> FreeSpace:
         return cls(np.zeros(0, np.uint64), np.zeros((0, _PLANES, _WORDS), np.uint64))
 
     def check(self) -> None:
@@ -66,7 +66,7 @@ class Passages:
             or self.planes.shape != (len(self.keys), _PLANES, _WORDS)
             or not (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
         ):
-            msg = "the passages are not planes of 512 cells for ascending keys"
+            msg = "the free-space crossings are not planes of 512 cells for ascending keys"
             raise ValueError(msg)
 
     def dense(

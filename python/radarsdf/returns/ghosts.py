@@ -93,10 +93,10 @@ def are_opaque(
     """(P,) which of `planes`, rows of flat surfels, most rays end at. `passed` (C,): rays whose first one is that of each cell."""
     cells = surfels.cell_of_plane[planes]
     support = surfels.support[cells]
-    passed_round = surfels.blocks.sum_round(
+    passed_near = surfels.blocks.neighbour_sums(
         surfels.keys[cells], np.ascontiguousarray(passed[:, None]), NEIGHBOUR_WEIGHT, num_threads
     )[:, 0]
-    opaque: NDArray[np.bool_] = support / (support + passed_round) > _MIN_OPACITY
+    opaque: NDArray[np.bool_] = support / (support + passed_near) > _MIN_OPACITY
     return opaque
 
 
@@ -117,6 +117,6 @@ def are_behind(
 def mostly_behind(surfels: Surfels, behind: NDArray[np.float64], num_threads: int = 0) -> NDArray[np.bool_]:
     """(C,) the cells round which most returns are `behind` (C,) a surface, in number."""
     columns = np.stack([behind, surfels.counts], 1)
-    sums = surfels.blocks.sum_round(surfels.keys, columns, 1.0, num_threads)
+    sums = surfels.blocks.neighbour_sums(surfels.keys, columns, 1.0, num_threads)
     ghosts: NDArray[np.bool_] = sums[:, 0] > _MIN_SHARE * sums[:, 1]
     return ghosts

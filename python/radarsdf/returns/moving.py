@@ -188,14 +188,14 @@ _MAX_MOVING = 0.4  # share of the returns; if more disagree, it is the Doppler t
 
 
 @dataclass(frozen=True)
-class Movers:
+class MovingReturns:
     """Which returns of F scans move."""
 
     masks: list[NDArray[np.bool_]]  # F arrays (N_i,). All False where a scan gives no velocity of the sensor
     why_none: str | None  # why none are named although there is Doppler, in words
 
     @classmethod
-    def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> Movers:
+    def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> MovingReturns:
         """The returns (N_i, 3), sensor frame, m, whose Doppler (N_i,), m/s or NaN, of either sign, disagrees with a static world."""
         scans, _, _ = check_scans(points)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
@@ -223,13 +223,13 @@ class Movers:
 
 
 @dataclass(frozen=True)
-class Standing:
+class StaticReturns:
     """The returns of F scans without those that move, as far as Doppler tells them."""
 
     points: Iterable[ArrayLike]  # F arrays (N_i, 3), sensor frame, m
     intensities: Iterable[ArrayLike] | None  # F arrays (N_i,), sensor units
-    movers: int  # number of returns that were left out
-    why_none: str | None  # as of :class:`Movers`
+    moving: int  # number of returns that were left out
+    why_none: str | None  # as of :class:`MovingReturns`
 
     @classmethod
     def of(
@@ -238,16 +238,16 @@ class Standing:
         intensities: Iterable[ArrayLike] | None,
         doppler_mps: Sequence[ArrayLike] | None,
         config: ReturnsConfig,
-    ) -> Standing:
-        """All returns, if there is no Doppler or ``config.drop_movers`` says so; else see :meth:`Movers.of`."""
-        if doppler_mps is None or not config.drop_movers:
+    ) -> StaticReturns:
+        """All returns, if there is no Doppler or ``config.drop_moving`` says so; else see :meth:`MovingReturns.of`."""
+        if doppler_mps is None or not config.drop_moving:
             return cls(points, intensities, 0, None)
         points = list(one_for_each_scan(points, "points"))
         intensities = None if intensities is None else list(one_for_each_scan(intensities, "intensities"))
         check_scans(points, intensities)
-        movers = Movers.of(points, doppler_mps)
-        values = None if intensities is None else movers.without(intensities)
-        return cls(movers.without(points), values, movers.count, movers.why_none)
+        moving = MovingReturns.of(points, doppler_mps)
+        values = None if intensities is None else moving.without(intensities)
+        return cls(moving.without(points), values, moving.count, moving.why_none)
 
 
 def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
@@ -262,9 +262,9 @@ def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike])
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
     """The static returns within the ranges of a fit, each seen from where its scan was taken. Intensity outliers are NaN."""
-    standing = Standing.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
+    static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
     limits: dict[str, Any] = {
         "min_range_m": config.returns.min_range_m,
         "max_range_m": config.returns.max_range_m,
     }
-    return prepare(standing.points, scans.poses, standing.intensities, **limits)
+    return prepare(static.points, scans.poses, static.intensities, **limits)

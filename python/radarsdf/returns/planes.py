@@ -46,10 +46,10 @@ class Surfels:
         cell_size_m = LEAVES_PER_SURFEL * sums.leaf_size_m
         keys, of_cells = sums.merged_moments()
         blocks = CellBlocks(keys)
-        support = support_round(blocks, keys, of_cells, num_threads)
+        support = neighbour_support(blocks, keys, of_cells, num_threads)
         # Most cells have few returns. Surfels for all of them would take most of the time and the memory.
         cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
-        centres, normals, widest, variances = planes_round(
+        centres, normals, widest, variances = neighbour_planes(
             blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
         )
         counts = of_cells[:, 0].copy()
@@ -60,7 +60,7 @@ class Surfels:
         flat: NDArray[np.bool_] = self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]
         return flat
 
-    def rough_share(self) -> float:
+    def clutter_ratio(self) -> float:
         """Share of the returns that lie on no thin surface, of those in a cell with a surfel. 0 without surfels."""
         # Measured: 0.02 to 0.06 on simulated scenes without clutter, whole or of every tenth scan; 0.27 to 0.44 on five
         # real drives.
@@ -96,24 +96,24 @@ class Surfels:
         return planes[cells]
 
 
-def support_round(
+def neighbour_support(
     blocks: CellBlocks, keys: NDArray[np.uint64], of_cells: NDArray[np.float64], num_threads: int = 0
 ) -> NDArray[np.float64]:
     """(K,) weighted number of returns in and around cells with these `keys` (K,). `of_cells`: moments of those of `blocks`."""
     counts = np.ascontiguousarray(of_cells[:, :1])
-    support: NDArray[np.float64] = blocks.sum_round(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
+    support: NDArray[np.float64] = blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     return support
 
 
-def planes_round(
+def neighbour_planes(
     blocks: CellBlocks,
     keys: NDArray[np.uint64],
     of_cells: NDArray[np.float64],
     cell_size_m: float,
     num_threads: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
-    """Centres, normals, widest directions and variances (K, 3) of the surfels of the cells with these `keys` (K,); see :func:`support_round`."""
-    moments = blocks.sum_round(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
+    """Centres, normals, widest directions and variances (K, 3) of the surfels of the cells with these `keys` (K,); see :func:`neighbour_support`."""
+    moments = blocks.neighbour_sums(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
     means = moments[:, 1:10] / moments[:, :1]
     centres = means[:, :3].copy()
     covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below

@@ -40,7 +40,7 @@ _COLUMNS = ("points", "directions", "ranges_m", "intensities", "counts")
 
 
 @dataclass(frozen=True)
-class EchoesAt:
+class ViewStatisticsAt:
     """Means of returns that are close and seen alike, in the world."""
 
     points: NDArray[np.float64]  # (G, 3) mean place, m
@@ -50,11 +50,11 @@ class EchoesAt:
     counts: NDArray[np.float64]  # (G,) returns
     sigma: float  # standard deviation of single returns from the mean of those that are close and seen alike
 
-    def select(self, chosen: NDArray[np.bool_]) -> EchoesAt:
+    def select(self, chosen: NDArray[np.bool_]) -> ViewStatisticsAt:
         return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @classmethod
-    def together(cls, parts: Sequence[EchoesAt]) -> EchoesAt:
+    def together(cls, parts: Sequence[ViewStatisticsAt]) -> ViewStatisticsAt:
         weights = np.array([max(float(part.counts.sum()), 1.0) for part in parts])
         variances = np.array([part.sigma**2 for part in parts])
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
@@ -62,7 +62,7 @@ class EchoesAt:
 
 
 @dataclass(frozen=True)
-class Echoes:
+class ViewStatistics:
     """Means of returns that are close and seen alike, as a map keeps them: 23 bytes each."""
 
     points: Float32  # (G, 3) mean place, local frame, m
@@ -73,7 +73,7 @@ class Echoes:
     sigma: float  # standard deviation of single returns from the mean of those that are close and seen alike
 
     @classmethod
-    def of(cls, rays: Rays, unit: Float32, leaf_size_m: float) -> Echoes:
+    def of(cls, rays: Rays, unit: Float32, leaf_size_m: float) -> ViewStatistics:
         rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, leaf_size_m)
         counts = np.bincount(rows, minlength=count)
         of_returns = unit.astype(np.float64)
@@ -96,7 +96,7 @@ class Echoes:
         )
 
     @classmethod
-    def none(cls) -> Echoes:
+    def none(cls) -> ViewStatistics:
         empty = np.zeros((0, 3), np.float32)
         none = empty[:, 0]
         return cls(empty, empty.astype(np.int8), none.astype(np.float16), none, none.astype(np.int16), 0.0)
@@ -106,17 +106,17 @@ class Echoes:
         count, limit_m = len(self.counts), MAX_CELLS_FROM_ORIGIN * leaf_size_m
         shapes = [getattr(self, name).shape for name in _COLUMNS]
         if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
-            msg = "the echoes have arrays of wrong shapes"
+            msg = "the view statistics have arrays of wrong shapes"
             raise ValueError(msg)
         near = (np.abs(self.points) <= limit_m).all() and (self.ranges_m >= 0).all()
         if not (near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf):
-            msg = "the echoes hold numbers out of range"
+            msg = "the view statistics hold numbers out of range"
             raise ValueError(msg)
 
-    def in_world(self, origin: NDArray[np.float64], low: float, high: float) -> EchoesAt:
+    def in_world(self, origin: NDArray[np.float64], low: float, high: float) -> ViewStatisticsAt:
         """In the world, where the local frame has its origin (3,), m. `low`, `high`: 0 and 1 in units of the sensor."""
         width = high - low
-        return EchoesAt(
+        return ViewStatisticsAt(
             self.points.astype(np.float64) + origin,
             self.directions / float(_UNITS),
             self.ranges_m.astype(np.float64),

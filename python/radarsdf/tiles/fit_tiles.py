@@ -180,7 +180,7 @@ def fit_tile(folder: str, name: str) -> None:
             rays,
             plan.scale,
             inside=inside,
-            rough_share=plan.rough_share,
+            clutter_ratio=plan.clutter_ratio,
             returns_per_cell=plan.returns_per_cell,
             sensor=plan.sensor,
             box_cells=plan.box_cells(tile.tile),

@@ -129,7 +129,7 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
         num_threads=threads,
     )
     evidence = city.evidence_at(torch.from_numpy(vertices))
-    surface = Surface.told_by(city.contents_of_any, vertices, faces, evidence, len(cells))
+    surface = Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells))
     counts = np.array([found, len(cells)])
     return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
 
@@ -222,7 +222,7 @@ def _separate(
 
 def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     """What views need of some tiles."""
-    cells = sum(len(city.contents_of(tile).evidence.looks) for tile in tiles)
+    cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(city.plan.origin_cells(tiles[0]))
     vertices, faces = _welded(city, [_part_of(city, tile) for tile in tiles])
@@ -236,7 +236,7 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
         return np.asarray(found, np.float32)
 
     local = vertices[used] - origin
-    surface = Surface.told_by(city.contents_of_any, local, faces, evidence(local), cells)
+    surface = Surface.from_triangles(city.contents_of_any, local, faces, evidence(local), cells)
     return ViewedMap.of_surface(
         surface, city.contents_of_any, origin, evidence, intensity if city.has_intensity else None
     )

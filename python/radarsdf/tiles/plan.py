@@ -144,7 +144,7 @@ class Plan:
     tile_m: _Length
     halo_m: _Length
     intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, sensor units
-    rough_share: Annotated[float, Field(ge=0, le=1)]  # clutter ratio of the largest tiles
+    clutter_ratio: Annotated[float, Field(ge=0, le=1)]  # clutter ratio of the largest tiles
     returns_per_cell: Annotated[float, Field(ge=0)]  # mean of the cells of surfels of these
     sensor: Sensor
     scans: Annotated[_Count, Field(ge=1)]

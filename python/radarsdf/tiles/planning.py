@@ -23,13 +23,13 @@ from radarsdf.fitting.average import SurfaceReturns
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
-from radarsdf.returns.moving import Standing
+from radarsdf.returns.moving import StaticReturns
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
 from radarsdf.scans import Scan, scans_in_memory
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 from radarsdf.tiles.plan import Plan, Tile, TileGrid, TilePlan, folder_of
 
 _LOG = logging.getLogger("radarsdf.tiles")
@@ -159,7 +159,7 @@ class _Planner:
         """Static returns, checked, in a frame of their own."""
         held, given = scans_in_memory(scans), self._config.preparation
         try:
-            static = Standing.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
+            static = StaticReturns.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
             return prepare(static.points, held.poses, static.intensities, whole=False, **given)
         except (ValueError, TypeError) as error:
             msg = f"of the {len(scans)} scans from number {first} on, numbered from 0: {error}"
@@ -184,7 +184,7 @@ class _Planner:
             tile_m=self._grid.tile_m,
             halo_m=self._grid.halo_m,
             intensity_range=self._intensity_range(tiles),
-            rough_share=0.0,
+            clutter_ratio=0.0,
             returns_per_cell=0.0,
             sensor=self._sensor(SensorNoise(0.0, 0.0, 0.0)),
             scans=len(axes),
@@ -218,17 +218,17 @@ class _Planner:
             tiles.append(dataclasses.replace(tile, memory_bytes=cost.peak_memory_bytes, seconds=seconds))
             if len(noises) == _SAMPLED_TILES:
                 continue
-            with Workers(plan.config.num_threads) as workers:
+            with ThreadPool(plan.config.num_threads) as workers:
                 surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
             noises.append(surface.noise)
-            clutter += surface.surfels.rough_share() * len(rays)
+            clutter += surface.surfels.clutter_ratio() * len(rays)
             returns += len(rays)
             cells += len(surface.surfels.keys)
         noise = SensorNoise.median(noises)
         return dataclasses.replace(
             plan,
             config=plan.config.override(returns=noise.settings),
-            rough_share=clutter / returns,
+            clutter_ratio=clutter / returns,
             returns_per_cell=returns / max(cells, 1),
             sensor=self._sensor(noise),
             tiles=tuple(sorted(tiles, key=lambda tile: tile.tile)),

@@ -18,7 +18,7 @@ from radarsdf.map import queries
 from radarsdf.map.map import Map
 from radarsdf.map.radar_map import load_file
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.view_statistics import EchoesAt
+from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
 from radarsdf.tiles.plan import Tile, map_path, report_of
 
@@ -98,7 +98,7 @@ class TiledMap(TileBlend):
 
         return mesh_of(self, voxel_size, **wanted)
 
-    def cells_round(self, lower: _Floats, upper: _Floats) -> queries.CellsInBox:
+    def cells_near(self, lower: _Floats, upper: _Floats) -> queries.CellsInBox:
         """Each cell is that of the tile that it lies in; of a tile that is not done, unknown."""
         lattice, edge = self.config.lattice, self.plan.tile_cells
         first = np.floor(lattice.cells(lower)).astype(np.int64)
@@ -117,17 +117,17 @@ class TiledMap(TileBlend):
                 passed[place], returns[place], observed[place] = found
         return queries.CellsInBox(lattice.position(first), passed, returns, observed)
 
-    def echoes(self) -> EchoesAt:
+    def view_statistics(self) -> ViewStatisticsAt:
         """Each echo is that of the tile that it lies in."""
         scale = self.intensity_scale
         ends = (0.0, 1.0) if scale is None else (scale.low, scale.high)
         found = []
         for planned in self.tiles:
             contents = self.contents_of(planned.tile)
-            echoes = contents.echoes.in_world(contents.origin, *ends)
-            cells = np.floor(self.config.lattice.cells(echoes.points)[:, :2])
-            found.append(echoes.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
-        return EchoesAt.together(found)
+            view_statistics = contents.view_statistics.in_world(contents.origin, *ends)
+            cells = np.floor(self.config.lattice.cells(view_statistics.points)[:, :2])
+            found.append(view_statistics.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
+        return ViewStatisticsAt.together(found)
 
     def _viewed_from(self, position: _Floats, range_m: float) -> ViewedMap:
         from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include "returns/looks.hpp"
+#include "returns/visibility.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -57,10 +57,10 @@ void check_whole_rays(const float* points, const float* directions, const float*
   if (!inside) throw std::invalid_argument("rays must be finite and within a million cells of the origin");
 }
 
-void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double leaf_size_m, const float* points,
-                 const float* directions, const float* ranges_m, const std::int32_t* scans, std::int64_t count,
-                 std::uint32_t* looks, int num_threads) {
-  const auto cube_key = [](std::uint64_t leaf_key) { return leaf_key >> (3 * kLookLevels); };
+void count_visibility(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double leaf_size_m, const float* points,
+                      const float* directions, const float* ranges_m, const std::int32_t* scans, std::int64_t count,
+                      std::uint32_t* visibility, int num_threads) {
+  const auto cube_key = [](std::uint64_t leaf_key) { return leaf_key >> (3 * kVisibilityLevels); };
   std::vector<std::uint64_t> keys;
   for (std::int64_t i = 0; i < num_leaves; ++i) {
     if (keys.empty() || keys.back() != cube_key(leaf_keys[i])) keys.push_back(cube_key(leaf_keys[i]));
@@ -74,7 +74,7 @@ void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double
     for (std::int64_t i = begin; i < end; ++i) {
       if (i % (1 << 12) == 0) check_interrupt();
       if (i > begin && scans[i] != scans[i - 1]) passed.clear();
-      visit_looks(points + 3 * i, directions + 3 * i, ranges_m[i], leaf_size_m, passed, [&](std::uint64_t key) {
+      visit_visible_cubes(points + 3 * i, directions + 3 * i, ranges_m[i], leaf_size_m, passed, [&](std::uint64_t key) {
         const std::int32_t row = rows.row(key);
         if (row >= 0) ++counts[static_cast<std::size_t>(row)];
       });
@@ -84,7 +84,7 @@ void count_looks(const std::uint64_t* leaf_keys, std::int64_t num_leaves, double
   std::size_t row = 0;
   for (std::int64_t i = 0; i < num_leaves; ++i) {
     if (keys[row] != cube_key(leaf_keys[i])) ++row;
-    looks[i] = counts[row];
+    visibility[i] = counts[row];
   }
 }
 

@@ -17,18 +17,18 @@ constexpr int kPassageWords = 8;  // of 64 bits: one for each leaf cell of a blo
 constexpr int kCountPlanes = 3, kPassagePlanes = kCountPlanes + 1;
 constexpr int kPassageStride = kPassagePlanes * kPassageWords;
 
-struct Passages {
+struct FreeSpace {
   std::vector<std::uint64_t> keys;    // (B,) of the blocks, ascending: those of leaf cells without their last 9 bits
   std::vector<std::uint64_t> planes;  // (B, planes, words); bit i of the 512 of a plane: leaf cell i in Morton order
 };
 
-// The passages of rays. A ray passes the cells from its sensor to `passed_m` along it, and has a return in that of its
-// point. points, directions: (count, 3), ranges_m, passed_m: (count), local frame, m, passed_m at most ranges_m; scans:
-// (count), ascending. lower, upper: (3), leaf cells; blocks that lie wholly outside [lower, upper) are left out.
-// Integers that stay at a limit: they do not depend on the number of threads, nor on the order of the rays of a scan.
-// Throws std::invalid_argument for rays without keys.
-Passages find_passages(const float* points, const float* directions, const float* ranges_m, const float* passed_m,
-                       const std::int32_t* scans, std::int64_t count, double leaf_size_m, const std::int32_t* lower,
-                       const std::int32_t* upper, int num_threads);
+// The free-space crossings of rays. A ray passes the cells from its sensor to `passed_m` along it, and has a return in
+// that of its point. points, directions: (count, 3), ranges_m, passed_m: (count), local frame, m, passed_m at most
+// ranges_m; scans: (count), ascending. lower, upper: (3), leaf cells; blocks that lie wholly outside [lower, upper) are
+// left out. Integers that stay at a limit: they do not depend on the number of threads, nor on the order of the rays of
+// a scan. Throws std::invalid_argument for rays without keys.
+FreeSpace find_free_space(const float* points, const float* directions, const float* ranges_m, const float* passed_m,
+                          const std::int32_t* scans, std::int64_t count, double leaf_size_m, const std::int32_t* lower,
+                          const std::int32_t* upper, int num_threads);
 
 }  // namespace radarsdf

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include "returns/passages.hpp"
+#include "returns/free_space.hpp"
 
 #include <algorithm>
 #include <array>
@@ -172,9 +172,9 @@ std::int64_t begin_of(const Rays& rays, std::int64_t part, std::int64_t parts) {
 
 }  // namespace
 
-Passages find_passages(const float* points, const float* directions, const float* ranges_m, const float* passed_m,
-                       const std::int32_t* scans, std::int64_t count, double leaf_size_m, const std::int32_t* lower,
-                       const std::int32_t* upper, int num_threads) {
+FreeSpace find_free_space(const float* points, const float* directions, const float* ranges_m, const float* passed_m,
+                          const std::int32_t* scans, std::int64_t count, double leaf_size_m, const std::int32_t* lower,
+                          const std::int32_t* upper, int num_threads) {
   const Rays rays{points, directions, ranges_m, passed_m, scans, count};
   check(rays, leaf_size_m);
   const Walker walker(rays, leaf_size_m, lower, upper);
@@ -193,7 +193,7 @@ Passages find_passages(const float* points, const float* directions, const float
   std::vector<std::size_t> order(all.keys.size());
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return all.keys[a] < all.keys[b]; });
-  Passages found;
+  FreeSpace found;
   found.keys.reserve(order.size());
   found.planes.reserve(order.size() * kPassageStride);
   for (const std::size_t i : order) {

@@ -6,14 +6,14 @@
 
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
-#include "returns/passages.hpp"
+#include "returns/free_space.hpp"
 
 namespace radarsdf {
 
-void bind_passages(py::module_& m) {
+void bind_free_space(py::module_& m) {
   using namespace py::literals;
   m.def(
-      "find_passages",
+      "find_free_space",
       [](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
          const Array<float>& passed_m, const Array<std::int32_t>& scans, double leaf_size_m,
          const std::array<std::int32_t, 3>& lower, const std::array<std::int32_t, 3>& upper, int num_threads) {
@@ -25,10 +25,10 @@ void bind_passages(py::module_& m) {
         }
         const float *p = points.data(), *d = directions.data(), *r = ranges_m.data(), *w = passed_m.data();
         const std::int32_t* s = scans.data();
-        Passages found;
+        FreeSpace found;
         {
           const py::gil_scoped_release release;
-          found = find_passages(p, d, r, w, s, count, leaf_size_m, lower.data(), upper.data(), num_threads);
+          found = find_free_space(p, d, r, w, s, count, leaf_size_m, lower.data(), upper.data(), num_threads);
         }
         const auto blocks = static_cast<py::ssize_t>(found.keys.size());
         const py::array planes = to_array(std::move(found.planes))

@@ -21,13 +21,13 @@ namespace radarsdf {
 // OpenMP's threads do: beside another busy program these made fits thirty times slower.
 //
 // One thread at a time may call it.
-class Crew {
+class ThreadPool {
  public:
   // The caller of `finish` is one of the threads. Where the system refuses some, the others do the work.
-  explicit Crew(int num_threads);
-  ~Crew() { abandon(); }
-  Crew(const Crew&) = delete;
-  Crew& operator=(const Crew&) = delete;
+  explicit ThreadPool(int num_threads);
+  ~ThreadPool() { abandon(); }
+  ThreadPool(const ThreadPool&) = delete;
+  ThreadPool& operator=(const ThreadPool&) = delete;
 
   // The other threads begin task(i) for i in [0, num_tasks), in this order, each task whole on one thread. Throws
   // std::logic_error before the tasks of the last call are finished.

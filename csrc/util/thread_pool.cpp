@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include "util/crew.hpp"
+#include "util/thread_pool.hpp"
 
 #include <chrono>
 #include <stdexcept>
@@ -42,16 +42,16 @@ void look(const Ready& ready) {
 
 }  // namespace
 
-Crew::Crew(int num_threads) : others_(std::make_unique<Others>()), forks_(num_forks()) {
+ThreadPool::ThreadPool(int num_threads) : others_(std::make_unique<Others>()), forks_(num_forks()) {
   try {
     for (int i = 1; i < num_threads; ++i) others_->threads.emplace_back([this] { live(); });
   } catch (const std::system_error&) {
   }
 }
 
-bool Crew::has_others() const { return others_ && !others_->threads.empty() && forks_ == num_forks(); }
+bool ThreadPool::has_others() const { return others_ && !others_->threads.empty() && forks_ == num_forks(); }
 
-void Crew::begin(std::int64_t num_tasks, std::function<void(std::int64_t)> task) {
+void ThreadPool::begin(std::int64_t num_tasks, std::function<void(std::int64_t)> task) {
   if (begun_) throw std::logic_error("the tasks before these are not finished");
   begun_ = true;
   task_ = std::move(task);
@@ -67,7 +67,7 @@ void Crew::begin(std::int64_t num_tasks, std::function<void(std::int64_t)> task)
   others_->wake.notify_all();
 }
 
-void Crew::finish() {
+void ThreadPool::finish() {
   if (!begun_) return;
   work();
   if (has_others()) {
@@ -81,12 +81,12 @@ void Crew::finish() {
   if (error_) std::rethrow_exception(std::exchange(error_, nullptr));
 }
 
-void Crew::run(std::int64_t num_tasks, std::function<void(std::int64_t)> task) {
+void ThreadPool::run(std::int64_t num_tasks, std::function<void(std::int64_t)> task) {
   begin(num_tasks, std::move(task));
   finish();
 }
 
-void Crew::abandon() {
+void ThreadPool::abandon() {
   if (others_ && forks_ != num_forks()) others_.release();
   if (!others_) return;
   next_ = num_tasks_;
@@ -99,7 +99,7 @@ void Crew::abandon() {
   others_.reset();
 }
 
-void Crew::work() {
+void ThreadPool::work() {
   for (std::int64_t i = next_++; i < num_tasks_; i = next_++) {
     try {
       task_(i);
@@ -112,7 +112,7 @@ void Crew::work() {
   }
 }
 
-void Crew::live() {
+void ThreadPool::live() {
   ignore_interrupts_here();
   std::int64_t seen = 0;
   while (true) {

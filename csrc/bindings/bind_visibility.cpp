@@ -2,14 +2,14 @@
 // SPDX-License-Identifier: MIT
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
-#include "returns/looks.hpp"
+#include "returns/visibility.hpp"
 
 namespace radarsdf {
 
-void bind_looks(py::module_& m) {
+void bind_visibility(py::module_& m) {
   using namespace py::literals;
   m.def(
-      "count_looks",
+      "count_visibility",
       [](const Array<std::uint64_t>& leaf_keys, double leaf_size_m, const Array<float>& points,
          const Array<float>& directions, const Array<float>& ranges_m, const Array<std::int32_t>& scans,
          int num_threads) {
@@ -19,16 +19,16 @@ void bind_looks(py::module_& m) {
         if (ranges_m.ndim() != 1 || scans.ndim() != 1 || ranges_m.shape(0) != count || scans.shape(0) != count) {
           throw std::invalid_argument("ranges_m and scans must be one for each point");
         }
-        py::array_t<std::uint32_t> looks(static_cast<py::ssize_t>(leaves));
+        py::array_t<std::uint32_t> visibility(static_cast<py::ssize_t>(leaves));
         const std::uint64_t* k = leaf_keys.data();
         const float *p = points.data(), *d = directions.data(), *r = ranges_m.data();
         const std::int32_t* s = scans.data();
-        std::uint32_t* result = looks.mutable_data();
+        std::uint32_t* result = visibility.mutable_data();
         {
           const py::gil_scoped_release release;
-          count_looks(k, leaves, leaf_size_m, p, d, r, s, count, result, num_threads);
+          count_visibility(k, leaves, leaf_size_m, p, d, r, s, count, result, num_threads);
         }
-        return looks;
+        return visibility;
       },
       "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "points"_a.noconvert(), "directions"_a.noconvert(),
       "ranges_m"_a.noconvert(), "scans"_a.noconvert(), "num_threads"_a = 0,
