@@ -26,7 +26,7 @@ from radarsdf.io.npz import write_scans
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.scans import Scans
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 _CONFIG = FitConfig(num_threads=1).override(
     training={"sdf_iterations": 2, "intensity_iterations": 2, "batch_size": 64, "intensity_batch_size": 64},
@@ -75,7 +75,7 @@ def training() -> Training:
     schedule = Schedule.of(
         config, surface_returns=count, returns=count, vertices=field.table.num_rows, with_intensity=True
     )
-    return Training(field, rays, rays, scale, schedule, config, Workers(1))
+    return Training(field, rays, rays, scale, schedule, config, ThreadPool(1))
 
 
 @functools.cache

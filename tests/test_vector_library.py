@@ -27,8 +27,8 @@ for name in names:
     recorded(name)
 everything = {(name, dtype, True) for name in names for dtype in (torch.float32, torch.float64)}
 for _ in range(2):
-    with threads.Workers(2) as workers:
-        assert all(workers.map(lambda _: set(calls) == everything, range(8)))
+    with threads.ThreadPool(2) as pool:
+        assert all(pool.map(lambda _: set(calls) == everything, range(8)))
 assert len(calls) == len(everything)
 """
 

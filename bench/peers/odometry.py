@@ -100,7 +100,7 @@ def _ours(drive: Drive, *, doppler: bool, gyroscope: bool) -> str:
         )
     except ValueError:
         return "refused"
-    part = found.longest_piece()
+    part = found.longest_segment()
     words = _words(_errors(found.poses[part], drive.poses[part]))
     count = part.stop - part.start
     return words if count == len(drive.points) else f"{words} ({count} scans in one piece)"

@@ -14,7 +14,6 @@ __all__: list[str] = [
     "CellMeans",
     "CellSet",
     "CommonPlanes",
-    "ThreadPool",
     "DIRECTION_QUANTA",
     "Encoding",
     "FEATURE_DIM",
@@ -32,14 +31,15 @@ __all__: list[str] = [
     "SumsChange",
     "SurfaceTracer",
     "SurfelMap",
+    "ThreadPool",
     "VertexTable",
     "available_instruction_sets",
     "bridge_cells",
     "cell_keys",
     "cell_rows",
     "compiler",
-    "count_visibility",
     "count_scans",
+    "count_visibility",
     "find_free_space",
     "fit_cell_means",
     "fourier",
@@ -656,14 +656,6 @@ class CellBlocks:
         """
         `values` (C, K) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 where there is no cell: (N, K).
         """
-    def rows(
-        self,
-        keys: numpy.typing.NDArray[numpy.uint64],
-        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-    ) -> numpy.typing.NDArray[numpy.int32]:
-        """
-        Row of each key (N,) int32, -1 where there is no such cell.
-        """
     def neighbour_sums(
         self,
         keys: numpy.typing.NDArray[numpy.uint64],
@@ -673,6 +665,14 @@ class CellBlocks:
     ) -> numpy.typing.NDArray[numpy.float64]:
         """
         For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that shares a face counts `weight` times, an edge its square, a corner its cube.
+        """
+    def rows(
+        self,
+        keys: numpy.typing.NDArray[numpy.uint64],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.int32]:
+        """
+        Row of each key (N,) int32, -1 where there is no such cell.
         """
 
 class SumsChange:
@@ -729,12 +729,6 @@ class GrowingSums:
         """
         Puts in what `sums_of` and `visibility_of` gave.
         """
-    def visibility_of(
-        self, block_keys: numpy.typing.NDArray[numpy.uint64]
-    ) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.uint32]]:
-        """
-        Of those of the blocks with these keys (B,), ascending, that are there: keys, and numbers of scans that looked, uint32.
-        """
     def sums_of(
         self, block_keys: numpy.typing.NDArray[numpy.uint64]
     ) -> tuple[
@@ -744,6 +738,12 @@ class GrowingSums:
     ]:
         """
         Of the blocks with these keys (B,), ascending: Morton keys (C,) of the leaf cells with returns, their sums (C, 14) int64, and numbers of scans (C,) uint32.
+        """
+    def visibility_of(
+        self, block_keys: numpy.typing.NDArray[numpy.uint64]
+    ) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.uint32]]:
+        """
+        Of those of the blocks with these keys (B,), ascending, that are there: keys, and numbers of scans that looked, uint32.
         """
     @property
     def num_blocks(self) -> int: ...
@@ -964,6 +964,16 @@ def compiler() -> str:
     Compiler that built the core.
     """
 
+def count_scans(
+    cells: numpy.typing.NDArray[numpy.int32],
+    scans: numpy.typing.NDArray[numpy.int32],
+    num_cells: typing.SupportsInt | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.uint32]:
+    """
+    Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each return's cell; `scans` (N,) int32, ascending.
+    """
+
 def count_visibility(
     leaf_keys: numpy.typing.NDArray[numpy.uint64],
     leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
@@ -975,16 +985,6 @@ def count_visibility(
 ) -> numpy.typing.NDArray[numpy.uint32]:
     """
     For each leaf cell (C,) the number of scans with a ray through its cube of 8 x 8 x 8 leaf cells, or to there: (C,) uint32. `leaf_keys` (C,) uint64, ascending; `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m; `scans` (N,) int32, ascending.
-    """
-
-def count_scans(
-    cells: numpy.typing.NDArray[numpy.int32],
-    scans: numpy.typing.NDArray[numpy.int32],
-    num_cells: typing.SupportsInt | typing.SupportsIndex,
-    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-) -> numpy.typing.NDArray[numpy.uint32]:
-    """
-    Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each return's cell; `scans` (N,) int32, ascending.
     """
 
 def find_free_space(

@@ -15,7 +15,7 @@ from radarsdf.fitting.average import near_leaf_keys
 from radarsdf.fitting.gradients import AutogradGradients, CoreGradients
 from radarsdf.fitting.sampling import Batch, RaySampler
 from radarsdf.returns.rays import prepare
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 from ..settings import grouped
 
@@ -48,7 +48,7 @@ class Made:
     def gradients(self, kind, stage, threads=2, **training):
         """By a back end with 0.7 of the dropout, on so many threads."""
         config, generator = self.config.override(training=training), torch.Generator().manual_seed(5)
-        with Workers(threads) as workers:
+        with ThreadPool(threads) as workers:
             backend = kind(self.field, config, 0.7, generator, workers)
             found, result = backend.of(stage, self.batch, lambda: "meanwhile")
             assert result == "meanwhile"

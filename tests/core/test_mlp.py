@@ -9,7 +9,7 @@ import itertools
 import pytest
 import torch
 from radarsdf.field.kernels import mlp
-from radarsdf.threads import Workers
+from radarsdf.threads import ThreadPool
 
 # What it has to be cut into: tiles of 64 rows, pieces of 2048, 16 columns.
 COUNTS = [0, 1, 7, 64, 65, 4100]
@@ -113,6 +113,6 @@ def test_what_is_not_a_number_stays_so():
         inputs[0][1, 2] = float("nan")
     out = mlp(inputs, layers)
     assert out.isnan()[:, 0].tolist() == [False, True, False]
-    with Workers(1):
+    with ThreadPool(1):
         grads = torch.autograd.grad(out.sum(), [layers[0][0]])
     assert grads[0].isnan().any()

@@ -67,7 +67,7 @@ def test_damaged_files_are_refused(tmp_path):
         with pytest.raises(ValueError, match=r"live\.npz"):
             LiveMap.load(file)
     for changed in (
-        {"standing 1": arrays["points 1"]},
+        {"is_static 1": arrays["points 1"]},
         {"keys": arrays["keys"][::-1]},
         {"points 0": arrays["points 0"][:, 0]},
     ):

@@ -73,7 +73,9 @@ class VertexFeatures(nn.Module):
         """Encoding of points (N, 3), local frame, m: levels side by side, (N, 8 · num_levels), of an octree their sum, (N, 8)."""
         found = interpolate(self.features, points, self.table)
         return (
-            found.unflatten(1, (found.shape[1] // FEATURE_DIM, FEATURE_DIM)).sum(1) if self._summed else found
+            found.view(len(points), found.shape[1] // FEATURE_DIM, FEATURE_DIM).sum(1)
+            if self._summed
+            else found
         )
 
 

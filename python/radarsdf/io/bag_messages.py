@@ -348,4 +348,6 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _damaged(path: Path, error: Exception) -> ValueError:
     remedy = "if its recording was cut off, mcap recover or rosbag reindex may repair it"
-    return ValueError(f"{path} is not a whole bag: {str(error) or type(error).__name__}; {remedy}")
+    return ValueError(
+        f"{path} is not a whole bag: {(str(error) or type(error).__name__).rstrip('.')}; {remedy}"
+    )

@@ -56,5 +56,5 @@ def test_wrong_arrays_are_refused(view_statistics):
         {"sigma": np.inf},
         {"sigma": np.nan},
     ):
-        with pytest.raises(ValueError, match="the echoes"):
+        with pytest.raises(ValueError, match="the view statistics"):
             dataclasses.replace(view_statistics, **change).check(LEAF_M)
