@@ -9,6 +9,7 @@ import threading
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from radarsdf.view import scene as module
 from radarsdf.view.quantities import quantities_of
@@ -16,7 +17,7 @@ from radarsdf.view.scene import Canvas, Painter, State
 from radarsdf.view.surface import ShownSurface
 
 ALL = State((0.0, 0.0, 1.5), max_uncertainty_m=9.0, min_confidence=0.0, quantity="intensity")
-MOVING = replace(ALL, sensor=(3.0, 0.0, 1.5))
+MOVING = replace(ALL, coarse=True, sensor=(3.0, 0.0, 1.5))
 
 
 class Node:
@@ -47,10 +48,10 @@ class Scene:
 
 @pytest.fixture
 def page(sharp_map, monkeypatch):
-    """A scene, its canvas, what is visible while a mesh is on its way to the page, and the states that are shown."""
+    """A scene, its canvas, and what is visible each time that the canvas waits for the page."""
     scene, waits, shown = Scene(), [], []
-    monkeypatch.setattr(module.time, "sleep", lambda _: waits.append(scene.seen()))
-    surface = ShownSurface.of(sharp_map, 0.4, progress=False)
+    monkeypatch.setattr(module, "wait_until_drawn", lambda *_: waits.append(scene.seen()))
+    surface = ShownSurface.of(sharp_map, 0.4, max_vertices=100_000, progress=False)
     quantities = quantities_of(sharp_map, surface, ALL.sensor)
     return scene, Canvas(scene, sharp_map, surface, quantities, None, shown.append), waits, shown
 
@@ -66,8 +67,10 @@ def test_something_is_visible_while_a_mesh_is_on_its_way(page):
     canvas.show_mesh(less, never)  # the old mesh stays until the new one is drawn
     assert waits.pop() == ["mesh 1", "mesh 2"]
     assert nodes.seen() == ["mesh 2"]
+    canvas.show_cloud(MOVING)
+    assert nodes.seen() == ["cloud"]
     canvas.show_mesh(MOVING, never)
-    assert waits.pop() == ["mesh 2", "mesh 3"]
+    assert waits.pop() == ["cloud", "mesh 3"]
     assert nodes.seen() == ["mesh 3"]
     assert shown == [ALL, less, MOVING]
     canvas.show_mesh(replace(MOVING, max_uncertainty_m=0.0), never)
@@ -75,22 +78,38 @@ def test_something_is_visible_while_a_mesh_is_on_its_way(page):
     assert len(canvas.faces) == 0
 
 
-def test_a_superseded_mesh_is_not_sent(page):
+def test_a_superseded_mesh_does_not_count_as_drawn(page):
     nodes, canvas, _, shown = page
     canvas.show_mesh(ALL, never)
-    canvas.show_mesh(MOVING, lambda: True)
-    assert nodes.seen() == ["mesh 1"]
+    canvas.show_cloud(MOVING)
+    answers = iter([False, True])  # a new position arrives while the page is waited for
+    canvas.show_mesh(MOVING, lambda: next(answers))
+    assert nodes.seen() == ["cloud", "mesh 2"]
     assert shown == [ALL]
+    canvas.show_mesh(MOVING, never)
+    assert [name for name in nodes.nodes if "mesh" in name] == ["/surface/mesh 3"]
+
+
+def test_the_cloud_hides_what_the_mesh_hides(page, sharp_map):
+    _, canvas, _, _ = page
+    limit = float(np.median(canvas._surface.uncertainty_m))
+    canvas.show_cloud(replace(MOVING, max_uncertainty_m=limit))
+    seen = canvas._cloud.points + sharp_map.origin
+    assert 0 < len(seen) == len(canvas._cloud.colors) < len(canvas._spread)
+    assert (sharp_map.uncertainty(seen) <= limit * 1.01).all()
 
 
 class SlowCanvas:
     def __init__(self):
-        self.scans, self.meshes = [], []
+        self.clouds, self.meshes = [], []
         self.drawn = threading.Event()
 
     def show_scan(self, state):
+        pass
+
+    def show_cloud(self, state):
         time.sleep(0.02)
-        self.scans.append(state.sensor[0])
+        self.clouds.append(state.sensor[0])
 
     def show_mesh(self, state, _):
         self.meshes.append(state.sensor[0])
@@ -106,14 +125,14 @@ def test_the_newest_state_wins():
     painter = Painter(canvas, ALL)
     canvas.wait()
     for i in range(200):
-        painter.change(sensor=(float(i), 0.0, 0.0), settle_s=9.0)
+        painter.change(sensor=(float(i), 0.0, 0.0), coarse=True, settle_s=9.0)
         time.sleep(0.001)
-    painter.change(settle_s=0.0)
+    painter.change(coarse=False, settle_s=0.0)
     canvas.wait()
-    assert 1 < len(canvas.scans) < 100
-    assert canvas.scans == sorted(canvas.scans)
+    assert 1 < len(canvas.clouds) < 100
+    assert canvas.clouds == sorted(set(canvas.clouds))
     assert canvas.meshes == [0.0, 199.0]
-    painter.change(sensor=(5.0, 0.0, 0.0), settle_s=0.05)  # a pause ends a drag
+    painter.change(sensor=(5.0, 0.0, 0.0), coarse=True, settle_s=0.05)  # a pause ends a drag
     canvas.wait()
     assert canvas.meshes[-1] == 5.0
     waiting = threading.Thread(target=painter.wait)

@@ -36,7 +36,7 @@ def test_a_thinned_mesh_is_the_same_surface_with_the_same_attributes(sharp_map):
 
 def test_a_map_without_a_surface_here(sharp_map):
     with pytest.raises(ValueError, match="no surface here"):
-        ShownSurface.of(sharp_map, 0.2, box=[[90, 90, 90], [91, 91, 91]], progress=False)
+        ShownSurface.of(sharp_map, 0.2, max_vertices=1000, box=[[90, 90, 90], [91, 91, 91]], progress=False)
 
 
 def test_a_glb_has_the_colors_that_were_given():

@@ -70,7 +70,7 @@ def slide(client, label, value):
 
 def test_a_new_client_gets_the_scene(client, viewer):
     clouds = {m.name: m.message["props"] for m in client.received() if m.kind == "PointCloudMessage"}
-    assert {"/scans/measured", "/scans/predicted"} == set(clouds)
+    assert {CLOUD, "/scans/measured", "/scans/predicted"} == set(clouds)
     assert clouds["/scans/measured"]["point_shape"] != clouds["/scans/predicted"]["point_shape"]
     assert {"/sensor", "/scans/path"} <= {message.name for message in client.received()}
     assert len(mesh_of(client.wait_for(is_mesh)).faces) == len(viewer.surface.faces)
@@ -79,11 +79,16 @@ def test_a_new_client_gets_the_scene(client, viewer):
     assert viewer._server.request_share_url() is None
 
 
-def test_a_drag_recolours_the_mesh_when_it_ends(client, viewer, sharp_map):
+def test_a_drag_recolours_few_points_and_then_the_mesh(client, viewer, sharp_map):
     before = len(client.received())
     _, ended_s = client.drag(0.5)
     new_mesh = client.wait_for(is_mesh, before)
     assert new_mesh.at_s > ended_s
+    moving = [m for m in client.received(before) if m.at_s < ended_s]
+    updates = [m for m in moving if m.changes(CLOUD, "colors")]
+    assert len(updates) >= 3  # of at most 10
+    assert not any(m.changes(CLOUD, "points") for m in moving)  # only what changed is sent
+    assert min(m.frame_bytes for m in updates) < 3 * len(viewer.surface.vertices) + 1000
 
     # The mesh has the colours for the last position of the drag, in the frame of the page.
     def difference(position):
@@ -116,7 +121,9 @@ def test_a_scan_is_shown_and_the_sensor_moves_there(client, viewer, scans, sharp
     client.wait_for(is_mesh, before)  # coloured for that position
     text = client.wait_for(lambda m: "scan 4: " in str(m.message.get("updates", {}).get("_markdown")), before)
     view = sharp_map.render(scans.poses[4])
-    assert f"{len(scans.points[4])} returns measured, {len(view)} predicted" in str(text.message)
+    assert f"{len(scans.points[4])} returns measured, {len(view)} predicted; median error" in str(
+        text.message
+    )
     shown = viewer._clouds.nodes["predicted"].points
     np.testing.assert_allclose(shown, view.world_points - sharp_map.origin, atol=1e-4)
     before = len(client.received())

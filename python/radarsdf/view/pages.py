@@ -16,12 +16,13 @@ from radarsdf.view.glb import glb, lightness_of, shaded
 from radarsdf.view.quantities import key, paragraph, table
 from radarsdf.view.scene import add_path
 from radarsdf.view.serving import Page, begin_at
-from radarsdf.view.surface import MAX_VERTICES, thinned
+from radarsdf.view.surface import thinned
 
 if TYPE_CHECKING:
     import trimesh
 
 _SURFACE_COLOR, _PATH_COLOR = (150, 160, 170), (0, 190, 255)
+_MAX_VERTICES = 500_000
 _MAX_LISTED = 12  # changes
 _NOTES = {"unseen": ": not observed by the other map", "gone": ": of the earlier map"}
 MEANING = {
@@ -74,7 +75,7 @@ class ChangesView(Page):
         port: int | None = None,
     ) -> None:
         super().__init__(host, port)
-        mesh: Any = thinned(changes.mesh(), MAX_VERTICES, edge_m)[0]
+        mesh: Any = thinned(changes.mesh(), _MAX_VERTICES, edge_m)[0]
         if len(mesh.faces) == 0:
             msg = "there is no surface here"
             raise ValueError(msg)

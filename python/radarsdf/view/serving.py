@@ -15,6 +15,7 @@ import socket
 import sys
 import time
 import warnings
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from radarsdf.checks import whole_number
@@ -95,6 +96,27 @@ def begin_at(server: Any, look: Look) -> None:
     camera = server.initial_camera
     camera.fov = FOV_RAD
     camera.position, camera.look_at = map(tuple, look)
+
+
+def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: float = 20.0) -> None:
+    """Wait until each page has drawn what was sent so far, or something newer is to be drawn.
+
+    viser does not report that, but a page answers a question after what came before it. The first answer says that the last
+    messages are on their way, the second that these have arrived, the third that another frame was drawn.
+    """
+    time.sleep(0.05)  # viser collects messages for a sixtieth of a second
+    for client in server.get_clients().values():
+        until_s = time.monotonic() + patience_s
+        answers = 0
+        while answers < 3 and time.monotonic() < until_s and not superseded():
+            try:
+                client.local_storage.get_item("drawn", timeout=0.5)
+            except TimeoutError:
+                continue
+            except RuntimeError as error:  # the page has no storage, which is an answer too, or is gone
+                if "disconnected" in str(error):
+                    break
+            answers += 1
 
 
 class Page:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import SurfaceTracer
+from radarsdf.checks import whole_number
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Threshold
 from radarsdf.view.glb import lightness_of
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
 
-MAX_VERTICES = 500_000  # of a mesh in a browser
+_MIN_VERTICES = 1000  # of max_vertices: fewer are not worth a look
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,16 @@ class ShownSurface:
         radar_map: Map,
         voxel_size: float,
         *,
+        max_vertices: int,
         box: ArrayLike | None = None,
         progress: bool | None = None,
         **limits: Any,
     ) -> ShownSurface:
-        """Mesh a map, and thin the mesh for a browser. `limits`: as `Map.mesh`. Raises a ValueError without a surface."""
+        """Mesh a map, and thin the mesh to `max_vertices`. `limits`: as `Map.mesh`. Raises a ValueError without a surface."""
+        whole_number(max_vertices, "max_vertices", _MIN_VERTICES)
         mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress, **limits)
         threshold = Threshold.of_mesh(mesh.metadata)
-        mesh, spacing_m = thinned(mesh, MAX_VERTICES, voxel_size)
+        mesh, spacing_m = thinned(mesh, max_vertices, voxel_size)
         if len(mesh.vertices) == 0:
             msg = "the map has no surface here"
             raise ValueError(msg)

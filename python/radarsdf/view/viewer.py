@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
-from radarsdf.view.framing import FOV_RAD, look_at_all
+from radarsdf.view.framing import FOV_RAD, Look, look_at_all
 from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
 from radarsdf.view.scene import (
+    HELD_S,
     MEASURED_COLOR,
     PATH_COLOR,
     PREDICTED_COLOR,
-    SETTLED_S,
+    SLID_S,
     Canvas,
     Painter,
     ScanClouds,
@@ -35,8 +36,9 @@ _MARK_COLOR = (0, 190, 255)  # not on the colour scale
 class Viewer(Page):
     """Serves a map, and scans to browse, in the browser until it is stopped.
 
-    The surface is recoloured where the sensor is held still. The page computes in float32 in the map's local frame, but
-    displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for :meth:`Map.mesh`, with its errors.
+    While the sensor is dragged, 30,000 vertices are recoloured; all of them are when the drag ends. The page computes in
+    float32 in the map's local frame, but displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for
+    :meth:`Map.mesh`, with its errors.
     """
 
     def __init__(
@@ -46,14 +48,17 @@ class Viewer(Page):
         *,
         voxel_size: float = 0.1,
         box: ArrayLike | None = None,
+        max_vertices: int = 500_000,
         host: str = "127.0.0.1",
         port: int | None = None,
         progress: bool | None = None,
         **limits: Any,
     ) -> None:
         super().__init__(host, port)
-        self._map = radar_map
-        self.surface = ShownSurface.of(radar_map, voxel_size, box=box, progress=progress, **limits)
+        self._map, self._voxel_size = radar_map, voxel_size
+        self.surface = ShownSurface.of(
+            radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
+        )
         self._start()
         try:
             self._fill(scans)
@@ -114,11 +119,11 @@ class Viewer(Page):
             self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
 
         async def on_limit(_: Any) -> None:
-            self._painter.change(**self._surface_state(), settle_s=SETTLED_S)
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=SLID_S)
 
         async def on_quantity(_: Any) -> None:
             self._legend.content = legend(self.quantities[self._quantity.value])
-            self._painter.change(**self._surface_state(), settle_s=0.0)
+            self._painter.change(**self._surface_state(), coarse=False, settle_s=0.0)
 
         async def on_reset(event: Any) -> None:
             self._look_at_all(event.client)
@@ -144,7 +149,7 @@ class Viewer(Page):
             sensor = clouds.sensor(int(slider.value))
             if self._gizmo is not None:
                 self._gizmo.position = tuple(np.array(sensor) - self._map.origin)
-            self._painter.change(scan=int(slider.value), sensor=sensor, settle_s=SETTLED_S)
+            self._painter.change(scan=int(slider.value), sensor=sensor, coarse=True, settle_s=SLID_S)
 
         async def on_box(_: Any) -> None:
             for name, box in boxes.items():
@@ -163,16 +168,27 @@ class Viewer(Page):
             "quantity": str(self._quantity.value),
         }
 
-    def _look_at_all(self, client: Any) -> None:
+    def _look_at_all(self, client: Any) -> Look:
         camera = client.camera
+        look = look_at_all(self._extent, aspect=_aspect(camera))
         with client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.fov = FOV_RAD
-            camera.position, camera.look_at = look_at_all(self._extent, aspect=_aspect(camera))
+            camera.position, camera.look_at = look
+        return look
 
     async def _on_connect(self, client: Any) -> None:
-        """Let a new page show everything."""
-        self._look_at_all(client)
+        """Let a new page show everything, also after its frame has changed, until the user moves the camera."""
+        first = look_at_all(self._extent)  # which a page may take after it was told a better one
+        aspect, look = _aspect(client.camera), self._look_at_all(client)
+
+        async def on_update(camera: Any) -> None:
+            nonlocal aspect, look
+            untouched = _is_at(camera, look) and _aspect(camera) != aspect
+            if untouched or (_is_at(camera, first) and not _is_at(camera, look)):
+                aspect, look = _aspect(camera), self._look_at_all(client)
+
+        client.camera.on_update(on_update)
 
     def _add_sensor(self, position: NDArray[np.float64]) -> None:
         scale = _GIZMO_SHARE * float(np.linalg.norm(np.ptp(self._extent, axis=0)))
@@ -188,8 +204,10 @@ class Viewer(Page):
 
         async def on_update(event: Any) -> None:
             sensor = self._map.origin + np.asarray(event.target.position, np.float64)
-            settle_s = 0.0 if event.phase == "end" else SETTLED_S
-            self._painter.change(sensor=tuple(sensor.tolist()), settle_s=settle_s)
+            ended = event.phase == "end"
+            self._painter.change(
+                sensor=tuple(sensor.tolist()), coarse=not ended, settle_s=0.0 if ended else HELD_S
+            )
 
         self._gizmo.on_update(on_update)
 
@@ -227,7 +245,20 @@ class Viewer(Page):
             rows["intensity"] = f"{self._map.intensity(x, sensor)[0]:.1f} from {range_m:.1f} m"
         self._answer.content = table(rows)
 
+    @property
+    def notes(self) -> list[str]:
+        """What is shown more coarsely than it is, in words."""
+        shown, spacing_m = len(self.surface.vertices), self.surface.spacing_m
+        thinned = (
+            f"the mesh is thinned to {shown} vertices, {spacing_m:.2g} m apart: --max-vertices allows more"
+        )
+        return [thinned] if spacing_m > self._voxel_size else []
+
 
 def _aspect(camera: Any) -> float:
     """Width of a page's frame over its height, within what a screen can have."""
     return float(np.clip(camera.image_width / max(camera.image_height, 1), 0.1, 10.0))
+
+
+def _is_at(camera: Any, look: Look) -> bool:
+    return bool(np.allclose(camera.position, look.position, atol=0.01))
