@@ -33,12 +33,12 @@ void bind_local_planes(py::module_& m) {
           "points"_a.noconvert(), "sign"_a = 1,
           "Adds points (N, 3) float64, world frame, m; with sign -1, takes them out again, exactly.")
       .def(
-          "beside",
+          "agreement",
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& pose,
              const VarianceNumbers& variances) {
             const std::int64_t count = check_points(points);
             check_shape(pose, 4, 4, "pose");
-            const Agreement found = planes.beside(points.data(), count, pose.data(), variances_of(variances));
+            const Agreement found = planes.agreement(points.data(), count, pose.data(), variances_of(variances));
             py::array_t<double> hessian({kPose, kPose}), gradient(kPose), doubt({kPose, kPose});
             std::copy(found.doubt.begin(), found.doubt.end(), doubt.mutable_data());
             std::copy(found.hessian.begin(), found.hessian.end(), hessian.mutable_data());

@@ -11,7 +11,7 @@
 
 namespace radarsdf {
 
-// What Adam remembers of a row beside its moments.
+// What Adam remembers of a row besides its moments.
 struct RowMark {
   std::int32_t last_step;  // in which it last moved; 0: never
   std::int32_t place;      // 1 + that of its sum among the sums of the step at hand; 0: the step has not touched it

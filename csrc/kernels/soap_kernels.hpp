@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// What a step of SOAP is made of beside products of matrices, compiled once for each instruction set (see
+// What a step of SOAP is made of besides products of matrices, compiled once for each instruction set (see
 // interpolation_kernels.hpp).
 #pragma once
 

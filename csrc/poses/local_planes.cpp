@@ -175,8 +175,8 @@ std::optional<LocalPlanes::Residual> LocalPlanes::residual(const double* point, 
   return Residual{dot3(off, here.axes[0]), of_return + of_plane + kLeastM2, &here};
 }
 
-Agreement LocalPlanes::beside(const double* points, std::int64_t count, const double* pose,
-                              const ReturnVariances& noise) const {
+Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const double* pose,
+                                 const ReturnVariances& noise) const {
   const Beams beams(points, count);
   const double up[3] = {pose[2], pose[6], pose[10]};
   struct Row {

@@ -39,7 +39,7 @@ class LocalPlanes {
 
   // points: (count, 3), sensor frame, m; pose: (4, 4) T_world_sensor. The variance of a residual is that of the return
   // and that of the plane at its place; its weight is that of Geman and McClure.
-  Agreement beside(const double* points, std::int64_t count, const double* pose, const ReturnVariances& noise) const;
+  Agreement agreement(const double* points, std::int64_t count, const double* pose, const ReturnVariances& noise) const;
 
   // scores: (num_poses, count), of each of the poses (num_poses, 4, 4) and the returns 1 / (1 + r^2 / (4 variance)); 0
   // for a return without a plane.

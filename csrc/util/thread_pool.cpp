@@ -17,7 +17,7 @@ namespace radarsdf {
 namespace {
 
 // As long as it takes to wake a thread: whoever looks so long loses at most as much again. A fit of `hugin`
-// takes 2.5, 2.7, 2.7, 2.7 s with 1000, 250, 60 and 0 us, and beside a busy program 4.8, 4.1, 3.9, 3.8.
+// takes 2.5, 2.7, 2.7, 2.7 s with 1000, 250, 60 and 0 us, and next to a busy program 4.8, 4.1, 3.9, 3.8.
 constexpr std::chrono::microseconds kLook{100};
 
 inline void pause() {

@@ -763,7 +763,7 @@ class LocalPlanes:
         """
         Adds points (N, 3) float64, world frame, m; with sign -1, takes them out again, exactly.
         """
-    def beside(
+    def agreement(
         self,
         points: numpy.typing.NDArray[numpy.float64],
         pose: numpy.typing.NDArray[numpy.float64],

@@ -44,7 +44,7 @@ def test_what_is_taken_out_was_never_there():
     scan = scans[1] - scans[1].mean(axis=0)
     at = np.eye(4)
     at[:3, 3] = scans[1].mean(axis=0)
-    for one, other in zip(changed.beside(scan, at, VARIANCES), kept.beside(scan, at, VARIANCES), strict=True):
+    for one, other in zip(changed.agreement(scan, at, VARIANCES), kept.agreement(scan, at, VARIANCES), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -66,7 +66,7 @@ def test_steps_by_gradient_and_hessian_lead_to_the_pose():
     seen = np.ascontiguousarray((scan - true[:3, 3]) @ true[:3, :3])
     found = np.eye(4)
     for _ in range(8):
-        hessian, gradient, doubt, weight = planes.beside(seen, found, VARIANCES)
+        hessian, gradient, doubt, weight = planes.agreement(seen, found, VARIANCES)
         found = moved(found[None], -np.linalg.solve(hessian, gradient)[None])[0]
     np.testing.assert_allclose(found, true, atol=4e-3)
     assert weight > 0.6 * len(scan)
@@ -80,7 +80,7 @@ def test_along_a_wall_all_is_doubt():
         return np.column_stack([rng.normal(5, 0.1, 2000), rng.uniform(-5, 5, 2000), rng.uniform(-1, 1, 2000)])
 
     planes = planes_of(wall(), wall())
-    hessian, _, doubt, _ = planes.beside(wall(), np.eye(4), VARIANCES)
+    hessian, _, doubt, _ = planes.agreement(wall(), np.eye(4), VARIANCES)
     across, along = doubt[0, 0] / hessian[0, 0], doubt[1, 1] / hessian[1, 1]
     assert across < 0.05
     assert 0.4 < along < 2.5

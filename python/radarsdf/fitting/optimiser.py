@@ -175,7 +175,7 @@ class RowAdam:
         if self.step_count >= len(self._decays):
             powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64, device="cpu")[:, None]
             decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
-            # Denormal numbers would be slow, and make no difference beside a gradient.
+            # Denormal numbers would be slow, and make no difference compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         self._cells.table.begin_adam_step(
             [(view(t.points), t.located.numpy(), rows_view(t.gradient)) for t in touched],

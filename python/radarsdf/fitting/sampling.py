@@ -174,7 +174,7 @@ class RaySampler:
         ray = self._rays.index_select(0, places)
         points = _returns(ray) - sdf_m[:, None] * _directions(ray)
         if noise_rad > 0:
-            # Noise in all directions is simpler. Along the beam it is small beside the width of the band.
+            # Noise in all directions is simpler. Along the beam it is small compared with the width of the band.
             noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
             points += noise * (noise_rad * ray[:, RAY_RANGE, None])
         near = [share(count, part, parts) for part in range(parts)]

@@ -24,7 +24,7 @@ from radarsdf.scans import Columns, Notes
 
 MAX_GAP_S = 0.5  # between two poses over which poses are interpolated, by default
 
-# Names of files of poses that are found beside scans.
+# Names of files of poses that are found next to scans.
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 POSE_SUFFIXES = (".tum", ".kitti", ".npy")  # that write_poses writes
 FIND_POSES = "radarsdf poses finds them from the radar alone"  # ends what is said of scans without poses
@@ -182,7 +182,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, qx, qy, qz and
       qw, as in files of EuRoC, evo and ``rostopic echo -p``. Without a time it is in order.
     - TUM: ``time x y z qx qy qz qw``, s and m.
-    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in ``calib.txt`` beside it,
+    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in ``calib.txt`` next to it,
       T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
 

@@ -156,7 +156,7 @@ def _read(path: Path, request: Request) -> Scans:
     if path.is_dir():
         if (dataset := datasets.find(path)) is not None:
             return dataset.read(path, request)
-        if bags := bags_in(path):  # NTU4DRadLM and Viking Hill have files beside them
+        if bags := bags_in(path):  # NTU4DRadLM and Viking Hill have files next to them
             if request.extrinsic is None:
                 request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
             file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)

@@ -174,7 +174,7 @@ class Tracker:
         Without the share that errors of the normals contribute: along a wall, normals that point a little along it would seem to
         measure the position along it.
         """
-        hessian, gradient, doubt, weight = planes.beside(scan, np.ascontiguousarray(pose), self._variances)
+        hessian, gradient, doubt, weight = planes.agreement(scan, np.ascontiguousarray(pose), self._variances)
         M = reduction(hessian, doubt)
         return M @ hessian @ M.T, M @ (M @ gradient), weight
 

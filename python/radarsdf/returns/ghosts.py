@@ -25,7 +25,7 @@ _MARGIN = 0.25  # cells of surfels
 _SIGMAS = 2.0  # standard deviations of the noise
 _MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there. A hedge lets most rays through.
 # A trunk, a rail or the end of a wall fills a part of a surfel's cell. What lies evenly on a strip reaches √3 standard
-# deviations across it from its middle. A ray farther from the centre passes beside; along a strip some do not, but what
+# deviations across it from its middle. A ray farther from the centre misses it; along a strip some do not, but what
 # is narrow mirrors little. Surfaces that fill the cell reach beyond it.
 _REACH_SIGMAS = 3**0.5
 # Share of the returns round a ghost that are behind a surface too. Round a noisy return it is lower.
@@ -61,14 +61,14 @@ def first_crossed(
     noise: SensorNoise,
     num_threads: int = 0,
     *,
-    beside: bool = True,
+    beyond_returns: bool = True,
 ) -> NDArray[np.int32]:
     """(N,) row in `planes`, rows of surfels, of the first that each ray crosses from its front, or -1.
 
-    `beside`: it also crosses one where the plane goes on, in the surfel's cell, beside the returns.
+    `beyond_returns`: it also crosses one where the plane continues, in the cell of the surfel, beyond the returns.
     """
     variances = surfels.variances[planes]
-    reach_m = np.full(len(planes), np.inf) if beside else _REACH_SIGMAS * np.sqrt(variances[:, 1])
+    reach_m = np.full(len(planes), np.inf) if beyond_returns else _REACH_SIGMAS * np.sqrt(variances[:, 1])
     chosen = (surfels.centres[planes], surfels.normals[planes], np.sqrt(variances[:, :1]), reach_m[:, None])
     surfel_map = SurfelMap(
         surfels.keys[surfels.cell_of_plane[planes]],
@@ -110,7 +110,7 @@ def are_behind(
 ) -> NDArray[np.bool_]:
     """(N,) which rays end behind one of `planes`, rows of opaque surfels. `crosses` (N,): which cross any flat one."""
     behind, chosen = crosses.copy(), rays.select(np.flatnonzero(crosses))
-    behind[crosses] = first_crossed(surfels, planes, chosen, noise, num_threads, beside=False) >= 0
+    behind[crosses] = first_crossed(surfels, planes, chosen, noise, num_threads, beyond_returns=False) >= 0
     return behind
 
 
