@@ -32,7 +32,7 @@ void bind_free_space(py::module_& m) {
         }
         const auto blocks = static_cast<py::ssize_t>(found.keys.size());
         const py::array planes = to_array(std::move(found.planes))
-                                     .reshape({blocks, py::ssize_t{kPassagePlanes}, py::ssize_t{kPassageWords}});
+                                     .reshape({blocks, py::ssize_t{kFreeSpacePlanes}, py::ssize_t{kFreeSpaceWords}});
         return py::make_tuple(to_array(std::move(found.keys)), Array<std::uint64_t>(planes));
       },
       "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "passed_m"_a.noconvert(),

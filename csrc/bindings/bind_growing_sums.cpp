@@ -101,7 +101,7 @@ void bind_growing_sums(py::module_& m) {
                                blocks = check_column(visibility_keys, "visibility_keys");
             check_shape(of_cells, cells, kSums, "sums");
             if (check_column(scans, "scans") != cells || check_column(visibility, "visibility") != blocks) {
-              throw std::invalid_argument("scans must be one for each cell, looks one for each block");
+              throw std::invalid_argument("scans must be one for each cell, visibility one for each block");
             }
             sums.insert({{keys.data(), keys.data() + cells},
                          {of_cells.data(), of_cells.data() + kSums * cells},

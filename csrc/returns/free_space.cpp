@@ -19,9 +19,9 @@ namespace {
 
 // A ray is followed towards the sensor until others of its scan have passed so many cells on end: they go there, too.
 constexpr int kPassedCells = 8;
-constexpr int kBlockBits = 3 * kPassageLevels;
-using Bits = std::array<std::uint64_t, kPassageWords>;  // of the leaf cells of a block
-using Planes = std::array<std::uint64_t, kPassageStride>;
+constexpr int kBlockBits = 3 * kFreeSpaceLevels;
+using Bits = std::array<std::uint64_t, kFreeSpaceWords>;  // of the leaf cells of a block
+using Planes = std::array<std::uint64_t, kFreeSpaceStride>;
 
 // Blocks by key, in the order in which they came.
 template <typename Block>
@@ -55,28 +55,29 @@ struct Seen {
 
 // Adds one scan to the counts of a block, 64 leaf cells at a time: bit planes are numbers upright.
 void add_scan(const Seen& seen, Planes& block) {
-  for (std::size_t word = 0; word < kPassageWords; ++word) {
-    std::uint64_t &ones = block[word], &twos = block[kPassageWords + word], &fours = block[2 * kPassageWords + word];
+  for (std::size_t word = 0; word < kFreeSpaceWords; ++word) {
+    std::uint64_t &ones = block[word], &twos = block[kFreeSpaceWords + word],
+                  &fours = block[2 * kFreeSpaceWords + word];
     const std::uint64_t more = seen.passed[word] & ~(ones & twos & fours);  // those at 7 stay
     const std::uint64_t carry = ones & more, carry2 = twos & carry;
     ones ^= more;
     twos ^= carry;
     fours ^= carry2;
-    block[kCountPlanes * kPassageWords + word] |= seen.returns[word];
+    block[kCountPlanes * kFreeSpaceWords + word] |= seen.returns[word];
   }
 }
 
 // Adds what other scans saw.
 void add_counts(const std::uint64_t* other, std::uint64_t* block) {
-  for (std::size_t word = 0; word < kPassageWords; ++word) {
+  for (std::size_t word = 0; word < kFreeSpaceWords; ++word) {
     std::uint64_t carry = 0;
     for (std::size_t plane = 0; plane < kCountPlanes; ++plane) {
-      const std::uint64_t a = block[plane * kPassageWords + word], b = other[plane * kPassageWords + word];
-      block[plane * kPassageWords + word] = a ^ b ^ carry;
+      const std::uint64_t a = block[plane * kFreeSpaceWords + word], b = other[plane * kFreeSpaceWords + word];
+      block[plane * kFreeSpaceWords + word] = a ^ b ^ carry;
       carry = (a & b) | (a & carry) | (b & carry);
     }
-    for (std::size_t plane = 0; plane < kCountPlanes; ++plane) block[plane * kPassageWords + word] |= carry;
-    block[kCountPlanes * kPassageWords + word] |= other[kCountPlanes * kPassageWords + word];
+    for (std::size_t plane = 0; plane < kCountPlanes; ++plane) block[plane * kFreeSpaceWords + word] |= carry;
+    block[kCountPlanes * kFreeSpaceWords + word] |= other[kCountPlanes * kFreeSpaceWords + word];
   }
 }
 
@@ -90,7 +91,7 @@ void check(const Rays& rays, double leaf_size_m) {
   if (!std::is_sorted(rays.scans, rays.scans + rays.count) || (rays.count > 0 && rays.scans[0] < 0)) {
     throw std::invalid_argument("scans must be ascending numbers of at least 0");
   }
-  const double limit_m = (kAxisBias - (1 << kPassageLevels)) * leaf_size_m;
+  const double limit_m = (kAxisBias - (1 << kFreeSpaceLevels)) * leaf_size_m;
   bool inside = leaf_size_m > 0;
   for (std::int64_t i = 0; i < 3 * rays.count; ++i) {  // NaN fails the comparison too
     const double range_m = rays.ranges_m[i / 3], sensor_m = rays.points[i] - range_m * double{rays.directions[i]};
@@ -105,8 +106,8 @@ class Walker {
   Walker(const Rays& rays, double leaf_size_m, const std::int32_t* lower, const std::int32_t* upper)
       : rays_(rays), leaf_size_m_(leaf_size_m) {
     for (int axis = 0; axis < 3; ++axis) {
-      first_[axis] = std::int64_t{lower[axis]} >> kPassageLevels;
-      last_[axis] = (std::int64_t{upper[axis]} - 1) >> kPassageLevels;
+      first_[axis] = std::int64_t{lower[axis]} >> kFreeSpaceLevels;
+      last_[axis] = (std::int64_t{upper[axis]} - 1) >> kFreeSpaceLevels;
     }
   }
 
@@ -152,7 +153,7 @@ class Walker {
   bool wanted(const CellWalk& cell) const {
     bool inside = true;
     for (int axis = 0; axis < 3; ++axis) {
-      const std::int64_t block = cell.coordinate(axis) >> kPassageLevels;
+      const std::int64_t block = cell.coordinate(axis) >> kFreeSpaceLevels;
       inside = inside && first_[axis] <= block && block <= last_[axis];
     }
     return inside;
@@ -195,7 +196,7 @@ FreeSpace find_free_space(const float* points, const float* directions, const fl
   std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return all.keys[a] < all.keys[b]; });
   FreeSpace found;
   found.keys.reserve(order.size());
-  found.planes.reserve(order.size() * kPassageStride);
+  found.planes.reserve(order.size() * kFreeSpaceStride);
   for (const std::size_t i : order) {
     found.keys.push_back(all.keys[i]);
     found.planes.insert(found.planes.end(), all.blocks[i].begin(), all.blocks[i].end());

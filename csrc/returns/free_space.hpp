@@ -9,13 +9,13 @@
 
 namespace radarsdf {
 
-// Leaf cells are kept in blocks of 2^kPassageLevels along each edge.
-constexpr int kPassageLevels = 3;
-constexpr int kPassageWords = 8;  // of 64 bits: one for each leaf cell of a block
+// Leaf cells are kept in blocks of 2^kFreeSpaceLevels along each edge.
+constexpr int kFreeSpaceLevels = 3;
+constexpr int kFreeSpaceWords = 8;  // of 64 bits: one for each leaf cell of a block
 // Of a block: three planes are the bits of the number of scans with a ray through each leaf cell, which stays at 7, and
 // one says in which cells there are returns.
-constexpr int kCountPlanes = 3, kPassagePlanes = kCountPlanes + 1;
-constexpr int kPassageStride = kPassagePlanes * kPassageWords;
+constexpr int kCountPlanes = 3, kFreeSpacePlanes = kCountPlanes + 1;
+constexpr int kFreeSpaceStride = kFreeSpacePlanes * kFreeSpaceWords;
 
 struct FreeSpace {
   std::vector<std::uint64_t> keys;    // (B,) of the blocks, ascending: those of leaf cells without their last 9 bits

@@ -19,7 +19,7 @@ constexpr int kVisibilityLevels = 3;
 // go to the same sensor. On `hugin` this finds 99.0 % of the counts in half the time; 3 cubes find 98.1 %.
 constexpr int kPassedCubes = 4;
 
-// Calls visit(key) for each cube that a ray of a scan looks at and none before it did. passed: those cubes, so far.
+// Calls visit(key) for each cube that a ray of a scan sees and none before it saw. passed: those cubes, so far.
 template <typename Visit>
 void visit_visible_cubes(const float* point, const float* direction, double range_m, double leaf_size_m,
                          FlatMap& passed, const Visit& visit) {

@@ -44,7 +44,9 @@ def test_what_is_taken_out_was_never_there():
     scan = scans[1] - scans[1].mean(axis=0)
     at = np.eye(4)
     at[:3, 3] = scans[1].mean(axis=0)
-    for one, other in zip(changed.agreement(scan, at, VARIANCES), kept.agreement(scan, at, VARIANCES), strict=True):
+    for one, other in zip(
+        changed.agreement(scan, at, VARIANCES), kept.agreement(scan, at, VARIANCES), strict=True
+    ):
         np.testing.assert_array_equal(one, other)
 
 

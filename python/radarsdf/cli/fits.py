@@ -15,7 +15,7 @@ from radarsdf import Interrupted, RadarMap
 from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split
 from radarsdf.cli.maps import evaluate, mesh
-from radarsdf.cli.options import Parser
+from radarsdf.cli.options import LIMITS, Parser
 from radarsdf.cli.pages import add_report
 from radarsdf.cli.pages import view as show_map
 from radarsdf.cli.results import Results
@@ -28,7 +28,7 @@ from radarsdf.report.subject import Subject
 from radarsdf.view import serving
 
 # Options of the demo that it passes on.
-_SHARED = ("paper", "quick", "config", "set", "voxel", "min_confidence", "max_uncertainty", "min_component")
+_SHARED = ("paper", "quick", "config", "set", "voxel", *LIMITS)
 
 
 def fit(given: Namespace, results: Results) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from radarsdf.cli.app import refuse_if, warn
+from radarsdf.cli.options import LIMITS
 from radarsdf.evaluation import holdout
 from radarsdf.io.poses import UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
@@ -82,11 +83,7 @@ def inputs_of(given: Namespace) -> list[Path]:
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:
     """What the mesh leaves out, as arguments of ``Map.mesh``."""
-    return {
-        "min_confidence": given.min_confidence,
-        "max_uncertainty": given.max_uncertainty,
-        "min_component_triangles": given.min_component,
-    }
+    return {name: getattr(given, name) for name in LIMITS}
 
 
 def check_address(given: Namespace) -> None:

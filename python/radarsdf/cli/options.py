@@ -76,6 +76,12 @@ GROUPS = {
     "workers": "--processes --cluster",
 }
 
+LIMITS = (
+    "min_confidence",
+    "max_uncertainty",
+    "min_component_triangles",
+)  # of "surface", arguments of Map.mesh
+
 _Kind = dict[str, Any]
 _FLAG: _Kind = {"action": "store_true"}
 _SWITCH: _Kind = {"action": argparse.BooleanOptionalAction}
@@ -142,7 +148,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o
     "--min-confidence": (_METRES | {"metavar": "P"},
                          "leave out surface below this, 0 to 1; default: that of the highest expected F-score"),
     "--max-uncertainty": (_METRES, "leave out surface with a standard error above this"),
-    "--min-component": (_COUNT, "leave out components of fewer triangles; default: 30, and fewer in large voxels"),
+    "--min-component": (_COUNT | {"dest": "min_component_triangles"}, "leave out components of fewer triangles; default: 30, and fewer in large voxels"),
     "--host": ({"default": "127.0.0.1"}, ("address to listen on; default: 127.0.0.1, this machine alone; with 0.0.0.0, "
                "everyone who can reach this machine sees the map")),
     "--port": ({"type": int}, "port to listen on; default: 8080, or the next that is free"),

@@ -317,10 +317,10 @@ class Training:
             stop = interrupted()
             write = checkpoint is not None and (stop or checkpoint.due())
             judge = i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
-            look = stop or write or judge
+            pause = stop or write or judge
             # No samples are drawn ahead before the state is written: it would contain the draw after the next.
             batch = ahead or stage.draw()
-            found, ahead = self._backend.of(stage.losses, batch, _nothing if look else stage.draw)
+            found, ahead = self._backend.of(stage.losses, batch, _nothing if pause else stage.draw)
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
@@ -340,7 +340,7 @@ class Training:
             del batch, found, move_networks
             bar.set_postfix_str(f"{stage.name} loss {loss:.3g}", refresh=False)
             bar.update()
-            if look:
+            if pause:
                 # A sum is finite only if all numbers are. A sum that overflows is no better.
                 if not all(math.isfinite(float(p.detach().sum())) for p in changing):
                     give_up("a parameter is not finite")

@@ -162,7 +162,7 @@ class GrowingState:
             blocks = np.array(sorted(self._changed), np.uint64)
         self._changed.clear()
         sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(blocks)))
-        return surface, (blocks, sums, self.noise, self._num_threads), self._looks()
+        return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
 
     def forget_surface(self) -> None:
         """The surface is derived again from all sums."""
@@ -212,7 +212,7 @@ class GrowingState:
 
     def fit_input(self) -> Callable[[], FitInput]:
         """What a fit of all scans starts from, with the sums that were kept up."""
-        scans, sums, visibility, origin = self.scans(), self._all_sums(), self._looks(), self.origin
+        scans, sums, visibility, origin = self.scans(), self._all_sums(), self._visibility(), self.origin
 
         def read() -> FitInput:
             rays = _rays_of(scans, self.config, origin)
@@ -229,7 +229,7 @@ class GrowingState:
     def _all_sums(self) -> ScanSums:
         return ScanSums(self.config.leaf_size_m, *self.sums.sums_of(self.sums.block_keys()))
 
-    def _looks(self) -> VisibilityCounts:
+    def _visibility(self) -> VisibilityCounts:
         return VisibilityCounts(*self.sums.visibility_of(self.sums.block_keys()))
 
     def _settle_noise(self) -> None:

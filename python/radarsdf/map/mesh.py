@@ -79,15 +79,10 @@ class Surface:
         tally = Tally.of(areas_m2, *(column.numpy() for column in columns))
         return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)
 
-    def allowed(self, max_uncertainty: float, min_confidence: float = 0.0) -> NDArray[np.bool_]:
-        """(F,) faces whose three vertices are within these limits."""
-        certain = np.nan_to_num(self.uncertainty_m, nan=np.inf) <= max_uncertainty
-        return with_all(certain & (self.confidence >= min_confidence), self.faces)
-
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
-        kept = self.allowed(
-            limits.max_uncertainty, self.tally.threshold(limits.min_confidence).min_confidence
-        )
+        """(F,) faces within the limits, without small components."""
+        min_confidence = self.tally.threshold(limits.min_confidence).min_confidence
+        kept = within(limits, min_confidence, self.faces, self.confidence, self.uncertainty_m)
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
@@ -152,6 +147,18 @@ def with_intensities(
 
 def local(contents: WholeMap, world: NDArray[np.float64]) -> torch.Tensor:
     return queries.to_local(contents, torch.from_numpy(world))
+
+
+def within(
+    limits: Limits,
+    min_confidence: float,
+    faces: NDArray[np.int32],
+    confidence: NDArray[np.float32],
+    uncertainty_m: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """(F,) which of the faces (F, 3) each have three vertices within the limits: the one place where they are compared."""
+    certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= limits.max_uncertainty
+    return with_all(certain & (confidence >= min_confidence), faces)
 
 
 def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:

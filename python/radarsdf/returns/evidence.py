@@ -46,7 +46,7 @@ class Evidence:
         num_threads: int = 0,
         visibility: VisibilityCounts | None = None,
     ) -> Evidence:
-        """Evidence in the leaf cells with these keys (C,), ascending. `rays` are all: those to false returns also looked."""
+        """Evidence in the leaf cells with these keys (C,), ascending. `rays` are all: those of false returns see cells, too."""
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
         if visibility is not None:
@@ -80,7 +80,7 @@ class ReturnsOfCells:
 
 @dataclass(frozen=True)
 class VisibilityCounts:
-    """How many scans looked at each block of 8 × 8 × 8 leaf cells."""
+    """Number of scans whose rays reach each block of 8 × 8 × 8 leaf cells."""
 
     keys: NDArray[np.uint64]  # (B,) Morton keys of leaf cells without their last nine bits, ascending
     scans: NDArray[np.uint32]  # (B,) number of scans with a ray through each block, or to there

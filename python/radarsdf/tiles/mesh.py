@@ -22,7 +22,7 @@ from radarsdf.io.files import check_outputs
 from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.mesh import Surface, crossed, described_mesh, one_for_equal, renumbered, with_all
+from radarsdf.map.mesh import Surface, crossed, described_mesh, one_for_equal, renumbered, within
 from radarsdf.map.queries import EvidenceAt
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
 from radarsdf.map.view import ViewedMap
@@ -162,9 +162,7 @@ def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np
 
 
 def _allowed(part: Part, min_confidence: float, limits: Limits) -> NDArray[np.bool_]:
-    """(F,) which faces are within the limits."""
-    certain = np.nan_to_num(part.uncertainty_m, nan=np.inf) <= limits.max_uncertainty
-    return with_all(certain & (part.confidence >= min_confidence), part.faces)
+    return within(limits, min_confidence, part.faces, part.confidence, part.uncertainty_m)
 
 
 def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
