@@ -277,6 +277,12 @@ class Scans:
             scans._ground_truth = lambda: None
         return scans
 
+    def with_ground_truth(self, points: Callable[[], NDArray[Any] | None]) -> Scans:
+        """The same scans with other lidar points, (M, 3), world frame, m, which `points` returns when they are asked for."""
+        scans = copy(self)
+        scans._ground_truth = cache(points)
+        return scans
+
     def _scan(self, i: int) -> Scan:
         values = self._loaded().values()
         points, intensities, doppler_mps, sigma = (None if array is None else array[i] for array in values)

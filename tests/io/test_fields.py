@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from radarsdf.io import read
 from radarsdf.io.fields import Fields
 from radarsdf.scans import Notes
 
@@ -137,3 +138,10 @@ def test_units_of_angles(text, said):
 )  # fmt: skip
 def test_names_of_other_programs(field, role):
     assert Fields.of(["x", "y", "z", field]).names[role] == field
+
+
+def test_an_intensity_in_linear_units_is_noted(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,snr_linear,rdot\n5,0,0,42,-3\n")
+    scans = read(tmp_path / "a.csv", [np.eye(4)])
+    assert scans.intensities[0].tolist() == [42]
+    assert any("snr_linear" in note for note in scans.notes)

@@ -172,6 +172,9 @@ def test_poses_that_are_given_win_over_those_of_an_npz(tmp_path):
     assert again.notes[1].startswith("1 scans left out: no poses within")
     mounting = pose([0.5, 0, 1], np.pi / 2)
     assert_allclose(read(path, POSES[1:5], extrinsic=mounting).poses, POSES[1:5] @ mounting)
+    assert read(path, POSES[1:5], ground_truth=np.ones((2, 3))).ground_truth.shape == (2, 3)
+    np.save(tmp_path / "lidar.npy", np.full((5, 3), 2.0))
+    assert_allclose(read(path, ground_truth=tmp_path / "lidar.npy").ground_truth, np.full((5, 3), 2.0))
     with pytest.raises(ValueError, match="there are 4 scans but 2 poses"):
         read(path, POSES[:2])
     with pytest.raises(ValueError, match="an extrinsic belongs to other poses"):

@@ -20,6 +20,7 @@ from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
 from radarsdf.scans import Notes, Scans, scans_in_memory
 from radarsdf.tiles.fit_tiles import cluster_executor, plan_tiles, run_fits
+from radarsdf.tiles.mesh import voxels_along
 from radarsdf.tiles.plan import Plan, failure_of, is_done
 from radarsdf.tiles.tiled_map import TiledMap
 
@@ -28,6 +29,7 @@ _FIRST_SCANS = 100  # that are checked before the work
 
 def run(given: Namespace, results: Results) -> int:
     """Plan, fit and mesh in one go."""
+    voxels_along(load_config(given).leaf_size_m, given.voxel)  # or an error before the work
     plan(given, results)
     in_folder = Namespace(**vars(given) | {"folder": given.out, "tile": None, "out": None})
     missing = fit(in_folder, results)

@@ -120,7 +120,10 @@ def check_kitti(paths: Sequence[Path]) -> None:
     within = _variance(numbers, _KITTI_WIDTH)
     for width in range(3, min(21, len(numbers) // 2 + 1)):
         other, few = _variance(numbers, width), len(numbers) < _ENOUGH_ROWS * width
-        check(other >= _LESS * within or (few and other), f".bin files have {width} columns: {remedy}")
+        check(
+            other >= _LESS * within or (few and other),
+            f"the numbers of the .bin files look like {width} columns, not four: {remedy}",
+        )
 
 
 def _variance(numbers: NDArray[np.float32], width: int) -> float:

@@ -109,8 +109,12 @@ class Fields:
         )
         return replace(self, in_degrees=in_degrees)
 
-    def note_unused(self, names: Iterable[str], notes: Notes) -> None:
-        """Notes which fields are not used."""
+    def note_use(self, names: Iterable[str], notes: Notes) -> None:
+        """Notes intensities in linear units, and which fields are not used."""
+        if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
+            notes.add(
+                f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
+            )
         if unused := [name for name in names if name and name not in self.names.values()]:
             listed = ", ".join(unused)
             notes.add(f"fields that are not used: {listed}; fields={{role: name}} or --field chooses others")

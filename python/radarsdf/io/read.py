@@ -13,12 +13,12 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import check_pose, path_of, positive
+from radarsdf.checks import check_pose, path_of, positions, positive
 from radarsdf.imu import checked_rotation
 from radarsdf.io import datasets
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
-from radarsdf.io.clouds import CLOUD_SUFFIXES
+from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
 from radarsdf.io.fields import SIGMA
 from radarsdf.io.files import check
 from radarsdf.io.npz import read_scans
@@ -50,6 +50,7 @@ def read(
     fields: Mapping[str, Any] | None = None,
     columns: int | Sequence[str] | None = None,
     max_gap_s: float = MAX_GAP_S,
+    ground_truth: str | PathLike[str] | ArrayLike | None = None,
 ) -> Scans:
     """Reads scans with poses from a file, a folder or bags.
 
@@ -97,6 +98,8 @@ def read(
         float32 x, y, z, intensity.
     max_gap_s : float
         Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
+    ground_truth : path-like or (M, 3) array_like, optional
+        Lidar points, world frame, m, in place of those that come with the scans.
 
     Returns
     -------
@@ -128,7 +131,8 @@ def read(
     check(stamps in (None, "header", "record"), f'stamps must be "header" or "record", not {stamps!r:.50}')
     one = isinstance(path, (str, PathLike))
     paths = [path_of(part, "path") for part in ([path] if one or not isinstance(path, Iterable) else path)]
-    for file in (*paths, *([Path(poses)] if isinstance(poses, (str, PathLike)) else [])):
+    files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
+    for file in (*paths, *map(Path, files)):
         if not file.exists():  # many readers would not name it
             msg = f"{file} does not exist"
             raise FileNotFoundError(msg)
@@ -146,7 +150,13 @@ def read(
         max_gap_s=positive(max_gap_s, "max_gap_s"),
         notes=Notes(str(path) if one else "the bags"),
     )
-    return _read(paths[0], request) if one else read_bags(paths, request)
+    scans = _read(paths[0], request) if one else read_bags(paths, request)
+    if ground_truth is None:
+        return scans
+    if isinstance(ground_truth, (str, PathLike)):
+        return scans.with_ground_truth(partial(read_points, ground_truth))
+    points = positions(ground_truth, "ground_truth")
+    return scans.with_ground_truth(lambda: points)
 
 
 def _read(path: Path, request: Request) -> Scans:

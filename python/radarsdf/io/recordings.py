@@ -146,7 +146,7 @@ def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields]
     if layout not in layouts:
         fields = Fields.of(list(columns), request.fields).judged(columns, notes)
         if not request.fields and topic not in {known for known, *_ in layouts}:
-            fields.note_unused(columns, notes)
+            fields.note_use(columns, notes)
         layouts[layout] = fields
     return layouts[layout]
 

@@ -74,16 +74,21 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
     return arrays
 
 
+def voxels_along(leaf_m: float, voxel_size: float) -> int:
+    """Voxels along the edge of a leaf cell. Raises a ValueError unless they divide it, so that those of two tiles meet."""
+    steps = round(leaf_m / voxel_size) if 0 < voxel_size <= leaf_m else 0
+    if steps < 1 or not math.isclose(steps * voxel_size, leaf_m, rel_tol=1e-9):
+        msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as those of tiles must: use {leaf_m / 2:g} or {leaf_m:g}"
+        raise ValueError(msg)
+    return steps
+
+
 def parts_of(
     city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
 ) -> tuple[list[Path], Limits, Threshold]:
     """Meshes all tiles: the files of the parts, the limits of a mesh of them (`wanted`), and what these come to."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
-    leaf_m = city.config.leaf_size_m
-    steps = round(leaf_m / voxel_size) if voxel_size <= leaf_m else 0
-    if steps < 1 or not math.isclose(steps * voxel_size, leaf_m, rel_tol=1e-9):
-        msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as those of tiles must: use {leaf_m / 2:g} or {leaf_m:g}"
-        raise ValueError(msg)
+    steps = voxels_along(city.config.leaf_size_m, voxel_size)
     corners = None if box is None else check_box(box)
     paths = []
     for planned in tqdm(city.tiles, "mesh", unit="tile", disable=hides_bar(progress)):
