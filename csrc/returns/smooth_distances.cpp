@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstring>
 #include <stdexcept>
 #include <utility>
 #include <vector>
@@ -108,24 +107,12 @@ class Plates {
 
   // Rows are numbered in Morton order, so those of a block follow each other.
   void number() {
-    const std::vector<std::uint64_t>& leaf_keys = table_->leaf_keys();
-    std::int32_t last = -1;
-    for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell)
-      last = std::max(last, *std::max_element(rows_of(cell), rows_of(cell) + 8));
-    LargeVector<std::uint64_t> keys(static_cast<std::size_t>(last + 1));
-    for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell) {
-      std::array<std::uint64_t, 8> corners;
-      corners[0] = leaf_keys[cell];
-      for (std::size_t c = 1; c < 8; ++c) {
-        const int axis = c >= 4 ? 2 : c >= 2 ? 1 : 0;
-        corners[c] = morton_neighbour(corners[c - (std::size_t{1} << axis)], axis, 1);
-      }
-      for (std::size_t c = 0; c < 8; ++c) keys[static_cast<std::size_t>(rows_of(cell)[c])] = corners[c];
-    }
+    const std::vector<std::int32_t> coordinates = leaf_vertices(*table_).coordinates;
     FlatMap numbers;
     std::vector<std::uint64_t> blocks;
-    vertices_.reserve(keys.size());
-    for (const std::uint64_t key : keys) {
+    vertices_.reserve(coordinates.size() / 3);
+    for (std::size_t row = 0; row < coordinates.size() / 3; ++row) {
+      const std::uint64_t key = lattice_key(coordinates.data() + 3 * row);
       const std::uint64_t block = CellBlocks::block_key(key);
       if (blocks.empty() || blocks.back() != block) {
         numbers.insert(block, static_cast<std::int32_t>(blocks.size()));
