@@ -201,7 +201,7 @@ def sample_lattice(
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    parts, even = _per_cell(voxel_size, leaf_size_m)
+    parts, even = per_cell(voxel_size, leaf_size_m)
     stored = contents.field.leaf_corners() if box is None else None
     if stored is not None and even and parts == 1:
         return *stored, len(cells)
@@ -209,7 +209,7 @@ def sample_lattice(
         cells = cells[_near_surface(stored.distances_m[stored.of_cells], leaf_size_m)]
     elif voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
-    voxels = _voxels_of(cells, voxel_size, config)
+    voxels = _voxels_of(cells, voxel_size, parts, even, config)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
@@ -245,10 +245,17 @@ def _near_surface(values_m: NDArray[Any], leaf_size_m: float) -> NDArray[np.bool
     return found
 
 
-def _per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
+def per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
     """Voxels along the edge of a leaf cell, and whether they divide it, so that each is in one cell."""
     parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
     return parts, math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
+
+
+def subdivided(cells: NDArray[Any], parts: int) -> NDArray[Any]:
+    """(M · parts³, 3) voxels of cells (M, 3), of which `parts` make an edge."""
+    inside = np.indices((parts,) * 3, cells.dtype).reshape(3, -1).T
+    voxels: NDArray[Any] = cells[:, None] * cells.dtype.type(parts) + inside
+    return voxels.reshape(-1, 3)
 
 
 def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -256,22 +263,21 @@ def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.
     return inside
 
 
-def _voxels_of(cells: NDArray[np.int32], voxel_size: float, config: FitConfig) -> NDArray[np.int32]:
-    """Lattice coordinates (M, 3) of the voxels that overlap leaf cells. Some voxels are repeated."""
+def _voxels_of(
+    cells: NDArray[np.int32], voxel_size: float, parts: int, even: bool, config: FitConfig
+) -> NDArray[np.int32]:
+    """Lattice coordinates (M, 3) of the voxels that overlap leaf cells; `parts`, `even`: see :func:`per_cell`. Some are repeated."""
     leaf_size_m = config.leaf_size_m
-    parts, even = _per_cell(voxel_size, leaf_size_m)
     if max(len(cells) * (parts + 1) ** 3, int(np.abs(cells).max(initial=0)) * parts) > _MAX_VOXELS:
         msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
         raise ValueError(msg)
     check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
-    # If voxels do not divide the cell: points from end to end, at most a voxel apart, find every voxel that overlaps it.
-    ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
-    steps = np.arange(parts, dtype=np.int32) if even else ends
-    inside = np.stack(np.meshgrid(*[steps] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     if even:
-        voxels: NDArray[np.int32] = cells[:, None] * np.int32(parts) + inside
-    else:
-        voxels = np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32)
+        return subdivided(cells, parts)
+    # Points from one end of a cell to the other, at most a voxel apart, find every voxel that overlaps it.
+    ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
+    inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
+    voxels = np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32)
     return voxels.reshape(-1, 3)
 
 

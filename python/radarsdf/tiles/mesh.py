@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -22,7 +21,16 @@ from radarsdf.io.files import check_outputs
 from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.mesh import Surface, crossed, described_mesh, one_for_equal, renumbered, within
+from radarsdf.map.mesh import (
+    Surface,
+    crossed,
+    described_mesh,
+    one_for_equal,
+    per_cell,
+    renumbered,
+    subdivided,
+    within,
+)
 from radarsdf.map.queries import EvidenceAt
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
 from radarsdf.map.view import ViewedMap
@@ -76,8 +84,8 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
 
 def voxels_along(leaf_m: float, voxel_size: float) -> int:
     """Voxels along the edge of a leaf cell. Raises a ValueError unless they divide it, so that those of two tiles meet."""
-    steps = round(leaf_m / voxel_size) if 0 < voxel_size <= leaf_m else 0
-    if steps < 1 or not math.isclose(steps * voxel_size, leaf_m, rel_tol=1e-9):
+    steps, even = per_cell(positive(voxel_size, "voxel_size"), leaf_m)
+    if not even:
         msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as those of tiles must: use {leaf_m / 2:g} or {leaf_m:g}"
         raise ValueError(msg)
     return steps
@@ -119,8 +127,7 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
             config.leaf_size_m,
             lambda _, corners, __: city.distances_at(corners.astype(np.int64), config.leaf_size_m),
         ).astype(np.int64)
-    inside = np.stack(np.meshgrid(*[np.arange(steps)] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    voxels = (cells[:, None, :] * steps + inside).reshape(-1, 3)
+    voxels = subdivided(cells, steps)
     if box is not None:
         centres = position((voxels + 0.5) / steps)
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
