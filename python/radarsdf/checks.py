@@ -32,6 +32,12 @@ _MAX_ROTATION_ERROR = 1e-3  # largest entry of R R^T - 1. float32 poses pass; sc
 _RIGID = f"rotation, translation within {MAX_POSITION_M:g} m, last row 0 0 0 1"
 
 
+def check(holds: object, message: str) -> None:
+    """Raises a ValueError with this message unless something `holds`."""
+    if not holds:
+        raise ValueError(message)
+
+
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
     """`values` as an array of `dtype`, of any shape, which is not copied if it is one already.
 
@@ -58,15 +64,15 @@ def refuse_masked(values: Any, name: str) -> None:
     """Refuse masked values: NumPy would take what is under the mask for a value."""
     parts = values if isinstance(values, (list, tuple)) else [values]
     masked = any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts)
-    _require(not masked, f"{name} has masked values: leave them out")
+    check(not masked, f"{name} has masked values: leave them out")
 
 
 def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """`values` as (N, 3) finite positions, m, in C order."""
     points: NDArray[np.float64] = np.ascontiguousarray(real_array(values, name))
-    _require(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
+    check(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
     within = (np.abs(points) <= MAX_POSITION_M).all()
-    _require(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
+    check(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
     return points
 
 
@@ -74,32 +80,32 @@ def check_box(box: ArrayLike) -> NDArray[np.float64]:
     """Lower and upper corner (2, 3), world, m."""
     corners = real_array(box, "box")
     ordered = corners.shape == (2, 3) and (corners[0] < corners[1]).all()
-    _require(ordered, "box must be a lower and an upper corner, (2, 3), the lower corner first")
+    check(ordered, "box must be a lower and an upper corner, (2, 3), the lower corner first")
     return positions(corners, "box")
 
 
 def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
     """Refuse no scans, and scans that are not arrays (N, 3)."""
-    _require(scans, "points holds no scans")
+    check(scans, "points holds no scans")
     for i, scan in enumerate(scans):
         check_scan_shape(scan, i)
 
 
 def check_scan_shape(scan: NDArray[Any], number: int) -> None:
     fits = scan.ndim == 2 and scan.shape[1] == 3
-    _require(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
+    check(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
     """Refuse values that are not arrays (N,) for scans (N, 3)."""
-    _require(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
+    check(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
         check_values_of_scan(value, scan, name, i)
 
 
 def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, number: int) -> None:
     fits = value.shape == (len(scan),)
-    _require(fits, f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}")
+    check(fits, f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}")
 
 
 def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
@@ -108,15 +114,15 @@ def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.
     shape = T_world_sensor.shape
     count = (shape or (0,))[0] if num_scans is None else num_scans
     wanted = f"({count}, 4, 4), one T_world_sensor a scan"
-    _require(shape == (count, 4, 4), f"poses must have shape {wanted}, not {shape}")
+    check(shape == (count, 4, 4), f"poses must have shape {wanted}, not {shape}")
     return T_world_sensor
 
 
 def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
     """`pose` as (4, 4) float64 T_a_b, m, which must be a rigid transform."""
     matrix: NDArray[np.float64] = real_array(pose, name)
-    _require(matrix.shape == (4, 4), f"{name} must have shape (4, 4), not {matrix.shape}")
-    _require(are_rigid(matrix[None]).all(), f"{name} is not a rigid transform ({_RIGID})")
+    check(matrix.shape == (4, 4), f"{name} must have shape (4, 4), not {matrix.shape}")
+    check(are_rigid(matrix[None]).all(), f"{name} is not a rigid transform ({_RIGID})")
     return matrix
 
 
@@ -205,7 +211,7 @@ def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise _wrong_type(name, "a whole number", value)
     least = "positive" if lowest == 1 else f"at least {lowest}"
-    _require(lowest <= value <= highest, f"{name} must be {least} and at most {highest}, not {value!r:.50}")
+    check(lowest <= value <= highest, f"{name} must be {least} and at most {highest}, not {value!r:.50}")
     return int(value)
 
 
@@ -226,13 +232,8 @@ def number(value: Any, name: str) -> float:
 
 def _scalar(value: Any, name: str, wanted: str, fits: Callable[[float], bool]) -> float:
     array = real_array(value, name)
-    _require(array.shape == () and fits(float(array)), f"{name} must be {wanted}, not {value!r:.50}")
+    check(array.shape == () and fits(float(array)), f"{name} must be {wanted}, not {value!r:.50}")
     return float(array)
-
-
-def _require(holds: object, message: str) -> None:
-    if not holds:
-        raise ValueError(message)
 
 
 def _wrong_type(name: str, wanted: str, value: Any) -> TypeError:

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import check
 from radarsdf.extras import require
-from radarsdf.io.files import check, check_regular_file
+from radarsdf.io.files import check_regular_file
 from radarsdf.scans import Columns, Notes
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")

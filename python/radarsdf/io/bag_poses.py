@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import check
 from radarsdf.io.bag_messages import (
     PATH,
     POSE_TYPES,
@@ -23,7 +24,6 @@ from radarsdf.io.bag_messages import (
     topics_of,
     topics_with,
 )
-from radarsdf.io.files import check
 from radarsdf.io.poses import (
     FIND_POSES,
     NoPoses,

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from radarsdf.checks import check
 from radarsdf.imu import Imu
 from radarsdf.io.bag_messages import (
     CLOUD_TYPES,
@@ -32,7 +33,6 @@ from radarsdf.io.bag_messages import (
     topics_with,
 )
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
-from radarsdf.io.files import check
 from radarsdf.io.poses import UNPOSED, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
 from radarsdf.scans import Scans

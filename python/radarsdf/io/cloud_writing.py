@@ -12,10 +12,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import path_of
+from radarsdf.checks import check, path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
-from radarsdf.io.files import check, check_fits_float32, whole_file
+from radarsdf.io.files import check_fits_float32, whole_file
 from radarsdf.scans import Columns, Scan, Scans
 
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back

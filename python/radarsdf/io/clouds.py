@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checks import path_of
+from radarsdf.checks import check, path_of
 from radarsdf.extras import require
 from radarsdf.io.fields import Fields, names_of
-from radarsdf.io.files import check, check_regular_file, reading
+from radarsdf.io.files import check_regular_file, reading
 from radarsdf.io.npz import array_in
 from radarsdf.io.text import read_table
 from radarsdf.scans import Columns, Notes

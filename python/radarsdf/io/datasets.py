@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import check_pose
-from radarsdf.io.files import check, reading
+from radarsdf.checks import check, check_pose
+from radarsdf.io.files import reading
 from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
 from radarsdf.io.recordings import Request, lidar_map, natural, read_files
 from radarsdf.io.text import read_numbers, read_text

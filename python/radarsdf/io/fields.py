@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.files import check
+from radarsdf.checks import check
 from radarsdf.io.text import SCALES, are_degrees, without_unit
 from radarsdf.scans import Notes, Scan, finite_returns
 

@@ -20,7 +20,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import path_of
+from radarsdf.checks import check, path_of
 
 _MAX_NAME_BYTES = 255  # of nearly all file systems
 _MAX_STEM = 50  # characters of at most four bytes: the temporary name must not be longer than the limit
@@ -34,12 +34,6 @@ def check_regular_file(path: str | PathLike[str]) -> None:
     check(Path(path).is_dir() or stat.S_ISREG(Path(path).stat().st_mode), f"{path} is not a regular file")
     with open(path, "rb"):  # noqa: PTH123 - raises the error that names the path, for a folder too
         pass
-
-
-def check(holds: object, message: str) -> None:
-    """Raises a ValueError with this message unless something `holds`."""
-    if not holds:
-        raise ValueError(message)
 
 
 @contextmanager

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import path_of, positions
+from radarsdf.checks import check, path_of, positions
 from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.clouds import has_faces, ply_bytes, read_points
-from radarsdf.io.files import check, check_fits_float32, check_regular_file, write_whole
+from radarsdf.io.files import check_fits_float32, check_regular_file, write_whole
 from radarsdf.io.npz import arrays_of
 from radarsdf.scans import Columns
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checks import instance, path_of
+from radarsdf.checks import check, instance, path_of
 from radarsdf.imu import Imu
-from radarsdf.io.files import check, check_regular_file, reading, whole_file
+from radarsdf.io.files import check_regular_file, reading, whole_file
 from radarsdf.scans import Scans
 
 # Measurements are mostly noise and compress by a factor of 2 to 5. Some kilobytes could unpack to gigabytes.

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from radarsdf.checks import are_rigid, check_pose, check_poses, path_of, pose_matrices, real_array
-from radarsdf.io.files import check, check_regular_file, reading, write_whole
+from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, pose_matrices, real_array
+from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
 from radarsdf.io.text import SCALES, in_seconds, read_numbers, read_table, without_unit
 from radarsdf.scans import Columns, Notes

@@ -13,14 +13,13 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import check_pose, path_of, positions, positive
+from radarsdf.checks import check, check_pose, path_of, positions, positive
 from radarsdf.imu import checked_rotation
 from radarsdf.io import datasets
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
 from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
 from radarsdf.io.fields import SIGMA
-from radarsdf.io.files import check
 from radarsdf.io.npz import read_scans
 from radarsdf.io.poses import (
     MAX_GAP_S,

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import check
 from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
 from radarsdf.io.fields import Fields
-from radarsdf.io.files import check, reading
+from radarsdf.io.files import reading
 from radarsdf.io.poses import (
     FIND_POSES,
     MAX_GAP_S,

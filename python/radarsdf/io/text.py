@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.io.files import check, reading
+from radarsdf.checks import check
+from radarsdf.io.files import reading
 from radarsdf.scans import Notes
 
 _COMMENT = re.compile("(#|//|%).*")
