@@ -124,13 +124,13 @@ def test_ctrl_c_is_status_130(monkeypatch, capsys):
     def interrupt(_):
         raise radarsdf.Interrupted
 
-    monkeypatch.setattr("radarsdf.cli.maps.load_map", interrupt)
+    monkeypatch.setattr("radarsdf.cli.inputs.load_map", interrupt)
     assert call("info", "map.safetensors") == 130
     assert capsys.readouterr().err.startswith("error: interrupted")
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch):
-    monkeypatch.setattr("radarsdf.cli.maps.load_map", lambda _: {}["missing"])
+    monkeypatch.setattr("radarsdf.cli.inputs.load_map", lambda _: {}["missing"])
     with pytest.raises(KeyError, match="missing"):
         main(["info", "map.safetensors"])
 

@@ -27,7 +27,7 @@ COMMANDS = {
     "Files and settings": {
         "convert": ("scans", "SCANS [POSES] -o FILE", "Write scans as one file or one point cloud, or a mesh in another format."),
         "config": ("settings", "", "Print every setting of a fit with its meaning, as a file for --config."),
-        "info": ("maps", "[MAP]", "Print versions and threads, for bug reports, and what a map holds."),
+        "info": ("info", "[MAP]", "Print versions and threads, for bug reports, and what a map holds."),
     },
 }  # fmt: skip
 """Module, arguments and help of each command, by heading of the overview."""
