@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``python -m bench.changes [KIND ...]``: what is found of cubes that come, go, move or are repainted between two simulated drives.
+"""``python -m bench.changes [KIND ...]``: what is found of cubes that come, go, move or change their reflectance.
 
-The second day has other noise and another way: half a metre beside, between the scans, and a little turned. Area within half
-a metre of a cube is no false one: precision is the share of the changed area that is near one. Recall is the share of a cube's area on
-its map that is called gone, appeared or moved. What is repainted, cubes and flat patches of the ground, answers 6 dB more or less on
-the second day; its recall is the share of the later surface that is called repainted.
+The second of two simulated drives has other noise and another path: half a metre aside, between the scans, and a little turned.
+Area within half a metre of a cube is no false one: precision is the share of the changed area that is near one. Recall is the
+share of a cube's area on its map that is called gone, appeared or moved. Cubes and flat patches of the ground that change their
+reflectance answer 6 dB more or less on the second day; their recall is the share of the later surface that is called so.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 _SIZES_M = (0.3, 0.6, 1.0, 2.0, 3.0)
 _CHANGES = ("put in", "taken out", "moved")
-_REPAINTED = ("reflectance_changed", "patch repainted")
+_OF_REFLECTANCE = ("reflectance_changed", "patch of changed reflectance")
 _STRONGER_DB = 6.0
 _PATCH_M = 0.02  # half the thickness of a patch, of which half is above the ground
 _ON_M, _NEAR_M = 0.2, 0.5
@@ -98,10 +98,10 @@ def other_way(poses: Floats, rng: np.random.Generator) -> Floats:
 
 
 def cubes(drive: Simulation, rng: np.random.Generator) -> list[Change]:
-    """One cube of each size and change, on the ground beside the way where there is room. What is repainted has what is left."""
+    """One cube of each size and change, on the ground next to the path where there is room. What changes its reflectance has what is left."""
     found: list[Change] = []
     centres: list[tuple[Floats, float]] = []
-    for kinds in (_CHANGES, _REPAINTED):
+    for kinds in (_CHANGES, _OF_REFLECTANCE):
         for size, kind in itertools.product(_SIZES_M, kinds):
             for _ in range(_TRIES):
                 pose = drive.poses[rng.integers(len(drive.poses))]
@@ -130,7 +130,7 @@ def cubes(drive: Simulation, rng: np.random.Generator) -> list[Change]:
 
 def reflectance_changed(kind: str, cube: Box, ground: float, rng: np.random.Generator) -> tuple[Box, Box]:
     """A cube, or a patch of asphalt below it, before and after."""
-    if kind == "patch repainted":
+    if kind == "patch of changed reflectance":
         x, y, _ = cube.half_extents
         cube = Box(
             np.array([*cube.center[:2], ground]), np.array([x, y, _PATCH_M]), cube.yaw_rad, materials.ASPHALT
@@ -182,7 +182,7 @@ def recalls(found: Changes, change: Change) -> list[float]:
     """Share of the area on the cube that is called changed, on each day that it is mapped; 0 if it is not mapped."""
     shares = []
     for surface, box in ((found.before, change.before), (found.after, change.after)):
-        if box is None or (change.kind in _REPAINTED and surface is found.before):
+        if box is None or (change.kind in _OF_REFLECTANCE and surface is found.before):
             continue
         kinds, areas = surface.of_faces()
         on = np.abs(box.signed_distance(surface.vertices[surface.faces].mean(axis=1))) < _ON_M

@@ -31,7 +31,7 @@ _SAMPLE = 40  # scans that show what returns of a sensor are like
 
 _LEFT_OUT = "Nothing needs to be done: a fit leaves them out."
 _FRAME = "Pass points of the sensor frame in metres, x forward, y left, z up, and T_world_sensor."
-_ANGLES = "Make the rotations of the poses anew, from angles in rad or unit quaternions x y z w."
+_ANGLES = "Recompute the rotations of the poses from angles in rad or unit quaternions x y z w."
 _NO_VALUE = "Look up in the driver what they stand for. A fit leaves them out of the reflectance."
 FIXES = {
     "returns_not_finite": _LEFT_OUT,
@@ -72,7 +72,7 @@ FIXES = {
     "moving_share": "A fit leaves them out, unless returns.drop_moving is false.",
     "below_ground": "Leave them out if they are reflections in the ground.",
     "fit_refuses": "See the message.",
-    "noise": "Nothing needs to be done: a fit estimates it anew.",
+    "noise": "Nothing needs to be done: a fit estimates it.",
     "cost": "Lower effort if that is too much.",
 }
 """What to do about each finding."""

@@ -26,7 +26,7 @@ class WholeMap:
 
     origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
-    clutter_ratio: float  # clutter ratio: share of the returns that lie on no thin surface, in [0, 1]
+    clutter_ratio: float  # share of the returns that lie on no thin surface, in [0, 1]
     returns_per_cell: float  # mean number of returns in the cells of surfels that hold any
 
 
@@ -40,6 +40,5 @@ class MapContents(WholeMap):
     sensor: Sensor  # the radar, as the scans of the fit show it
     report: dict[str, Any]  # counts, losses, noise of the sensor and seconds of the fit
     free_space: FreeSpace = dataclasses.field(default_factory=FreeSpace.none)  # free-space crossings, or none
-    view_statistics: ViewStatistics = dataclasses.field(
-        default_factory=ViewStatistics.none
-    )  # view statistics of intensity, or none
+    # View statistics of intensity, or none.
+    view_statistics: ViewStatistics = dataclasses.field(default_factory=ViewStatistics.none)
