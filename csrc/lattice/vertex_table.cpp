@@ -316,38 +316,41 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
   }
 }
 
-std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& leaf_keys) {
+std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& keys) {
   std::vector<std::int32_t> coordinates;
-  coordinates.reserve(3 * leaf_keys.size());
-  for (const std::uint64_t key : leaf_keys) {
+  coordinates.reserve(3 * keys.size());
+  for (const std::uint64_t key : keys) {
     for (int axis = 0; axis < 3; ++axis)
       coordinates.push_back(static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias);
   }
   return coordinates;
 }
 
-LeafVertices leaf_vertices(const VertexTable& table) {
+std::vector<std::uint64_t> leaf_vertex_keys(const VertexTable& table) {
   if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
-  const std::vector<std::int32_t> cells = leaf_coordinates(table.leaf_keys());
-  const std::size_t num_cells = table.leaf_keys().size();
-  LeafVertices vertices;
-  vertices.of_cells.resize(8 * num_cells);
+  const std::vector<std::uint64_t>& leaf_keys = table.leaf_keys();
+  const auto rows_of = [&](std::size_t cell) { return table.cells()[cell].rows; };
   std::int32_t num_rows = 0;
+  for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell)
+    num_rows = std::max(num_rows, *std::max_element(rows_of(cell), rows_of(cell) + 8) + 1);
+  std::vector<std::uint64_t> keys(static_cast<std::size_t>(num_rows));
+  for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell) {
+    std::uint64_t corners[8] = {leaf_keys[cell]};
+    for (int axis = 0; axis < 3; ++axis)
+      for (int c = 0; c < 1 << axis; ++c) corners[c + (1 << axis)] = morton_neighbour(corners[c], axis, 1);
+    for (int c = 0; c < 8; ++c) keys[static_cast<std::size_t>(rows_of(cell)[c])] = corners[c];
+  }
+  return keys;
+}
+
+LeafVertices leaf_vertices(const VertexTable& table) {
+  LeafVertices vertices{leaf_coordinates(leaf_vertex_keys(table)), {}};
+  const std::size_t num_cells = table.leaf_keys().size();
+  vertices.of_cells.resize(8 * num_cells);
   for (std::size_t i = 0; i < num_cells; ++i) {
     for (std::size_t c = 0; c < 8; ++c) {
       // The table's corners step along x first, those in C order along z.
-      const std::int32_t row = table.cells()[i].rows[(c & 1) << 2 | (c & 2) | c >> 2];
-      vertices.of_cells[8 * i + c] = row;
-      num_rows = std::max(num_rows, row + 1);
-    }
-  }
-  vertices.coordinates.resize(3 * static_cast<std::size_t>(num_rows));
-  for (std::size_t i = 0; i < num_cells; ++i) {
-    for (std::size_t c = 0; c < 8; ++c) {
-      std::int32_t* at = &vertices.coordinates[3 * static_cast<std::size_t>(vertices.of_cells[8 * i + c])];
-      for (std::size_t axis = 0; axis < 3; ++axis) {
-        at[axis] = cells[3 * i + axis] + static_cast<std::int32_t>(c >> (2 - axis) & 1);
-      }
+      vertices.of_cells[8 * i + c] = table.cells()[i].rows[(c & 1) << 2 | (c & 2) | c >> 2];
     }
   }
   return vertices;

@@ -51,6 +51,10 @@ class VertexTable {
   std::int64_t num_rows_ = 0;
 };
 
+// Morton keys of the vertices of the leaf cells of an octree, in the order of their rows, which are the first of the
+// feature matrix. Throws std::invalid_argument for another table.
+std::vector<std::uint64_t> leaf_vertex_keys(const VertexTable& table);
+
 // Of a table of an octree, the vertices of the leaf cells: the coordinates (rows, 3) of those that the first rows of
 // the feature matrix belong to, and the rows (leaf cells, 8) of each cell's, in C order. Throws std::invalid_argument.
 struct LeafVertices {
@@ -58,7 +62,7 @@ struct LeafVertices {
 };
 LeafVertices leaf_vertices(const VertexTable& table);
 
-// Lattice coordinates (size, 3) of the cells: cell i spans [i, i + 1) * leaf_size_m.
-std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& leaf_keys);
+// Lattice coordinates (size, 3) of cells or vertices: cell i spans [i, i + 1) * leaf_size_m.
+std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& keys);
 
 }  // namespace radarsdf

@@ -107,12 +107,11 @@ class Plates {
 
   // Rows are numbered in Morton order, so those of a block follow each other.
   void number() {
-    const std::vector<std::int32_t> coordinates = leaf_vertices(*table_).coordinates;
+    const std::vector<std::uint64_t> keys = leaf_vertex_keys(*table_);
     FlatMap numbers;
     std::vector<std::uint64_t> blocks;
-    vertices_.reserve(coordinates.size() / 3);
-    for (std::size_t row = 0; row < coordinates.size() / 3; ++row) {
-      const std::uint64_t key = lattice_key(coordinates.data() + 3 * row);
+    vertices_.reserve(keys.size());
+    for (const std::uint64_t key : keys) {
       const std::uint64_t block = CellBlocks::block_key(key);
       if (blocks.empty() || blocks.back() != block) {
         numbers.insert(block, static_cast<std::int32_t>(blocks.size()));
@@ -186,8 +185,9 @@ class Plates {
         });
   }
 
-  // Regions of which no coordinate follows on another's share no vertex, so threads may add to several at once. The
-  // order in which a vertex is added to is the same for all numbers of threads, and for a part of the cells.
+  // Cells come by regions of 16 x 16 x 16. Regions whose coordinates have the same parities share no vertex, so threads
+  // add the pulls of several at once. A vertex gets its pulls in the same order with any number of threads, and where
+  // only a part of the cells is given.
   void begin_cell(std::uint64_t key, std::int32_t cell, std::size_t first_place) {
     const std::uint64_t region = CellBlocks::region_key(key);
     const auto number = static_cast<std::int64_t>(first_.size());
@@ -226,6 +226,8 @@ class Plates {
         edges[v] = static_cast<std::uint8_t>(edges[v] | c | (7U & ~c) << 3);
       }
     }
+    LargeVector<std::uint8_t>& is_bent = edges;  // bit `axis`
+    for (std::uint8_t& of_vertex : is_bent) of_vertex = static_cast<std::uint8_t>(of_vertex & of_vertex >> 3);
     LargeVector<float> stiffness(size, 0.0F);
     for (std::size_t i = 0; i + 1 < first_.size(); ++i) {
       for (std::int64_t k = first_[i]; k < first_[i + 1]; ++k) {
@@ -236,45 +238,37 @@ class Plates {
           stiffness[static_cast<std::size_t>(corners_[8 * i + c])] += root * shares[c];
       }
     }
-    // Bit by bit, along each axis.
-    std::vector<std::array<std::uint64_t, 3>> bent(num_blocks_ + 1, {0, 0, 0});
-    is_bent_.resize(kPlateBends * num_blocks_);
+    is_bent_.assign(kPlateBends * num_blocks_, 0);
     compliance_.resize(size);
-    const auto for_each_block = [&](const auto& visit) {
-      parallel_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks, num_threads_,
-                      [&](std::int64_t begin, std::int64_t end) {
-                        for (auto b = static_cast<std::size_t>(begin); b < static_cast<std::size_t>(end); ++b) visit(b);
-                      });
-    };
-    for_each_block([&](std::size_t block) {
-      for (std::size_t i = 0; i < kPlateVertices; ++i) {
-        const unsigned own = edges[kPlateVertices * block + i], both = own & own >> 3;
-        for (std::size_t axis = 0; axis < 3; ++axis) bent[block][axis] |= std::uint64_t{both >> axis & 1U} << i;
-      }
-    });
-    for_each_block([&](std::size_t block) { connect(block, bent, stiffness.data() + kPlateVertices * block); });
+    parallel_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks, num_threads_,
+                    [&](std::int64_t begin, std::int64_t end) {
+                      for (auto b = static_cast<std::size_t>(begin); b < static_cast<std::size_t>(end); ++b)
+                        connect_block(b, is_bent.data(), stiffness.data() + kPlateVertices * b);
+                    });
   }
 
   // The matrix is at most a diagonal of `stiffness`: (sum of a x)^2 <= (sum of |a|) (sum of |a| x^2), row by row.
-  void connect(std::size_t block, const std::vector<std::array<std::uint64_t, 3>>& bent, float* stiffness) {
-    std::uint8_t* is_bent = is_bent_.data() + kPlateBends * block;
+  void connect_block(std::size_t block, const std::uint8_t* is_bent, float* stiffness) {
+    std::uint8_t* of_lines = is_bent_.data() + kPlateBends * block;
     for (std::size_t axis = 0; axis < 3; ++axis) {
-      const auto at = [&](std::size_t side) {
-        return bent[static_cast<std::size_t>(neighbours_[6 * block + 2 * axis + side])][axis];
+      const auto bent = [&](std::size_t of_block, unsigned position) {
+        return static_cast<std::uint8_t>(is_bent[kPlateVertices * of_block + position] >> axis & 1U);
       };
-      const std::uint64_t before = at(0), own = bent[block][axis], after = at(1);
+      const auto before = static_cast<std::size_t>(neighbours_[6 * block + 2 * axis]);
+      const auto after = static_cast<std::size_t>(neighbours_[6 * block + 2 * axis + 1]);
       for (unsigned i = 0; i < 16; ++i) {
-        // Positions of a line along the axis.
+        // A line along the axis: its four positions, and one of each neighbour.
         const unsigned stride = 1U << (2 * axis), first = axis == 0 ? 4 * i : axis == 1 ? i % 4 + 16 * (i / 4) : i;
-        std::uint8_t line[6] = {static_cast<std::uint8_t>(before >> (first + 3 * stride) & 1U)};
-        for (unsigned k = 0; k < 4; ++k) line[k + 1] = static_cast<std::uint8_t>(own >> (first + k * stride) & 1U);
-        line[5] = static_cast<std::uint8_t>(after >> first & 1U);
+        std::uint8_t line[6] = {bent(before, first + 3 * stride)};
+        for (unsigned k = 0; k < 4; ++k) line[k + 1] = bent(block, first + k * stride);
+        line[5] = bent(after, first);
         for (unsigned k = 0; k < 4; ++k)
           stiffness[first + k * stride] += static_cast<float>(4 * line[k] + 8 * line[k + 1] + 4 * line[k + 2]);
         if (axis == 0) {
-          std::copy_n(line, 6, is_bent + 8 * i);
+          std::copy_n(line, 6, of_lines + 8 * i);
         } else {
-          for (std::size_t k = 0; k < 6; ++k) is_bent[kBendsAlongX + (axis - 1) * kBendsAlongYZ + 16 * k + i] = line[k];
+          for (std::size_t k = 0; k < 6; ++k)
+            of_lines[kBendsAlongX + (axis - 1) * kBendsAlongYZ + 16 * k + i] = line[k];
         }
       }
     }
@@ -287,12 +281,12 @@ class Plates {
   LargeVector<std::int32_t> vertices_;  // position of each row in the blocks
   std::size_t num_blocks_ = 0;
   std::vector<std::int32_t> neighbours_;
-  UninitialisedVector<std::uint8_t> is_bent_;
+  LargeVector<std::uint8_t> is_bent_;
   UninitialisedVector<float> compliance_;
   LargeVector<std::int32_t> corners_;  // of the cells with places
   std::vector<std::int64_t> first_;
   UninitialisedVector<float> shares_, targets_m_;
-  std::array<std::vector<Range>, 8> regions_;  // of cells, by the parity of their coordinates
+  std::array<std::vector<Range>, 8> regions_;  // of cells, by the parities of the coordinates
   std::uint64_t last_region_ = 0;
 };
 
