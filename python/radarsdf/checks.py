@@ -237,4 +237,5 @@ def _scalar(value: Any, name: str, wanted: str, fits: Callable[[float], bool]) -
 
 
 def _wrong_type(name: str, wanted: str, value: Any) -> TypeError:
-    return TypeError(f"{name} must be {wanted}, not {value!r:.50}")
+    found = repr(value) if isinstance(value, (str, bytes, int, float, type(None))) else type(value).__name__
+    return TypeError(f"{name} must be {wanted}, not {found:.50}")

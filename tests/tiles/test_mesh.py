@@ -66,6 +66,9 @@ def test_export_writes_the_same_mesh(city, tmp_path):
     np.testing.assert_array_equal(raw["uncertainty_m"].ravel(), mesh.vertex_attributes["uncertainty_m"])
     with pytest.raises(ValueError, match=r"city\.txt"):
         city.export(tmp_path / "city.txt", 0.2)
+    with pytest.raises(ValueError, match="no surface"):
+        city.export(tmp_path / "empty.ply", 0.2, min_component_triangles=10**9, progress=False)
+    assert not (tmp_path / "empty.ply").exists()
 
 
 def test_the_threshold_is_that_of_the_whole_map(city):

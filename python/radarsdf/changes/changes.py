@@ -172,7 +172,7 @@ class Changes:
         Parameters
         ----------
         path : path-like
-            The suffix tells the format, as for :func:`radarsdf.io.write_mesh`.
+            The suffix selects the format, as for :func:`radarsdf.io.write_mesh`.
 
         Raises
         ------

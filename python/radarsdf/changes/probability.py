@@ -164,11 +164,11 @@ class Side:
 class Errors:
     """Distances between surfaces that did not change, over their standard error: Student's t, widened.
 
-    At edges, in corners and at ghosts both maps are worse than their uncertainty says, so some distances are far off.
+    At edges, in corners and at ghosts both maps are worse than their uncertainty, so some distances have large errors.
     """
 
     freedom: float  # degrees of freedom. Few: some distances are far larger than the others.
-    scale: float  # by how much they are larger than the standard errors say
+    scale: float  # by how much they exceed the standard errors
 
     @classmethod
     def of(cls, sides: Sequence[Side]) -> Errors:

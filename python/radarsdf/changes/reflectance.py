@@ -15,7 +15,7 @@ from radarsdf.products import turned
 from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
 _OTHER_UNITS = 1.7  # ratio of spreads: half decibels and decibels differ by 2
-_FEWEST_VIEWS = 100  # fewer say little about units
+_FEWEST_VIEWS = 100  # fewer do not determine the units
 
 
 @dataclass(frozen=True)

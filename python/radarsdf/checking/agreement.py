@@ -18,7 +18,7 @@ from radarsdf.poses.rigid import between, turned_by
 FloatArray = NDArray[np.float64]
 
 _NEIGHBOURS = 4  # returns of the same scan whose mean distance is the spacing at a return
-MIN_RETURNS = _NEIGHBOURS + 2  # of a scan. One with fewer tells nothing
+MIN_RETURNS = _NEIGHBOURS + 2  # of a scan. A scan with fewer is not compared
 # Quotients below and above these count as much as these. A return in empty space must not count more than one beside
 # a surface, or a hypothesis would win that merely makes the fields of view overlap.
 _LEAST, _MOST = 0.1, 1.5

@@ -88,7 +88,7 @@ def message_of(error: Exception) -> str:
         return first_wrong(error)  # type: ignore[arg-type]
     if isinstance(error, OSError) and error.strerror is not None:
         return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
-    # NumPy says which array it could not have; our own words are kept.
+    # NumPy's message names an array of no use to users; our own messages are kept.
     if isinstance(error, MemoryError) and (not str(error) or str(error).startswith("Unable to allocate")):
         return "there is not enough memory"
     return " ".join(str(error).split()) or type(error).__name__

@@ -58,7 +58,7 @@ def read_scans(given: Namespace, poses: StampedPoses | None = None) -> Scans:
 
 
 def scans_or_unposed(given: Namespace, *, find: bool = False) -> tuple[Scans, bool]:
-    """Read scans, and whether their poses are to be found: there are none, or `find` says so."""
+    """Read scans, and whether their poses are to be estimated: with `find`, or where there are none."""
     if not find:
         try:
             return read_scans(given), False

@@ -88,7 +88,7 @@ def posed_scans(
     find: bool = False,
     times_for: Path | None = None,
 ) -> tuple[Scans, PosedScans]:
-    """Read scans; find their poses if there are none or `find` says so, or `refine` them.
+    """Read scans; estimate their poses with `find` or if there are none, or `refine` them.
 
     Of a trajectory in several segments, the scans of the longest are returned. `times_for`: a file of poses to be written.
     """
@@ -124,7 +124,7 @@ def add_segments(results: Results, posed: PosedScans) -> None:
 
 
 def convert(given: Namespace, results: Results) -> None:
-    """Read, and write as the ending of the output says."""
+    """Read, and write in the format of the output's suffix."""
     out, folder = given.out, given.scans.resolve()
     check_outputs([out], inputs_of(given))
     if given.poses is None and holds_mesh(given.scans):

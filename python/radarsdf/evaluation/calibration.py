@@ -19,7 +19,7 @@ _Floats = NDArray[np.float64]
 _ENCE_BINS = 20
 _DECILES = 10
 _LEAST_M = 1e-12  # ratios of squares do not overflow
-_LEAST_SHARE = 0.01  # of the points. The share of true ones among fewer says little
+_LEAST_SHARE = 0.01  # of the points. A share of fewer is too uncertain
 
 
 def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[str, Any]:

@@ -111,7 +111,7 @@ class GrowingState:
     def _bound(self) -> None:
         """Lets scans go, to the folder if there is one, where memory is short."""
         if self.max_bytes is not None and self.num_bytes > self.max_bytes:
-            if self._noise_of == 0:  # the scans that tell it may go
+            if self._noise_of == 0:  # the scans it is estimated from may go
                 self._settle_noise()
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 

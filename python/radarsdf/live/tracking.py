@@ -29,7 +29,7 @@ _KNOWN_STEPS = 2  # before a start that make it none: how the sensor moves is kn
 _CLEAR = 5.0  # standard errors by which more returns agree if the Doppler has the other sign
 _CHANCE = 0.25  # share of a sparse radar's returns that agree at a wrong pose, about: 0.13 to 0.27
 _MOVES = 5.0  # standard deviations of a velocity that is not zero
-_OBSERVED_STEPS = 10  # over which returns alone must tell how the sensor moves
+_OBSERVED_STEPS = 10  # over which returns alone must observe the motion of the sensor
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
 
 
@@ -100,7 +100,7 @@ class Follower:
         if any(step.found.segment for step in found):
             why = f"the scan at {new.time_s:.6f} s agrees nowhere near, or in several places"
         elif not by_doppler and len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED:
-            why = "the returns alone do not tell how the sensor moves"
+            why = "the returns alone do not observe the motion of the sensor"
         if why:
             msg = f"{why}: give its pose, or its Doppler (doppler_mps)"
             if logged.doppler_mps is not None and not by_doppler:

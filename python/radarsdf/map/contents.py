@@ -36,7 +36,7 @@ class MapContents(WholeMap):
 
     field: Field  # signed distance and intensity, in the local frame
     intensity_scale: IntensityScale | None  # range of the training intensities. None: it has no intensities
-    evidence: Evidence  # what the returns tell of each leaf cell
+    evidence: Evidence  # evidence of a surface in each leaf cell
     sensor: Sensor  # the radar, as the scans of the fit show it
     report: dict[str, Any]  # counts, losses, noise of the sensor and seconds of the fit
     free_space: FreeSpace = dataclasses.field(default_factory=FreeSpace.none)  # free-space crossings, or none

@@ -50,7 +50,7 @@ _LEAST_LOGIT = -80.0  # what was observed is not impossible: float32 has this pr
 # Least share of the scans that reach a surface that have a return in one of its cells.
 _DETECTION_RATE = 1 / 36
 _SMOOTH = 0.5  # standard deviations: a few more hits than needed are a little more evidence
-_ODDS_CELLS = 50_000  # evenly spread leaf cells that calibrate how much free-space crossings tell
+_ODDS_CELLS = 50_000  # evenly spread leaf cells that calibrate the weight of free-space crossings
 
 
 @torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
@@ -79,7 +79,7 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
         ranges_m = rays.norm(dim=1)
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
-        # Nothing tells how the intensity continues beyond the ranges of the returns: a regression would extrapolate.
+        # Beyond the ranges of the returns a regression would extrapolate.
         ranges_m = ranges_m.clamp(*contents.sensor.range_m)
         return scale.to_sensor(field.intensity(positions, directions, ranges_m))
 

@@ -20,7 +20,7 @@ from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _SAMPLED, _PAIRS = 400, 40  # returns of a scan, and pairs of neighbouring scans, that show the sign
 _ERRORS = 3.0  # standard errors of a difference that is no chance
-# Measured (Astyx drives): a velocity is off by more than its returns say, since they are not independent. So is one of
+# Measured (Astyx drives): the error of a velocity exceeds that of independent returns. So is one of
 # elevations that all have the same error.
 LEAST_MPS = 0.02
 _COMPARED = 8  # steps, over which errors of single poses are small
@@ -178,7 +178,7 @@ def doppler_sign(scans: Sequence[Floats], velocities: SensorVelocities, times_s:
     )
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
     pairs = np.flatnonzero(usable)
-    pairs = np.sort(pairs[np.argsort(moved_m[pairs])[-_PAIRS:]])  # the longest ways tell most
+    pairs = np.sort(pairs[np.argsort(moved_m[pairs])[-_PAIRS:]])  # the longest ones determine most
     gains = []
     for i in pairs.tolist():
         first, second = scans[i : i + 2]

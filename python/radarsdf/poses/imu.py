@@ -209,7 +209,7 @@ class ImuAlignment:
     def words(self) -> str:
         """What was found, in one sentence."""
         how = f"found to {np.degrees(self.sigma_rad):.1f} degrees" if self.sigma_rad > 0 else "given"
-        return f"The IMU's axes were {how}, scans are {self.time_offset_s:.3f} s late in its clock, and its accelerometer says which way is up."
+        return f"The IMU's axes were {how}, scans are {self.time_offset_s:.3f} s late in its clock, and its accelerometer gives the vertical."
 
     @classmethod
     def of(cls, imu: Imu, velocities: SensorVelocities, times_s: Floats) -> ImuAlignment | None:

@@ -21,7 +21,7 @@ _SPAN = 4.0  # standard deviations from end to end, that a search covers
 _FEWEST, _MOST = 64, 8192  # poses of a search
 
 _LEAST_SPAN = 0.1  # of a step, in median steps: two scans at the same time may still differ
-_LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # deviations to divide by: no radar tells less
+_LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # deviations to divide by: no radar resolves less
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ def odometry(
     ValueError
         If scans, Doppler, times or rates are invalid, if there are no times, or if nothing measures a part of the motion:
         without Doppler, the position along a wall; without a gyroscope, the turns of a radar with few returns that is slower
-        than 20 m/s. If Doppler was given and not used, the error says why.
+        than 20 m/s. If Doppler was given and not used, the error gives the reason.
 
     Notes
     -----
@@ -209,7 +209,7 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
     ):
         if not measured and observed < least:
             msg = (
-                f"the returns alone do not tell how the sensor {moved}: of a step's variance, they remove {observed:.1%}, and "
+                f"the returns alone do not observe how the sensor {moved}: of a step's variance, they remove {observed:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
             )
             raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))

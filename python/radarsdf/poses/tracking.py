@@ -37,7 +37,7 @@ _FOLLOWED = 12  # best poses of a search
 _ELSEWHERE = 500  # poses that show what agrees by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
 _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
-# Of the last scans, that it is estimated from: so many tell a deviation to a percent. With all 25 scans of 2,000 returns, it took
+# Of the last scans, that it is estimated from: so many determine a deviation to a percent. With all 25 scans of 2,000 returns, it took
 # three times as long as a scan.
 _NOISE_RETURNS = 10_000
 _SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells: further than returns of one thing reach
@@ -49,7 +49,7 @@ _TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 _MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 _PASSES = 3
 # Share of a step's variance that the returns must remove where nothing else measures the translation. Below a half, the motion before
-# says more than they do. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
+# is more informative than they are. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
 LEAST_OBSERVED = 0.5
 # Deviation of the acceleration across the trajectory: what moves fast turns slowly. Vehicles on roads: about 1; drones and hands: 2.
 LATERAL_MPS2 = 2.0

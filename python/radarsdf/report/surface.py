@@ -82,7 +82,7 @@ def views(mesh: Any, colors: _Colors) -> dict[str, bytes]:
 
 
 def picture(mesh: Any, colors: _Colors, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
-    """JPEG picture of a mesh with vertex colours (V, 3), seen as :func:`eye_around` says."""
+    """JPEG picture of a mesh with vertex colours (V, 3), seen from :func:`eye_around`."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
     eye = eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg)

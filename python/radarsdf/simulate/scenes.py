@@ -47,7 +47,7 @@ class Site:
         things: Iterable[tuple[str, tuple[int, int], tuple[float, float]]],
         place: Callable[[float, float], tuple[FloatArray, float]],
     ) -> None:
-        """Put things by the names of their methods, so many of each, where `place` says: a position and a yaw by limits.
+        """Add things by the names of their methods, so many of each, at positions and yaws that `place` draws within limits.
 
         Each has ten tries, and is left out if all fail.
         """

@@ -68,7 +68,7 @@ def fit_tiles(
         What runs the fits: processes, or that of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
         By default one after another in this process.
     config : FitConfig, optional
-        Settings of the fits. With an executor, each has one thread unless ``num_threads`` says otherwise.
+        Settings of the fits. With an executor, each has one thread unless ``num_threads`` is set.
     progress : bool, optional
         Whether to show progress bars. By default only on a terminal.
 

@@ -210,6 +210,9 @@ def export_mesh(
     check_mesh_path(path)
     check_outputs([path])
     mesh = mesh_of(city, voxel_size, progress, **limits)
+    if len(mesh.faces) == 0:
+        msg = f"{city.folder} has no surface here: nothing written"
+        raise ValueError(msg)
     write_mesh(path, mesh)
     return len(mesh.vertices), len(mesh.faces)
 

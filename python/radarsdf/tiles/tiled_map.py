@@ -170,7 +170,7 @@ class TiledMap(TileBlend):
         Raises
         ------
         ValueError, MemoryError, OSError
-            As of :meth:`mesh`, or if the suffix is another, there is no surface for 3D Tiles, or a file cannot be written.
+            As of :meth:`mesh`, or if the suffix is another, there is no surface, or a file cannot be written.
         """
         from radarsdf.tiles.mesh import export_mesh  # noqa: PLC0415 - as above
 
