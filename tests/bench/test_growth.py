@@ -1,19 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The street is what it says, and a table of growth has each row, or why there is none."""
+"""The street of the growth benches, and their check of the map."""
 
 from __future__ import annotations
-
-import json
 
 import numpy as np
 import pytest
 from radarsdf import FitConfig, RadarMap, fit
 
-from bench.growth.__main__ import EXPERIMENTS
 from bench.growth.fits import map_errors
 from bench.growth.street import street
-from bench.runner import main
 
 
 @pytest.mark.parametrize(
@@ -31,19 +27,6 @@ def test_a_street_has_its_returns_and_its_length(count, size_m, frames):
     assert (on < 1e-2).any(1)[: 4 if size_m == 50 else 2].all()  # all surfaces are hit
     range_m = np.linalg.norm(scans.hits - scans.hit_sensors, axis=1)
     assert np.abs(scans.hit_intensities - (100 - 40 * np.log10(range_m))).max() < 6.01
-
-
-def test_quick_fits_give_a_table(tmp_path):
-    main("bench.growth", EXPERIMENTS, ["fits", "--quick", "--threads", "2", "--out", str(tmp_path)])
-    values = json.loads((tmp_path / "growth-fits.json").read_text())
-    geometry, both = values["rows"]
-    assert geometry["right"] > 0.8
-    assert both["mae"] < 3
-    assert geometry["peak_mb"] > geometry["before_mb"]
-    assert geometry["training_s"] < geometry["wall_s"]
-    assert values["command"].startswith("python -m bench.growth fits")
-    assert "| leaf cells" in (tmp_path / "growth-fits.md").read_text(encoding="utf-8")
-    assert (tmp_path / "growth-fits.png").stat().st_size > 1000
 
 
 def test_a_map_of_another_street_is_refused():
