@@ -232,7 +232,7 @@ def test_choices_that_are_not_clear(tmp_path):
     ):
         with pytest.raises(ValueError, match=names):
             read(tmp_path / path, **choices)
-    with pytest.raises(ValueError, match="is no bag"):
+    with pytest.raises(ValueError, match="is not a bag"):
         read([tmp_path / "a.bag", tmp_path])
 
 

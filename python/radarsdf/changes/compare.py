@@ -63,7 +63,7 @@ def compare(
     before : Map
         The earlier map, fitted with ``returns.free_space``, which is the default of :class:`FitConfig`.
     after : Map, iterable of F arrays, or Scans
-        The later map, fitted likewise; or new scans as :func:`fit` takes them, of which a quick map is made first, with the ranges,
+        The later map, fitted likewise; or new scans as :func:`fit` takes them, which are first fitted with `FitConfig.quick`, with the ranges,
         errors of poses and leaf cells of `before`.
     poses : (F, 4, 4) array_like, optional
         Of new scans: T_world_sensor, m.
@@ -100,14 +100,14 @@ def compare(
     if not isinstance(before, Map):
         msg = f"before must be a map, not {type(before).__name__}"
         raise TypeError(msg)
+    corners = None if box is None else check_box(box)
+    check_free_space(before, "before")
     if not isinstance(after, Map):
         after = fit(after, poses, intensities, config=_quick(before.config), progress=progress)
     elif poses is not None or intensities is not None:
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)
-    corners = None if box is None else check_box(box)
-    for name, radar_map in (("before", before), ("after", after)):
-        check_free_space(radar_map, name)
+    check_free_space(after, "after")
     placed = PlacedMap.of(before), PlacedMap.of(after)
     for name, found in zip(("before", "after"), placed, strict=True):
         if len(found.faces) == 0:
@@ -118,19 +118,24 @@ def compare(
     later = replace(later, T_common_map=alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
     errors = Errors.of(sides)
-    (absent, moved), (absent_later, moved_later) = map(errors.log_odds, sides)
+    (absent, shifted), (absent_later, shifted_later) = map(errors.log_odds, sides)
     share = share_of_changes(np.concatenate([absent, absent_later]))
-    gone = _changed(sides[0], absent, moved, share, GONE)
-    appeared = _changed(sides[1], absent_later, moved_later, share, APPEARED)
+    gone = _changed(sides[0], absent, shifted, share, GONE)
+    appeared = _changed(sides[1], absent_later, shifted_later, share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
-    report: dict[str, Any] = {"alignment": alignment.words, "intensity_offset": None}
+    report: dict[str, Any] = {
+        "alignment": alignment.words,
+        "intensity_offset": None,
+        "reflectance": differences,
+    }
     if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
         appeared = _reflectance_changed(appeared, differences, np.concatenate(changed))
         report["intensity_offset"] = differences.offset
-        differences = f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
-    report["reflectance"] = differences
+        report["reflectance"] = (
+            f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
+        )
     if corners is not None:
         gone, appeared = _inside(corners, gone), _inside(corners, appeared)
     return Changes(gone, appeared, alignment.T_before_after, report | areas_of(gone, appeared))
@@ -140,7 +145,12 @@ def _quick(config: FitConfig) -> FitConfig:
     """Settings of the quick map of new scans."""
     names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
     same = {name: getattr(config.returns, name) for name in names}
-    return FitConfig.quick(leaf_size_m=config.leaf_size_m, returns={"free_space": True, **same})
+    return FitConfig.quick(
+        leaf_size_m=config.leaf_size_m,
+        num_threads=config.num_threads,
+        max_memory_bytes=config.max_memory_bytes,
+        returns={"free_space": True, **same},
+    )
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
@@ -153,7 +163,7 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
 
 
 def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
-    """Kinds, probabilities and movements by log odds (V,). `lost`: the kind of a surface that the other map has not."""
+    """Kinds, probabilities and movements by log odds (V,). `lost`: the kind of surface missing from the other map."""
     own, other = side.own, side.other
     gone = own.confidence * posterior(absent, share)
     elsewhere = own.confidence * posterior(shifted, share)

@@ -89,17 +89,17 @@ def _stops(findings: list[Finding]) -> bool:
 
 def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
     """All findings, the worst first. `config` None: only the cheap ones."""
-    found, recording = _usable(recording)
+    found, recording, numbers = _usable(recording)
     if not _stops(found):
         for check_values in (
             trajectory.check_times,
             noise.check_elevation,
             trajectory.check_rounding,
             check_intensities,
-            trajectory.check_duplicates,
         ):
             found += check_values(recording)
-        found += _of_poses(recording, config, effort)
+        found += trajectory.check_duplicates(recording, numbers)
+        found += _of_poses(recording, numbers, config, effort)
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
@@ -107,22 +107,26 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
-def _of_poses(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
-    found = [*frames.check_still(recording, effort)] or [*frames.check_frames(recording, effort)]
+def _of_poses(
+    recording: Scans, numbers: NDArray[np.int64], config: FitConfig | None, effort: frames.Effort
+) -> list[Finding]:
+    found = list(frames.check_still(recording, effort))
+    if not found:
+        found = list(frames.check_frames(recording, effort))
     if not _stops(found):
         found += trajectory.check_lengths(recording)
     if not _stops(found):  # else the scans do not agree, whatever the clock
-        found += trajectory.check_jumps(recording, effort)
+        found += trajectory.check_jumps(recording, numbers, effort)
         found += check_doppler(recording)
-        if config is not None and not any(finding.severity != "note" for finding in found):
+        if config is not None and all(finding.severity == "note" for finding in found):
             found += frames.check_clock(recording, effort)
         found += noise.check_ground(recording)
     return found
 
 
-def _usable(recording: Scans) -> tuple[list[Finding], Scans]:
-    """Findings about rows, scans and poses that a fit leaves out, and the recording without them."""
-    found = []
+def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
+    """Findings about rows, scans and poses that a fit leaves out, the recording without them, and its scans' numbers (F,)."""
+    found, numbers = [], np.arange(len(recording))
     left_out = [~measured(scan) for scan in recording.points]
     total, unmeasured = sum(map(len, left_out)), sum(int(mask.sum()) for mask in left_out)
     infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in recording.points)
@@ -143,8 +147,9 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans]:
         found.append(Finding("empty_scans", "error" if empty.all() else "note", evidence))
     if not empty.all():
         found += trajectory.check_rigid(recording)
-        recording = recording.select(np.flatnonzero(~empty & are_rigid(recording.poses)))
-    return found, recording
+        numbers = np.flatnonzero(~empty & are_rigid(recording.poses))
+        recording = recording.select(numbers)
+    return found, recording, numbers
 
 
 def _without(recording: Scans, left_out: list[NDArray[np.bool_]]) -> Scans:

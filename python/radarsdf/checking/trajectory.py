@@ -8,6 +8,7 @@ import functools
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
@@ -37,26 +38,14 @@ def check_rigid(recording: Scans) -> Iterator[Finding]:
     count, wrong, first = len(poses), int((~usable).sum()), int(np.argmin(usable))
     if wrong == 0:
         return
-    transposed, mirrored = poses.transpose(0, 2, 1), poses * [1.0, -1, 1, 1]
+    name = "poses_not_rigid"
     evidence = f"{wrong} of {count} poses are no rigid transforms, the first is pose {first}: {poses[first].round(3).tolist()}."
-    name, evidence = next(
-        texts
-        for holds, *texts in (
-            (2 * wrong < count, "poses_not_rigid", evidence),
-            (
-                are_rigid(transposed).all(),
-                "poses_transposed",
-                "The translations are in the last row of the poses.",
-            ),
-            (
-                (are_rigid(mirrored) | usable).all(),
-                "mirrored",
-                f"{wrong} of {count} poses are left-handed: their rotations have determinant -1.",
-            ),
-            (True, "poses_not_rigid", evidence),
-        )
-        if holds
-    )
+    if 2 * wrong >= count:
+        if are_rigid(poses.transpose(0, 2, 1)).all():
+            name, evidence = "poses_transposed", "The translations are in the last row of the poses."
+        elif (are_rigid(poses * [1.0, -1, 1, 1]) | usable).all():
+            name = "mirrored"
+            evidence = f"{wrong} of {count} poses are left-handed: their rotations have determinant -1."
     yield Finding(name, "warning" if 2 * wrong < count else "error", evidence)
 
 
@@ -96,8 +85,8 @@ def check_times(recording: Scans) -> Iterator[Finding]:
     yield Finding("times", "warning", evidence)
 
 
-def check_duplicates(recording: Scans) -> Iterator[Finding]:
-    """Whether scans, or the poses of different scans, are the same."""
+def check_duplicates(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[Finding]:
+    """Whether scans, or the poses of different scans, are the same. `numbers` (F,): of the scans, for the user."""
     first_of: dict[tuple[object, ...], int] = {}
     repeated = []
     for i, scan in enumerate(recording.points):
@@ -108,7 +97,7 @@ def check_duplicates(recording: Scans) -> Iterator[Finding]:
         if same != i and np.array_equal(recording.points[same], scan):
             repeated.append((same, i))
     if repeated:
-        first, copy = repeated[0]
+        first, copy = numbers[list(repeated[0])]
         evidence = (
             f"{len(repeated)} of {len(recording)} scans are copies, such as scan {copy} of scan {first}."
         )
@@ -128,7 +117,7 @@ def check_duplicates(recording: Scans) -> Iterator[Finding]:
     yield Finding("duplicate_poses", "warning" if held else "note", f"{evidence}{leap}.")
 
 
-def check_jumps(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
+def check_jumps(recording: Scans, numbers: NDArray[np.int64], effort: Effort = FULL) -> Iterator[Finding]:
     """Where the trajectory jumps: a step far longer than those near it, without which the scans agree better.
 
     A recording that pauses while the sensor moves has long steps too; then the scans agree with them.
@@ -159,7 +148,7 @@ def check_jumps(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
         worst = max(confirmed, key=lambda k: changes[k])
         step_m, turn_deg = np.linalg.norm(moved[worst, :3]), np.degrees(np.linalg.norm(moved[worst, 3:]))
         evidence = (
-            f"{len(confirmed)} of {count - 1} steps are jumps, the largest after scan {worst}: {step_m:.3g} m and "
+            f"{len(confirmed)} of {count - 1} steps are jumps, the largest after scan {numbers[worst]}: {step_m:.3g} m and "
             f"{turn_deg:.3g} degrees; without them, the scans agree better."
         )
         yield Finding("pose_jumps", "error" if len(confirmed) > count // 10 else "warning", evidence)

@@ -34,8 +34,8 @@ _SHARED = ("paper", "quick", "config", "set", "voxel", *LIMITS)
 def fit(given: Namespace, results: Results) -> None:
     """Fit a map, or estimate what the fit takes."""
     out, report = given.out, given.report
-    neither = (out is None) != given.dry_run
-    refuse_if(neither, "-o MAP writes the map, --dry-run only estimates: give one of them")
+    not_exactly_one = (out is None) != given.dry_run
+    refuse_if(not_exactly_one, "-o MAP writes the map, --dry-run only estimates: give one of them")
     refuse_if(out and out.suffix != MAP_SUFFIX, f"{out}: a map is written as {MAP_SUFFIX}")
     refuse_if(given.dry_run and report, f"--dry-run makes no map: leave out --report {report}")
     if report is not None:
@@ -90,7 +90,7 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
     left_out = {
         "move by their Doppler": moving,
         "are ghosts": ghosts,
-        "are out of range": report["returns"] - used - moving - ghosts,
+        "are invalid or out of range": report["returns"] - used - moving - ghosts,
     }
     line = f"{used} of {report['returns']} returns in {report['scans']} scans make the surface"
     line += "".join(f", {count} {why}" for why, count in left_out.items() if count)

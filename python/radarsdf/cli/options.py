@@ -90,7 +90,7 @@ _OUT: _Kind = _FILE | {"required": True}
 _PATH: _Kind = {"type": Path}
 _MAYBE: _Kind = _PATH | {"nargs": "?"}
 _COUNT: _Kind = {"type": int, "metavar": "N"}
-_METRES: _Kind = {"type": float, "metavar": "M"}
+_FLOAT: _Kind = {"type": float, "metavar": "M"}
 _NAME: _Kind = {"metavar": "NAME"}
 _NAMES: _Kind = _NAME | {"action": "append"}
 _POINT: _Kind = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z")}
@@ -118,7 +118,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o
     "--imu-rotation": (_FILE, "R_sensor_imu, 3 x 3; default: of the bag, or found"),
     "--field": (_NAMES | {"metavar": "ROLE=NAME"}, "which field holds x, y, z, intensity or doppler; may be repeated"),
     "--columns": (_NAME, "in files without a header: how many, or their names, such as x,y,z,intensity,doppler"),
-    "--max-gap": (_METRES | {"metavar": "S", "default": 0.5}, "longest gap between poses to interpolate; default: 0.5 s"),
+    "--max-gap": (_FLOAT | {"metavar": "S", "default": 0.5}, "longest gap between poses to interpolate; default: 0.5 s"),
     "--world-frame": (_NAME, "in a bag with TF: the frame of the world"),
     "--stamps": ({"choices": ("header", "record")}, "in a bag: whether a scan has the time of its header or record"),
 
@@ -143,11 +143,11 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o
     "--quick": (_FLAG, "average distances instead of training: less accurate, under a second; mesh with --voxel 0.2"),
     "--config": (_FILE, "change the settings in this TOML file; radarsdf config prints all"),
     "--set": (_NAMES | {"metavar": "NAME=VALUE"}, "change a setting, such as training.sdf_iterations=200; may be repeated"),
-    "--voxel": (_METRES | {"default": 0.1}, "edge length of a voxel; default: 0.1 m"),
-    "grid --voxel": (_METRES | {"default": 0.2}, "edge length of a voxel; default: 0.2 m"),
-    "--min-confidence": (_METRES | {"metavar": "P"},
+    "--voxel": (_FLOAT | {"default": 0.1}, "edge length of a voxel; default: 0.1 m"),
+    "grid --voxel": (_FLOAT | {"default": 0.2}, "edge length of a voxel; default: 0.2 m"),
+    "--min-confidence": (_FLOAT | {"metavar": "P"},
                          "leave out surface below this, 0 to 1; default: that of the highest expected F-score"),
-    "--max-uncertainty": (_METRES, "leave out surface with a standard error above this"),
+    "--max-uncertainty": (_FLOAT, "leave out surface with a standard error above this"),
     "--min-component": (_COUNT | {"dest": "min_component_triangles"}, "leave out components of fewer triangles; default: 30, and fewer in large voxels"),
     "--host": ({"default": "127.0.0.1"}, ("address to listen on; default: 127.0.0.1, this machine alone; with 0.0.0.0, "
                "everyone who can reach this machine sees the map")),
@@ -176,17 +176,17 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o
     "--samples": (_COUNT | {"default": 10_000_000}, "points sampled on the mesh; default: 10000000"),
     "--pose": ({"nargs": "+", "action": "append", "required": True, "metavar": "P"}, ("where the sensor is, world frame: "
                "x y z, m, or x y z qx qy qz qw, or a file of poses as for radarsdf fit; may be repeated")),
-    "--returns": (_METRES | {"metavar": "N"}, "number of returns in a scan; default: that of the map's sensor"),
+    "--returns": (_FLOAT | {"metavar": "N"}, "number of returns in a scan; default: that of the map's sensor"),
     "--noise": (_FLAG, "add the noise of the sensor"),
     "--seed": (_COUNT | {"default": 0}, "seed of the noise"),
     "--align": (_SWITCH | {"default": True}, "move the later map if its surface is then nearer to the earlier one"),
-    "--min-area": (_METRES | {"metavar": "M2", "default": 0.1}, "smallest region that is listed; default: 0.1 m2"),
+    "--min-area": (_FLOAT | {"metavar": "M2", "default": 0.1}, "smallest region that is listed; default: 0.1 m2"),
     "--heights": ({"type": float, "nargs": 2, "default": (0.3, 2.0), "metavar": ("LOW", "HIGH")},
                   "range of heights above the ground that the .yaml map covers, m; default: 0.3 2.0"),
     "--distances": (_FILE, "also write the Euclidean distance field of the grid, as .npz"),
     "--costmap": (_FILE, "also write heights, slopes, steps and costs for wheels, as .npz"),
-    "--tile-size": (_METRES, "edge of a tile; default: 512 leaf cells"),
-    "--halo": (_METRES, "margin around a tile that its fit sees"),
+    "--tile-size": (_FLOAT, "edge of a tile; default: 512 leaf cells"),
+    "--halo": (_FLOAT, "margin around a tile that its fit sees"),
     "--tile": (_NAMES, "only the tile of this name; may be repeated"),
     "--processes": (_COUNT, "worker processes; each fits one tile at a time"),
     "--cluster": ({"metavar": "ADDRESS"}, "of dask.distributed's scheduler, such as tcp://host:8786"),

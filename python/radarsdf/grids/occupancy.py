@@ -84,7 +84,7 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
 def check_free_space(radar_map: Map, name: str) -> None:
     """Raise a ValueError if a map, called `name` in it, has no free-space crossings."""
     if not radar_map.config.returns.free_space:
-        msg = f"{name} does not keep what rays passed: fit it with returns.free_space, which FitConfig() has and quick() has not"
+        msg = f"{name} has no free-space crossings: fit it with returns.free_space=True, the default but for quick()"
         raise ValueError(msg)
 
 

@@ -51,7 +51,7 @@ _PEEKED_SCANS = 10  # whose stamps and fields are looked at
 def read_bags(paths: list[Path], request: Request) -> Scans:
     """Scans of one drive in one or several bags; see :func:`radarsdf.io.read`."""
     others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
-    check(paths and all(map(is_bag, paths)), f"{others} is no bag: only bags can be read together")
+    check(paths and all(map(is_bag, paths)), f"{others} is not a bag: only bags can be read together")
     topics = topics_of(paths)
     scan_topics = _scan_topics(topics, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}

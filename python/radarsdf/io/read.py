@@ -71,7 +71,7 @@ def read(
     poses : path-like, array_like or poses by time, optional
         (F, 4, 4) T_world_sensor, m, or a file: TUM, KITTI, 4 x 4 matrices, or a table that names its columns. By default
         those of the data set, of the ``.npz``, of a file such as ``poses.txt`` in the folder, or of `pose_topic`.
-        `radarsdf.io.UNPOSED` reads scans without poses.
+        `radarsdf.io.UNPOSED` reads scans without poses; an ``.npz`` keeps its own.
     extrinsic : (4, 4) array_like, optional
         T_base_sensor, m, if the poses are T_world_base.
     topic : str or sequence of str, optional
@@ -128,8 +128,8 @@ def read(
     ['1 returns left out: a coordinate or the intensity is not a finite number']
     """
     check(stamps in (None, "header", "record"), f'stamps must be "header" or "record", not {stamps!r:.50}')
-    one = isinstance(path, (str, PathLike))
-    paths = [path_of(part, "path") for part in ([path] if one or not isinstance(path, Iterable) else path)]
+    single = isinstance(path, (str, PathLike))
+    paths = [path_of(part, "path") for part in ([path] if single or not isinstance(path, Iterable) else path)]
     files = [value for value in (poses, ground_truth) if isinstance(value, (str, PathLike))]
     for file in (*paths, *map(Path, files)):
         if not file.exists():  # many readers would not name it
@@ -147,9 +147,9 @@ def read(
         fields=fields,
         columns=columns,
         max_gap_s=positive(max_gap_s, "max_gap_s"),
-        notes=Notes(str(path) if one else "the bags"),
+        notes=Notes(str(path) if single else "the bags"),
     )
-    scans = _read(paths[0], request) if one else read_bags(paths, request)
+    scans = _read(paths[0], request) if single else read_bags(paths, request)
     if ground_truth is None:
         return scans
     if isinstance(ground_truth, (str, PathLike)):
@@ -174,7 +174,7 @@ def _read(path: Path, request: Request) -> Scans:
                 request = dataclasses.replace(request, poses=file)
             return read_bags(bags, request)
     for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
-        check(getattr(request, name) in (None, ()), f"{path} is no bag: {name} is of bags alone")
+        check(getattr(request, name) in (None, ()), f"{path} is not a bag: {name} applies only to bags")
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path, request)
@@ -191,7 +191,7 @@ def _npz(path: Path, request: Request) -> Scans:
     """The scans of our own file, with its poses or those that are given."""
     notes = request.notes
     others = None if request.poses is UNPOSED else request.poses
-    what = "has its own poses T_world_sensor: an extrinsic belongs to other poses, which are not given"
+    what = "contains its own poses T_world_sensor: extrinsic applies only to poses passed as an argument"
     check(others is not None or request.extrinsic is None, f"{path} {what}")
     scans = read_scans(path)
     truth = scans.ground_truth

@@ -34,8 +34,8 @@ class Map(ABC):
 
     Queries take world coordinates, m, as array_like or CPU tensors of shape (N, 3), and return the same kind: float64 for
     float64 input and lists, float32 otherwise. Coordinates are converted to the local frame in float64, so large
-    ones such as UTM lose no precision. A wrong shape is a ValueError; a TypeError, what are no real numbers, or a tensor on another
-    device. Several threads may query a map at once, and a map can be pickled.
+    ones such as UTM lose no precision. A wrong shape raises a ValueError; values that are
+    not real numbers, or a tensor on another device, raise a TypeError. Several threads may query a map at once, and a map can be pickled.
 
     A map knows the leaf cells near returns, see :meth:`observed`. Elsewhere, free space included, and at positions that are
     not finite, the signed distance, its gradient and the intensity are NaN. Without returns near a position, the

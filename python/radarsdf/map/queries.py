@@ -34,7 +34,7 @@ _MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor
 
 # From this clutter ratio on, the errors are those of a rough scene.
 # Measured: 0 to 0.07 on simulated scenes without much clutter, 0.27 to 0.44 on five real drives.
-_ROUGH_SHARE = 0.27
+_ROUGH_CLUTTER_RATIO = 0.27
 # The part of the uncertainty that repetition does not shrink, leaf cells: in smooth scenes, and what rough ones add.
 # Returns that agree there may share an error. Chosen with `python -m bench.paper calibration`: errors are within 95 %
 # intervals with 0.00 to 0.03 m on smooth simulated scenes, and with 0.20 to 0.29 m on the drives.
@@ -197,7 +197,7 @@ def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 def roughness(contents: WholeMap) -> float:
     """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
-    return min(contents.clutter_ratio / _ROUGH_SHARE, 1.0)
+    return min(contents.clutter_ratio / _ROUGH_CLUTTER_RATIO, 1.0)
 
 
 def _floor_m(contents: WholeMap) -> float:
@@ -219,13 +219,12 @@ class Probabilities(NamedTuple):
 
 
 def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
-    """Logistic functions of :func:`terms`."""
+    """Logistic regression on :func:`terms`. The confidence is at most the probability that the position is within a leaf cell."""
     start_vector_library()
     columns = terms(contents, evidence)
     logits = torch.tensor([_CONFIDENCE, _COVERING], dtype=torch.float64, device="cpu")
     true, covering = ((columns * logit).sum(1).clamp(min=_LEAST_LOGIT).sigmoid() for logit in logits)
     reach = torch.erf(math.sqrt(0.5) / _smoothed(columns[:, 1].exp()))
-    # A surface is no nearer than its position is known.
     return Probabilities(true.minimum(reach), covering, reach)
 
 
@@ -238,7 +237,7 @@ def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
     deviations = (expected - evidence.hits.double()) / (expected + 1).sqrt()
     missing = (deviations + deviations.square().add(_SMOOTH**2).sqrt()) / 2  # a smooth max(0, deviations)
     of_map = (
-        math.tanh(contents.clutter_ratio / _ROUGH_SHARE),
+        math.tanh(contents.clutter_ratio / _ROUGH_CLUTTER_RATIO),
         contents.returns_per_cell / (contents.returns_per_cell + _CROWDED_RETURNS),
     )
     rough, crowded = (torch.full_like(error_cells, value) for value in of_map)

@@ -118,7 +118,7 @@ class TiledMap(TileBlend):
         return queries.CellsInBox(lattice.position(first), passed, returns, observed)
 
     def view_statistics(self) -> ViewStatisticsAt:
-        """Each echo is that of the tile that it lies in."""
+        """View statistics of each cell come from its own tile."""
         scale = self.intensity_scale
         ends = (0.0, 1.0) if scale is None else (scale.low, scale.high)
         found = []
