@@ -177,5 +177,5 @@ def test_poses_that_are_given_win_over_those_of_an_npz(tmp_path):
     assert_allclose(read(path, ground_truth=tmp_path / "lidar.npy").ground_truth, np.full((5, 3), 2.0))
     with pytest.raises(ValueError, match="there are 4 scans but 2 poses"):
         read(path, POSES[:2])
-    with pytest.raises(ValueError, match="an extrinsic belongs to other poses"):
+    with pytest.raises(ValueError, match="extrinsic applies only to poses"):
         read(path, extrinsic=mounting)
