@@ -56,6 +56,7 @@ def open_page(url: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
 class Page:
     def __init__(self, tab: Any) -> None:
         self.tab = tab
+        tab.set_default_timeout(120_000)  # ms: it draws without a GPU, beside other tests
         self.requests: list[str] = []
         self.errors: list[str] = []
         tab.on("request", lambda request: self.requests.append(request.url))
