@@ -94,3 +94,8 @@ def test_options_are_the_parameters_of_read(tmp_path):
         read_scans(given("check", *words, "--world-frame", "map"))
     with pytest.raises(ValueError, match=r"poses\.tum"):
         read_scans(given("check", *words, "--extrinsic", poses))
+
+
+def test_negative_numbers_are_no_options():
+    words = ("map.safetensors", "-o", "mesh.ply", "--box", "-1e-05", "-.5", "-2", "-1e+00", "5", "6")
+    assert given("mesh", *words).box == [[-1e-05, -0.5, -2.0], [-1.0, 5.0, 6.0]]

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,6 +19,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, command: str, usage: str = "", text: str = "") -> None:
         super().__init__(f"radarsdf {command}", usage or None, text, allow_abbrev=False)
+        # Before Python 3.14, argparse takes -1e-5 for an option.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
         for name in OF_COMMANDS[command].split():
             if name in GROUPS:
                 group = self.add_argument_group(name)
