@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read, read_points
+from radarsdf.io.lzf import unpack_lzf
 
 from .test_folders import write_pcd
 
@@ -35,6 +36,37 @@ COLUMNS = {
     "z": np.array([3, 6], np.float32),
     "power": np.array([40.5, 70]),
 }
+
+
+def test_compressed_pcd(tmp_path):
+    write_pcd(tmp_path / "a.pcd", COLUMNS, DATA="binary_compressed")
+    header = tmp_path.joinpath("a.pcd").read_bytes().partition(b"binary_compressed\n")[:2]
+    raw = b"".join(column.tobytes() for column in COLUMNS.values())
+    packed = b"".join(bytes([len(raw[i : i + 32]) - 1]) + raw[i : i + 32] for i in range(0, len(raw), 32))
+    body = struct.pack("<II", len(packed), len(raw)) + packed
+    (tmp_path / "a.pcd").write_bytes(b"".join(header) + body)
+    check(tmp_path / "a.pcd")
+    for damaged in (body[:-1], struct.pack("<II", len(packed), len(raw) + 8) + packed):
+        (tmp_path / "a.pcd").write_bytes(b"".join(header) + damaged)
+        with pytest.raises(ValueError, match=r"a\.pcd.*unpack"):
+            one(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize(
+    ("data", "unpacked"),
+    [
+        (b"\x02abc", b"abc"),
+        (b"\x00a\x20\x00", b"aaaa"),  # three from one byte back: it overlaps with itself
+        (b"\x01ab\xe0\x09\x01", b"ab" * 10),
+        (b"\x02abc\x20\x02", b"abcabc"),
+        (bytes([31]) + b"z" * 32 + bytes([31]) + b"y" * 32 + b"\x20\x27", b"z" * 32 + b"y" * 32 + b"zzz"),
+    ],
+)
+def test_lzf(data, unpacked):
+    assert unpack_lzf(data, len(unpacked)) == unpacked
+    for damaged in (b"", data[:-1], b"\x00a\x20\x05", data + b"\x00a"):
+        with pytest.raises(ValueError, match="compressed data"):
+            unpack_lzf(damaged, len(unpacked))
 
 
 def test_bin(tmp_path):

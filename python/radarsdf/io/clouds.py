@@ -19,6 +19,7 @@ from radarsdf.checks import check, path_of
 from radarsdf.extras import require
 from radarsdf.io.fields import Fields, names_of
 from radarsdf.io.files import check_regular_file, reading
+from radarsdf.io.lzf import unpack_lzf
 from radarsdf.io.npz import array_in
 from radarsdf.io.text import read_table
 from radarsdf.scans import Columns, Notes
@@ -155,7 +156,7 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
 
 
 def _pcd(path: Path, _: GivenColumns) -> Columns:
-    """The fields with one number a point: of ascii or binary files to version 0.7."""
+    """The fields with one number a point: of ascii, binary or binary_compressed files to version 0.7."""
     with path.open("rb") as file:
         header = _pcd_header(file)
         body = file.read()
@@ -163,12 +164,25 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
     dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for kind, size, count in fields]
-    if header["DATA"][0] == "binary":
+    form = header["DATA"][0]
+    check(form in ("ascii", "binary", "binary_compressed"), f"its DATA is {form}: save it as binary")
+    if form == "binary":
         record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
         cloud = np.frombuffer(body, record, points)
         columns = [cloud[name][:, 0] for name in record.names or ()]
+    elif form == "binary_compressed":  # one field after another
+        packed, unpacked = np.frombuffer(body, "<u4", 2).tolist()
+        ends = np.cumsum([points * dtype.itemsize for dtype in dtypes]).tolist()
+        check(
+            unpacked == ends[-1], f"its {unpacked} unpacked bytes are not {points} points of {ends[-1]} bytes"
+        )
+        data = unpack_lzf(body[8 : 8 + packed], unpacked)
+        starts = [0, *ends[:-1]]
+        columns = [
+            np.frombuffer(data, dtype, points, start)[:, 0]
+            for dtype, start in zip(dtypes, starts, strict=True)
+        ]
     else:
-        check(header["DATA"][0] == "ascii", f"its DATA is {header['DATA'][0]}: save it as binary")
         table = np.array(body.split(), np.float64).reshape(points, sum(counts))
         columns = [table[:, i] for i in np.cumsum([0, *counts[:-1]])]
     # The name _ means padding, and several fields may have it.
