@@ -81,12 +81,11 @@ def test_scales_are_described_by_their_steps_offset_and_ends():
     ]
     assert said(offset - 34)[1:] == []  # the median is 42.5 from 128
     assert said(np.tile(np.arange(60, 140), 10))[1:] == []  # a twentieth is below 64
-    for share, severity in ((5, []), (6, ["note"]), (30, ["warning"])):
-        # So many of 100 at the end, after 1 % at each of the last values before.
-        counts = [1] * 12 + [share]
-        whole = np.concatenate([np.zeros(100 - sum(counts)), np.repeat(np.arange(1, 14), counts)])
-        ends = [words for words in said(np.tile(whole, 10)) if "clipped" in words]
-        what = f"{share:.1f}% of the intensities have the highest value, 13."
+    for count, severity in ((20, []), (21, ["note"]), (50, ["note"]), (51, ["warning"])):
+        # So many of 1000 at the end, after four at each of the values before.
+        counts = [1000 - 48 - count, *[4] * 12, count]
+        ends = [words for words in said(np.repeat(np.arange(14), counts)) if "clipped" in words]
+        what = f"{count / 10:.1f}% of the intensities have the highest value, 13."
         assert ends == [f"{kind}: intensity_clipped: {what}" for kind in severity]
 
 
