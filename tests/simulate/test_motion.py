@@ -33,6 +33,7 @@ def test_an_imu_with_axes_and_lever_of_its_own(circle):
     lever_m = np.array([0.5, -0.3, 0.2])  # of the sensor in the axes of the IMU
     imu = sim.measured_imu(poses, times_s, rate_hz=1000.0, R_sensor_imu=R_sensor_imu, lever_m=tuple(lever_m))
     assert len(imu) == 2001
+    assert len(sim.measured_imu(poses, times_s)) == 201
     np.testing.assert_allclose(np.diff(imu.times_s), 1e-3, atol=1e-9)
     R_world_imu = poses[20, :3, :3] @ R_sensor_imu
     position = poses[20, :3, 3] - R_world_imu @ lever_m
@@ -75,6 +76,7 @@ def test_doppler_and_rates_have_the_noise_that_is_stated():
         0.1 * 0.92, rel=0.05
     )  # 8 % of a normal variable are within 0.1 deviations
     assert np.sqrt(np.mean(noise[moving] ** 2)) == pytest.approx(5.2, rel=0.05)
+    np.testing.assert_allclose(sim.measured_motion(drive).times_s, 0.1 * np.arange(len(times_s)))
     folded = np.concatenate(sim.measured_motion(drive, rate_hz=5.0, interval_mps=3.0).doppler_mps)
     assert -1.5 <= folded.min() < -1.4 < 1.4 < folded.max() <= 1.5
     turns = (np.concatenate(motion.doppler_mps) - folded) / 3.0
