@@ -56,7 +56,8 @@ def test_a_growing_surface_is_replaced(server):
     assert vertices.dtype == np.float32
     assert np.allclose(np.ptp(vertices, axis=0), 2.0, atol=1e-6)
     assert len(faces) == 12
-    assert server.shown["/path"].shape == (2, 2, 3)
+    np.testing.assert_allclose(vertices, mesh.vertices - path[0], atol=1e-6)
+    np.testing.assert_allclose(server.shown["/path"], np.stack([path[:-1], path[1:]], 1) - path[0])
     assert np.abs(server.initial_camera.position).max() < 100
 
 
