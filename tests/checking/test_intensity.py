@@ -122,16 +122,3 @@ def test_the_ground_is_where_most_returns_below_the_sensor_are():
 def test_returns_in_a_plane_have_no_elevation(returns, thickness_m, found):
     plane = np.random.default_rng(0).uniform(-10, 10, (returns, 3)) * [1, 1, thickness_m / 10]
     assert len(list(check_elevation(checked_input([plane], [np.eye(4)])))) == found
-
-
-def test_reflections_in_the_ground_are_named(good):
-    points, poses, _ = good
-    mirrored = []
-    for scan in points:
-        lower = scan.copy()
-        lower[::4, 2] = (
-            -3.6 - lower[::4, 2]
-        )  # the ground is about 1.2 m below the sensor; what is above is mirrored
-        mirrored.append(lower)
-    found = check_cheaply(mirrored, poses)
-    assert ("below_ground", "warning") in [(finding.name, finding.severity) for finding in found]

@@ -114,23 +114,6 @@ def test_a_pause_of_the_recording_is_no_jump(good):
 
 
 @pytest.mark.usefixtures("right_frames")
-def test_poses_that_are_held_are_named(good):
-    points, poses = good
-    assert names(check_cheaply(points, np.repeat(poses[::2], 2, axis=0)))[:1] == ["duplicate_poses"]
-
-
-@pytest.mark.usefixtures("right_frames")
-def test_a_sensor_that_stands_still_is_a_note(good):
-    points, poses = good
-    still = [0] * 3 + list(range(27))
-    found = check_cheaply(
-        [p + np.float32(1e-3 * i) for i, p in enumerate(points[j] for j in still)], poses[still]
-    )
-    assert names(found) == []
-    assert "duplicate_poses" in [finding.name for finding in found]
-
-
-@pytest.mark.usefixtures("right_frames")
 def test_copies_of_scans_are_named(good):
     points, poses = good
     points = [*points[:5], points[4], *points[6:]]
@@ -172,12 +155,6 @@ def test_utm_coordinates_in_float32_are_named_with_their_steps(good):
     assert "steps of 0.5 m" in found.evidence
     assert list(check_rounding(along_x(np.float32([1.3e5, 1.31e5])))) == []  # 0.0078 m
     assert "steps of 0.0156 m" in next(check_rounding(along_x(np.float32([0, 1.32e5])))).evidence
-
-
-@pytest.mark.usefixtures("right_frames")
-def test_a_radar_without_elevation_is_named(good):
-    points, poses = good
-    assert names(check_cheaply([scan * np.float32([1, 1, 0]) for scan in points], poses)) == ["no_elevation"]
 
 
 @pytest.mark.usefixtures("right_frames")
