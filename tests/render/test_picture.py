@@ -84,6 +84,25 @@ def test_what_lies_behind_the_viewer_is_not_drawn():
     assert (render(half, width=160, height=100, viewpoint=(0.0, 0.0, 0.0)) == WHITE).all()
 
 
+def test_from_straight_above_north_is_at_the_top():
+    """Four squares on the ground, to the east, north, west and south; and a viewer in their middle, who looks north."""
+    squares = [square((0, 0, 0)) for _ in range(4)]
+    for number, tile in enumerate(squares):
+        tile.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+        tile.apply_translation(3 * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])[number])
+    colors = [(200, 0, 0), (0, 200, 0), (0, 0, 200), (200, 200, 0)]
+    shown = np.vstack([one_color(tile, color) for tile, color in zip(squares, colors, strict=True)])
+    mesh = trimesh.util.concatenate(squares)
+    image = render(mesh, shown, width=200, height=200, viewpoint=(0, 0, 20)).astype(int)
+    places = [(100, 170), (30, 100), (100, 30), (170, 100)]  # row and column
+    for (row, column), color in zip(places, colors, strict=True):
+        np.testing.assert_array_equal(image[row, column] > image[row, column].max() / 2, np.array(color) > 0)
+    walls = trimesh.util.concatenate([square((0, 9, 0)), square((0, -9, 0))])
+    shown = np.vstack([one_color(square((0, 0, 0)), color) for color in colors[:2]])
+    middle = render(walls, shown, width=60, height=40, viewpoint=(0, 0, 0))[20, 30].astype(int)
+    assert middle[0] > middle[1]  # the northern wall
+
+
 def test_save_picture_has_the_colors_of_the_scalar(tmp_path):
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread  # noqa: PLC0415
