@@ -99,8 +99,18 @@ def test_few_sparse_scans_have_no_finding(frames, seed):
 
 def test_a_clock_that_is_off_is_found_where_the_motion_changes():
     scans = radarsdf.simulate.wall(frames=24)
-    (found,) = check_clock(checked_input(scans.points[1:], scans.poses[:-1]))
-    assert (found.name, found.severity) == ("clock_offset", "error")
+    for rows, poses, times_s, words in (
+        (
+            slice(1, None),
+            scans.poses[:-1],
+            None,
+            "With the poses of a time about 1 steps between scans later",
+        ),
+        (slice(-1), scans.poses[1:], 0.2 * np.arange(23), "With the poses of a time about 0.2 s earlier"),
+    ):
+        (found,) = check_clock(checked_input(scans.points[rows], poses, times_s=times_s))
+        assert (found.name, found.severity) == ("clock_offset", "error")
+        assert found.evidence.startswith(words)
 
 
 @pytest.mark.parametrize("name", ["r0009_0024", "r0133_0142"])

@@ -139,7 +139,12 @@ def test_what_a_fit_leaves_out_is_noted(good):
     found = check_cheaply([*padded, hole, hole[:0], *points[5:]], poses)
     assert names(found) == ["poses_not_rigid"]
     assert found[0].evidence.startswith("1 of 30 poses are no rigid transforms, the first is pose 9")
-    assert {"returns_not_finite", "padding", "empty_scans"} <= {f.name for f in found if f.severity == "note"}
+    total = sum(map(len, padded)) + len(hole) + sum(map(len, points[5:]))
+    zeros = sum(len(scan) for scan in padded) * 3 // 4
+    notes = {finding.name: finding.evidence for finding in found if finding.severity == "note"}
+    assert notes["returns_not_finite"].startswith(f"{-(-len(hole) // 2)} of {total} returns")
+    assert notes["padding"].startswith(f"{zeros} of {total} returns are no measurements")
+    assert notes["empty_scans"] == "1 of 30 scans have no returns, the first is scan 4."
     none = check_cheaply([scan[:0] for scan in points], good[1])
     assert [(finding.name, finding.severity) for finding in none] == [("empty_scans", "error")]
 
