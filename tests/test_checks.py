@@ -42,11 +42,6 @@ def test_whole_numbers_and_flags():
     assert [checks.hides_bar(value) for value in (None, True, False)] == [None, False, True]
 
 
-def test_without_standard_error_there_is_no_bar(monkeypatch):
-    monkeypatch.setattr("sys.stderr", None)
-    assert checks.hides_bar(True) is True
-
-
 def test_positions_and_boxes():
     np.testing.assert_array_equal(checks.positions([[1e12, -1e12, 0]], "name"), [[1e12, -1e12, 0]])
     for wrong in ([[FAR, 0, 0]], [[0, -FAR, 0]], [[0, np.nan, 0]], [[0, 0]], [0, 0, 0]):
@@ -79,14 +74,9 @@ def test_a_minority_of_wrong_poses_is_interpolated():
     np.testing.assert_allclose(found[1:], poses[1:], atol=1e-12)
     np.testing.assert_allclose(found[0], poses[1], atol=1e-12)  # nothing is known before
     broken[6] = np.nan
-    assert refuses_poses(broken)
-    assert refuses_poses(broken[:2])  # one of two is no minority
-
-
-def refuses_poses(poses):
-    with pytest.raises(ValueError, match="pose 0 is not a rigid transform"):
-        checks.usable_poses(poses)
-    return True
+    for wrong in (broken, broken[:2]):  # one of two is no minority
+        with pytest.raises(ValueError, match="pose 0 is not a rigid transform"):
+            checks.usable_poses(wrong)
 
 
 def test_measurements_of_an_imu():
@@ -97,13 +87,8 @@ def test_measurements_of_an_imu():
     turn[:3, 3] = 1, 2, 3
     np.testing.assert_array_equal(Imu(times_s, rates, None, turn).R_sensor_imu, turn[:3, :3])
     for wrong in (
-        (times_s[::-1], rates),
-        (times_s[:2], rates),
-        (times_s, rates[:, :2]),
-        (times_s, rates, rates * np.nan),
-        (times_s[:0], rates[:0]),
-        (times_s, rates, None, 2 * np.eye(3)),
-        (times_s, rates, None, np.eye(5)),
-    ):
+        (times_s[::-1], rates), (times_s[:2], rates), (times_s, rates[:, :2]), (times_s, rates, rates * np.nan),
+        (times_s[:0], rates[:0]), (times_s, rates, None, 2 * np.eye(3)), (times_s, rates, None, np.eye(5)),
+    ):  # fmt: skip
         with pytest.raises(ValueError, match=r"IMU|R_sensor_imu"):
             Imu(*wrong)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 import radarsdf
@@ -89,22 +91,12 @@ def test_rates_are_those_of_the_seconds(capsys):
 
 
 def test_the_page_shows_the_surface_from_time_to_time():
-    class Map:
-        def mesh(self):
-            return "mesh"
-
-    class Page:
-        def show(self, mesh, path):
-            seen.append((mesh, path.tolist()))
-
-    seen, shown = [], _Shown(Map(), Page())
-    done = Replay(poses=[np.eye(4) + np.eye(4)[:, :1] * np.eye(4)[3]])
-    shown(done)
-    shown._thread.join()
-    shown(done)  # too soon
-    shown._thread.join()
-    assert seen == [("mesh", [[1.0, 0.0, 0.0]])]
-    shown._next_s = 0.0
-    shown(done)
-    shown._thread.join()
-    assert len(seen) == 2
+    page, done = Mock(), Replay(poses=[np.eye(4) + np.eye(4)[:, :1] * np.eye(4)[3]])
+    shown = _Shown(Mock(**{"mesh.return_value": "mesh"}), page)
+    for due, times in ((True, 1), (False, 1), (True, 2)):
+        shown._next_s = 0.0 if due else shown._next_s
+        shown(done)
+        shown._thread.join()
+        assert page.show.call_count == times
+    mesh, path = page.show.call_args.args
+    assert (mesh, path.tolist()) == ("mesh", [[1.0, 0.0, 0.0]])
