@@ -117,7 +117,8 @@ def test_scores_against_a_plain_calculation():
     assert agreement.scores(np.array([[0, 1]]), motion[None, None])[0, 0] == pytest.approx(score, rel=1e-9)
     own = np.sort(np.linalg.norm(scans[0][:, None] - scans[0], axis=2), axis=1)[:, 1:5].mean(axis=1)
     assert agreement.spacing_m(0) == pytest.approx(np.median(own))
-    assert Agreement([scans[0][:6], scans[0][:5]], 60, 60).spacing_m(1) == 0 < agreement.spacing_m(0)
+    few = Agreement([scans[0][:6], scans[0][:5]], 60, 60)
+    assert few.spacing_m(0) > 0 == few.spacing_m(1)
 
 
 def test_a_gain_has_the_standard_error_of_its_mean():
