@@ -101,6 +101,8 @@ def test_arrays_of_other_types_or_with_masked_values():
     for wrong in ([1 + 2j, 2, 3], ["1", "2", "3"], np.array(["2026-01-01"] * 3, "datetime64[D]")):
         with pytest.raises(TypeError, match="real numbers"):
             intensity_metrics(np.array(wrong), [1.0, 2.0, 3.0])
+        with pytest.raises(TypeError, match="scan 0 must be real numbers"):
+            radarsdf.check([np.array([wrong])], np.eye(4)[None])
     with pytest.raises(ValueError, match="masked"):
         intensity_metrics(np.ma.array([1.0, 2.0, 3.0], mask=[False, True, False]), [1.0, 2.0, 3.0])
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -153,7 +154,14 @@ def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
     out = tmp_path / "changes.ply"
     arguments = ["compare", *(str(tmp_path / f"{n}.safetensors") for n in "ab"), "-o", str(out)]
     assert main(arguments) == 0
-    assert "gone" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    for region in changes.regions(0.1)[:10]:
+        numbers = (region.area_m2, *region.box.mean(axis=0), region.probability)
+        assert re.search(
+            r"\s+".join([re.escape(region.words), *(f"{number:.2f}" for number in numbers)]), said
+        )
+    assert f"of {changes.report['compared_m2']:.0f} m2 that both observed" in said
+    assert f"gone {changes.report['areas_m2']['gone']:.1f}" in said
     mesh, expected = trimesh.load(out, process=False), changes.mesh()
     np.testing.assert_array_equal(mesh.visual.vertex_colors, expected.visual.vertex_colors)
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) >= 3

@@ -279,6 +279,7 @@ WAYS: dict[str, tuple[str, Way]] = {
     "Doppler as intensity": ("intensity_is_doppler", _doppler_as_intensity),
     "Doppler with the other sign": ("doppler_sign", _with_other_sign),
     "sensor turned by 8 degrees": ("sensor_turned", _sensor_turned),
+    "no elevations": ("no_elevation", _points(lambda p: p * [1, 1, 0])),
     "reflections below the ground": ("below_ground", _below_ground),
 }
 """What is broken, and the name of its finding and how to break it."""

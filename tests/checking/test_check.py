@@ -42,7 +42,11 @@ def added_m(points, poses):
     """What the note says that the poses add, m. None without a note."""
     findings = check_noise_and_cost(checked_input(points, poses), CONFIG)
     notes = [finding.evidence for finding in findings if finding.name == "poses_disagree"]
-    return float(re.search(r"about ([0-9.]+) m", notes[0])[1]) if notes else None
+    if not notes:
+        return None
+    significance = int(re.search(r"surfaces, (\d+) standard errors", notes[0])[1])
+    assert 3 <= significance < 1000  # fewer are not noted
+    return float(re.search(r"about ([0-9.]+) m", notes[0])[1])
 
 
 @pytest.mark.parametrize(("kind", "frames"), [("hugin", 16), ("wall", 20)])

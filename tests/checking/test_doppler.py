@@ -124,7 +124,33 @@ def test_a_turned_sensor_is_named(drive):
     turn = np.array([[np.cos(0.12), -np.sin(0.12), 0], [np.sin(0.12), np.cos(0.12), 0], [0, 0, 1]])
     turned = [(scan @ turn.T).astype(np.float32) for scan in points]
     found = check_doppler(checked_input(turned, poses, doppler_mps=doppler, times_s=times))
-    assert "sensor_turned" in named(found)
+    (evidence,) = (finding.evidence for finding in found if finding.name == "sensor_turned")
+    assert float(evidence.split()[3]) == pytest.approx(-np.degrees(0.12), abs=0.5)  # to the left
+
+
+@pytest.mark.parametrize(
+    ("scans", "moving", "expected"),
+    [(4, 0.35, ("moving_share", "note")), (4, 0.5, ("moving_share", "warning")), (3, 0.35, None),
+     (4, 0.9, ("doppler_without_velocity", "warning")), (3, 0.9, None)],
+)  # fmt: skip
+def test_scans_in_which_much_moves_are_named(scans, moving, expected):
+    points, doppler, _ = one_scan(moving=moving, count=600)
+    poses = np.tile(np.eye(4), (scans, 1, 1))
+    found = list(check_doppler(checked_input([points] * scans, poses, doppler_mps=[doppler] * scans)))
+    assert [(finding.name, finding.severity) for finding in found] == ([expected] if expected else [])
+    if expected and moving == 0.9:
+        assert found[0].evidence.startswith(f"In {scans} of {scans} scans")
+
+
+def test_the_velocity_of_poses_is_that_of_their_curve():
+    """On a circle of 5 m radius at 0.5 rad/s, 2.5 m/s ahead."""
+    times_s = np.array([0.0, 0.1, 0.3, 0.4, 0.5])
+    poses, yaws = np.tile(np.eye(4), (5, 1, 1)), 0.5 * times_s
+    poses[:, :2, 3] = 5 * np.stack([np.sin(yaws), -np.cos(yaws)], 1)
+    poses[:, :2, :2] = np.array([[np.cos(yaws), -np.sin(yaws)], [np.sin(yaws), np.cos(yaws)]]).transpose(
+        2, 0, 1
+    )
+    np.testing.assert_allclose(velocity_of_poses(poses, times_s), np.tile([2.5, 0, 0], (5, 1)), atol=2e-3)
 
 
 def test_doppler_that_contradicts_poses_or_intensities_is_named(drive):

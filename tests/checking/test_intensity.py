@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
+from radarsdf.checking.intensity import check_intensities
+from radarsdf.checking.noise import check_elevation, check_ground
+from radarsdf.checking.recording import checked_input
 
 pytestmark = pytest.mark.usefixtures("right_frames")
 
@@ -58,14 +61,64 @@ def test_what_is_wild_is_counted_and_named(good):
     assert "are 1e+09" in found["intensity_outliers"].evidence
 
 
-def test_reflections_in_the_ground_are_named(good):
-    points, poses, _ = good
-    mirrored = []
-    for scan in points:
-        lower = scan.copy()
-        lower[::4, 2] = (
-            -3.6 - lower[::4, 2]
-        )  # the ground is about 1.2 m below the sensor; what is above is mirrored
-        mirrored.append(lower)
-    found = check_cheaply(mirrored, poses)
-    assert ("below_ground", "warning") in [(finding.name, finding.severity) for finding in found]
+def said(*scans):
+    """Findings about intensities, (N,) each."""
+    points = [np.zeros((len(values), 3)) for values in scans]
+    found = check_intensities(checked_input(points, np.tile(np.eye(4), (len(scans), 1, 1)), list(scans)))
+    return [f"{finding.severity}: {finding.name}: {finding.evidence}" for finding in found]
+
+
+def test_scales_are_described_by_their_steps_offset_and_ends():
+    steps = "note: intensity_steps: Intensities are "
+    even = np.repeat(np.arange(10) / 2, 100)
+    assert said(even) == [f"{steps}0 to 4.5, in steps of 0.5."]
+    assert said(even[::11][:99]) == []  # too few returns for a scale
+    assert said(np.linspace(0, 1, 1000)) == []
+    assert said(np.linspace(0, 1, 999)) == [f"{steps}0 to 1, in steps of 0.001."]
+    offset = np.tile(np.arange(100, 140), 10)
+    assert said(offset)[1:] == [
+        "note: intensity_offset: Intensities are whole numbers with the median 119.5, like dBsm with 128 added."
+    ]
+    assert said(offset - 34)[1:] == []  # the median is 42.5 from 128
+    assert said(np.tile(np.arange(60, 140), 10))[1:] == []  # a twentieth is below 64
+    for count, severity in ((20, []), (21, ["note"]), (50, ["note"]), (51, ["warning"])):
+        # So many of 1000 at the end, after four at each of the values before.
+        counts = [1000 - 48 - count, *[4] * 12, count]
+        ends = [words for words in said(np.repeat(np.arange(14), counts)) if "clipped" in words]
+        what = f"{count / 10:.1f}% of the intensities have the highest value, 13."
+        assert ends == [f"{kind}: intensity_clipped: {what}" for kind in severity]
+
+
+def test_constant_intensities_are_told_from_those_constant_in_scans():
+    assert said(np.ones(3), np.ones(2)) == ["error: intensity_constant: All intensities are 1."]
+    held = [np.full(3, float(i)) for i in range(3)]
+    constant = "warning: intensity_constant_in_scans: In {} of the scans all returns have the same intensity."
+    assert said(*held, np.array([1.0, 2.0]), np.ones(1)) == [constant.format("75%")]
+    assert said(*held[:2], np.array([1.0, 2.0]), np.array([3.0, 2.0])) == []
+    assert said(np.full(3, np.nan)) == [
+        "error: intensity_not_finite: 100.00% of the intensities are not finite."
+    ]
+
+
+def test_the_ground_is_where_most_returns_below_the_sensor_are():
+    """Ground 1.4 m below the sensor, 10 m away; from 1 m and a tenth of the distance below it on, returns are reflections."""
+    ground, above = np.tile([9.9, 0, -1.4], (800, 1)), np.tile([10.0, 0, 0.5], (160, 1))
+    reflected, deep, far = (np.tile(p, (20, 1)) for p in ([9.4, 0, -3.25], [9.4, 0, -3.5], [24.9, 0, -9.0]))
+    turned = np.diag([1.0, -1, -1, 1])  # the sensor hangs upside down
+    scans = [
+        np.concatenate([ground, above, reflected, deep, far]),
+        np.concatenate([ground, above]) * [1, -1, -1],
+    ]
+    (found,) = check_ground(checked_input(scans, [np.eye(4), turned]))
+    assert found.severity == "note"
+    assert found.evidence == (
+        f"{20 / 1960:.1%} of the returns closer than 25 m lie clearly below the ground, which is 1.4 m below the sensor."
+    )
+    assert list(check_ground(checked_input([np.concatenate([ground, above, reflected])], [np.eye(4)]))) == []
+    assert list(check_ground(checked_input([np.concatenate([ground[:50], deep, deep])], [np.eye(4)]))) == []
+
+
+@pytest.mark.parametrize(("returns", "thickness_m", "found"), [(100, 1e-6, 1), (99, 1e-6, 0), (100, 0.01, 0)])
+def test_returns_in_a_plane_have_no_elevation(returns, thickness_m, found):
+    plane = np.random.default_rng(0).uniform(-10, 10, (returns, 3)) * [1, 1, thickness_m / 10]
+    assert len(list(check_elevation(checked_input([plane], [np.eye(4)])))) == found

@@ -9,7 +9,14 @@ import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checking.recording import checked_input
-from radarsdf.checking.trajectory import check_jumps
+from radarsdf.checking.trajectory import (
+    check_duplicates,
+    check_jumps,
+    check_lengths,
+    check_rigid,
+    check_rounding,
+    check_times,
+)
 
 from .breakages import slow
 
@@ -27,6 +34,61 @@ def good(lap):
     return points[:30], poses[:30]
 
 
+def along_x(positions_m, range_m=10.0, **arrays):
+    """Scans of ten returns, no two the same, at such ranges, from positions along x."""
+    poses = np.tile(np.eye(4), (len(positions_m), 1, 1))
+    poses[:, 0, 3] = positions_m
+    points = [np.tile([range_m, 1e-9 * i, 0], (10, 1)) for i in range(len(positions_m))]
+    return checked_input(points, poses, **arrays)
+
+
+@pytest.mark.parametrize(
+    ("range_m", "severity"),
+    [(399, None), (401, "warning"), (999, "warning"), (1001, "error"), (0.21, None), (0.19, "warning"), (0.019, "error")],
+)  # fmt: skip
+def test_ranges_of_no_radar_are_named(range_m, severity):
+    found = list(check_lengths(along_x([0, 1, 2], range_m)))
+    assert [(finding.name, finding.severity) for finding in found] == [("units", severity)] * bool(severity)
+    assert all(f"are {range_m} m or more" in finding.evidence for finding in found)
+
+
+@pytest.mark.parametrize(("step_m", "found"), [(9.9, []), (10.5, ["error: 105 m/s"])])
+def test_speeds_of_no_vehicle_are_named(step_m, found):
+    positions_m, times_s = step_m * np.arange(4), 0.1 * np.arange(4)
+    said = list(check_lengths(along_x(positions_m, times_s=times_s)))
+    assert [f"{finding.severity}: {finding.evidence[-8:-1]}" for finding in said] == found
+    assert list(check_lengths(along_x(positions_m))) == []
+
+
+@pytest.mark.parametrize(
+    ("positions_m", "severity", "evidence"),
+    [([0, 1, 2, 2, 4, 5, 6, 6, 8, 9], "warning", "2 of 10 scans have exactly the pose of the scan before, and the step after is 2.0 times the usual one."),
+     ([0, 1, 2, 2, 3.5, 4.5, 5.5, 5.5, 7, 8], "note", "2 of 10 scans have exactly the pose of the scan before."),
+     ([0, 0, 2, 2, 4, 4, 6, 6], "warning", "4 of 8 scans have exactly the pose of the scan before, and the step after is 2.0 times the usual one."),
+     ([0, 1, 2, 2, 4, 5, 6, 7, 8, 9], "note", "1 of 10 scans have exactly the pose of the scan before.")],
+)  # fmt: skip
+def test_held_poses_leap_and_standing_ones_do_not(positions_m, severity, evidence):
+    (found,) = check_duplicates(along_x(positions_m))
+    assert (found.name, found.severity, found.evidence) == ("duplicate_poses", severity, evidence)
+    assert list(check_duplicates(along_x([0, 1, 2]))) == list(check_duplicates(along_x([3, 3, 3]))) == []
+
+
+def test_poses_that_are_no_transforms_are_told_apart():
+    poses = along_x(np.arange(1, 9)).poses
+    few, half, columns, left = (poses.copy() for _ in range(4))
+    few[[2, 5, 7], 0, 0] = 2
+    half[::2, 0, 0] = 2
+    columns[:] = columns.transpose(0, 2, 1)
+    left[[1, 3, 4, 6], :3, 1] *= -1
+    points = [np.ones((10, 3))] * 8
+    found = [next(check_rigid(checked_input(points, broken))) for broken in (few, half, columns, left)]
+    assert [(finding.name, finding.severity) for finding in found] == [
+        ("poses_not_rigid", "warning"), ("poses_not_rigid", "error"), ("poses_transposed", "error"), ("mirrored", "error")
+    ]  # fmt: skip
+    assert found[0].evidence.startswith("3 of 8 poses are no rigid transforms, the first is pose 2")
+    assert found[3].evidence.startswith("4 of 8 poses are left-handed")
+
+
 def names(findings):
     return [finding.name for finding in findings if finding.severity != "note"]
 
@@ -37,7 +99,11 @@ def test_a_displacement_from_one_scan_on_is_a_jump(lap):
     poses[30:, :3, 3] += poses[30, :3, 1] * 4
     found = check_cheaply(points, poses)
     assert names(found) == ["pose_jumps"]
-    assert "after scan 29" in found[0].evidence
+    step = np.linalg.inv(poses[29]) @ poses[30]
+    length_m, turn_deg = np.linalg.norm(step[:3, 3]), np.degrees(np.arccos((np.trace(step) - 2) / 2))
+    largest = f"the largest after scan 29: {length_m:.3g} m and {turn_deg:.3g} degrees"
+    assert found[0].evidence.startswith(f"1 of 59 steps are jumps, {largest}")
+    assert found[0].severity == "warning"
 
 
 @pytest.mark.usefixtures("right_frames")
@@ -45,23 +111,6 @@ def test_a_pause_of_the_recording_is_no_jump(good):
     points, poses = good
     kept = [i for i in range(30) if not 12 <= i < 18]
     assert names(check_cheaply([points[i] for i in kept], poses[kept])) == []
-
-
-@pytest.mark.usefixtures("right_frames")
-def test_poses_that_are_held_are_named(good):
-    points, poses = good
-    assert names(check_cheaply(points, np.repeat(poses[::2], 2, axis=0)))[:1] == ["duplicate_poses"]
-
-
-@pytest.mark.usefixtures("right_frames")
-def test_a_sensor_that_stands_still_is_a_note(good):
-    points, poses = good
-    still = [0] * 3 + list(range(27))
-    found = check_cheaply(
-        [p + np.float32(1e-3 * i) for i, p in enumerate(points[j] for j in still)], poses[still]
-    )
-    assert names(found) == []
-    assert "duplicate_poses" in [finding.name for finding in found]
 
 
 @pytest.mark.usefixtures("right_frames")
@@ -90,7 +139,12 @@ def test_what_a_fit_leaves_out_is_noted(good):
     found = check_cheaply([*padded, hole, hole[:0], *points[5:]], poses)
     assert names(found) == ["poses_not_rigid"]
     assert found[0].evidence.startswith("1 of 30 poses are no rigid transforms, the first is pose 9")
-    assert {"returns_not_finite", "padding", "empty_scans"} <= {f.name for f in found if f.severity == "note"}
+    total = sum(map(len, padded)) + len(hole) + sum(map(len, points[5:]))
+    zeros = sum(len(scan) for scan in padded) * 3 // 4
+    notes = {finding.name: finding.evidence for finding in found if finding.severity == "note"}
+    assert notes["returns_not_finite"].startswith(f"{-(-len(hole) // 2)} of {total} returns")
+    assert notes["padding"].startswith(f"{zeros} of {total} returns are no measurements")
+    assert notes["empty_scans"] == "1 of 30 scans have no returns, the first is scan 4."
     none = check_cheaply([scan[:0] for scan in points], good[1])
     assert [(finding.name, finding.severity) for finding in none] == [("empty_scans", "error")]
 
@@ -104,17 +158,16 @@ def test_utm_coordinates_in_float32_are_named_with_their_steps(good):
     (found,) = [f for f in check_cheaply(points, poses.astype(np.float32)) if f.severity != "note"]
     assert (found.name, found.severity) == ("positions_rounded", "warning")
     assert "steps of 0.5 m" in found.evidence
-
-
-@pytest.mark.usefixtures("right_frames")
-def test_a_radar_without_elevation_is_named(good):
-    points, poses = good
-    assert names(check_cheaply([scan * np.float32([1, 1, 0]) for scan in points], poses)) == ["no_elevation"]
+    assert list(check_rounding(along_x(np.float32([1.3e5, 1.31e5])))) == []  # 0.0078 m
+    assert "steps of 0.0156 m" in next(check_rounding(along_x(np.float32([0, 1.32e5])))).evidence
 
 
 @pytest.mark.usefixtures("right_frames")
 def test_times_of_nothing_are_named(good):
     assert names(radarsdf.check(*good, times_s=np.zeros(30))) == ["times"]
+    (found,) = check_times(along_x([0, 1, 2, 3], times_s=[0, 1, 1, np.nan]))
+    assert found.evidence.startswith("2 of 3 times are not later than the one before")
+    assert list(check_times(along_x([0, 1, 2], times_s=[0, 1, 2]))) == []
 
 
 def test_shapes_that_do_not_fit_are_refused(good):

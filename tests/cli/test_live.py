@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-import time
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli.live import replay
+from radarsdf.cli.live import Replay, _add_rates, _Shown, replay
+from radarsdf.cli.results import Results
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
 
@@ -35,19 +36,67 @@ def test_it_writes_the_map_and_where_scans_were_placed(recording, capsys):
     assert len(radarsdf.load(out).mesh(0.2).faces) > 100
 
 
-def test_scans_that_come_too_fast_are_dropped():
-    class Slow:
-        def integrate(self, *_given, **_named):
-            time.sleep(0.03)
-            return type("Done", (), {"pose": np.eye(4), "moved": ()})
+class Clock:
+    """In place of the module `time`; the map takes `integration_s` of it for a scan."""
 
-    scans = Scans(SCENE.points, SCENE.poses, None)
-    done = replay(Slow(), scans, rate=10.0)  # a scan each 10 ms
-    assert done.dropped
-    assert done.rows[0] == 0
-    assert done.rows[-1] == 5  # the newest is always taken
+    def __init__(self, integration_s):
+        self.now_s, self.integration_s, self.taken = 100.0, integration_s, []
+
+    def perf_counter(self):
+        return self.now_s
+
+    def sleep(self, seconds):
+        assert seconds >= 0
+        self.now_s += seconds
+
+    def integrate(self, _points, pose, _intensities, *, time_s, **_named):
+        self.taken.append((round(self.now_s - 100, 9), round(time_s, 9)))
+        self.now_s += self.integration_s
+        return type("Done", (), {"pose": pose, "moved": ()})
+
+
+@pytest.mark.parametrize(
+    ("rate", "integration_s", "times_s", "begun_s"),
+    [(5.0, 0.005, None, {0: 0, 1: 0.02, 2: 0.04, 3: 0.06, 4: 0.08, 5: 0.1}),
+     (10.0, 0.024, None, {0: 0, 2: 0.024, 4: 0.048, 5: 0.072}),  # the newest is always taken
+     (0.0, 0.03, None, {i: 0.03 * i for i in range(6)}),
+     (1.0, 0.01, [7, 8, 8.5, 9, 9.1, 9.2], {0: 0, 1: 1, 2: 1.5, 3: 2, 4: 2.1, 5: 2.2})],
+)  # fmt: skip
+def test_scans_come_at_their_times_and_too_fast_ones_are_dropped(
+    monkeypatch, rate, integration_s, times_s, begun_s
+):
+    clock = Clock(integration_s)
+    monkeypatch.setattr("radarsdf.cli.live.time", clock)
+    times_s = None if times_s is None else np.array(times_s)
+    done = replay(clock, Scans(SCENE.points, SCENE.poses, None, times_s=times_s), rate=rate)
+    assert done.rows == list(begun_s)
     assert sorted(done.rows + done.dropped) == list(range(6))
+    stamps = 0.1 * np.arange(6) if times_s is None else times_s
+    assert clock.taken == [(pytest.approx(begun), pytest.approx(stamps[i])) for i, begun in begun_s.items()]
+    np.testing.assert_allclose(done.seconds, integration_s)
 
 
 def test_scans_without_poses_need_times(recording, capsys):
     assert "times" in refusal(capsys, recording, "live", recording / "scans.npz", "--find")
+
+
+def test_rates_are_those_of_the_seconds(capsys):
+    _add_rates(Results(), Replay([0, 1, 2, 4], [], [0.01, 0.02, 0.03, 0.06], [3], []), 5)
+    assert capsys.readouterr().out.splitlines() == [
+        "4 of 5 scans in the map, 1 dropped, 0 lost",
+        "a scan took 25.0 ms (median), 59.1 ms (99 of 100), 60.0 ms (worst): 33 scans a second",
+    ]
+    with pytest.raises(ValueError, match="no scan came into the map"):
+        _add_rates(Results(), Replay(), 5)
+
+
+def test_the_page_shows_the_surface_from_time_to_time():
+    page, done = Mock(), Replay(poses=[np.eye(4) + np.eye(4)[:, :1] * np.eye(4)[3]])
+    shown = _Shown(Mock(**{"mesh.return_value": "mesh"}), page)
+    for due, times in ((True, 1), (False, 1), (True, 2)):
+        shown._next_s = 0.0 if due else shown._next_s
+        shown(done)
+        shown._thread.join()
+        assert page.show.call_count == times
+    mesh, path = page.show.call_args.args
+    assert (mesh, path.tolist()) == ("mesh", [[1.0, 0.0, 0.0]])

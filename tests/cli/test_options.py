@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from radarsdf import FitConfig
 from radarsdf.cli.inputs import read_scans
-from radarsdf.cli.options import Parser
+from radarsdf.cli.options import OPTIONS, Parser
 from radarsdf.cli.settings import load_config
 
 from .calls import call, refusal
@@ -99,3 +99,16 @@ def test_options_are_the_parameters_of_read(tmp_path):
 def test_negative_numbers_are_no_options():
     words = ("map.safetensors", "-o", "mesh.ply", "--box", "-1e-05", "-.5", "-2", "-1e+00", "5", "6")
     assert given("mesh", *words).box == [[-1e-05, -0.5, -2.0], [-1.0, 5.0, 6.0]]
+
+
+def test_the_help_states_the_defaults_that_hold():
+    stated = {}
+    for name, (kind, words) in OPTIONS.items():
+        default = kind.get("default")
+        if isinstance(default, (float, int, tuple)):
+            shown = " ".join(f"{value:.10g}" for value in np.atleast_1d(default))
+            stated[name] = shown if f"default: {shown}" in words else default
+    assert {name: default for name, default in stated.items() if not isinstance(default, str)} == {
+        "--rate": 1.0, "--seed": 0, "--align": True
+    }  # fmt: skip
+    assert {"--max-gap", "--voxel", "grid --voxel", "--samples", "--min-area", "--heights"} <= set(stated)

@@ -165,7 +165,8 @@ def test_of_two_parents_the_one_with_poses_counts(tmp_path, other):
 
     def second(bag):
         for time_s in times_s:
-            T_parent_base = pose([7.0, 0, 0]) if other == "constant" else straight(time_s)
+            T_parent_base = pose([7.0, 0, 0]) if other == "constant" else straight(time_s).copy()
+            T_parent_base[:3, 3] *= 1000 if other == "short" else 1  # far, but not for long
             bag.write("/tf", bag.transforms(time_s, {("camera_init", "base"): T_parent_base}), time_s)
 
     scans = read(bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), second, clouds))

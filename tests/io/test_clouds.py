@@ -135,6 +135,12 @@ def test_text(tmp_path, text):
     check(tmp_path / "a.csv")
 
 
+def test_compressed_pcd_says_what_to_do(tmp_path):
+    write_pcd(tmp_path / "0.pcd", COLUMNS, DATA="binary_compressed")
+    with pytest.raises(ValueError, match="its DATA is binary_compressed: save it as binary"):
+        read_points(tmp_path / "0.pcd")
+
+
 def test_viewpoint(tmp_path):
     """A quarter of a turn to the left, 100 m along x: points of ground truth move, scans have the given poses."""
     half = np.sqrt(0.5)

@@ -102,6 +102,21 @@ def polar(text):
     return scan_of(Fields.of(names).judged(columns, notes), columns).points, notes.lines
 
 
+@pytest.mark.parametrize(
+    "columns",
+    [{"x_cm": 300, "y [mm]": -4000, "z_km": 0.005, "doppler (km/h)": -36, "power": 7},
+     {"X(m)": 3, "Y": -4, "Z": 5, "v_r_kmh": -36, "power": 7},
+     {"range_m": 50**0.5, "azimuth_mrad": 1e3 * np.arctan2(-4, 3), "elevation_deg": 45, "rdot_mps": -10, "power": 7}],
+)  # fmt: skip
+def test_units_in_names_become_metres_rad_and_metres_per_second(columns):
+    rows = {name: np.full(2, value, np.float64) for name, value in columns.items()}
+    notes = Notes()
+    scan = scan_of(Fields.of(list(rows)).judged(rows, notes), rows)
+    assert_allclose(scan.points, [[3, -4, 5]] * 2, rtol=1e-6)
+    assert_allclose(scan.doppler_mps, [-10, -10], rtol=1e-6)
+    assert (scan.intensities.tolist(), notes.lines) == ([7, 7], [])
+
+
 LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from radarsdf.io.poses import Trajectory, TransformChain, poses_of, read_poses
+from radarsdf.io.poses import Trajectory, TransformChain, are_poses, poses_of, read_poses, trajectory_of
 from radarsdf.scans import Notes
 from scipy.spatial.transform import Rotation
 
@@ -137,8 +137,29 @@ def test_one_time_of_many_is_as_all_of_them():
     assert trajectory.pose_at(times_s[0] - 0.01, 1.0) is None
     assert trajectory.pose_at(times_s[-1] + 0.01, 1.0) is None
     assert_allclose(trajectory.pose_at(times_s[-1] + 4e-4, 1.0), expected[-1], atol=1e-9)  # times are rounded
-    assert trajectory.pose_at((times_s[3] + times_s[4]) / 2, 0.01) is None
+    between_s = (times_s[3] + times_s[4]) / 2
+    assert trajectory.pose_at(between_s, 0.01) is None
+    assert trajectory.pose_at(between_s, times_s[4] - times_s[3]) is not None  # the longest gap itself counts
+    assert trajectory.pose_at(times_s[-1] + 1.1e-3, 1.0) is None
+    assert trajectory.pose_at(times_s[0] - 0.9e-3, 1.0) is not None
+    assert trajectory.pose_at(np.nan, 1.0) is None
     chain = TransformChain((POSES[1], trajectory, POSES[2]))
     assert_allclose(chain.pose_at(wanted[0], 1.0), POSES[1] @ expected[0] @ POSES[2], atol=1e-9)
     assert chain.pose_at(0.0, 1.0) is None
     assert chain.span() == trajectory.span()
+
+
+def test_most_rows_of_a_table_must_be_poses():
+    """A quaternion may be off by a hundredth, for files of three digits; half of the rows may have none, but not wrong ones."""
+    rows = np.tile([0.0, 1, 2, 3, 0, 0, 0, 1], (4, 1))
+    rows[:, 0], rows[:, 7] = np.arange(4), [1.0099, 0.9901, 1.0101, 0.9899]
+    assert are_poses(rows[:, 1:]).tolist() == [True, True, False, False]
+    with pytest.raises(ValueError, match=r"x holds 2 poses at different times; .* 2 of 4 poses are left out"):
+        trajectory_of(rows, "x")
+    rows[3, 7] = 0  # a row without a rotation stands for a missing pose
+    notes = Notes()
+    assert trajectory_of(rows, "x", notes).times_s.tolist() == [0, 1]
+    assert notes.lines[0].endswith("the first: pose 2")
+    rows[1, 0] = 0  # of two poses at one time, the first counts
+    with pytest.raises(ValueError, match="x holds 1 poses at different times"):
+        trajectory_of(rows, "x")

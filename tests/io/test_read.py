@@ -96,15 +96,6 @@ def test_times_in_names_and_tum_poses(tmp_path):
     assert_allclose(scans.poses[1], [[c, -c, 0, 1], [c, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("name", "time_s"),
-    [("1700000000123.pcd", 1700000000.123), ("1700000000_123456789.pcd", 1700000000.123456789)],
-)
-def test_units_of_times(tmp_path, name, time_s):
-    write_pcd(tmp_path / name, radar_cloud([[1, 2, 3]]))
-    assert read(tmp_path, POSES[:1]).times_s == pytest.approx([time_s], abs=1e-6)
-
-
 def test_scans_outside_of_the_poses_and_in_gaps_are_counted(tmp_path):
     clouds(tmp_path, 8, "{}.0.pcd")
     rows = [f"{t} {t} 0 0 0 0 0 1" for t in (1, 2, 3, 6, 7)]

@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds import read_columns
 from radarsdf.io.poses import read_poses, trajectory_of
-from radarsdf.io.text import read_numbers
+from radarsdf.io.recordings import _time_in
+from radarsdf.io.text import are_degrees, in_seconds, read_numbers
 from radarsdf.scans import Notes
 
 ROWS = np.array([[1.5, -2, 3, 40.25], [4, 5.125, 6, 70], [7, 8, 9e-2, 10]])
@@ -116,3 +117,34 @@ def test_times_may_be_in_other_units(folder):
     scans = read(folder, max_gap_s=1.5)
     assert pairs(scans) == [(1, 10), (2, 20), (3, 30), (4, 40)]
     assert "times of times.txt are taken as ns since 1970" in scans.notes
+
+
+@pytest.mark.parametrize(
+    ("time", "time_s", "unit"),
+    [(9.9e10, 9.9e10, "s"), (1.1e11, 1.1e8, "ms"), (9.9e13, 9.9e10, "ms"), (1.1e14, 1.1e8, "µs"),
+     (9.9e16, 9.9e10, "µs"), (1.1e17, 1.1e8, "ns"), (-1.1e11, -1.1e8, "ms")],
+)  # fmt: skip
+def test_large_times_are_in_the_unit_that_makes_them_a_date(time, time_s, unit):
+    notes = Notes()
+    assert_allclose(in_seconds(np.array([time]), "a.txt", notes), [time_s], rtol=1e-12)
+    assert notes.lines == [f"times of a.txt are taken as {unit} since 1970"] * (unit != "s")
+    assert len(in_seconds(np.zeros(0), "a.txt", notes)) == 0
+
+
+@pytest.mark.parametrize(
+    ("stem", "time_s"),
+    [("12.5", 12.5), ("scan_1700000000123", 1700000000.123), ("1700000000_250000000", 1700000000.25), ("1234567890", 1234567890.0),
+     ("170000000-500000000", 170000000.5), ("1700000000250000000", 1700000000.25), ("scan_123456789", None), ("7", None)],
+)  # fmt: skip
+def test_names_of_files_end_in_times(stem, time_s):
+    assert _time_in(stem) == (None if time_s is None else pytest.approx(time_s, rel=1e-15))
+
+
+@pytest.mark.parametrize(
+    ("azimuths", "elevation", "degrees"),
+    [((-1.04, 1.04), 0, False), ((-1.06, 1.06), 0, True), ((0, 2.09, 2.09), 0, False), ((0, 2.12, 2.12), 0, True),
+     ((0, 1), 0.52, False), ((0, 1), -0.53, True), ((0, np.nan), 9, True), ((np.nan, np.nan), 9, False)],
+)  # fmt: skip
+def test_angles_beyond_what_rad_can_be_are_degrees(azimuths, elevation, degrees):
+    azimuth = np.pi * np.repeat(azimuths, 100)
+    assert are_degrees(azimuth, np.full(len(azimuth), np.pi * elevation)) is degrees

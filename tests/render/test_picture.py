@@ -84,6 +84,25 @@ def test_what_lies_behind_the_viewer_is_not_drawn():
     assert (render(half, width=160, height=100, viewpoint=(0.0, 0.0, 0.0)) == WHITE).all()
 
 
+def test_from_straight_above_north_is_at_the_top():
+    """Four squares on the ground, to the east, north, west and south; and a viewer in their middle, who looks north."""
+    squares = [square((0, 0, 0)) for _ in range(4)]
+    for number, tile in enumerate(squares):
+        tile.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+        tile.apply_translation(3 * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])[number])
+    colors = [(200, 0, 0), (0, 200, 0), (0, 0, 200), (200, 200, 0)]
+    shown = np.vstack([one_color(tile, color) for tile, color in zip(squares, colors, strict=True)])
+    mesh = trimesh.util.concatenate(squares)
+    image = render(mesh, shown, width=200, height=200, viewpoint=(0, 0, 20)).astype(int)
+    places = [(100, 170), (30, 100), (100, 30), (170, 100)]  # row and column
+    for (row, column), color in zip(places, colors, strict=True):
+        np.testing.assert_array_equal(image[row, column] > image[row, column].max() / 2, np.array(color) > 0)
+    walls = trimesh.util.concatenate([square((0, 9, 0)), square((0, -9, 0))])
+    shown = np.vstack([one_color(square((0, 0, 0)), color) for color in colors[:2]])
+    middle = render(walls, shown, width=60, height=40, viewpoint=(0, 0, 0))[20, 30].astype(int)
+    assert middle[0] > middle[1]  # the northern wall
+
+
 def test_save_picture_has_the_colors_of_the_scalar(tmp_path):
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread  # noqa: PLC0415
@@ -145,3 +164,34 @@ def test_the_last_trajectory_places_the_returns(tmp_path):
 
     assert {"#d95f02", "#1b6ca8", "#b9b9b9"} <= colors({"given": poses, "refined": aside})
     assert "#1b6ca8" not in colors({"found": poses})
+
+
+def test_a_grid_is_drawn_in_its_place(tmp_path, monkeypatch):
+    """A floor with a block on it: heights, costs, occupancy and clearance, x to the right and y up, NaN where unknown."""
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    from radarsdf.grids.grid import Grid  # noqa: PLC0415
+    from radarsdf.render import figures  # noqa: PLC0415
+
+    state = np.zeros((12, 8, 9), np.int8)
+    state[:, :, 0] = state[3:5, 5:7, 1:4] = 1
+    state[10:] = -1
+    above_m = np.broadcast_to(0.5 * np.arange(9, dtype=np.float32) - 0.25, state.shape)
+    grid = Grid(np.array([100.0, -20.0, 3.0]), 0.5, state, np.full_like(above_m, 0.5), above_m, 0.0)
+    drawn, png_of = [], figures.png_of
+    monkeypatch.setattr(figures, "png_of", lambda figure: drawn.append(figure) or png_of(figure))
+    figures.save_grid_picture(tmp_path / "grid.png", grid, 0.3, 2.0)
+    assert (tmp_path / "grid.png").read_bytes().startswith(b"\x89PNG")
+    axes = [ax for ax in drawn[0].axes if ax.images]
+    costs, level = grid.costmap(), int(np.argmax(grid.free.sum(axis=(0, 1))))
+    distance_m = grid.distances().not_free_m[:, :, level]
+    flat = grid.flat(0.3, 2.0).state
+    expected = [
+        costs.height_m, np.where(costs.cost < 0, np.nan, costs.cost), np.where(flat < 0, np.nan, flat),
+        np.where(distance_m > 0, distance_m, np.nan),
+    ]  # fmt: skip
+    for ax, values in zip(axes, expected, strict=True):
+        (image,) = ax.images
+        np.testing.assert_array_equal(np.ma.filled(image.get_array(), np.nan), np.float32(values).T)
+        assert image.get_extent() == [100.0, 106.0, -20.0, -16.0]
+        assert image.origin == "lower"
+    assert axes[3].get_title() == f"clearance at z = {3 + (level + 0.5) * 0.5:.1f} m, m"

@@ -16,6 +16,7 @@ from radarsdf.changes.changes import (
     ChangedSurface,
     Changes,
 )
+from radarsdf.view.pages import centre_of
 
 from .reading import Page
 
@@ -38,11 +39,13 @@ def surface(kinds):
 
 
 @pytest.mark.parametrize("kinds", [[SAME], [SAME, APPEARED, MOVED, REFLECTANCE_CHANGED]])
-def test_each_change_is_named_listed_and_shown(kinds, tmp_path):
+def test_each_change_is_named_listed_and_shown(kinds, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="the extra view is not installed")
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
-    from radarsdf.report.changes import write_changes_report  # noqa: PLC0415
+    from radarsdf.report import changes as module  # noqa: PLC0415
 
+    scene, shown = module.scene, []
+    monkeypatch.setattr(module, "scene", lambda *mesh: shown.append(mesh) or scene(*mesh))
     areas_m2 = {NAMES[kind]: 4.0 * kinds.count(kind) for kind in (APPEARED, 1, MOVED, REFLECTANCE_CHANGED)}
     report = {
         "alignment": "As <b>given</b>.",
@@ -52,12 +55,17 @@ def test_each_change_is_named_listed_and_shown(kinds, tmp_path):
     }
     changes = Changes(surface([SAME]), surface(kinds), np.eye(4), report)
     regions, path = changes.regions(0.1), tmp_path / "changes.html"
-    assert write_changes_report(path, changes, ("monday", HOSTILE), 0.2, regions) == path.stat().st_size
+    assert (
+        module.write_changes_report(path, changes, ("monday", HOSTILE), 0.2, regions) == path.stat().st_size
+    )
+    np.testing.assert_allclose(shown[0][0].mean(axis=0), 0, atol=1e-9)  # the page computes in float32
     page = Page(path.read_text("utf-8"))
     assert "As <b>given</b>." in page.sections["conclusion"]
     for region in regions:
         assert region.kind.capitalize() in page.sections["conclusion"]
-        assert region.words in page.sections["changes"]
+        size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
+        figures = f"{size} {region.area_m2:.2f} {region.probability:.2f}"
+        assert f"{region.words} {centre_of(region)} {figures}" in page.sections["changes"]
     assert len(regions) == len(kinds) - 1
     assert len(page.all("tr")) == (1 + len(regions) if regions else 0)
     assert len(page.all("img")) == 2

@@ -7,9 +7,11 @@ from __future__ import annotations
 import dataclasses
 import re
 
+import numpy as np
 import radarsdf
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.io import Scans
+from scipy.spatial import cKDTree
 
 from .conftest import HOSTILE
 from .reading import Page
@@ -78,15 +80,35 @@ def test_figures_are_those_of_the_evaluation(written, subject, scene):
     assert f_score in page.sections["errors"]
     share = re.search(r"([\d.]+ %) of them are within one standard error", page.sections["uncertainty"])[1]
     assert f"{share} of the errors" in page.sections["conclusion"]
+    # Errors along the normal, against the nearest point of the truth, where there is one within 0.4 m.
+    truth, vertices = subject.scans.ground_truth, np.asarray(subject.mesh.vertices)
+    distance_m, nearest = cKDTree(truth).query(vertices)
+    error_m = np.einsum("ni,ni->n", truth[nearest] - vertices, subject.mesh.vertex_normals)
+    sigma_m, confidence = (subject.mesh.vertex_attributes[name] for name in ("uncertainty_m", "confidence"))
+    known = (distance_m <= 0.4) & np.isfinite(sigma_m)
+    z = np.abs(error_m / sigma_m)[known]
+    assert share == f"{100 * np.mean(z <= 0.99446):.1f} %"
+    assert f"{100 * np.mean(z <= 1.95996):.1f} % within the 95 % interval" in page.sections["uncertainty"]
+    assert f"for the {100 * known.mean():.1f} % of the surface within 0.4 m" in page.sections["uncertainty"]
+    uncertainties = " ".join(f"{v:.3f}" for v in np.nanpercentile(sigma_m, [10, 50, 90]))
+    confidences = " ".join(f"{v:.2f}" for v in np.nanpercentile(confidence, [10, 50, 90]))
+    assert f"Uncertainty, m {uncertainties} Confidence {confidences}" in page.sections["uncertainty"]
     sensor = scene.poses[0, :3, 3]
     x = scene.points[0] @ scene.poses[0, :3, :3].T + sensor
     metrics = intensity_metrics(subject.radar_map.intensity(x, sensor), scene.intensities[0])
     assert f"This map {metrics['mae']:.2f} {metrics['medae']:.2f}" in page.sections["intensity"]
     assert f"{metrics['mae']:.2f} sensor units" in page.sections["conclusion"]
+    off = np.abs(scene.intensities[0] - np.median(scene.intensities[0]))
+    assert f"Median of all returns {off.mean():.2f} {np.median(off):.2f}" in page.sections["intensity"]
     assert "1,500 returns of 1 scans" in page.sections["intensity"]
     report = subject.radar_map.report
     assert f"{report['noise']['range_m']:.3f} m" in page.sections["conclusion"]
-    assert f"{report['returns']:,}" in page.sections["training"]
+    for name in ("returns", "leaf_cells", "vertices"):
+        assert f" {report[name]:,} " in page.sections["training"]
+    for stage, done in report["iterations_done"].items():
+        assert f"Iterations, {stage} {done:,} of {report['iterations'][stage]:,}" in page.sections["training"]
+    fit_s = sum(report[name] for name in report if name.endswith("_s") and name != "skipped_s")
+    assert f"Fit {fit_s:.1f} s" in page.sections["conclusion"] + page.sections[""]
     assert all(words in page.sections["skipped"] for words in report["skipped"])
     assert "learning_rate = " in page.sections["configuration"]
 
@@ -130,3 +152,15 @@ def test_a_large_mesh_is_drawn_thinned_and_evaluated_whole(subject, tmp_path, mo
     assert len(large.shown[0].faces) < faces / 2
     page = write(tmp_path / "large.html", subject, scans=None, held_out=None)
     assert f"{len(large.shown[0].faces):,} of {faces:,} triangles" in page.sections["surface"]
+
+
+def test_the_truth_and_the_viewpoint_are_those_of_the_scans_in_the_box(subject, radar_map):
+    scans, corner = subject.scans, subject.scans.ground_truth[0]
+    np.testing.assert_array_equal(subject.viewpoint, scans.poses[2, :3, 3])  # the middle one of five
+    alone = dataclasses.replace(subject, scans=None)
+    np.testing.assert_array_equal(alone.viewpoint, radar_map.origin)
+    assert alone.ground_truth is None
+    step_m = np.array([0.5, 0.5, 0.0])
+    boxed = dataclasses.replace(subject, box=[corner - [0, 0, 1], corner + step_m])  # on its faces is within
+    assert len(boxed.ground_truth) == 4
+    assert dataclasses.replace(subject, box=[corner + [0, 0, 1], corner + [9, 9, 2]]).ground_truth is None

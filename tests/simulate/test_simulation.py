@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from radarsdf import simulate as sim
 from radarsdf.simulate import materials
-from scipy.spatial.transform import Rotation
 
 FACING = sim.Material("facing wall", 0.0, specular=0.0, looks=3.0)
 QUIET = sim.RadarSensor(
@@ -109,6 +108,8 @@ def test_poses_are_rigid_and_smooth(simulation, monkeypatch):
     assert ((height > 0.9) & (height < 1.7)).all()
     nothing = sim.Scan(np.zeros((0, 3)), *np.zeros((3, 0)))
     monkeypatch.setattr(sim.RadarSensor, "scan", lambda *_: nothing)  # the test is of its poses
+    usual = {"hugin": 120, "oculii": 120, "wall": 90, "astyx": 20}[simulation.name]
+    assert len(sim.SCENES[simulation.name]()) == usual
     fine = sim.SCENES[simulation.name](seed=3, frames=8 * 3)
     np.testing.assert_allclose(fine.poses[1::3], simulation.poses, atol=1e-9)  # more frames, same path
     assert np.linalg.norm(np.diff(fine.poses[:, :3, 3], axis=0), axis=1).max() < 4.0
@@ -161,10 +162,38 @@ def test_lidar_lies_on_what_the_radar_could_see(simulation):
     assert seen.all()
 
 
+# Of seed 3 and two scans. BENCHMARK.md and the documents compare versions on these scenes, so they stay as they are.
+SUMMARIES = {
+    "astyx": ([55.497, 3.974, 2.245, 3.545], 2.026, 0.081, [2241, 15, 15, 99, 2196], [44.94, 11.35, 2.47], 54.18, 53.96, 8879),
+    "hugin": ([46.102, -0.515, 1.271, 3.518], 2.119, 5.604, [2810, 38, 39, 0, 0], [39.80, 0.47, 1.06], 80.37, 80.68, 9343),
+    "oculii": ([0.195, 0.283, 1.799, 3.819], 1.945, 3.738, [1543, 36, 125, 0, 0], [0.79, 0.06, 1.34], 15.99, 17.33, 13632),
+    "wall": ([-0.060, 1.910, 1.341, 4.730], 2.589, -3.292, [2106, 7, 1, 0, 0], [1.33, -0.04, 1.00], 104.74, 105.16, 12799),
+}  # fmt: skip
+
+
+def summary(one):
+    """Means of bounding spheres, distances and reflectivities; returns by origin, their mean, intensities, lidar points."""
+    spheres = [
+        (*center, radius) for center, radius in (solid.bounding_sphere() for solid in one.scene.solids)
+    ]
+    probe = np.random.default_rng(0).uniform([-20, -20, -1], [60, 20, 6], size=(300, 3))
+    intensities, noiseless = (np.concatenate(v) for v in (one.intensities, one.noiseless_intensities))
+    return (
+        np.mean(spheres, axis=0), np.abs(one.scene.signed_distance(probe)).mean(),
+        np.mean([part.material.reflectivity_db for part in one.scene.parts]),
+        np.bincount(np.concatenate(one.origin_kind), minlength=5), one.world_points().mean(axis=0),
+        intensities.mean(dtype=np.float64), np.nanmean(noiseless, dtype=np.float64), len(one.ground_truth),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("name", sorted(sim.SCENES))
 def test_same_seed_same_bits_other_seed_other_layout(name):
     one, again = (sim.SCENES[name](seed=3, frames=2) for _ in range(2))
     other = sim.SCENES[name](seed=4, frames=1)
+    for value, expected, atol in zip(
+        summary(one), SUMMARIES[name], [1e-3, 1e-3, 1e-3, 2, 0.02, 0.02, 0.02, 3], strict=True
+    ):
+        np.testing.assert_allclose(value, expected, rtol=0, atol=atol)
     for field in ("points", "intensities", "noiseless_intensities", "origin_kind"):
         for a, b in zip(getattr(one, field), getattr(again, field), strict=True):
             np.testing.assert_array_equal(a, b)
@@ -175,6 +204,35 @@ def test_same_seed_same_bits_other_seed_other_layout(name):
     assert np.mean(np.abs(first - changed) > 0.01) > 0.3
 
 
+def test_a_sensor_and_a_material_without_settings_are_as_documented():
+    sensor, material = sim.RadarSensor(), sim.Material("plain", 0.0)
+    angle = np.array([0.0, 0.25])
+    lobe = 0.5 * np.cos(angle) ** 2 + 0.5 * np.exp(-0.5 * (angle / 0.25) ** 2)
+    np.testing.assert_allclose(
+        material.echo_db(np.zeros((2, 3)), np.cos(angle)), 10 * np.log10(lobe), atol=1e-4
+    )
+    scan = sensor.scan(wall_ahead(10.0, material), np.eye(4))
+    points = scan.points.astype(np.float64)
+    range_m, azimuth = np.linalg.norm(points, axis=1), np.arctan2(points[:, 1], points[:, 0])
+    elevation = np.arcsin(points[:, 2] / range_m)
+    assert (scan.origin_kind == sim.Origin.SURFACE).all()
+    assert 0.9 * 3000 < len(points) <= 3000
+    assert np.abs(azimuth).max() == pytest.approx(0.96, abs=0.02)
+    assert np.abs(elevation).max() == pytest.approx(0.26, abs=0.03)
+    noise_m = np.hypot(0.04, np.hypot(0.004 * points[:, 1], 0.006 * points[:, 2]))
+    assert np.std((points[:, 0] - 10.0) / noise_m) == pytest.approx(1.0, rel=0.1)
+    ahead = np.abs(azimuth) < 0.05
+    assert np.median(scan.noiseless_intensities[ahead]) == pytest.approx(130.0 - 40.0, abs=0.5)
+    assert 64.0 <= scan.intensities.min() < 70.0
+    np.testing.assert_allclose(scan.intensities * 10, np.round(scan.intensities * 10), atol=1e-3)
+    assert scan.intensities.max() < 118.0
+    for distance_m in (0.45, 59.0):
+        points = sensor.scan(wall_ahead(distance_m, material), np.eye(4)).points
+        range_m = np.linalg.norm(points.astype(np.float64), axis=1)
+        assert 0 < len(points) < 3000
+        assert ((range_m > 0.5 - 1e-5) & (range_m < 60 + 1e-5)).all()
+
+
 def test_clutter_does_not_change_the_other_returns():
     scene, pose = wall_ahead(10.0), np.eye(4)
     clean = QUIET.scan(scene, pose, seed=1)
@@ -183,37 +241,6 @@ def test_clutter_does_not_change_the_other_returns():
     order_a, order_b = np.lexsort(clean.points.T), np.lexsort(cluttered.points[surface].T)
     np.testing.assert_array_equal(clean.points[order_a], cluttered.points[surface][order_b])
     np.testing.assert_array_equal(clean.intensities[order_a], cluttered.intensities[surface][order_b])
-
-
-@pytest.mark.parametrize("distance", [10.0, 40.0])
-def test_noise_along_and_across_the_beam(distance):
-    """A pole-thin field of view on a wall: range noise is the spread in x, angles times range the spread across."""
-    sensor = replace(
-        QUIET, azimuth_fov_rad=1e-6, elevation_fov_rad=1e-6, beams=20_000,
-        sigma_range_m=0.07, sigma_azimuth_rad=0.005, sigma_elevation_rad=0.011,
-    )  # fmt: skip
-    points = sensor.scan(wall_ahead(distance), np.eye(4)).points.astype(np.float64)
-    assert len(points) == 20_000
-    range_m = np.linalg.norm(points, axis=1)
-    assert range_m.mean() == pytest.approx(distance, abs=0.003)
-    assert range_m.std() == pytest.approx(0.07, rel=0.03)
-    assert points[:, 1].std() == pytest.approx(0.005 * distance, rel=0.03)
-    assert points[:, 2].std() == pytest.approx(0.011 * distance, rel=0.03)
-
-
-def test_power_falls_with_the_fourth_power_of_range():
-    """Regress the measured, speckled dB on log10 of the range: the slope is -40, the offset gain + reflectivity."""
-    sensor = replace(QUIET, azimuth_fov_rad=0.01, elevation_fov_rad=0.01, gain_db=120.0)
-    log_range, power = [], []
-    for frame, distance in enumerate(np.geomspace(3, 60, 12)):
-        scan = sensor.scan(wall_ahead(distance), np.eye(4), seed=0, frame=frame)
-        log_range.append(np.full(len(scan.points), np.log10(distance)))
-        power.append(scan.intensities)
-        assert np.median(scan.intensities - scan.noiseless_intensities) == pytest.approx(0.0, abs=0.3)
-    slope, offset = np.polyfit(np.concatenate(log_range), np.concatenate(power), 1)
-    assert slope == pytest.approx(-40.0, abs=0.5)
-    fading_mean = -0.50  # dB, of a Gamma variable of 3 looks whose median is 1: 10·(ψ(3) - ln 2.674)/ln 10
-    assert offset == pytest.approx(120.0 + fading_mean, abs=0.6)
 
 
 def test_incidence_lobe():
@@ -252,7 +279,9 @@ def test_ghosts_lie_behind_the_mirror_at_the_length_of_the_path():
     assert ghosts.sum() == (~ghosts).sum() == sensor.beams
     # Mirrored at the plane x - y = 10 - 0.05·√2, the target's face y = 20 appears at this x.
     np.testing.assert_allclose(scan.points[ghosts, 0], 30.0 - 0.05 * np.sqrt(2), atol=1e-3)
-    assert np.median(scan.intensities[ghosts]) < np.median(scan.intensities[~ghosts])
+    # The radar equation over the whole path, less the mirror's loss on both ways. Fading has the median 0.
+    expected_db = sensor.gain_db - 40 * np.log10(30.0) - 2 * 3.0
+    assert np.median(scan.intensities[ghosts]) == pytest.approx(expected_db, abs=0.3)
     ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1)
     first = scene.raycast(np.zeros(3), scan.points / ranges[:, None], 80.0).range_m
     assert (ranges[ghosts] > first[ghosts] + 1.0).all()
@@ -264,6 +293,17 @@ def test_reflector_lobe_in_the_wall_scene():
     reflector = scene.scene.solids[-1]
     sensor = replace(scene.sensor, threshold_db=0.0, saturation_db=300.0, beams=40_000, azimuth_fov_rad=0.3,
                      elevation_fov_rad=0.3)  # fmt: skip
+    axis = np.array([[1.0, 0, 0]])
+    turned = np.array(
+        [[np.cos(0.28), np.sin(0.28), 0.0]]
+    )  # one deviation of the lobe, which has 4.34 / 2 dB less there
+    for seen, below_db in ((axis, 0.0), (turned, 2.171)):
+        echo_db = reflector.echo_db(reflector.apex[None], -seen, seen)
+        alone_db = reflector.material.echo_db(reflector.apex[None], np.ones(1))
+        lobe_db = reflector.material.reflectivity_db + 25.0 - below_db
+        np.testing.assert_allclose(
+            echo_db, 10 * np.log10(10 ** (alone_db / 10) + 10 ** (lobe_db / 10)), atol=1e-3
+        )
     strongest = []
     for angle in np.deg2rad([0, 20, 40, 75]):
         eye = reflector.apex + 10 * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -288,8 +328,9 @@ def test_reflector_lobe_in_the_wall_scene():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"beams": 0}, {"min_range_m": 70.0}, {"azimuth_fov_rad": 7.0}, {"sigma_range_m": -1.0}, {"ghost_share": 1.5},
-     {"saturation_db": 10.0}, {"sigma_power_db": float("nan")}],
+    [{"beams": 0}, {"min_range_m": 60.0}, {"azimuth_fov_rad": 6.3}, {"sigma_range_m": -1e-9}, {"ghost_share": 1.01},
+     {"saturation_db": 64.0}, {"floor_db": 118.0}, {"sigma_power_db": float("nan")}, {"elevation_fov_rad": 3.2},
+     {"max_range_m": 0.0}],
     ids=lambda wrong: next(iter(wrong)),
 )  # fmt: skip
 def test_impossible_sensors_are_refused(wrong):
@@ -308,23 +349,9 @@ def test_a_drive_without_scans_is_refused():
         sim.wall(frames=-1)
 
 
-def test_what_is_measured_of_a_motion_is_its_derivative():
-    """Along a straight line at 2 m/s, turning at 0.1 rad/s, the radar and the IMU measure no more than their noise."""
-    times_s = np.arange(0, 2, 0.1)
-    poses = np.tile(np.eye(4), (len(times_s), 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("z", 0.1 * times_s[:, None]).as_matrix()
-    poses[:, 0, 3] = 2.0 * times_s
-    drive = sim.simulate(wall_ahead(30.0), QUIET, poses, name="straight")
-    motion = sim.measured_motion(drive, gyroscope_bias_rad_s=(0, 0, 0))
-    np.testing.assert_allclose(motion.angular_velocity.mean(axis=0), [0, 0, 0.1], atol=0.005)
-    assert np.median(motion.doppler_mps[0]) == pytest.approx(-2.0, abs=0.05)
-    imu = sim.measured_imu(poses, times_s, gyroscope_bias_rad_s=(0, 0, 0))
-    np.testing.assert_allclose(imu.angular_velocity.mean(axis=0), [0, 0, 0.1], atol=0.005)
-    np.testing.assert_allclose(imu.specific_force.mean(axis=0), [0, 0, 9.81], atol=0.1)
-
-
 def test_an_empty_world_returns_nothing():
     simulation = sim.simulate(sim.Scene([]), QUIET, np.eye(4)[None], name="void")
     assert simulation.world_points().shape == (0, 3)
     assert simulation.ground_truth.shape == (0, 3)
     assert np.isnan(simulation.intensity_noise_floor())
+    assert len(simulation) == 1

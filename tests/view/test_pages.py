@@ -56,7 +56,8 @@ def test_a_growing_surface_is_replaced(server):
     assert vertices.dtype == np.float32
     assert np.allclose(np.ptp(vertices, axis=0), 2.0, atol=1e-6)
     assert len(faces) == 12
-    assert server.shown["/path"].shape == (2, 2, 3)
+    np.testing.assert_allclose(vertices, mesh.vertices - path[0], atol=1e-6)
+    np.testing.assert_allclose(server.shown["/path"], np.stack([path[:-1], path[1:]], 1) - path[0])
     assert np.abs(server.initial_camera.position).max() < 100
 
 
@@ -85,7 +86,10 @@ def test_changes_have_their_colours_and_a_legend(server, monkeypatch):
     legend, alignment, table = server.texts
     assert all("rgb({},{},{})".format(*COLORS[kind]) in legend and NAMES[kind] in legend for kind in NAMES)
     assert "As &lt;given&gt;." in alignment
-    assert all(region.words in table for region in changes.regions())
+    for region in changes.regions():
+        x, y, z = region.box.mean(axis=0)
+        row = f"<td>({x:.1f}, {y:.1f}, {z:.1f}) m</td><td>{region.words}, {region.area_m2:.1f} m²</td>"
+        assert row in table
     nothing = ChangedSurface(*(values[:0] for values in vars(after).values()))
     with pytest.raises(ValueError, match="no surface"):
         pages.ChangesView(Changes(nothing, nothing, np.eye(4), changes.report), [], 0.2, port=0)

@@ -65,7 +65,11 @@ def slide(client, label, value):
     found = client.wait_for(
         lambda m: m.kind.startswith("Gui") and m.message.get("props", {}).get("label") == label
     )
+    props = found.message["props"]
+    assert props["visible"]
+    assert not props["disabled"]
     client.send("GuiUpdateMessage", uuid=found.message["uuid"], updates={"value": value})
+    return props
 
 
 def test_a_new_client_gets_the_scene(client, viewer):
@@ -115,7 +119,8 @@ def test_limits_hide_triangles(client, viewer):
 
 def test_a_scan_is_shown_and_the_sensor_moves_there(client, viewer, scans, sharp_map):
     before = len(client.received())
-    slide(client, "scan", 4)
+    props = slide(client, "scan", 4)
+    assert (props["min"], props["max"]) == (0, len(scans) - 1)
     moved = client.wait_for(lambda m: m.kind == "SetPositionMessage" and m.name == "/sensor", before)
     np.testing.assert_allclose(moved.message["position"], scans.poses[4, :3, 3] - sharp_map.origin, atol=1e-6)
     client.wait_for(is_mesh, before)  # coloured for that position

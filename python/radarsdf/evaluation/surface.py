@@ -267,8 +267,6 @@ def _angles(vertices: _Points, faces: _Faces, corners: _Points | None) -> _Point
     normals = np.cross(b - a, c - a)
     has_area = np.linalg.norm(normals, axis=1) > 0  # without it, a triangle has no direction
     faces, normals = faces[has_area], normals[has_area]
-    if len(faces) == 0:
-        return np.zeros(0)
     pairs, edges = face_adjacency(faces, return_edges=True)  # type: ignore[no-untyped-call]
     if corners is not None:
         middle = vertices[edges].mean(axis=1)

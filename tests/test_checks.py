@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 the radarsdf authors
+# SPDX-License-Identifier: MIT
+"""The limits of the checks of arguments: the last value that passes, and the first that does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from radarsdf import checks
+from radarsdf.imu import Imu
+from scipy.spatial.transform import Rotation
+
+FAR = np.nextafter(1e12, np.inf)
+
+
+def refuses(function, *arguments, kind=ValueError):
+    with pytest.raises(kind, match=r"name|box"):
+        function(*arguments)
+    return True
+
+
+@pytest.mark.parametrize(
+    ("function", "good", "bad"),
+    [(checks.positive, [5e-324, 3], [0, -1, np.inf, np.nan]),
+     (checks.not_negative, [0, 0.0, 7], [-5e-324, np.inf, np.nan]),
+     (checks.number, [-np.inf, 0, np.inf], [np.nan])],
+)  # fmt: skip
+def test_numbers(function, good, bad):
+    assert [function(value, "name") for value in good] == good
+    assert all(refuses(function, value, "name") for value in bad)
+    assert refuses(function, [1.0], "name")
+
+
+def test_whole_numbers_and_flags():
+    assert [checks.whole_number(value, "name", 1, 3) for value in (1, np.int32(3))] == [1, 3]
+    assert all(refuses(checks.whole_number, value, "name", 1, 3) for value in (0, 4))
+    assert checks.whole_number(2**63 - 1, "name", 0) == 2**63 - 1
+    assert refuses(checks.whole_number, 2**63, "name", 0)
+    assert all(refuses(checks.whole_number, v, "name", 0, kind=TypeError) for v in (True, np.True_, 1.0))
+    assert checks.flag(np.False_, "name") is False
+    assert refuses(checks.flag, 1, "name", kind=TypeError)
+    assert [checks.hides_bar(value) for value in (None, True, False)] == [None, False, True]
+
+
+def test_positions_and_boxes():
+    np.testing.assert_array_equal(checks.positions([[1e12, -1e12, 0]], "name"), [[1e12, -1e12, 0]])
+    for wrong in ([[FAR, 0, 0]], [[0, -FAR, 0]], [[0, np.nan, 0]], [[0, 0]], [0, 0, 0]):
+        assert refuses(checks.positions, wrong, "name")
+    np.testing.assert_array_equal(checks.check_box([[0, 0, 0], [1, 1, 1]]), [[0, 0, 0], [1, 1, 1]])
+    assert all(refuses(checks.check_box, wrong) for wrong in ([[0, 0, 0], [1, 1, 0]], [[0, 0], [1, 1]]))
+
+
+def test_rigid_transforms():
+    good, scaled, sheared, mirrored, far, row = (np.eye(4) for _ in range(6))
+    good[:3, :3] = Rotation.from_euler("ZYX", [2.0, 0.3, -1.0]).as_matrix() * (1 + 4.9e-4)
+    good[:3, 3] = 1e12, -1e12, 0
+    scaled[:3, :3] *= 1 + 5.1e-4
+    sheared[0, 1] = 1.1e-3
+    mirrored[1, 1] = -1
+    far[0, 3] = FAR
+    row[3, 3] = 1 + 1e-9
+    found = checks.are_rigid(np.stack([good, scaled, sheared, mirrored, far, row, np.full((4, 4), np.nan)]))
+    assert found.tolist() == [True] + [False] * 6
+
+
+def test_a_minority_of_wrong_poses_is_interpolated():
+    poses = np.tile(np.eye(4), (7, 1, 1))
+    poses[:, :3, 3] = np.arange(7)[:, None] * [1.0, 2, 3]
+    poses[:, :3, :3] = Rotation.from_euler("z", 0.2 * np.arange(7)[:, None]).as_matrix()
+    broken = poses.copy()
+    broken[[0, 3, 4]] = np.nan
+    found, rigid = checks.usable_poses(broken)
+    assert np.flatnonzero(~rigid).tolist() == [0, 3, 4]
+    np.testing.assert_allclose(found[1:], poses[1:], atol=1e-12)
+    np.testing.assert_allclose(found[0], poses[1], atol=1e-12)  # nothing is known before
+    broken[6] = np.nan
+    for wrong in (broken, broken[:2]):  # one of two is no minority
+        with pytest.raises(ValueError, match="pose 0 is not a rigid transform"):
+            checks.usable_poses(wrong)
+
+
+def test_measurements_of_an_imu():
+    times_s, rates = np.array([0.0, 1.0, 1.0]), np.zeros((3, 3))
+    assert len(Imu(times_s, rates, rates)) == 3  # equal times pass
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", 0.4).as_matrix()
+    turn[:3, 3] = 1, 2, 3
+    np.testing.assert_array_equal(Imu(times_s, rates, None, turn).R_sensor_imu, turn[:3, :3])
+    for wrong in (
+        (times_s[::-1], rates), (times_s[:2], rates), (times_s, rates[:, :2]), (times_s, rates, rates * np.nan),
+        (times_s[:0], rates[:0]), (times_s, rates, None, 2 * np.eye(3)), (times_s, rates, None, np.eye(5)),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"IMU|R_sensor_imu"):
+            Imu(*wrong)
