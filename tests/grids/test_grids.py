@@ -135,7 +135,7 @@ def test_costs_where_the_ground_is_unknown():
 
 
 def test_a_column_is_free_if_all_between_the_heights_is():
-    grid, height_m = ramp(0.0)  # ground at -1 m
+    grid, _ = ramp(0.0)  # ground at -1 m
     assert (grid.flat(0.1, 1.3).state[:, :3] == 0).all()
     assert (grid.flat(0.1, 1.3).state[:, 3:] == 0).all()  # the beam begins at 1.4 m
     assert (grid.flat(0.1, 1.6).state[:, 3:] == 1).all()
