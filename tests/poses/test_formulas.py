@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.posed import PosedScans, pose_sigmas
+from radarsdf.poses.refine import _by_biases, _plan
 from radarsdf.poses.rigid import (
     alignment,
     between,
@@ -29,7 +31,16 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import Drive, Tracked, _apart_m, _removed_share, begun, rates_of, thinned
+from radarsdf.poses.tracking import (
+    Drive,
+    Tracked,
+    Tracker,
+    _apart_m,
+    _removed_share,
+    begun,
+    rates_of,
+    thinned,
+)
 from radarsdf.poses.verdict import Verdict
 from radarsdf.simulate import drifted
 from scipy.stats import t as student
@@ -305,3 +316,80 @@ def test_deviations_of_poses_become_settings_of_the_returns():
         assert posed.config(stated) == stated
     assert PosedScans.refined(dataclasses.replace(refined, improved=False), poses).sigmas is None
     assert dataclasses.replace(posed, sigmas=(0.1, 7.0)).config(FitConfig()).returns.pose_sigma_rad == 1.0
+
+
+def test_common_errors_of_steps_are_those_of_one_inverse():
+    """Poses and biases, which have a prior deviation of one, together."""
+    hessian, by = spread(8, 12) + 3 * np.eye(12), np.random.default_rng(9).normal(0, 0.3, (2, 12))
+    gradient, own = np.ones(12), np.array([3.0, 5])
+    motions = [
+        SimpleNamespace(by_bias=lambda _, k=k: (by[k : k + 1].reshape(1, 2, 6), own[k : k + 1]))
+        for k in (0, 1)
+    ]
+    found = _by_biases(
+        motions,
+        np.zeros((2, 4, 4)),
+        lambda more: -np.linalg.solve(hessian, gradient + np.ravel(more)).reshape(2, 6),
+    )
+    whole = np.linalg.inv(np.block([[hessian, by.T], [by, np.diag(own + 1)]]))[:12, :12]
+    added = whole - np.linalg.inv(hessian)
+    np.testing.assert_allclose(found, [added[:6, :6], added[6:, 6:]], atol=1e-12)
+
+
+def test_rounds_go_from_short_windows_and_coarse_cells_to_all_scans():
+    of_all = [(20, 4), (20, 4), (20, 2), (20, 2)] + [(20, 1)] * 12
+    assert _plan(20, 8) == [(8, 4), (8, 2), (16, 4), (16, 2), *of_all]
+    assert _plan(8, 8)[0] == (8, 4)
+    assert _plan(20, 20) == of_all
+
+
+def test_poses_elsewhere_are_upright_and_turned_away():
+    tracker = Tracker(0.4, FitConfig().returns, 1)
+    scan = np.random.default_rng(1).normal(0, 5, (50, 3))
+    tilted = transform(np.array([0.3, 0, 0]), np.array([10.0, 0, 2]))
+    for i in range(3):
+        tracker.keep(scan, dataclasses.replace(begun(tilted), agreeing=1.0) if i else begun(tilted))
+    found = tracker._elsewhere(4.0)
+    up = tilted[:3, 2]
+    np.testing.assert_allclose(found[:, :3, 2], np.tile(up, (500, 1)), atol=1e-12)
+    angles = turned_by(np.tile(tilted, (500, 1, 1)), found)
+    assert np.pi / 6 <= angles.min() < np.pi / 5
+    assert 0.9 * np.pi < angles.max() <= np.pi
+    shifts = found[:, :3, 3] - tilted[:3, 3]
+    np.testing.assert_allclose(shifts @ up, 0, atol=1e-12)
+    assert 3.5 < np.abs(shifts[:, 0]).max() <= 4
+    assert np.abs(shifts.mean(axis=0)).max() < 0.4
+
+
+def test_motions_of_a_tracked_drive():
+    poses = trajectory(5)
+    rotation_vectors = np.stack([rotation_vector(step[:3, :3]) for step in between(poses[:-1], poses[1:])])
+    tracked = [begun(poses[0])] + [
+        Tracked(p, np.eye(6), 1.0, 0, t) for p, t in zip(poses[1:], rotation_vectors, strict=True)
+    ]
+    drive = Drive([np.zeros((0, 3))] * 5, 0.5 * np.arange(5.0), None, None)
+    (motion,) = drive.motions(tracked, slice(0, 5))
+    np.testing.assert_allclose(motion.variances, [0.03**2, 0.003**2])
+    np.testing.assert_allclose(motion.least_variances, [(0.5 * 5) ** 2, (0.5 * 0.3) ** 2])
+    np.testing.assert_allclose(motion.steps, between(poses[:-1], poses[1:]), atol=1e-12)
+    assert np.isfinite(motion.shares).all()
+    mean = np.tile([10.0, 0, 0], (5, 1))
+    velocities = SensorVelocities(
+        mean, np.tile(0.01 * np.eye(3), (5, 1, 1)), np.ones(3), [[]] * 5, np.ones(5, bool)
+    )
+    gyroscope = Gyroscope(
+        2 * rotation_vectors, np.full(4, 0.5), MotionRate(np.zeros(3), np.diag([1.0, 4, 9]) * 1e-4)
+    )
+    with_both = dataclasses.replace(drive, velocities=velocities, gyroscope=gyroscope)
+    turning, moving = with_both.motions(tracked, slice(1, 4))
+    np.testing.assert_allclose(turning.steps[:, :3, :3], rotation(2 * rotation_vectors[1:3]))
+    np.testing.assert_allclose(turning.least_variances, [(0.5 * 5) ** 2, 0])
+    np.testing.assert_allclose(turning.bias_sigma, [0, 0, 0, 0.005, 0.01, 0.015])
+    assert np.isinf(turning.shares[:, :3]).all()
+    np.testing.assert_allclose(turning.shares[:, 3:], 1)
+    assert np.isinf(moving.shares[:, 3:]).all()
+    np.testing.assert_allclose(moving.shares[:, :3], 0.01 * 2 * 0.25 / 4 + 0.5**3 / 12)
+    np.testing.assert_allclose(moving.bias_sigma, [0.003 * 10 * 0.5] * 3 + [0] * 3)
+    half = rotation(0.5 * rotation_vectors[1]), rotation(rotation_vectors[1])
+    path = 0.5 / 6 * (np.eye(3) + 4 * half[0] + half[1]) @ [10.0, 0, 0]
+    np.testing.assert_allclose(moving.steps[0, :3, 3], path)
