@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.changes.alignment import Alignment, _Surface
 from radarsdf.changes.changes import (
     APPEARED,
@@ -45,10 +46,10 @@ def test_odds_and_the_share_that_explains_them():
     changed = rng.random(20_000) < 0.1
     differences = np.where(changed, rng.uniform(-reach, reach, 20_000), rng.normal(0, sigma))
     odds = odds_of_differences(differences, sigma, reach)
-    np.testing.assert_allclose(odds, np.log(1 / (2 * reach)) - norm.logpdf(differences, 0, sigma))
+    assert_allclose(odds, np.log(1 / (2 * reach)) - norm.logpdf(differences, 0, sigma))
     share = share_of_changes(odds)
     assert share == pytest.approx(0.1, abs=0.01)
-    np.testing.assert_allclose(posterior(odds, 0.1), 1 / (1 + np.exp(-odds) * 0.9 / 0.1))
+    assert_allclose(posterior(odds, 0.1), 1 / (1 + np.exp(-odds) * 0.9 / 0.1))
     assert share_of_changes(odds[~changed]) < 0.002
     assert share_of_changes(odds[:0]) == 1e-6
     assert share_of_changes(np.full(9, 30.0)) == 0.5
@@ -140,7 +141,7 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     for lost, sign in ((GONE, -1), (APPEARED, 1)):
         found = _changed(of_side, *odds, 0.5, lost)
         assert found.kind[0] == (lost if kind == GONE else kind)
-        np.testing.assert_allclose(found.moved_m[0], sign * distance_m if kind == MOVED else np.nan)
+        assert_allclose(found.moved_m[0], sign * distance_m if kind == MOVED else np.nan)
         probable = (
             shifted if kind == MOVED and distance_m < 0 else max(absent, shifted) if kind == MOVED else absent
         )
@@ -184,7 +185,7 @@ def test_reflectance_changes_where_all_views_say_so():
     differences = Differences(between, [day, day], 0.0, 0.6, 40.0)
     same = np.ones(5, bool)
     change, probability = differences.probability(places, same, places[4:] + 0.3)
-    np.testing.assert_allclose(change, [*values[:4].mean(axis=1), np.nan])
+    assert_allclose(change, [*values[:4].mean(axis=1), np.nan])
     assert probability[1] > 0.99
     assert (probability[[0, 2, 3]] < 0.5).all()
     assert probability[4] == 0
@@ -218,7 +219,7 @@ def test_regions_areas_and_colours_of_changes():
     ]
     for one, other in zip(found, expected, strict=True):
         assert one == tuple(v if v is None or isinstance(v, str) else pytest.approx(v) for v in other)
-    np.testing.assert_array_equal(changes.regions()[0].box, [[0, 0, 3], [4, 4, 3]])
+    assert_array_equal(changes.regions()[0].box, [[0, 0, 3], [4, 4, 3]])
     assert len(changes.regions(9.0)) == 3
     words = [region.words for region in changes.regions()]
     assert words[1:3] == ["moved by 8.00 m", "reflectance_changed, 1.5 weaker"]
@@ -231,10 +232,10 @@ def test_regions_areas_and_colours_of_changes():
     )
     assert report["compared_m2"] == pytest.approx(1 + 4 + 9 + 1 + 9 + 16)
     mesh = changes.mesh()
-    np.testing.assert_array_equal(
+    assert_array_equal(
         mesh.vertices, np.concatenate([after.vertices, before.vertices[[0, 1, 2, 3, 8, 9, 10, 11]]])
     )
-    np.testing.assert_array_equal(mesh.faces[8:], [[16, 17, 18], [16, 18, 19], [20, 21, 22], [20, 22, 23]])
+    assert_array_equal(mesh.faces[8:], [[16, 17, 18], [16, 18, 19], [20, 21, 22], [20, 22, 23]])
     green, purple = (mesh.visual.vertex_colors[row, :3].tolist() for row in (13, 8))
     assert (green, purple) == ([0, 158, 115], [204, 121, 167])
 
@@ -243,19 +244,19 @@ def test_frames_of_maps_and_their_errors():
     T = transform(np.array([0.1, -0.2, 0.7]), np.array([3.0, -2, 1]))
     x = np.random.default_rng(4).normal(0, 3, (50, 3))
     placed = PlacedMap(None, T, x, np.zeros((0, 3), np.int32), np.tile([0.6, 0, 0.8], (50, 1)), np.zeros(50))
-    np.testing.assert_allclose(placed.to_common(x), x @ T[:3, :3].T + T[:3, 3])
-    np.testing.assert_allclose(placed.to_own(placed.to_common(x)), x)
+    assert_allclose(placed.to_common(x), x @ T[:3, :3].T + T[:3, 3])
+    assert_allclose(placed.to_own(placed.to_common(x)), x)
     near_m, rows, off_m = placed.nearest(x + [0.01, 0.02, 0])
-    np.testing.assert_allclose(near_m, np.hypot(0.01, 0.02))
-    np.testing.assert_array_equal(rows, np.arange(50))
-    np.testing.assert_allclose(off_m, 0.006)
+    assert_allclose(near_m, np.hypot(0.01, 0.02))
+    assert_array_equal(rows, np.arange(50))
+    assert_allclose(off_m, 0.006)
     surface = _Surface(x, x, x[:, 0], rows, x.mean(axis=0), 1.0)
     offset = surface.offset(T)
-    np.testing.assert_allclose(surface.pose(offset), T, atol=1e-12)
-    np.testing.assert_allclose(surface.centre + offset[:3], T[:3, :3] @ surface.centre + T[:3, 3])
+    assert_allclose(surface.pose(offset), T, atol=1e-12)
+    assert_allclose(surface.centre + offset[:3], T[:3, :3] @ surface.centre + T[:3, 3])
     # A rotation about the centre moves places by their distance from its axis.
     covariance = np.diag([0.01, 0.04, 0.09, 0, 0, 0.0004])
     alignment = Alignment(covariance=covariance, centre=np.array([1.0, 0, 0]))
     normals = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
     expected = np.sqrt([0.01 + 0.0004 * 25, 0.04 + 0.0004 * 4, 0.09])
-    np.testing.assert_allclose(alignment.sigma_m(np.tile([3.0, 5, 7], (3, 1)), normals), expected)
+    assert_allclose(alignment.sigma_m(np.tile([3.0, 5, 7], (3, 1)), normals), expected)

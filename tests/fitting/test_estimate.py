@@ -107,25 +107,6 @@ def seconds(config=BOTH, *, returns=1000, cells=3000, rows=200_000, network=True
     return estimate.seconds_of(config, schedule, returns, cells, rows, network)
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"sdf_iterations": 200, "intensity_iterations": 600},
-        {"intensity_iterations": 400},
-        {"batch_size": 2000},
-        {"intensity_hidden": (128, 128, 128)},
-        {"normals": True},
-        {"fourier_count": 16},
-        {"optimiser": "adam"},
-        {"returns": 50_000},
-        {"cells": 50_000},
-    ],
-)
-def test_what_makes_more_work_takes_longer(more):
-    assert seconds(**more) > 1.01 * seconds() > 2 * seconds(FitConfig.quick())
-    assert seconds(network=False) < seconds()
-
-
 def skipped_of(config, with_intensity):
     sizes = {"returns": 500_000, "with_intensity": with_intensity}
     schedule = Schedule.of(config, surface_returns=sizes["returns"], vertices=10**9, **sizes)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
-from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.imu import (
     Gyroscope,
     ImuAlignment,
@@ -25,10 +24,16 @@ from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
 
 from ..conftest import recorded_file
+from .drift import velocities_of
 
 R_SENSOR_IMU = Rotation.from_euler("ZYX", [130, -40, 75], degrees=True).as_matrix()
 LATE_S = 0.07
 LEVER_M = (0.2, -0.1, 0.3)
+
+
+def speeds_at(t):
+    """(F, 3) of the ride, world, m/s."""
+    return np.column_stack([1.5 * np.cos(0.5 * t), -0.8 * np.sin(0.4 * t), 0.27 * np.cos(0.9 * t)])
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +45,9 @@ def ride():
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("ZYX", turns).as_matrix()
     poses[:, :3, 3] = xyz
-    speeds = np.column_stack([1.5 * np.cos(0.5 * t), -0.8 * np.sin(0.4 * t), 0.27 * np.cos(0.9 * t)])
-    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds)
+    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds_at(t))
     seen += np.random.default_rng(1).normal(0, 1, seen.shape) * [0.02, 0.02, 0.04]
-    count = len(t)
-    velocities = SensorVelocities(
-        seen, np.tile(np.diag([0.02, 0.02, 0.04]) ** 2, (count, 1, 1)), np.ones(3), [], np.ones(count, bool)
-    )
-    return t, poses, velocities
+    return t, poses, velocities_of(seen, np.diag([0.02, 0.02, 0.04]) ** 2)
 
 
 @pytest.fixture(scope="module")
@@ -82,18 +82,12 @@ def test_velocities_tell_how_it_sits_there(ride, imu):
 
 @pytest.mark.parametrize("late_s", [LATE_S, -0.3])
 def test_without_noise_it_is_exact(ride, monkeypatch, late_s):
-    times_s, poses, velocities = ride
+    times_s, poses, _ = ride
     for name in ("_GYROSCOPE_SIGMA_RAD_S", "_ACCELEROMETER_SIGMA_MPS2"):
         monkeypatch.setattr(f"radarsdf.simulate.motion.{name}", 0)
-    speeds = np.column_stack(
-        [1.5 * np.cos(0.5 * times_s), -0.8 * np.sin(0.4 * times_s), 0.27 * np.cos(0.9 * times_s)]
-    )
-    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds)
-    velocities = dataclasses.replace(
-        velocities, mean_mps=seen, covariance=np.tile(1e-6 * np.eye(3), (300, 1, 1))
-    )
+    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds_at(times_s))
     imu = measured_imu(poses, times_s, R_sensor_imu=R_SENSOR_IMU, lever_m=LEVER_M)
-    found = Inertial.of(imu, velocities, times_s + late_s, 0.0)
+    found = Inertial.of(imu, velocities_of(seen, 1e-6 * np.eye(3)), times_s + late_s, 0.0)
     report = found.report
     assert angle(np.array(report["R_sensor_imu"]), R_SENSOR_IMU) < 1e-2
     assert report["time_offset_s"] == pytest.approx(late_s, abs=1e-4)
@@ -122,8 +116,8 @@ def test_rates_that_nothing_turns_at_are_not_used(rate_rad_s, speed_mps, is_used
     times_s = np.arange(5.0)
     rates = rate_rad_s * np.array([[0.6, 0, 0.8]] * 3 + [[0, 0, 0]] * 2)
     means = np.tile([0.6 * speed_mps, 0.8 * speed_mps, 0], (5, 1))
-    velocities = SensorVelocities(means, np.tile(np.eye(3), (5, 1, 1)), np.ones(3), [], np.ones(5, bool))
-    found = Inertial.of(Imu(times_s, rates, R_sensor_imu=np.eye(3)), velocities, times_s, 0.0)
+    imu = Imu(times_s, rates, R_sensor_imu=np.eye(3))
+    found = Inertial.of(imu, velocities_of(means, np.eye(3)), times_s, 0.0)
     assert (found.gyroscope is not None) == is_used
     if not is_used:
         across = f"{rate_rad_s:.3g} rad/s, {rate_rad_s * speed_mps:.0f} m/s² across the trajectory"
@@ -156,10 +150,7 @@ def test_a_sensor_that_goes_straight_on_leaves_it_open():
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, 0, 3] = times_s
     rng = np.random.default_rng(2)
-    covariance = np.tile(0.02**2 * np.eye(3), (200, 1, 1))
-    velocities = SensorVelocities(
-        [1, 0, 0] + rng.normal(0, 0.02, (200, 3)), covariance, np.ones(3), [], np.ones(200, bool)
-    )
+    velocities = velocities_of([1, 0, 0] + rng.normal(0, 0.02, (200, 3)), 0.02**2 * np.eye(3))
     assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None
 
 
