@@ -35,13 +35,15 @@ from radarsdf.poses.rigid import (
 from radarsdf.poses.tracking import (
     Drive,
     Tracked,
+    Tracker,
     _apart_m,
     _removed_share,
     begun,
     rates_of,
     thinned,
 )
-from radarsdf.poses.verdict import Verdict
+from radarsdf.poses.verdict import Verdict, _crowding, _gains
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
 from scipy.stats import t as student
 
@@ -350,3 +352,53 @@ def test_motions_of_a_tracked_drive():
     half = rotation(0.5 * rotation_vectors[1]), rotation(rotation_vectors[1])
     path = 0.5 / 6 * (np.eye(3) + 4 * half[0] + half[1]) @ [10.0, 0, 0]
     assert_allclose(moving.steps[0, :3, 3], path)
+
+
+def test_information_that_returns_have_anywhere_is_taken_away():
+    """Of 100 along x at the pose and 40 on average beside it, 60 are left."""
+    tracker = Tracker(0.4, FitConfig().returns, 1)
+    tracker._planes, asked = [None, None], []
+
+    def equations(_, __, pose):
+        asked.append(pose[0, 3])
+        along = {5: 100.0, 5.8: 70, 4.2: 30, 6.6: 50, 3.4: 10}[round(pose[0, 3], 6)]
+        return np.diag([along, 1e6, 1e6, 1e6, 1e6, 1e6]), None, None
+
+    tracker._normal_equations = equations
+    prior, pose = np.eye(6), transform(np.zeros(3), np.array([5.0, 0, 0]))
+    covariance = np.diag([1 / 101] + [1e-6] * 5)
+    found = tracker._without_chance(None, pose, prior, covariance)
+    assert_allclose(found, np.diag([1 / 61] + [1e-6] * 5), rtol=1e-9)
+    assert len(asked) == 5
+    sure = (0.05 * 0.8) ** 2 * 0.99  # in cells of 0.8 m, this needs no returns
+    assert tracker._without_chance(None, pose, sure * prior, covariance) is covariance
+
+
+def test_gains_are_those_of_a_search_of_all_returns():
+    rng = np.random.default_rng(11)
+    before = drifted(trajectory(4), 0.1, 0.01, 3)
+    returns = SensorReturns.of([rng.normal(0, 3, (60, 3)) for _ in before], 0.1, None)
+    held, used = returns.select(np.arange(240) % 5 == 0), returns.select(np.arange(240) % 5 > 0)
+    noise = SensorNoise(0.3, 0.03, 0.04)
+    others = held.scans[:, None] != used.scans
+    of_held, of_used = (noise.mean_variances_m2(of.ranges_m) for of in (held, used))
+    densities, counts = [], []
+    edge_m = 0.5 * np.median(held.ranges_m)
+    for poses in (before, trajectory(4)):
+        a, b = (of.posed(poses).points.astype(np.float64) for of in (held, used))
+        apart = np.linalg.norm(a[:, None] - b, axis=2)
+        nearest = apart <= np.sort(apart, axis=1)[:, 15:16]
+        if poses is before:
+            first_m = np.median(np.where(others, apart, np.inf).min(axis=1))
+        variance = of_held[:, None] + first_m**2 + of_used
+        kernel = np.exp(-0.5 * apart**2 / variance) / variance**1.5
+        densities.append(np.where(others & nearest, kernel, 0).sum(axis=1))
+        same = (np.floor(a / edge_m)[:, None] == np.floor(b / edge_m)).all(axis=2)
+        counts.append((same & others).sum(axis=1))
+    gains = _gains(held, used, before, trajectory(4), noise)
+    floor = np.median(densities[0])
+    assert_allclose(gains, np.log((densities[1] + floor) / (densities[0] + floor)), atol=1e-4)
+    floor = max(np.median(counts[0]), 1)
+    expected = np.log((counts[1] + floor) / (counts[0] + floor))
+    assert_allclose(_crowding(held, used, before, trajectory(4)), expected, atol=1e-9)
+    assert np.ptp(expected) > 0.5

@@ -20,6 +20,7 @@ from radarsdf.io.files import take_lock
 from radarsdf.map import storage
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, map_path
+from radarsdf.tiles.planning import _chunks
 
 from .conftest import CONFIG, TILE_M
 
@@ -234,3 +235,17 @@ def test_a_full_disk_is_said_and_what_was_done_is_kept(drive, folder, tmp_path, 
         )
     assert tiles_of(drive, out).missing == {}
     assert_same_bits(maps_of(folder), maps_of(out))
+
+
+def test_chunks_end_between_groups_where_they_are_long_dense_or_far():
+    def sizes(count, returns=0, step_m=0.0):
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, 1, 3] = step_m * np.arange(count)
+        scans = [Scan(np.zeros((returns, 3), np.float32), pose) for pose in poses]
+        return [len(chunk) for chunk in _chunks(scans, 3)]
+
+    assert sizes(520) == [258, 258, 4]
+    assert sizes(8, returns=100_000) == [6, 2]  # half a million with the fifth
+    assert sizes(10, step_m=-199.9) == [6, 4]
+    assert sizes(10, step_m=-334.0) == [3, 3, 3, 1]
+    assert sizes(0) == []
