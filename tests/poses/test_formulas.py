@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.poses.checked_scans import median_range_m
-from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, upright
+from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, doppler_sign, upright
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
@@ -184,6 +184,7 @@ def test_velocities_between_scans_that_have_one():
     assert_allclose(
         found.step_covariance(3, 2.0), found.covariance[3:5].sum(axis=0) + np.diag(found.change) * 8 / 12
     )
+    assert doppler_sign(scans[:2], found.select(slice(0, 2)), times_s[:2]) == 1  # one pair tells nothing
     assert found.usual_mps == pytest.approx(np.sqrt([50, 65]).mean(), abs=1e-2)
     noise = [rng.uniform(-50, 50, 60) for _ in scans]
     assert (
