@@ -272,6 +272,8 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
         assert ((grid.origin <= box[0]) & (box[0] < grid.origin + size)).all()
         assert ((upper >= box[1] - 1e-9) & (box[1] > upper - size)).all()
         np.testing.assert_array_equal(in_octomap(grid, tmp_path / "grid.bt")[0], grid.state)
+    assert radarsdf.grid(sharp_map, [[9.05, 0.05, 0.05], [9.15, 0.1, 0.15]], 0.2).shape == (1, 1, 1)
+    assert radarsdf.grid(sharp_map, [[9.0, 0.2, 0.0], [9.2, 0.6, 0.2]], 0.2).shape == (1, 2, 1)
     with pytest.raises(ValueError, match=r"0\.07.*multiple.*0\.2 m.*0\. "):
         made(np.ones((2, 2, 2)), [0.07, 0.2, 0.4], 0.2).save(tmp_path / "off.bt")
     with pytest.raises(ValueError, match="32768"):
