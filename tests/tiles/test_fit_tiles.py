@@ -145,6 +145,7 @@ def test_another_plan_is_refused(drive, folder):
         tiles_of(drive.select(np.arange(11)), folder)
     with pytest.raises(ValueError, match="num_threads differ"):
         tiles_of(drive, folder, config=CONFIG.override(num_threads=2))
+    assert tiles_of(drive, folder, config=CONFIG.override(num_threads=0)).missing == {}  # any will do
 
 
 def test_one_process_at_a_time_plans_a_folder(drive, folder, tmp_path):
