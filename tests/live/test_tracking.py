@@ -77,7 +77,7 @@ def test_scans_go_on_from_given_poses(drive, with_doppler):
     live = LiveMap(SETTINGS)
     with pytest.raises(ValueError, match="a pose, or a time"):
         live.integrate(scans.points[0])
-    for i in range(13):
+    for i in (*range(10), 9, 10, 11, 12):  # one of them twice
         pose = scans.poses[i] if i < 10 else None
         speeds = motion.doppler_mps[i] if with_doppler else None
         done = live.integrate(scans.points[i], pose, doppler_mps=speeds, time_s=motion.times_s[i])
