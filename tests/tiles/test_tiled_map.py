@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import TiledMap
+from radarsdf.fitting.average import SurfaceReturns
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
+from radarsdf.tiles.planning import read_rays
 
 from .conftest import CONFIG, TILE_M
 
@@ -41,11 +43,13 @@ def test_answers_are_those_of_one_map(city, whole, points):
     assert np.quantile(np.linalg.norm(gradients[0] - gradients[1], axis=1), 0.95) < 0.05
 
 
-def test_what_all_tiles_have_in_common_is_that_of_one_map(city, whole, drive):
-    plan, contents = city.plan, whole._contents
-    assert plan.clutter_ratio == pytest.approx(contents.clutter_ratio, abs=0.02)
-    # Of the cells far away, a tile has only the returns whose rays cross it.
-    assert plan.returns_per_cell == pytest.approx(contents.returns_per_cell, rel=0.25)
+def test_what_all_tiles_have_in_common_is_that_of_one_map(folder, city, whole, drive):
+    plan = city.plan
+    rays = [read_rays(folder, plan, tile)[0] for tile in plan.tiles]
+    surfels, counts = [SurfaceReturns.of(part, CONFIG, 1).surfels for part in rays], list(map(len, rays))
+    clutter_ratio = np.average([part.clutter_ratio() for part in surfels], weights=counts)
+    assert plan.clutter_ratio == pytest.approx(clutter_ratio, rel=1e-6)
+    assert plan.returns_per_cell == pytest.approx(sum(counts) / sum(len(part.keys) for part in surfels))
     assert (city.num_cells, len(city.tiles)) == (
         pytest.approx(len(whole.field.table.leaf_keys()), rel=0.01),
         4,
