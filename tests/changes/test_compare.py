@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ import radarsdf
 import trimesh
 from radarsdf.changes.alignment import align
 from radarsdf.changes.changes import APPEARED, GONE, UNSEEN
-from radarsdf.changes.probability import PlacedMap, _passed
+from radarsdf.changes.probability import PlacedMap
 from radarsdf.cli import main
 from radarsdf.poses.rigid import transform
 from radarsdf.simulate import Box
@@ -174,18 +173,3 @@ def test_maps_without_passages_and_poses_of_maps_are_refused(maps, drives):
         radarsdf.compare(maps[0], blind)
     with pytest.raises(ValueError, match="a map has its own"):
         radarsdf.compare(maps[0], maps[1], drive.poses)
-
-
-def test_rays_that_pass_tell_that_a_surface_went():
-    def told(hits, passes):
-        return SimpleNamespace(hits=2.0 * np.array(hits), passes=2.0 * np.array(passes))
-
-    # A wall that twenty scans hit; a fence that two of twenty hit.
-    own = told([20.0] * 3 + [2.0] * 2, [0.0] * 3 + [18.0] * 2)
-    other = told([0.0, 0, 20, 0, 1], [0.0, 20, 0, 5, 9])
-    unseen, through, hit, fence, as_before = _passed(own, other)
-    assert unseen == pytest.approx(0, abs=1e-12)
-    assert through > 10
-    assert hit < 0
-    assert abs(fence) < 1
-    assert as_before < 0

@@ -160,6 +160,12 @@ def test_gradients_of_interpolation(encoding):
     assert torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-7)
     assert torch.autograd.gradgradcheck(function, inputs, eps=1e-6, atol=1e-7)
 
+    def by_both(f, x):
+        gradients = torch.autograd.grad(function(f, x).square().sum(), (f, x), create_graph=True)
+        return sum(gradient.sin().sum() for gradient in gradients)
+
+    assert torch.autograd.gradcheck(by_both, inputs, eps=1e-6, atol=1e-5)
+
 
 def test_gradients_of_fourier():
     points = torch.randn(

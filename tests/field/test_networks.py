@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -73,6 +74,18 @@ def test_the_intensity_network_sees_what_it_is_told_to(setting, seen, width):
 
 def intensity(field, points, *, frozen=True):
     return field.intensity_network(field.geometry(points, frozen=frozen), *views(points))
+
+
+@torch.no_grad()
+def test_with_a_closed_form_it_is_within_the_range_of_the_training():
+    field, points = make_field(FitConfig())
+    alone = field.intensity(points, *views(points))
+    assert torch.equal(alone, intensity(field, points))
+    for added in (-5.0, 0.1, 5.0):
+        added_at = lambda x, *_, a=added: np.full(len(x), a, np.float32)
+        field.reflectance = SimpleNamespace(network_share=0.5, at=added_at)
+        expected = (added + alone / 2).clamp(0, 1)
+        np.testing.assert_allclose(field.intensity(points, *views(points)), expected, atol=1e-6)
 
 
 def test_normals_are_the_normalised_gradient():

@@ -19,18 +19,8 @@ from radarsdf.scans import Scans
 
 from bench.estimates import peak_of_a_fit
 
-from ..settings import grouped
-
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 SHORT = FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 6, "batch_size": 512})
-BOTH = FitConfig(
-    training={
-        "sdf_iterations": 100,
-        "intensity_iterations": 300,
-        "batch_size": 1000,
-        "intensity_batch_size": 500,
-    }
-)
 NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 10, "intensity_iterations": 12}}
 
 
@@ -97,33 +87,6 @@ def test_a_dry_run_prints_and_writes_nothing(scene, tmp_path, capsys, monkeypatc
     assert main(["fit", str(tmp_path / "scans.npz"), "--dry-run"]) == 0
     assert "9000 returns, about" in capsys.readouterr().out
     assert [p.name for p in tmp_path.iterdir()] == ["scans.npz"]
-
-
-def seconds(config=BOTH, *, returns=1000, cells=3000, rows=200_000, network=True, **changes):
-    config = config.override(num_threads=1, **grouped(**changes))
-    schedule = Schedule.of(
-        config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=network
-    )
-    return estimate.seconds_of(config, schedule, returns, cells, rows, network)
-
-
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"sdf_iterations": 200, "intensity_iterations": 600},
-        {"intensity_iterations": 400},
-        {"batch_size": 2000},
-        {"intensity_hidden": (128, 128, 128)},
-        {"normals": True},
-        {"fourier_count": 16},
-        {"optimiser": "adam"},
-        {"returns": 50_000},
-        {"cells": 50_000},
-    ],
-)
-def test_what_makes_more_work_takes_longer(more):
-    assert seconds(**more) > 1.01 * seconds() > 2 * seconds(FitConfig.quick())
-    assert seconds(network=False) < seconds()
 
 
 def skipped_of(config, with_intensity):

@@ -9,6 +9,7 @@ import pytest
 import radarsdf
 from radarsdf.cli import main
 from radarsdf.grids.grid import Grid, Wheels
+from radarsdf.grids.occupancy import _crossed, _touched
 
 from bench.kinds import KINDS
 
@@ -54,28 +55,141 @@ def test_larger_voxels_are_free_only_throughout(sharp_map):
     parts = fine.state.reshape(x, 2, y, 2, z, 2).transpose(0, 2, 4, 1, 3, 5).reshape(x, y, z, 8)
     np.testing.assert_array_equal(coarse.free, (parts == 0).all(axis=-1))
     np.testing.assert_array_equal(coarse.occupied, (parts == 1).any(axis=-1))
+    likeliest = np.fmax.reduce(fine.probability.reshape(x, 2, y, 2, z, 2), axis=(1, 3, 5))
+    np.testing.assert_array_equal(coarse.probability, likeliest)
+    np.testing.assert_array_equal(coarse.distance_m, fine.distance_m[1::2, 1::2, 1::2])
+    assert (coarse.voxel_size, coarse.position_error_m) == (0.4, fine.position_error_m)
 
 
-def test_distances_are_within_their_error_and_the_unknown_is_no_way_out(grid):
-    field = grid.distances()
-    x = grid.centres(grid.free)
-    true = np.minimum(x[:, 2], 20 - x[:, 0])
-    error = (field.occupied_m[grid.free] - true)[x[:, 0] > 9]  # before that, no ground was seen
-    assert (np.abs(error) <= field.error_m).mean() > 0.95
-    np.testing.assert_array_equal(field.not_free_m[~grid.free], 0)
-    assert (field.not_free_m[grid.free] <= field.occupied_m[grid.free] + 1e-5).all()
-    edge = np.minimum(x[:, 1] - grid.origin[1], grid.origin[1] + grid.shape[1] * 0.2 - x[:, 1])
-    assert (field.not_free_m[grid.free] <= edge + 0.1 + 1e-5).all()
+def ramp(slope, kerb_m=0.0):
+    """Ground at -1 m that rises along x by `slope` and by a kerb at x = 1 m; over y > 0.6 m, a beam from 0.4 to 0.6 m."""
+    x, y, z = np.meshgrid(*((np.arange(n) + 0.5) * 0.2 for n in (10, 5, 20)), indexing="ij")
+    above = z - 2 - (slope * x + kerb_m * (x > 1))
+    state = np.where(above > 0, 0, -1)
+    state[np.abs(above) <= 0.1] = 1
+    state[(y > 0.6) & (np.abs(z - 2.2 - 1.3) < 0.05)] = 1
+    none = np.zeros(state.shape, np.float32)
+    height_m = -1 + slope * x[:, :, 0] + kerb_m * (x[:, :, 0] > 1)
+    grid = Grid(np.array([5.0, 7.0, -3.0]), 0.2, state.astype(np.int8), none, above.astype(np.float32), 0.1)
+    return grid, height_m
 
 
-def test_the_ground_is_cheap_and_the_wall_is_not(grid):
-    costs = grid.costmap(Wheels(max_slope_rad=0.3, max_step_m=0.2))
-    inner = costs.height_m[25:60, 10:-10]
-    assert abs(np.nanmedian(inner)) < 0.05
-    assert np.nanquantile(np.abs(inner), 0.9) < 0.1
-    assert np.median(costs.cost[25:60, 10:-10]) < 60
-    wall = costs.cost[74:76, 10:-10]  # x from 19.8 to 20.2 m
-    assert (wall == 100).mean() > 0.9
+def test_costs_of_a_ramp_and_a_kerb():
+    grid, height_m = ramp(0.2)
+    costs = grid.costmap(Wheels(max_slope_rad=0.4, max_step_m=0.2, clearance_m=1.2))
+    np.testing.assert_allclose(costs.height_m, height_m, atol=1e-5)
+    np.testing.assert_allclose(costs.slope_rad, np.arctan(0.2), atol=1e-5)
+    np.testing.assert_allclose(costs.step_m, 0, atol=1e-5)
+    assert (costs.cost[:, :3] == np.floor(99 * np.arctan(0.2) / 0.4)).all()
+    assert np.isinf(costs.clearance_m[:, :3]).all()
+    # The beam begins at 0.4 m.
+    np.testing.assert_allclose(costs.clearance_m[:, 3:], 0.4 - height_m[:, 3:], atol=1e-5)
+    np.testing.assert_array_equal(costs.cost[:, 3:] == 100, costs.clearance_m[:, 3:] < 1.2)
+    assert {True, False} == set((costs.clearance_m[:, 3:] < 1.2).ravel().tolist())
+    kerb = ramp(0.0, 0.12)[0].costmap(Wheels(max_slope_rad=1.4, max_step_m=0.1))
+    # Beside the kerb, a plane through 0, 0 and 0.12 m, thrice each, is 0.04 m off.
+    expected = np.zeros(10)
+    expected[4:6] = 0.04
+    np.testing.assert_allclose(kerb.step_m[:, 2], expected, atol=1e-5)
+    np.testing.assert_array_equal(kerb.cost[:, 2], np.where(expected > 0, np.floor(99 * 0.4), 0))
+    np.testing.assert_allclose(kerb.slope_rad[4:6, 2], np.arctan(0.06 / 0.2), atol=1e-5)
+    assert (ramp(0.0, 0.12)[0].costmap(Wheels(max_step_m=0.039)).cost[4:6] == 100).all()
+
+
+def test_costs_where_the_ground_is_unknown():
+    grid, _ = ramp(0.2)
+    grid.distance_m[2, 1], grid.distance_m[5:8, 1] = np.nan, np.nan
+    grid.state[5:8, 1] = -1
+    costs = grid.costmap(Wheels(max_slope_rad=0.4))
+    assert costs.cost[2, 1] == 100  # something stands there
+    assert (costs.cost[5:8, 1] == -1).all()
+    assert np.isnan(costs.height_m[5:8, 1]).all()
+    np.testing.assert_allclose(costs.slope_rad[3:9, 2], np.arctan(0.2), atol=1e-5)  # by those around
+    grid.distance_m[:, :] = np.nan
+    grid.distance_m[0, 0], grid.distance_m[0, 1] = ramp(0.2)[0].distance_m[0, :2]
+    lone = grid.costmap()
+    assert np.isfinite(lone.height_m).sum() == 2
+    assert np.isnan(lone.slope_rad).all()  # two columns have no plane
+
+
+def test_a_column_is_free_if_all_between_the_heights_is():
+    grid, _ = ramp(0.0)  # ground at -1 m
+    assert (grid.flat(0.1, 1.3).state[:, :3] == 0).all()
+    assert (grid.flat(0.1, 1.3).state[:, 3:] == 0).all()  # the beam begins at 1.4 m
+    assert (grid.flat(0.1, 1.6).state[:, 3:] == 1).all()
+    assert (grid.flat(1.7, 1.9).state[:, 3:] == 0).all()
+    assert (grid.flat(0.1, 2.0).state[:, :3] == 0).all()  # the box ends 2 m above the ground
+    assert (grid.flat(0.1, 2.2).state[:, :3] == -1).all()
+    grid.state[3, 1, 12], grid.state[4, 1, 19] = -1, -1
+    flat = grid.flat(0.1, 1.9)
+    assert flat.state[3, 1] == flat.state[4, 1] == -1
+    assert (flat.origin.tolist(), flat.cell_size) == ([5.0, 7.0], 0.2)
+    grid.distance_m[5, 2] = np.nan  # the ground of the nearest column counts
+    assert grid.flat(0.1, 1.6).state[5, 2] == 0
+    for lower_m, upper_m in ((1.0, 1.0), (1.0, 0.5)):
+        with pytest.raises(ValueError, match="upper_m must be above lower_m"):
+            grid.flat(lower_m, upper_m)
+    grid.distance_m[:] = np.nan
+    with pytest.raises(ValueError, match="no column of the grid shows ground"):
+        grid.flat()
+
+
+def test_distances_are_those_of_a_search_of_all_voxels():
+    state = np.random.default_rng(1).choice([-1, 0, 0, 0, 1], (6, 5, 4))
+    field, centres = made(state, [1.0, 2.0, 3.0], 0.5).distances(), np.argwhere(np.ones(state.shape)) * 0.5
+    of_states = state.ravel()
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    occupied, free = of_states == 1, of_states == 0
+    expected = np.where(occupied, -apart[:, ~occupied].min(axis=1), apart[:, occupied].min(axis=1))
+    beyond = np.minimum(centres + 0.5, np.array(state.shape) * 0.5 - centres).min(axis=1)
+    expected_not_free = np.where(free, np.minimum(apart[:, ~free].min(axis=1), beyond), 0)
+    np.testing.assert_allclose(field.occupied_m.ravel(), expected, rtol=1e-6)
+    np.testing.assert_allclose(field.not_free_m.ravel(), expected_not_free, rtol=1e-6)
+    assert field.error_m == pytest.approx(np.sqrt(3) / 4)
+    nothing = made(np.zeros((2, 2, 2)), [0, 0, 0], 0.5).distances()
+    assert np.isinf(nothing.occupied_m).all()
+    assert (nothing.not_free_m == 0.5).all()
+
+
+def test_positions_are_in_the_voxel_that_spans_them():
+    grid = made(np.arange(24).reshape(2, 3, 4) % 3 - 1, [1.0, 2.0, 3.0], 0.5)
+    centres = grid.centres()
+    np.testing.assert_array_equal(grid.at(centres), grid.state.ravel())
+    np.testing.assert_array_equal(grid.at(centres - 0.2499), grid.state.ravel())
+    assert centres[0].tolist() == [1.25, 2.25, 3.25]
+    assert centres[-1].tolist() == [1.75, 3.25, 4.75]
+    np.testing.assert_array_equal(grid.centres(grid.occupied), centres[grid.state.ravel() == 1])
+    upper = np.array([2.0, 3.5, 5.0]) - 1e-9
+    assert grid.at([upper]).tolist() == [grid.state[-1, -1, -1]]
+    assert grid.at([[1.0, 2.0, 3.0]] + 2e-9 * np.eye(3)).tolist() == [grid.state[0, 0, 0]] * 3
+    assert grid.at(upper + 2e-9 * np.eye(3)).tolist() == [-1] * 3
+    assert grid.at(np.array([1.0, 2.0, 3.0]) - 2e-9 * np.eye(3)).tolist() == [-1] * 3
+    for wrong in (upper, [upper[:2]], [[upper]]):
+        with pytest.raises(ValueError, match="positions must have shape"):
+            grid.at(wrong)
+
+
+def test_a_plane_reaches_into_the_voxels_near_it():
+    """The probability that a plane through a voxel is in another one, against draws of its position."""
+    normal = np.array([0.48, 0.6, 0.64])
+    planes = np.array([0.05, 0.05]), np.stack([normal, normal]), np.array([0.06, 0.1]), np.array([0.8, 0.0])
+    voxels, size, step = np.array([[2, 2, 2], [0, 0, 0]]), 0.2, 2
+    found = _touched(voxels, planes, (5, 5, 5), size, step)
+    drawn = 0.05 + 0.06 * np.random.default_rng(0).standard_normal(20_000)
+    for offset in np.ndindex(3, 3, 3):
+        voxel = voxels[0] + (np.array(offset) - 1) * step
+        distance_m = drawn + (np.array(offset) - 1) @ normal * step * size
+        share = (np.abs(distance_m) < 0.5 * size * normal.sum()).mean()  # whether the plane is in the cube
+        assert found[tuple(voxel)] == pytest.approx(0.8 * share, abs=0.012)
+    assert np.count_nonzero(found) <= 27
+
+
+def test_a_surface_is_between_voxels_on_both_sides_of_it():
+    distance_m = np.array([0.4, 0.1, -0.15, -0.2, np.nan, 0.05, 0.3, -0.6, -0.1, 0.12], np.float32)
+    expected = [False, True, True, False, False, False, True, False, True, True]
+    for axis in range(3):
+        line = distance_m.reshape([-1 if i == axis else 1 for i in range(3)])
+        assert _crossed(line, 0.15).ravel().tolist() == expected
 
 
 def in_map_server(path):
@@ -146,6 +260,8 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
         assert ((grid.origin <= box[0]) & (box[0] < grid.origin + size)).all()
         assert ((upper >= box[1] - 1e-9) & (box[1] > upper - size)).all()
         np.testing.assert_array_equal(in_octomap(grid, tmp_path / "grid.bt")[0], grid.state)
+    assert radarsdf.grid(sharp_map, [[9.05, 0.05, 0.05], [9.15, 0.1, 0.15]], 0.2).shape == (1, 1, 1)
+    assert radarsdf.grid(sharp_map, [[9.0, 0.2, 0.0], [9.2, 0.6, 0.2]], 0.2).shape == (1, 2, 1)
     with pytest.raises(ValueError, match=r"0\.07.*multiple.*0\.2 m.*0\. "):
         made(np.ones((2, 2, 2)), [0.07, 0.2, 0.4], 0.2).save(tmp_path / "off.bt")
     with pytest.raises(ValueError, match="32768"):

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig, LiveMap
-from radarsdf.live.tracking import Lost
+from radarsdf.live.store import LoggedScan
+from radarsdf.live.tracking import Lost, Step, _signed
+from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.rigid import aligned
+from radarsdf.poses.tracking import begun
+from radarsdf.returns.moving import SensorVelocity
 
 from ..poses.drift import first
 
@@ -73,7 +77,7 @@ def test_scans_go_on_from_given_poses(drive, with_doppler):
     live = LiveMap(SETTINGS)
     with pytest.raises(ValueError, match="a pose, or a time"):
         live.integrate(scans.points[0])
-    for i in range(13):
+    for i in (*range(10), 9, 10, 11, 12):  # one of them twice
         pose = scans.poses[i] if i < 10 else None
         speeds = motion.doppler_mps[i] if with_doppler else None
         done = live.integrate(scans.points[i], pose, doppler_mps=speeds, time_s=motion.times_s[i])
@@ -151,3 +155,31 @@ def test_the_next_scan_is_placed_where_the_map_has_the_others(drive, tmp_path):
     live.remove("bad")
     done = follow(live, scans, motion, [9])
     assert np.linalg.norm(done.pose[:3, 3] - (shift @ T[9])[:3, 3]) < 0.1
+
+
+def test_a_sensor_moves_if_its_velocity_is_five_deviations_from_zero():
+    logged = LoggedScan(np.eye(4), np.zeros((3, 3)), time_s=0.0)
+    covariance = np.diag([0.03, 0.04, 1.0]) ** 2 - 0.02**2 * np.eye(
+        3
+    )  # each velocity is off by 0.02 m/s more
+    for mean, moves in (
+        ([0.149, 0, 0], False),
+        ([0.151, 0, 0], True),
+        ([0.1, 0.149, 0], False),
+        ([0, 0, 4.9], False),
+    ):
+        velocity = SensorVelocity(np.array(mean), covariance, np.ones(3, bool))
+        assert Step(0, logged, velocity, begun(np.eye(4))).moves == moves
+    assert Step(0, logged, None, begun(np.eye(4))).moves
+
+
+def test_a_velocity_of_open_sign_is_none_with_its_speed_as_deviation():
+    mean, covariance = np.array([[3.0, 4, 0], [0, 1, 2]]), np.tile(0.01 * np.eye(3), (2, 1, 1))
+    velocities = SensorVelocities(mean, covariance, np.ones(3), [], np.ones(2, bool))
+    for sign in (1, -1):
+        found = _signed(velocities, sign)
+        np.testing.assert_array_equal(found.mean_mps, sign * mean)
+        np.testing.assert_array_equal(found.covariance, covariance)
+    found = _signed(velocities, 0)
+    assert not found.mean_mps.any()
+    np.testing.assert_allclose(found.covariance[0], [[9.01, 12, 0], [12, 16.01, 0], [0, 0, 0.01]])

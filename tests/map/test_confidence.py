@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -81,30 +82,23 @@ ERROR_OF_A_CELL = 1 / 0.2**2
 """Information of a standard error of a leaf cell's edge, m⁻²."""
 
 
-def test_what_raises_it_and_what_lowers_it(radar_map):
-    """Everything else the same: the information and the detections raise it, the looks and the clutter ratio lower it.
-
-    So do more returns elsewhere, of which more are false.
-    """
-    numbers = np.array([1.0, 2, 5, 20, 100, 1000])
-    for hits, visibility in ((1, 1), (5, 20), (200, 1000)):
-        assert (np.diff(confidence(radar_map, numbers * ERROR_OF_A_CELL, hits, visibility)) > 0).all()
-    for information in (10 * ERROR_OF_A_CELL, 30 * ERROR_OF_A_CELL):
-        assert (np.diff(confidence(radar_map, information, numbers, 500)) > 0).all()
-        assert (np.diff(confidence(radar_map, information, 20, numbers)) < 0).all()
-        by_share = [confidence(radar_map, information, 20, 100, share)[0] for share in (0.02, 0.1, 0.4, 1)]
-        assert (np.diff(by_share) < 0).all()
-        by_returns = [confidence(radar_map, information, 20, 100, 0.1, n)[0] for n in (1, 2, 5, 50)]
-        assert (np.diff(by_returns) < 0).all()
-
-
-@pytest.mark.parametrize(("error_cells", "most"), [(0.5, 0.9545), (10, 0.2850)])
-def test_it_is_at_most_the_share_of_the_errors_within_a_cell(radar_map, error_cells, most):
-    """However many scans saw it. The shares are those of a normal distribution, of the error of a surface that bends little."""
-    found = queries.probabilities(radar_map._contents, at(ERROR_OF_A_CELL / error_cells**2, 1000, 10))
-    assert found.reach.item() == pytest.approx(most, abs=1e-4)
-    unlikely = confidence(radar_map, ERROR_OF_A_CELL / error_cells**2, 1000, 10, 0.0, 0.0)
-    assert unlikely <= found.reach.item()
+@pytest.mark.parametrize(("clutter_ratio", "returns_per_cell"), [(0.0, 0.0), (0.1, 2.0), (0.5, 12.0)])
+def test_it_is_the_logistic_function_of_what_is_missing_and_how_rough_the_map_is(
+    radar_map, clutter_ratio, returns_per_cell
+):
+    hits, visibility = np.array([4.0, 9, 1]), np.array([16.0, 3, 80])  # 4, 0.75 and 20 are expected
+    error_cells = np.array([0.3, 0.2, 1.0])
+    deviations = (visibility / 4 - hits) / np.sqrt(visibility / 4 + 1)
+    missing = (deviations + np.hypot(deviations, 0.5)) / 2
+    rough, crowded = np.tanh(clutter_ratio / 0.27), returns_per_cell / (returns_per_cell + 4)
+    logits = 3.29 - 1.25 * np.log(error_cells) - 0.87 * missing - 3.77 * rough - 3.50 * crowded
+    # Where the density of information is low, that of the neighbours holds a surface that bends by at most two cells.
+    smoothed = np.minimum(error_cells, np.sqrt(2 / 8 * np.sqrt(9) * error_cells))
+    reach = np.array([math.erf(math.sqrt(0.5) / cells) for cells in smoothed])
+    expected = np.minimum(1 / (1 + np.exp(-logits)), reach)
+    information = ERROR_OF_A_CELL / error_cells**2
+    found = confidence(radar_map, information, hits, visibility, clutter_ratio, returns_per_cell)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_places_have_the_evidence_of_their_cells(radar_map):

@@ -15,6 +15,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig
 from radarsdf.io.tensors import open_tensors, tensor_bytes
+from radarsdf.map.storage import load_leaf_keys
 from safetensors.torch import save_file
 
 from ..settings import grouped
@@ -173,6 +174,22 @@ def test_tensors_that_do_not_fit(saved, tmp_path, name, change):
     path = write(tmp_path / "bad.safetensors", tensors | {name: change(tensors[name])}, metadata)
     with pytest.raises(ValueError, match="is not a whole radarsdf map"):
         radarsdf.load(path)
+
+
+def test_keys_that_are_read_alone_are_checked(saved, tmp_path):
+    _, path, tensors, metadata = saved
+    keys = tensors["leaf_keys"]
+    np.testing.assert_array_equal(load_leaf_keys(path), keys.numpy())
+    for wrong in (
+        keys.flip(0),
+        longer(keys),
+        flat(keys),
+        keys.half(),
+        torch.cat([-torch.ones_like(keys[:1]), keys]),
+    ):
+        damaged = write(tmp_path / "bad.safetensors", {"leaf_keys": wrong}, metadata)
+        with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+            load_leaf_keys(damaged)
 
 
 @pytest.mark.parametrize(

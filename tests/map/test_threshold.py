@@ -9,7 +9,7 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.map.mesh import Surface
-from radarsdf.map.threshold import Tally, Threshold
+from radarsdf.map.threshold import Limits, Tally, Threshold
 
 WALL_X_M = 10.1
 PATCH_X_M = 6.1
@@ -121,3 +121,36 @@ def test_the_sums_of_parts_are_those_of_the_whole(of_many):
     together = Tally.of_sums(parts[0].sums() + parts[1].sums())
     np.testing.assert_allclose(together.sums(), surface.tally.sums(), rtol=1e-9, atol=1e-9)
     assert together.threshold().min_confidence == surface.tally.threshold().min_confidence
+
+
+def test_a_tally_sums_areas_by_confidence():
+    area_m2, confidence = np.array([2.0, 3, 4, 5]), np.array([0.1, 0.25, 0.9995, 1.0])
+    covering, reach, hits = (
+        np.array([0.5, 0.2, 0.3, 1]),
+        np.array([0.05, 0.5, 1, 1]),
+        np.array([1.2, 2, 1, 3]),
+    )
+    found = Tally.of(area_m2, confidence, covering, reach, hits)
+    expected = np.zeros((3, 1000))
+    for row, number in zip((100, 250, 999, 999), range(4), strict=True):
+        expected[:, row] += area_m2[number] * np.array([1, confidence[number], covering[number]])
+    np.testing.assert_allclose([found.area_m2, found.true_m2, found.covering], expected)
+    # What may be anywhere is no more than the surface that was found.
+    assert found.existing_m2 == pytest.approx(2 + 1.5 + 4 * 0.9995 + 5)
+    assert (found.once_m2, found.twice_m2) == pytest.approx((0.2 + 4 * 0.9995, 0.75))
+    assert tally([1], [0.5], [1], once=1.0).reachable == 0  # nothing was seen twice
+    assert tally([0], [0.5], [0]).threshold().expected_precision == 0
+
+
+def test_limits_of_a_mesh():
+    assert Limits.of(0.1) == (None, np.inf, 30)
+    assert Limits.of(0.05).min_component_triangles == 30
+    assert Limits.of(0.2).min_component_triangles == 15
+    edges = {"min_confidence": 1, "max_uncertainty": 0, "min_component_triangles": 0}
+    assert Limits.of(0.1, **edges) == (1, 0, 0)
+    assert Limits.of(0.1, min_confidence=0).min_confidence == 0
+    for name, wrong in (("min_confidence", 1.001), ("min_confidence", -0.001), ("max_uncertainty", -0.001)):
+        with pytest.raises(ValueError, match=name):
+            Limits.of(0.1, **{name: wrong})
+    with pytest.raises(ValueError, match="min_component_triangles"):
+        Limits.of(0.1, min_component_triangles=-1)

@@ -102,11 +102,3 @@ def test_the_rougher_the_less_repetition_helps(walls):
         assert RadarMap(rough).mesh().vertices[:, 0].max() > 39
     assert errors_m[0] == pytest.approx(0.05 * LEAF_M, rel=1e-4)
     assert (np.diff(errors_m) > 0).all()
-
-
-def test_more_scans_make_it_certain():
-    place = [[40.0, 2.0, 0.0]]
-    maps = [radarsdf.fit(*two_walls(scans), config=CONFIG, progress=False) for scans in (4, 16)]
-    few, many = (radar_map.uncertainty(place)[0] for radar_map in maps)
-    few, many = (np.sqrt(sigma_m**2 - floor_m(maps[0]) ** 2) for sigma_m in (few, many))
-    assert many / few == pytest.approx(0.5, rel=0.15)

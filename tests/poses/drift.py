@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import Scans
+from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.simulate import RadarSensor, Scan, drifted, measured_motion
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +25,13 @@ def trajectory(count):
     ).as_matrix()
     poses[:, :3, 3] = np.stack([0.5 * k, 2 * np.sin(0.1 * k), 0.1 * np.cos(k)], 1)
     return poses
+
+
+def velocities_of(mean_mps, covariance):
+    """Velocities (F, 3) of all scans, with the same covariance (3, 3)."""
+    count = len(mean_mps)
+    every = np.tile(covariance, (count, 1, 1))
+    return SensorVelocities(mean_mps, every, np.ones(3), [[]] * count, np.ones(count, bool))
 
 
 def position_error_m(poses, true):

@@ -10,17 +10,30 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
-from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.imu import Gyroscope, ImuAlignment, Inertial, UnusableGyroscopeError, cumulated, levelled
+from radarsdf.poses.imu import (
+    Gyroscope,
+    ImuAlignment,
+    Inertial,
+    UnusableGyroscopeError,
+    _windows,
+    cumulated,
+    levelled,
+)
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
 
 from ..conftest import recorded_file
+from .drift import velocities_of
 
 R_SENSOR_IMU = Rotation.from_euler("ZYX", [130, -40, 75], degrees=True).as_matrix()
 LATE_S = 0.07
 LEVER_M = (0.2, -0.1, 0.3)
+
+
+def speeds_at(t):
+    """(F, 3) of the ride, world, m/s."""
+    return np.column_stack([1.5 * np.cos(0.5 * t), -0.8 * np.sin(0.4 * t), 0.27 * np.cos(0.9 * t)])
 
 
 @pytest.fixture(scope="module")
@@ -32,14 +45,9 @@ def ride():
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("ZYX", turns).as_matrix()
     poses[:, :3, 3] = xyz
-    speeds = np.column_stack([1.5 * np.cos(0.5 * t), -0.8 * np.sin(0.4 * t), 0.27 * np.cos(0.9 * t)])
-    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds)
+    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds_at(t))
     seen += np.random.default_rng(1).normal(0, 1, seen.shape) * [0.02, 0.02, 0.04]
-    count = len(t)
-    velocities = SensorVelocities(
-        seen, np.tile(np.diag([0.02, 0.02, 0.04]) ** 2, (count, 1, 1)), np.ones(3), [], np.ones(count, bool)
-    )
-    return t, poses, velocities
+    return t, poses, velocities_of(seen, np.diag([0.02, 0.02, 0.04]) ** 2)
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +80,50 @@ def test_velocities_tell_how_it_sits_there(ride, imu):
     assert angle(end, poses[-1, :3, :3]) < 3
 
 
+@pytest.mark.parametrize("late_s", [LATE_S, -0.3])
+def test_without_noise_it_is_exact(ride, monkeypatch, late_s):
+    times_s, poses, _ = ride
+    for name in ("_GYROSCOPE_SIGMA_RAD_S", "_ACCELEROMETER_SIGMA_MPS2"):
+        monkeypatch.setattr(f"radarsdf.simulate.motion.{name}", 0)
+    seen = np.einsum("fji,fj->fi", poses[:, :3, :3], speeds_at(times_s))
+    imu = measured_imu(poses, times_s, R_sensor_imu=R_SENSOR_IMU, lever_m=LEVER_M)
+    found = Inertial.of(imu, velocities_of(seen, 1e-6 * np.eye(3)), times_s + late_s, 0.0)
+    report = found.report
+    assert angle(np.array(report["R_sensor_imu"]), R_SENSOR_IMU) < 1e-2
+    assert report["time_offset_s"] == pytest.approx(late_s, abs=1e-4)
+    np.testing.assert_allclose(report["lever_m"], LEVER_M, atol=1e-3)
+    assert tilt(poses, found.alignment.up) < 1e-2
+    turns = cumulated(found.gyroscope.turns)
+    assert max(angle(poses[0, :3, :3] @ turns[i], poses[i, :3, :3]) for i in (100, -1)) < 1e-2
+    late = f"scans are {late_s:.3f} s late in its clock"
+    assert f"found to {np.degrees(report['sigma_rad']):.1f} degrees, {late}" in found.alignment.words
+
+
+def test_windows_end_after_four_seconds_and_at_gaps():
+    times_s = np.r_[0.1 * np.arange(60), 7.0, 7.1, 9.0 + 0.1 * np.arange(41)]
+    rows, window = _windows(times_s)
+    np.testing.assert_array_equal(rows, np.r_[:60, 62:103])  # two scans between gaps are too few
+    np.testing.assert_array_equal(window, np.repeat([0, 1, 2], [41, 19, 41]))
+    slow = _windows(np.arange(30.0))[1]
+    np.testing.assert_array_equal(slow, np.repeat([0, 1, 2], [11, 11, 8]))  # of ten intervals, then
+
+
+@pytest.mark.parametrize(
+    ("rate_rad_s", "speed_mps", "is_used"),
+    [(5.9, 0, True), (6.1, 0, False), (2, 14.9, True), (2, 15.1, False)],
+)
+def test_rates_that_nothing_turns_at_are_not_used(rate_rad_s, speed_mps, is_used):
+    times_s = np.arange(5.0)
+    rates = rate_rad_s * np.array([[0.6, 0, 0.8]] * 3 + [[0, 0, 0]] * 2)
+    means = np.tile([0.6 * speed_mps, 0.8 * speed_mps, 0], (5, 1))
+    imu = Imu(times_s, rates, R_sensor_imu=np.eye(3))
+    found = Inertial.of(imu, velocities_of(means, np.eye(3)), times_s, 0.0)
+    assert (found.gyroscope is not None) == is_used
+    if not is_used:
+        across = f"{rate_rad_s:.3g} rad/s, {rate_rad_s * speed_mps:.0f} m/s² across the trajectory"
+        assert across in found.notes[0]
+
+
 def test_axes_that_are_given_stay(ride, imu):
     times_s, poses, velocities = ride
     given = dataclasses.replace(imu, R_sensor_imu=R_SENSOR_IMU)
@@ -98,10 +150,7 @@ def test_a_sensor_that_goes_straight_on_leaves_it_open():
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, 0, 3] = times_s
     rng = np.random.default_rng(2)
-    covariance = np.tile(0.02**2 * np.eye(3), (200, 1, 1))
-    velocities = SensorVelocities(
-        [1, 0, 0] + rng.normal(0, 0.02, (200, 3)), covariance, np.ones(3), [], np.ones(200, bool)
-    )
+    velocities = velocities_of([1, 0, 0] + rng.normal(0, 0.02, (200, 3)), 0.02**2 * np.eye(3))
     assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None
 
 

@@ -9,11 +9,9 @@ import itertools
 
 import numpy as np
 import pytest
-from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate
-from radarsdf.poses.rigid import moved, steps, transform
+from radarsdf.poses.rigid import moved
 from radarsdf.simulate import drifted
-from scipy.spatial.transform import Rotation
 
 from .drift import trajectory
 
@@ -52,26 +50,6 @@ def test_deviations_and_bias_are_learnt_from_poses_that_are_known():
     assert np.sqrt(learnt.variances[0]) == pytest.approx(0.03, rel=0.1)
     assert np.sqrt(learnt.variances[1]) == pytest.approx(0.004, rel=0.1)
     assert learnt.bias[5] == pytest.approx(-0.01, abs=5e-4)
-
-
-def test_velocities_lead_from_pose_to_pose():
-    times_s = np.arange(12) * 0.1
-    h = 1e-4
-
-    def pose(time_s):
-        """A curve that turns and gains speed."""
-        turn = Rotation.from_euler("zyx", [0.5 * time_s**2, 0.2 * np.sin(time_s), 0.1 * time_s]).as_rotvec()
-        return transform(turn, np.array([3 * time_s**2, np.sin(2 * time_s), 0.2 * time_s]))
-
-    poses = np.stack([pose(t) for t in times_s])
-    mean = np.stack([pose(t)[:3, :3].T @ (pose(t + h) - pose(t - h))[:3, 3] / (2 * h) for t in times_s])
-    count = len(times_s)
-    velocities = SensorVelocities(
-        mean, np.tile(1e-4 * np.eye(3), (count, 1, 1)), np.ones(3), [], np.ones(count, bool)
-    )
-    found = DopplerMotion.by(velocities, times_s, poses)
-    # Between scans its velocity is taken to change evenly, in its own frame. That of a neighbour would be off by 0.05 m.
-    np.testing.assert_allclose(found.steps, steps(poses), atol=2e-3)
 
 
 TURNS = MotionPrior(np.array([0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.15]), True)

@@ -122,15 +122,6 @@ def test_sums_over_27_cells_and_scans_that_looked(rays):
             assert a.tobytes() == b.tobytes()
 
 
-def test_many_returns_of_one_scan_are_one_detection(rays):
-    leaf_keys = keys_round(rays.points)
-    evidence = Evidence.of(returns_of(rays, np.full(len(rays), VARIANCE_M2)), rays, leaf_keys, LEAF_M)
-    assert at(evidence, leaf_keys, CLUTTER) == (pytest.approx(6 / VARIANCE_M2), 1, SCANS)
-    _, hits, looked = at(evidence, leaf_keys, np.array([5.1, 0.1, 0.1]))
-    assert looked == SCANS
-    assert hits > 5 * SCANS  # of nine cells of the wall
-
-
 def test_a_false_return_is_no_evidence_but_its_scan_looked(rays):
     leaf_keys = keys_round(rays.points)
     real = rays.select(~is_false(rays))

@@ -65,6 +65,24 @@ def test_a_fit_leaves_it_out_and_says_how_many(drive):
     assert kept_all.report["moving"] == 0
 
 
+def test_half_of_the_scans_must_agree_on_a_velocity(drive):
+    scans, doppler, _ = drive
+    rng = np.random.default_rng(2)
+    noise = [rng.uniform(-20, 20, len(v)) for v in doppler]
+    expected = MovingReturns.of(scans.points, doppler).masks
+    found = MovingReturns.of(scans.points, doppler[:6] + noise[6:])
+    assert found.why_none is None
+    for mask, agreeing in zip(found.masks[:6], expected, strict=False):
+        np.testing.assert_array_equal(mask, agreeing)
+    assert not np.concatenate(found.masks[6:]).any()
+    # Scans of less than ten returns do not count.
+    points = [*scans.points[:11], scans.points[11][:9]]
+    assert MovingReturns.of(points, [*doppler[:6], *noise[6:11], doppler[11][:9]]).why_none is None
+    lost = MovingReturns.of(scans.points, doppler[:5] + noise[5:])
+    assert lost.count == 0
+    assert lost.why_none == "only 5 of 12 scans agree on a velocity of the sensor"
+
+
 def _too_near(scans, doppler):
     left = MovingReturns.of(scans.points, doppler).without(scans.points)
     return sum(int((np.linalg.norm(points, axis=1) < 2.5).sum()) for points in left)

@@ -63,6 +63,19 @@ def test_json_keeps_a_sensor():
     assert Sensor.from_dict(json.loads(json.dumps(sensor.to_dict()))) == sensor
 
 
+def test_numbers_at_their_limits_and_beyond_the_thresholds():
+    limits = (-np.pi, np.pi), (-np.pi / 2, np.pi / 2), (0.0, 1e6)
+    sensor = Sensor(*limits, 1e7, SensorNoise(0.0, 0.0, 0.0), ((2.0, 50.0), (4.0, 40.0)))
+    np.testing.assert_allclose(sensor.threshold(np.array([0.0, 2, 3, 4, 9])), [50, 50, 45, 40, 40])
+    assert np.isneginf(dataclasses.replace(sensor, thresholds=()).threshold(np.ones(3))).all()
+    azimuth, elevation = np.array([np.pi / 2, -np.pi / 4]), np.array([0.0, np.pi / 6])
+    expected = [[0, 1, 0], [0.5 * 3**0.5 * 0.5**0.5, -0.5 * 3**0.5 * 0.5**0.5, 0.5]]
+    np.testing.assert_allclose(sensor.directions(azimuth, elevation), expected, atol=1e-12)
+    one = Sensor.of([np.array([[3.0, 0, 0], [3.0, 0, 0]])])
+    assert one.range_m == pytest.approx((3 - 0.003, 3))
+    assert one.azimuth_rad == pytest.approx((-1e-6, 0))
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -72,6 +85,9 @@ def test_json_keeps_a_sensor():
         ({"range_m": (-1.0, 5.0)}, "range_m"),
         ({"range_m": (1.0, np.nan)}, "range_m"),
         ({"returns_per_scan": 0}, "returns_per_scan"),
+        ({"returns_per_scan": 10_000_001}, "returns_per_scan"),
+        ({"range_m": (1.0, 1_000_001)}, "range_m"),
+        ({"elevation_rad": (-1.6, 0.0)}, "elevation_rad"),
         ({"noise": SensorNoise(-1.0, 0.0, 0.0)}, "noise"),
         ({"thresholds": ((5.0, 1.0), (5.0, 2.0))}, "ascending"),
     ],

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
@@ -36,6 +37,18 @@ def test_ghosts_are_found_and_the_surface_is_kept():
     assert dropped[~is_ghost].mean() < 0.005
     np.testing.assert_array_equal(dropped, ghosts_of(rays, surfels, num_threads=1))
     np.testing.assert_array_equal(dropped, ghosts_of(rays, surfels, num_threads=3))
+
+
+def test_clutter_is_what_lies_on_no_flat_surfel():
+    points, poses, _ = a_wall()
+    surfels = Surfels.of(prepare(points, poses), LEAF_M)
+    flat = surfels.variances[:, 0] < 0.5 * surfels.variances[:, 1]
+    of_planes = surfels.counts[surfels.cell_of_plane]
+    assert 0.05 < flat.mean() < 1
+    assert surfels.clutter_ratio() == pytest.approx(of_planes[~flat].sum() / of_planes.sum())
+    assert surfels.returns_per_cell() == pytest.approx(sum(map(len, points)) / len(surfels.keys))
+    lone = Surfels.of(prepare([np.array([[5.0, 0, 0]])], poses[:1]), LEAF_M)
+    assert (lone.clutter_ratio(), lone.returns_per_cell(), len(lone.cell_of_plane)) == (0, 1, 0)
 
 
 def test_a_fit_drops_and_counts_them():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.view_statistics import ViewStatistics, rows_of_views
+from radarsdf.returns.view_statistics import ViewStatistics, ViewStatisticsAt, rows_of_views
 
 LEAF_M = 0.2
 
@@ -58,3 +58,22 @@ def test_wrong_arrays_are_refused(view_statistics):
     ):
         with pytest.raises(ValueError, match="the view statistics"):
             dataclasses.replace(view_statistics, **change).check(LEAF_M)
+
+
+def test_parts_are_joined_with_the_mean_of_their_variances(view_statistics):
+    one = view_statistics.in_world(np.array([1.0, 2, 3]), 10.0, 30.0)
+    assert one.sigma == pytest.approx(20 * view_statistics.sigma)
+    few = dataclasses.replace(one.select(np.arange(len(one.counts)) < 5), sigma=3.0)
+    both = ViewStatisticsAt.together([one, few])
+    weights = np.array([one.counts.sum(), few.counts.sum()])
+    assert both.sigma == pytest.approx(np.sqrt(weights @ [one.sigma**2, 9] / weights.sum()))
+    np.testing.assert_array_equal(both.points, np.concatenate([one.points, one.points[:5]]))
+    assert ViewStatisticsAt.together([few.select(np.zeros(5, bool))]).sigma == 3
+
+
+def test_the_deviation_is_that_of_single_returns_from_their_means(rays, view_statistics):
+    rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, LEAF_M)
+    values = rays.intensities / 100
+    means = np.bincount(rows, values) / np.bincount(rows)
+    squares = (values - means[rows]) ** 2
+    assert view_statistics.sigma == pytest.approx(np.sqrt(squares.sum() / (len(rows) - count)), rel=1e-4)

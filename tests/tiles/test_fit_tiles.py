@@ -18,8 +18,10 @@ from radarsdf import FitConfig
 from radarsdf.io import Scan
 from radarsdf.io.files import take_lock
 from radarsdf.map import storage
+from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, map_path
+from radarsdf.tiles.planning import _chunks
 
 from .conftest import CONFIG, TILE_M
 
@@ -143,6 +145,7 @@ def test_another_plan_is_refused(drive, folder):
         tiles_of(drive.select(np.arange(11)), folder)
     with pytest.raises(ValueError, match="num_threads differ"):
         tiles_of(drive, folder, config=CONFIG.override(num_threads=2))
+    assert tiles_of(drive, folder, config=CONFIG.override(num_threads=0)).missing == {}  # any will do
 
 
 def test_one_process_at_a_time_plans_a_folder(drive, folder, tmp_path):
@@ -213,8 +216,31 @@ def test_a_bad_scan_is_named(drive, tmp_path, values, said):
 
 def test_scans_that_cannot_be_used_are_left_out(drive, tmp_path):
     empty = {"points": np.zeros((0, 3)), "intensities": np.zeros(0)}
-    scans = changed(changed(drive, 7, T_world_sensor=np.full((4, 4), np.nan)), 3, **empty)
+    nowhere = np.full((4, 4), np.nan)
+    scans = changed(changed(drive, 7, T_world_sensor=nowhere), 3, **empty)
     assert tiles_of(scans, tmp_path / "city").missing == {}
+    half = [
+        dataclasses.replace(scan, T_world_sensor=nowhere) if i > 5 else scan for i, scan in enumerate(drive)
+    ]
+    with pytest.raises(ValueError, match="6 of 12 poses are not rigid transforms, the first is pose 6"):
+        tiles_of(half, tmp_path / "half")
+
+
+def test_the_sensor_is_that_of_evenly_spread_scans(drive, tmp_path, monkeypatch):
+    monkeypatch.setattr("radarsdf.tiles.planning._SENSOR_SCANS", 5)
+    plan = plan_tiles(drive, tmp_path / "city", tile_size=TILE_M, halo=6.4, config=CONFIG)
+    some = drive.select(np.array([0, 4, 8]))
+    limits = {name: getattr(CONFIG.returns, name) for name in ("min_range_m", "max_range_m")}
+    assert plan.sensor == Sensor.of(some.points, some.intensities, noise=plan.sensor.noise, **limits)
+
+
+def test_a_map_of_which_all_tiles_fail_is_an_error(drive, tmp_path):
+    out = tmp_path / "city"
+    names = [tile.name for tile in plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG).tiles]
+    for name in names:
+        (out / "tiles" / name / "rays.bin").write_bytes(b"")
+    with pytest.raises(ValueError, match=f"all {len(names)} tiles failed, the first: .* rays of the plan"):
+        run_fits(out, progress=False)
 
 
 def test_a_full_disk_is_said_and_what_was_done_is_kept(drive, folder, tmp_path, monkeypatch):
@@ -234,3 +260,17 @@ def test_a_full_disk_is_said_and_what_was_done_is_kept(drive, folder, tmp_path, 
         )
     assert tiles_of(drive, out).missing == {}
     assert_same_bits(maps_of(folder), maps_of(out))
+
+
+def test_chunks_end_between_groups_where_they_are_long_dense_or_far():
+    def sizes(count, returns=0, step_m=0.0):
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, 1, 3] = step_m * np.arange(count)
+        scans = [Scan(np.zeros((returns, 3), np.float32), pose) for pose in poses]
+        return [len(chunk) for chunk in _chunks(scans, 3)]
+
+    assert sizes(520) == [258, 258, 4]
+    assert sizes(8, returns=100_000) == [6, 2]  # half a million with the fifth
+    assert sizes(10, step_m=-199.9) == [6, 4]
+    assert sizes(10, step_m=-334.0) == [3, 3, 3, 1]
+    assert sizes(0) == []

@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import TiledMap
+from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
+from radarsdf.tiles.planning import read_rays
 
 from .conftest import CONFIG, TILE_M
 
@@ -38,6 +41,34 @@ def test_answers_are_those_of_one_map(city, whole, points):
     assert np.median(difference) < 0.05
     gradients = city.gradient(points), whole.gradient(points)
     assert np.quantile(np.linalg.norm(gradients[0] - gradients[1], axis=1), 0.95) < 0.05
+
+
+def test_what_all_tiles_have_in_common_is_that_of_one_map(folder, city, whole, drive):
+    plan = city.plan
+    rays = [read_rays(folder, plan, tile)[0] for tile in plan.tiles]
+    surfels, counts = [SurfaceReturns.of(part, CONFIG, 1).surfels for part in rays], list(map(len, rays))
+    clutter_ratio = np.average([part.clutter_ratio() for part in surfels], weights=counts)
+    assert plan.clutter_ratio == pytest.approx(clutter_ratio, rel=1e-6)
+    assert plan.returns_per_cell == pytest.approx(sum(counts) / sum(len(part.keys) for part in surfels))
+    assert (city.num_cells, len(city.tiles)) == (
+        pytest.approx(len(whole.field.table.leaf_keys()), rel=0.01),
+        4,
+    )
+    np.testing.assert_allclose(city.extent, whole.extent, atol=0.21)
+    for name in ("azimuth_rad", "elevation_rad", "range_m", "returns_per_scan", "thresholds"):
+        np.testing.assert_allclose(
+            getattr(city.sensor, name), getattr(whole.sensor, name), rtol=0.02, atol=0.02
+        )
+    known = [tile.returns for tile in plan.tiles]
+    assert sum(known) == city.report["returns"] == whole.report["returns_used"] + whole.report["ghosts"]
+    assert city.report["scans"] == whole.report["scans"] == len(drive)
+    assert city.report["noise"] == pytest.approx(whole.report["noise"], rel=0.1)
+    owners = plan.grid.tiles_of(np.concatenate([scan.world_points for scan in drive]))
+    for planned in plan.tiles:
+        assert planned.returns <= (owners == planned.tile).all(axis=1).sum()
+        lower, upper = plan.box_cells(planned.tile) + plan.origin_cells(planned.tile)
+        np.testing.assert_array_equal(lower[:2], np.array(planned.tile) * plan.tile_cells)
+        np.testing.assert_array_equal(upper - lower, [plan.tile_cells] * 2 + [2 * MAX_CELLS_FROM_ORIGIN])
 
 
 def test_beyond_a_tile_that_is_missing_its_neighbours_answer_within_half_a_halo(

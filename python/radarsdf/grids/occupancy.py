@@ -105,7 +105,7 @@ def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: t
     enclosed = binary_erosion(known, np.ones((3, 3, 3)))[places] & ~cells.returns[places]
     odds = radar_map.free_space_odds
     probability = np.where(passed > 0, (odds / (1 + odds)).astype(np.float32)[passed], np.float32(np.nan))
-    free = enclosed & (passed > 0) & (probability <= _FREE_TO)
+    free = enclosed & (probability <= _FREE_TO)  # NaN is not
     distance_m = np.full(shape, np.nan, np.float32)
     occupied = np.zeros(shape, bool)
     rows = np.nonzero(observed)

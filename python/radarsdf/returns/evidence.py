@@ -87,10 +87,10 @@ class VisibilityCounts:
 
     def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint32]:
         """(C,) of the blocks that leaf cells with these Morton keys (C,), ascending, are in."""
-        blocks = leaf_keys >> BLOCK_BITS
-        rows = np.minimum(np.searchsorted(self.keys, blocks), max(len(self.keys) - 1, 0))
         if len(self.keys) == 0:
             return np.zeros(len(leaf_keys), np.uint32)
+        blocks = leaf_keys >> BLOCK_BITS
+        rows = np.minimum(np.searchsorted(self.keys, blocks), len(self.keys) - 1)
         return np.where(self.keys[rows] == blocks, self.scans[rows], np.uint32(0))
 
 
