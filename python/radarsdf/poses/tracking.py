@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.special import ndtr
 from scipy.stats import t as student
 from tqdm import tqdm
 
@@ -43,8 +44,8 @@ _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimat
 # three times as long as a scan.
 _NOISE_RETURNS = 10_000
 _SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells: further than returns of one thing reach
-# Cells along the least certain axis, in which a scan must not fit as well as where it was found.
-_ELSEWHERE_ALONG = (0, *(sign * shift for shift in range(1, 7) for sign in (1, -1)))
+# Cells along the least certain axis, of which the best one is where a scan may be instead of where it was found.
+_ELSEWHERE_ALONG = tuple(sign * shift for shift in range(1, 7) for sign in (1, -1))
 _SURE = 0.05  # cells: deviation of an expected translation that needs no returns
 _LEAST_VARIANCE = 1e-12
 # Initial priors. The drive's own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
@@ -207,12 +208,16 @@ class Tracker:
             variance = axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis
             information.append(1 / variance if variance > 0 else 0.0)
         chance = min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
-        # Nor does it say where the scan is if it fits as well elsewhere, as where things repeat themselves.
+        of_returns = 1 / max((1 - chance) * (1 / left - 1 / before), 1e-12)
+        # Where things repeat themselves, the scan may as well be elsewhere.
         poses = np.stack([_shifted(pose, shift * cell_m * axis) for shift in _ELSEWHERE_ALONG])
-        here, *rivals = self._planes[-1].scores(scan, poses, self._variances)
-        if not _clear(here, np.stack(rivals)):
-            chance = 1.0
-        widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
+        means = self._planes[-1].scores(scan, poses, self._variances).mean(axis=1)
+        rival = self._settled(scan, *2 * (poses[np.argmax(means)],), prior)[0]
+        apart_m = float(axis @ (rival - pose)[:3, 3])
+        if abs(apart_m) > 0.5 * cell_m:
+            here, there = self._planes[-1].scores(scan, np.stack([pose, rival]), self._variances)
+            of_returns += float(ndtr(-_margins(here, there[None])[0])) * apart_m**2
+        widened = 1 / (1 / before + 1 / of_returns) - left
         covariance = covariance.copy()
         covariance[:3, :3] += max(widened, 0.0) * np.outer(axis, axis)
         return covariance
@@ -263,7 +268,11 @@ class Tracker:
         of_found, by_chance = scores(at), chance[_best(chance.mean(axis=1))]
         first = int(np.argmax(of_found.mean(axis=1)))
         rivals = of_found[_apart_m(at, at[first], radius_m) > capture_m]
-        return found[first] if _clear(of_found[first], np.concatenate([by_chance, rivals])) else None
+        return (
+            found[first]
+            if (_margins(of_found[first], np.concatenate([by_chance, rivals])) > _ERRORS).all()
+            else None
+        )
 
     def _shifted_across(
         self, pose: Floats, expected: PredictedStep, capture_m: float, radius_m: float
@@ -298,10 +307,11 @@ def begun(pose: Floats, segment: int = 0) -> Tracked:
     return Tracked(pose, np.zeros((6, 6)), np.nan, segment, np.zeros(3))
 
 
-def _clear(scores: Floats, others: Floats) -> bool:
-    """Whether the scores (N,) of returns at one pose are significantly higher than at each other one (K, N)."""
+def _margins(scores: Floats, others: Floats) -> Floats:
+    """(K,) by how many standard errors returns have higher scores (N,) at one pose than at others (K, N)."""
     gains = scores - others
-    return bool((gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(scores))).all())
+    margins: Floats = gains.mean(axis=1) / np.maximum(gains.std(axis=1) / np.sqrt(len(scores)), 1e-12)
+    return margins
 
 
 def _shifted(pose: Floats, shift_m: Floats) -> Floats:
