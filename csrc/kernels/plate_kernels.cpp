@@ -109,11 +109,14 @@ void pull(const PlatePlaces& places, const float* distances_m, float* pulls_m, s
     for (std::int32_t k = places.first[cell]; k < places.first[cell + 1]; ++k) {
       const auto shares = load_vector<Floats>(places.shares + 8 * std::int64_t{k});
       const Floats products = shares * distances;
-      const float off_m = ((products[0] + products[4]) + (products[1] + products[5])) +
-                          ((products[2] + products[6]) + (products[3] + products[7])) - places.targets_m[k];
-      pulls += off_m * shares;
+      const Floats pairs = products + shuffled<across<4>>(products, products);
+      const Floats fours = pairs + shuffled<across<1>>(pairs, pairs);
+      const float target_m = places.targets_m[k];
+      pulls += (fours + shuffled<across<2>>(fours, fours) - target_m) * shares;  // all lanes have the same sum
     }
-    for (int c = 0; c < 8; ++c) pulls_m[corners[c]] += pulls[c];
+    float of_corners[kPlateVertices];
+    store_vector(of_corners, pulls);
+    for (int c = 0; c < kPlateVertices; ++c) pulls_m[corners[c]] += of_corners[c];
   }
 }
 
