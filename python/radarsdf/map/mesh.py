@@ -197,14 +197,14 @@ def sample_lattice(
     """
     config, num_threads = contents.config, torch.get_num_threads()
     leaf_size_m = config.leaf_size_m
+    parts, even = per_cell(voxel_size, leaf_size_m)
+    stored = contents.field.leaf_corners() if box is None else None
+    if stored is not None and even and parts == 1:
+        return *stored, len(stored.of_cells)
     cells = contents.field.table.leaf_cells()
     if box is not None:
         lower, upper = box
         cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    parts, even = per_cell(voxel_size, leaf_size_m)
-    stored = contents.field.leaf_corners() if box is None else None
-    if stored is not None and even and parts == 1:
-        return *stored, len(cells)
     if stored is not None and voxel_size < leaf_size_m:
         cells = cells[_near_surface(stored.distances_m[stored.of_cells], leaf_size_m)]
     elif voxel_size < leaf_size_m and contents.field.smooth_in_cells:
