@@ -9,6 +9,7 @@
 
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_walk.hpp"
+#include "util/large_array.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
@@ -53,7 +54,7 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   const auto size_m = static_cast<float>(table.leaf_size_m()), limit_m = static_cast<float>(truncation_m),
              quanta = kQuanta / limit_m;  // in 1 m
 
-  const auto add_ray = [&](std::int64_t i, std::vector<Sum>& sums) {
+  const auto add_ray = [&](std::int64_t i, LargeVector<Sum>& sums) {
     NearbyRows leaf_rows(table.leaves());
     const float *n = rays.normals + 3 * i, *p = rays.points + 3 * i;
     const auto weight = static_cast<std::uint32_t>(rays.weights[i]);
@@ -94,16 +95,16 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   const auto num_rows = static_cast<std::size_t>(table.num_rows());
   const std::int64_t most = std::min<std::int64_t>(kMaxGroups, resolve_num_threads(num_threads));
   const std::int64_t num_groups = std::clamp<std::int64_t>(rays.count / kRaysOfGroup, 1, most);
-  std::vector<std::vector<Sum>> groups(static_cast<std::size_t>(num_groups));
+  std::vector<LargeVector<Sum>> groups(static_cast<std::size_t>(num_groups));
   parallel_tasks(num_groups, num_threads, [&](std::int64_t g) {
-    std::vector<Sum>& sums = groups[static_cast<std::size_t>(g)];
+    LargeVector<Sum>& sums = groups[static_cast<std::size_t>(g)];
     sums.resize(num_rows);
     for (std::int64_t i = rays.count * g / num_groups; i < rays.count * (g + 1) / num_groups; ++i) add_ray(i, sums);
   });
   parallel_blocks(table.num_rows(), 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (auto row = static_cast<std::size_t>(begin); row < static_cast<std::size_t>(end); ++row) {
       Sum total;
-      for (const std::vector<Sum>& sums : groups) total += sums[row];
+      for (const LargeVector<Sum>& sums : groups) total += sums[row];
       const double weight = static_cast<double>(total.weight) * static_cast<double>(quanta);
       distances_m[row] = total.weight > 0 ? static_cast<float>(static_cast<double>(total.distance) / weight) : 0;
       sides[row] = total.side();

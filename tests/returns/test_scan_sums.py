@@ -10,8 +10,9 @@ import operator
 
 import numpy as np
 import pytest
+from radarsdf._core import QUANTA
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.sums import QUANTA, UPPER, MeanRays, ReturnCells, ScanSums
+from radarsdf.returns.sums import UPPER, MeanRays, ReturnCells, ScanSums
 
 from ..conftest import ground_and_wall
 
