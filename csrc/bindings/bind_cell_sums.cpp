@@ -127,6 +127,50 @@ void bind_cell_sums(py::module_& m) {
       "DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, the row of "
       "each "
       "return's cell.");
+  m.attr("QUANTA") = kQuanta;
+  const auto check_sums = [](const Array<std::uint64_t>& keys, const Array<std::int64_t>& sums) {
+    const std::int64_t count = check_column(keys, "keys");
+    check_shape(sums, count, kSums, "sums");
+    return count;
+  };
+  m.def(
+      "merge_sums",
+      [check_sums](const Array<std::uint64_t>& keys, const Array<std::int64_t>& sums, double leaf_size_m) {
+        const std::int64_t count = check_sums(keys, sums);
+        const std::uint64_t* k = keys.data();
+        const std::int64_t* s = sums.data();
+        Moments merged;
+        {
+          const py::gil_scoped_release release;
+          merged = merge_sums(k, s, count, leaf_size_m);
+        }
+        const auto rows = static_cast<py::ssize_t>(merged.keys.size());
+        return std::make_pair(
+            to_array(std::move(merged.keys)),
+            Array<double>(to_array(std::move(merged.numbers)).reshape({rows, py::ssize_t{kSums - 1}})));
+      },
+      "keys"_a.noconvert(), "sums"_a.noconvert(), "leaf_size_m"_a,
+      "Keys (P,) uint64, ascending, of the cells twice as large as leaf cells with these `keys` (C,), ascending, and "
+      "moments (P, 13) float64 of their returns, local frame, m, from `sums` (C, 14) of `sum_returns`.");
+  m.def(
+      "mean_rays",
+      [check_sums](const Array<std::uint64_t>& keys, const Array<std::int64_t>& sums, double leaf_size_m,
+                   int num_threads) {
+        const auto count = static_cast<py::ssize_t>(check_sums(keys, sums));
+        Array<float> points({count, py::ssize_t{3}}), directions({count, py::ssize_t{3}}), ranges(count), counts(count);
+        const MeanRays means{points.mutable_data(), directions.mutable_data(), ranges.mutable_data(),
+                             counts.mutable_data()};
+        const std::uint64_t* k = keys.data();
+        const std::int64_t* s = sums.data();
+        {
+          const py::gil_scoped_release release;
+          mean_rays(k, s, count, leaf_size_m, means, num_threads);
+        }
+        return std::make_tuple(points, directions, ranges, counts);
+      },
+      "keys"_a.noconvert(), "sums"_a.noconvert(), "leaf_size_m"_a, "num_threads"_a = 0,
+      "Of the returns in each leaf cell, from `sums` (C, 14) of `sum_returns`: mean points (C, 3) and unit directions "
+      "(C, 3), ranges (C,) and number (C,), float32, local frame, m.");
   m.def(
       "principal_axes",
       [](const Array<double>& matrices, int num_threads) {

@@ -50,11 +50,11 @@ VertexTableClass bind_vertex_table(py::module_& m) {
           "Lattice coordinates of the occupied leaf cells (C, 3) int32: cell i spans [i, i + 1) * leaf_size_m.");
   table.def(
       "leaf_vertices",
-      [](const VertexTable& t) {
+      [](const VertexTable& t, int num_threads) {
         LeafVertices vertices;
         {
           const py::gil_scoped_release release;
-          vertices = leaf_vertices(t);
+          vertices = leaf_vertices(t, num_threads);
         }
         const auto rows = static_cast<py::ssize_t>(vertices.coordinates.size() / 3);
         const auto cells = static_cast<py::ssize_t>(vertices.of_cells.size() / 8);
@@ -62,6 +62,7 @@ VertexTableClass bind_vertex_table(py::module_& m) {
             Array<std::int32_t>(to_array(std::move(vertices.coordinates)).reshape({rows, py::ssize_t{3}})),
             Array<std::int32_t>(to_array(std::move(vertices.of_cells)).reshape({cells, py::ssize_t{8}})));
       },
+      "num_threads"_a = 0,
       "Of an octree: lattice coordinates (V, 3) int32 of the leaf cells' vertices, in the order of the feature "
       "matrix, whose first V rows are theirs, and the vertices (C, 8) int32 of each cell, in C order.");
   return table;

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
+#include "returns/scan_rays.hpp"
 #include "returns/visibility.hpp"
 
 namespace radarsdf {
@@ -52,6 +53,33 @@ void bind_visibility(py::module_& m) {
       "cells"_a.noconvert(), "scans"_a.noconvert(), "num_cells"_a, "num_threads"_a = 0,
       "Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each "
       "return's cell; `scans` (N,) int32, ascending.");
+  m.def(
+      "scan_rays",
+      [](const Array<double>& points, const Array<double>& rotation, const Array<double>& position,
+         const Array<double>& seen_from, double min_range_m, double max_range_m) {
+        const std::int64_t count = check_points(points);
+        check_shape(rotation, 3, 3, "rotation");
+        if (check_column(position, "position") != 3 || check_column(seen_from, "seen_from") != 3)
+          throw std::invalid_argument("position and seen_from must have shape (3,)");
+        Array<bool> kept(static_cast<py::ssize_t>(count));
+        std::vector<float> to(static_cast<std::size_t>(3 * count)), along(to.size());
+        std::vector<float> ranges(static_cast<std::size_t>(count));
+        const PlacedScan scan{points.data(), count, rotation.data(), position.data(), seen_from.data()};
+        const auto rows = static_cast<std::size_t>(
+            scan_rays(scan, min_range_m, max_range_m, kept.mutable_data(), to.data(), along.data(), ranges.data()));
+        to.resize(3 * rows);
+        along.resize(3 * rows);
+        ranges.resize(rows);
+        const auto shape = {static_cast<py::ssize_t>(rows), py::ssize_t{3}};
+        return py::make_tuple(kept, to_array(std::move(to)).reshape(shape), to_array(std::move(along)).reshape(shape),
+                              to_array(std::move(ranges)));
+      },
+      "points"_a.noconvert(), "rotation"_a.noconvert(), "position"_a.noconvert(), "seen_from"_a.noconvert(),
+      "min_range_m"_a, "max_range_m"_a,
+      "Which of the `points` (N, 3) of a scan, sensor frame, m, lie within the ranges from the sensor, (N,) bool, and "
+      "these K returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. `rotation` "
+      "(3, 3) from the sensor to the world, `position` (3,) of the sensor and `seen_from` (3,), where the rays begin, "
+      "local frame, m, float64.");
 }
 
 }  // namespace radarsdf

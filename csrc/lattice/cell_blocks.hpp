@@ -29,6 +29,29 @@ struct Occupancy {
   }
 };
 
+// The parts of a block that lie at even places along an axis (0 and 2), at place 1, and at place 3. A part's place is
+// two bits of its Morton number: bit `axis` is the low one and bit `axis + 3` the high one.
+constexpr std::uint64_t parts_where(int axis, bool low_bit, bool any_high_bit, bool high_bit) {
+  std::uint64_t mask = 0;
+  for (int i = 0; i < 64; ++i) {
+    if ((i >> axis & 1) == low_bit && (any_high_bit || (i >> (axis + 3) & 1) == high_bit))
+      mask |= std::uint64_t{1} << i;
+  }
+  return mask;
+}
+constexpr std::uint64_t kEven[3] = {parts_where(0, false, true, false), parts_where(1, false, true, false),
+                                    parts_where(2, false, true, false)};
+constexpr std::uint64_t kOne[3] = {parts_where(0, true, false, false), parts_where(1, true, false, false),
+                                   parts_where(2, true, false, false)};
+constexpr std::uint64_t kThree[3] = {parts_where(0, true, false, true), parts_where(1, true, false, true),
+                                     parts_where(2, true, false, true)};
+
+// All parts one further along the axis: those that stay in the block, and those that are in the next one.
+inline std::uint64_t shifted(std::uint64_t mask, int axis) {
+  return (mask & kEven[axis]) << (1 << axis) | (mask & kOne[axis]) << (7 << axis);
+}
+inline std::uint64_t carried(std::uint64_t mask, int axis) { return (mask & kThree[axis]) >> (9 << axis); }
+
 class CellBlocks {
  public:
   // keys: Morton keys, ascending, each once; a key's position is its row. Throws std::invalid_argument.

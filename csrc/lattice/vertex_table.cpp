@@ -20,6 +20,9 @@
 namespace radarsdf {
 namespace {
 
+// The bits of a key that hold the coordinate along an axis.
+constexpr std::uint64_t key_bits(int axis) { return std::uint64_t{0x1249249249249249} << axis; }
+
 // The corners of a cell that carry features of their own: on one plane of the tri-quadtree (the axis that the plane
 // leaves out is zero in every key, so cells of one column share vertices), or in space.
 struct VertexGroup {
@@ -29,21 +32,20 @@ struct VertexGroup {
   std::uint64_t project(std::uint64_t cell_key) const {
     std::uint64_t key = 0;
     for (int axis = 0; axis < 3; ++axis) {
-      if (uses_axis[static_cast<std::size_t>(axis)]) key |= spread_bits(morton_coordinate(cell_key, axis)) << axis;
+      if (uses_axis[static_cast<std::size_t>(axis)]) key |= cell_key & key_bits(axis);
     }
     return key;
   }
 
-  // Corner c of a projected cell: bit i of c steps along the i-th axis that is used.
-  std::uint64_t corner(std::uint64_t projected_key, int c) const {
-    std::uint64_t key = 0;
-    int bit = 0;
+  // The corners of a projected cell: bit i of a corner's number steps along the i-th axis that is used.
+  void corners(std::uint64_t projected_key, std::uint64_t* keys) const {
+    keys[0] = projected_key;
+    int count = 1;
     for (int axis = 0; axis < 3; ++axis) {
       if (!uses_axis[static_cast<std::size_t>(axis)]) continue;
-      const std::uint32_t step = static_cast<std::uint32_t>(c >> bit++) & 1u;
-      key |= spread_bits(morton_coordinate(projected_key, axis) + step) << axis;
+      for (int c = 0; c < count; ++c) keys[c + count] = morton_neighbour(keys[c], axis, 1);
+      count *= 2;
     }
-    return key;
   }
 };
 
@@ -71,26 +73,20 @@ class BlockMasks {
     blocks_[static_cast<std::size_t>(found)].parts.mask |= mask;
   }
 
-  // Numbers what is there from `first_row` on, in the order of the keys, and returns how much that is.
-  std::int64_t number(std::int64_t first_row, int num_threads) {
-    std::vector<std::uint64_t> keys;
-    keys.reserve(blocks_.size());
-    std::int64_t count = 0;
-    for (const Block& block : blocks_) {
-      keys.push_back(block.key);
-      count += count_bits(block.parts.mask);
-    }
-    if (first_row + count > std::numeric_limits<std::int32_t>::max()) {
-      throw std::invalid_argument("the map needs more than 2^31 vertices: use larger cells");
-    }
-    parallel_sort(keys, num_threads);
+  // Sorts the blocks, numbers what is there from `first_row` on, in the order of the keys, and returns how much that
+  // is.
+  std::int64_t number(std::int64_t first_row) {
+    std::sort(blocks_.begin(), blocks_.end(), [](const VertexBlock& a, const VertexBlock& b) { return a.key < b.key; });
+    numbers_.clear();
     std::int64_t row = first_row;
-    for (const std::uint64_t key : keys) {
-      Occupancy& parts = blocks_[static_cast<std::size_t>(numbers_.find(key))].parts;
-      parts.first = static_cast<std::int32_t>(row);
-      row += count_bits(parts.mask);
+    for (std::size_t i = 0; i < blocks_.size(); ++i) {
+      numbers_.insert(blocks_[i].key, static_cast<std::int32_t>(i));
+      blocks_[i].parts.first = static_cast<std::int32_t>(row);
+      row += count_bits(blocks_[i].parts.mask);
+      if (row > std::numeric_limits<std::int32_t>::max())
+        throw std::invalid_argument("the map needs more than 2^31 vertices: use larger cells");
     }
-    return count;
+    return row - first_row;
   }
 
   const Occupancy* find(std::uint64_t block_key) const {
@@ -98,108 +94,101 @@ class BlockMasks {
     return found >= 0 ? &blocks_[static_cast<std::size_t>(found)].parts : nullptr;
   }
 
-  struct Block {
-    std::uint64_t key;
-    Occupancy parts;
-  };
-  const std::vector<Block>& blocks() const { return blocks_; }
+  std::vector<VertexBlock>& blocks() { return blocks_; }
 
  private:
   FlatMap numbers_;
-  std::vector<Block> blocks_;
+  std::vector<VertexBlock> blocks_;
 };
 
-// The parts of a block that lie at even places along an axis (0 and 2), at place 1, and at place 3. A part's place is
-// two bits of its Morton number: bit `axis` is the low one and bit `axis + 3` the high one.
-constexpr std::uint64_t parts_where(int axis, bool low_bit, bool any_high_bit, bool high_bit) {
-  std::uint64_t mask = 0;
-  for (int i = 0; i < 64; ++i) {
-    if ((i >> axis & 1) == low_bit && (any_high_bit || (i >> (axis + 3) & 1) == high_bit))
-      mask |= std::uint64_t{1} << i;
-  }
-  return mask;
-}
-constexpr std::uint64_t kEven[3] = {parts_where(0, false, true, false), parts_where(1, false, true, false),
-                                    parts_where(2, false, true, false)};
-constexpr std::uint64_t kOne[3] = {parts_where(0, true, false, false), parts_where(1, true, false, false),
-                                   parts_where(2, true, false, false)};
-constexpr std::uint64_t kThree[3] = {parts_where(0, true, false, true), parts_where(1, true, false, true),
-                                     parts_where(2, true, false, true)};
+// A block and the vertices after it, in a cube of 5 x 5 x 5, x slowest: the places of the block's parts, and for the
+// block itself and each of the seven after it which of its parts are in the cube.
+struct Corners {
+  std::uint8_t places[64] = {};
+  std::uint64_t masks[8] = {};
 
-// All parts one further along the axis: those that stay in the block, and those that are in the next one.
-std::uint64_t shifted(std::uint64_t mask, int axis) {
-  return (mask & kEven[axis]) << (1 << axis) | (mask & kOne[axis]) << (7 << axis);
-}
-std::uint64_t carried(std::uint64_t mask, int axis) { return (mask & kThree[axis]) >> (9 << axis); }
-
-// Gives every vertex of the group at this level a row, from first_row on, and writes the rows into the cells at
-// slot `first_corner`. Returns the number of vertices.
-std::int64_t assign_rows(const VertexGroup& group, const std::vector<std::uint64_t>& keys, Cell* cells,
-                         int first_corner, std::int64_t first_row, int num_threads) {
-  std::vector<std::uint64_t> projected(keys.size());
-  const auto count = static_cast<std::int64_t>(keys.size());
-  parallel_blocks(count, 1 << 13, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i)
-      projected[i] = group.project(keys[i]);
-  });
-  BlockMasks columns(0);
-  for (std::size_t i = 0; i < projected.size();) {
-    const std::uint64_t block_key = CellBlocks::block_key(projected[i]);
-    std::uint64_t mask = 0;
-    for (; i < projected.size() && CellBlocks::block_key(projected[i]) == block_key; ++i) {
-      mask |= std::uint64_t{1} << (projected[i] & 63);
+  constexpr Corners() {
+    for (int part = 0; part < 64; ++part) {
+      int place = 0, inside = 7;
+      for (int axis = 0; axis < 3; ++axis) {
+        const int at = (part >> axis & 1) | (part >> (axis + 2) & 2);
+        place += at * kStrides[axis];
+        if (at > 0) inside &= ~(1 << axis);
+      }
+      places[part] = static_cast<std::uint8_t>(place);
+      for (int block = 0; block < 8; ++block) {
+        if ((block & ~inside) == 0) masks[block] |= std::uint64_t{1} << part;
+      }
     }
+  }
+
+  static constexpr int kStrides[3] = {25, 5, 1};
+};
+constexpr Corners kCorners;
+
+// Gives every vertex of the group at this level a row, from next_row on, and writes the rows into the cells at
+// slot `first_corner`. Returns the vertices.
+std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector<std::uint64_t>& keys, Cell* cells,
+                                     int first_corner, std::int64_t& next_row, int num_threads) {
+  const auto count = static_cast<std::int64_t>(keys.size());
+  const auto block_of = [&](std::size_t i) { return CellBlocks::block_key(group.project(keys[i])); };
+  BlockMasks columns(0);
+  for (std::size_t i = 0; i < keys.size();) {
+    const std::uint64_t block_key = block_of(i);
+    std::uint64_t mask = 0;
+    for (; i < keys.size() && block_of(i) == block_key; ++i) mask |= std::uint64_t{1} << (group.project(keys[i]) & 63);
     columns.add(block_key, mask);
   }
 
   check_interrupt();
   const int num_corners = group.num_corners;
+  int axes[8] = {};  // of the corners, bit `axis` for each that they step along
   BlockMasks vertices(2 * columns.blocks().size());
-  for (const BlockMasks::Block& block : columns.blocks()) {
+  for (const VertexBlock& block : columns.blocks()) {
     // Parts of the block itself and of those after it, numbered as the corners of a cell are.
-    std::uint64_t masks[8] = {block.parts.mask};
+    std::uint64_t masks[8] = {block.parts.mask}, block_keys[8];
+    group.corners(block.key, block_keys);
     int bit = 1;
     for (int axis = 0; axis < 3; ++axis) {
       if (!group.uses_axis[static_cast<std::size_t>(axis)]) continue;
       for (int c = 0; c < bit; ++c) {
+        axes[c + bit] = axes[c] | 1 << axis;
         masks[c + bit] = carried(masks[c], axis);
         masks[c] |= shifted(masks[c], axis);
       }
       bit *= 2;
     }
-    for (int c = 0; c < num_corners; ++c) {
-      if (masks[c] != 0) vertices.add(group.corner(block.key, c), masks[c]);
-    }
+    for (int c = 0; c < num_corners; ++c) vertices.add(block_keys[c], masks[c]);
   }
 
   check_interrupt();
-  const std::int64_t num_vertices = vertices.number(first_row, num_threads);
+  next_row += vertices.number(next_row);
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
     std::uint64_t block_key = kEmptyKey;
-    const Occupancy* blocks[8] = {};
+    int steps[8] = {};
+    for (int c = 0; c < num_corners; ++c)
+      for (int axis = 0; axis < 3; ++axis) steps[c] += (axes[c] >> axis & 1) * Corners::kStrides[axis];
+    std::int32_t rows[5 * 5 * 5] = {};
     for (std::int64_t i = begin; i < end; ++i) {
-      const std::uint64_t key = projected[static_cast<std::size_t>(i)];
+      const std::uint64_t key = group.project(keys[static_cast<std::size_t>(i)]);
       if (CellBlocks::block_key(key) != block_key) {
         block_key = CellBlocks::block_key(key);
-        for (int c = 0; c < num_corners; ++c) blocks[c] = vertices.find(group.corner(block_key, c));
-      }
-      for (int c = 0; c < num_corners; ++c) {
-        std::uint64_t part = key & 63;
-        int block = 0, bit = 0;
-        for (int axis = 0; axis < 3; ++axis) {
-          if (!group.uses_axis[static_cast<std::size_t>(axis)]) continue;
-          if (c >> bit & 1) {
-            const bool low = part >> axis & 1, high = part >> (axis + 3) & 1;
-            part += static_cast<std::uint64_t>(!low ? 1 : high ? -9 : 7) << axis;
-            if (low && high) block |= 1 << bit;
+        std::uint64_t block_keys[8];
+        group.corners(block_key, block_keys);
+        for (int c = 0; c < num_corners; ++c) {
+          const Occupancy* block = vertices.find(block_keys[c]);
+          if (block == nullptr) continue;
+          for (std::uint64_t bits = block->mask & kCorners.masks[axes[c]]; bits != 0; bits &= bits - 1) {
+            const int part = lowest_bit(bits);
+            rows[kCorners.places[part] + 4 * steps[c]] = block->row(static_cast<std::uint64_t>(part));
           }
-          ++bit;
         }
-        cells[i].rows[first_corner + c] = blocks[block]->row(part);
       }
+      const std::int32_t* first = rows + kCorners.places[key & 63];
+      for (int c = 0; c < num_corners; ++c) cells[i].rows[first_corner + c] = first[steps[c]];
     }
   });
-  return num_vertices;
+  return std::move(vertices.blocks());
 }
 
 // Cells of the next coarser level.
@@ -221,18 +210,20 @@ inline int count_eight_bits(std::uint32_t eight_bits) {
 
 VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_m, int num_levels, Encoding encoding,
                          int num_threads)
-    : leaf_keys_(std::move(leaf_keys)), leaf_size_m_(leaf_size_m), num_levels_(num_levels), encoding_(encoding) {
+    : leaf_keys_(std::move(leaf_keys)),
+      leaf_size_m_(leaf_size_m),
+      num_levels_(num_levels),
+      encoding_(encoding),
+      leaves_(leaf_keys_.data(), static_cast<std::int64_t>(leaf_keys_.size())) {
   if (!(leaf_size_m > 0) || !std::isfinite(leaf_size_m))
     throw std::invalid_argument("leaf_size_m must be positive and finite");
   if (num_levels < 1 || num_levels > kMaxLevels) throw std::invalid_argument("num_levels must be 1 to 12");
   for (std::size_t i = 0; i < leaf_keys_.size(); ++i) {
-    if (i > 0 && leaf_keys_[i - 1] >= leaf_keys_[i])
-      throw std::invalid_argument("leaf_keys must be ascending and unique");
     for (int axis = 0; axis < 3; ++axis) {
       // The far vertex of a cell, at every level, must fit its key.
-      if (leaf_keys_[i] >> 63 || morton_coordinate(leaf_keys_[i], axis) >= (1u << kAxisBits) - (1u << num_levels)) {
+      const std::uint64_t last = key_bits(axis) >> (3 * num_levels) << (3 * num_levels);
+      if (leaf_keys_[i] >> 63 || (leaf_keys_[i] & last) == last)
         throw std::invalid_argument("leaf_keys holds a cell outside the lattice");
-      }
     }
   }
 
@@ -253,7 +244,8 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
     Cell* level_cells = cells_.data() + first;
     int corner = 0;
     for (const VertexGroup& group : vertex_groups(encoding)) {
-      num_rows_ += assign_rows(group, level_keys, level_cells, corner, num_rows_, num_threads);
+      std::vector<VertexBlock> blocks = assign_rows(group, level_keys, level_cells, corner, num_rows_, num_threads);
+      if (first == 0 && encoding == Encoding::kOctree) leaf_vertex_blocks_ = std::move(blocks);
       corner += group.num_corners;
     }
     if (&level_keys != &keys.back()) {
@@ -267,16 +259,13 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
     }
     first += level_keys.size();
   }
-  roots_ = FlatMap(keys.back().size());
-  const std::size_t first_root = total - keys.back().size();
-  for (std::size_t i = 0; i < keys.back().size(); ++i) {
-    roots_.insert(keys.back()[i], static_cast<std::int32_t>(first_root + i));
-  }
+  if (num_levels > 1) roots_ = CellBlocks(keys.back().data(), static_cast<std::int64_t>(keys.back().size()));
 }
 
 template <typename T>
 void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cells) const {
-  const FlatMapView roots = roots_.view();
+  NearbyRows roots(num_levels_ == 1 ? leaves_ : roots_);
+  const std::int32_t first_root = num_levels_ == 1 ? 0 : static_cast<std::int32_t>(num_cells() - roots_.size());
   const T inverse = static_cast<T>(1.0 / leaf_size_m_), limit = static_cast<T>(kAxisBias);
   const int coarsest = num_levels_ - 1;
   // In stages over a block that stays in the first-level cache, so that the misses of many points overlap.
@@ -293,10 +282,10 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
       for (int axis = 0; axis < 3; ++axis)
         leaf[i][axis] = static_cast<std::uint32_t>(floor_to_int(u[axis]) + kAxisBias);
       root_key[i] = morton_key(leaf[i][0] >> coarsest, leaf[i][1] >> coarsest, leaf[i][2] >> coarsest);
-      prefetch(&roots.slots[roots.home(root_key[i])]);
     }
     for (std::int64_t i = 0; i < size; ++i) {
-      const std::int32_t root = root_key[i] == kEmptyKey ? -1 : roots.find(root_key[i]);
+      const std::int32_t row = root_key[i] == kEmptyKey ? -1 : roots.row(root_key[i]);
+      const std::int32_t root = row >= 0 ? first_root + row : -1;
       cells[(first + i) * num_levels_ + coarsest] = root;
       if (root >= 0) prefetch(&cells_[static_cast<std::size_t>(root)]);
     }
@@ -326,33 +315,33 @@ std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& key
   return coordinates;
 }
 
-std::vector<std::uint64_t> leaf_vertex_keys(const VertexTable& table) {
+LeafVertices leaf_vertices(const VertexTable& table, int num_threads) {
   if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
-  const std::vector<std::uint64_t>& leaf_keys = table.leaf_keys();
-  const auto rows_of = [&](std::size_t cell) { return table.cells()[cell].rows; };
-  std::int32_t num_rows = 0;
-  for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell)
-    num_rows = std::max(num_rows, *std::max_element(rows_of(cell), rows_of(cell) + 8) + 1);
-  std::vector<std::uint64_t> keys(static_cast<std::size_t>(num_rows));
-  for (std::size_t cell = 0; cell < leaf_keys.size(); ++cell) {
-    std::uint64_t corners[8] = {leaf_keys[cell]};
-    for (int axis = 0; axis < 3; ++axis)
-      for (int c = 0; c < 1 << axis; ++c) corners[c + (1 << axis)] = morton_neighbour(corners[c], axis, 1);
-    for (int c = 0; c < 8; ++c) keys[static_cast<std::size_t>(rows_of(cell)[c])] = corners[c];
-  }
-  return keys;
-}
-
-LeafVertices leaf_vertices(const VertexTable& table) {
-  LeafVertices vertices{leaf_coordinates(leaf_vertex_keys(table)), {}};
-  const std::size_t num_cells = table.leaf_keys().size();
-  vertices.of_cells.resize(8 * num_cells);
-  for (std::size_t i = 0; i < num_cells; ++i) {
-    for (std::size_t c = 0; c < 8; ++c) {
-      // The table's corners step along x first, those in C order along z.
-      vertices.of_cells[8 * i + c] = table.cells()[i].rows[(c & 1) << 2 | (c & 2) | c >> 2];
+  const std::vector<VertexBlock>& blocks = table.leaf_vertex_blocks();
+  const auto num_cells = static_cast<std::int64_t>(table.leaf_keys().size());
+  const std::int64_t num_vertices =
+      blocks.empty() ? 0 : blocks.back().parts.first + count_bits(blocks.back().parts.mask);
+  LeafVertices vertices{std::vector<std::int32_t>(static_cast<std::size_t>(3 * num_vertices)),
+                        std::vector<std::int32_t>(static_cast<std::size_t>(8 * num_cells))};
+  const auto num_blocks = static_cast<std::int64_t>(blocks.size());
+  parallel_blocks(num_blocks, 1 << 9, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (auto block = blocks.begin() + begin; block != blocks.begin() + end; ++block) {
+      std::int32_t* to = vertices.coordinates.data() + 3 * std::int64_t{block->parts.first};
+      for (std::uint64_t bits = block->parts.mask; bits != 0; bits &= bits - 1) {
+        const std::uint64_t key = block->key << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(bits));
+        for (int axis = 0; axis < 3; ++axis)
+          *to++ = static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias;
+      }
     }
-  }
+  });
+  parallel_blocks(num_cells, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const std::int32_t* rows = table.cells()[static_cast<std::size_t>(i)].rows;
+      std::int32_t* to = vertices.of_cells.data() + 8 * i;
+      // The table's corners step along x first, those in C order along z.
+      for (int c = 0; c < 8; ++c) to[c] = rows[(c & 1) << 2 | (c & 2) | c >> 2];
+    }
+  });
   return vertices;
 }
 

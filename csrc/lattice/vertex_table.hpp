@@ -12,7 +12,7 @@
 #include <vector>
 
 #include "lattice/cell.hpp"
-#include "lattice/flat_map.hpp"
+#include "lattice/cell_blocks.hpp"
 #include "util/large_array.hpp"
 
 namespace radarsdf {
@@ -20,6 +20,12 @@ namespace radarsdf {
 // The corners of a cell that carry features, in groups: one for each plane of a tri-quadtree, or one for all of space.
 constexpr int num_vertex_groups(Encoding encoding) { return encoding == Encoding::kTriQuadtree ? 3 : 1; }
 constexpr int corners_per_group(Encoding encoding) { return encoding == Encoding::kTriQuadtree ? 4 : 8; }
+
+// The vertices of a block of 4 x 4 x 4, and their rows.
+struct VertexBlock {
+  std::uint64_t key;  // of CellBlocks::block_key
+  Occupancy parts;
+};
 
 class VertexTable {
  public:
@@ -35,6 +41,9 @@ class VertexTable {
   Encoding encoding() const { return encoding_; }
   const std::vector<std::uint64_t>& leaf_keys() const { return leaf_keys_; }
   const UninitialisedVector<Cell>& cells() const { return cells_; }
+  const CellBlocks& leaves() const { return leaves_; }
+  // Of an octree, the vertices of the leaf cells, in Morton order: their rows are the first of the feature matrix.
+  const std::vector<VertexBlock>& leaf_vertex_blocks() const { return leaf_vertex_blocks_; }
 
   // The occupied cell of every level, finest first, that holds each point, or -1: (count, num_levels). Points outside
   // the lattice and NaN are in no cell. Leaf cells have the numbers of their keys, from 0; coarser ones follow.
@@ -47,20 +56,17 @@ class VertexTable {
   int num_levels_;
   Encoding encoding_;
   UninitialisedVector<Cell> cells_;
-  FlatMap roots_;
+  CellBlocks leaves_, roots_{nullptr, 0};  // the second of a table with more than one level
+  std::vector<VertexBlock> leaf_vertex_blocks_;
   std::int64_t num_rows_ = 0;
 };
-
-// Morton keys of the vertices of the leaf cells of an octree, in the order of their rows, which are the first of the
-// feature matrix. Throws std::invalid_argument for another table.
-std::vector<std::uint64_t> leaf_vertex_keys(const VertexTable& table);
 
 // Of a table of an octree, the vertices of the leaf cells: the coordinates (rows, 3) of those that the first rows of
 // the feature matrix belong to, and the rows (leaf cells, 8) of each cell's, in C order. Throws std::invalid_argument.
 struct LeafVertices {
   std::vector<std::int32_t> coordinates, of_cells;
 };
-LeafVertices leaf_vertices(const VertexTable& table);
+LeafVertices leaf_vertices(const VertexTable& table, int num_threads);
 
 // Lattice coordinates (size, 3) of cells or vertices: cell i spans [i, i + 1) * leaf_size_m.
 std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& keys);

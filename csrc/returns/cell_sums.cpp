@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <iterator>
 #include <stdexcept>
 #include <vector>
 
@@ -19,6 +20,8 @@ namespace {
 constexpr std::int32_t kEdge = 1 << kBlockBits;
 
 constexpr std::int32_t kWide = kEdge + 2;
+
+constexpr int kFewColumns = 4;  // the choice depends on nothing else, or bits would depend on which keys are asked for
 
 constexpr std::int32_t part_coordinate(int part, int axis) { return (part >> axis & 1) | (part >> (axis + 2) & 2); }
 
@@ -83,64 +86,60 @@ class BlocksRound {
     }
   }
 
-  // The row of the cell at these coordinates, counted from the middle block's first cell; -1 where there is none.
-  std::int32_t row(std::int32_t x, std::int32_t y, std::int32_t z) const {
-    const auto block = [](std::int32_t v) { return (v + kEdge) >> kBlockBits; };
-    const Occupancy* found = blocks_[9 * block(x) + 3 * block(y) + block(z)];
-    if (found == nullptr) return -1;
-    return found->row(child_[x & 3] | child_[y & 3] << 1 | child_[z & 3] << 2);
-  }
-
  private:
-  static constexpr std::uint64_t child_[kEdge] = {0, 1, 8, 9};  // spread_bits of 0 to 3
-
   const CellBlocks* cells_;
   std::uint64_t block_key_ = kEmptyKey, region_key_ = kEmptyKey;
   const Occupancy* region_ = nullptr;
   const Occupancy* blocks_[27] = {};
 };
 
-// From how many keys in a block on it is less work to add up round all 64, axis after axis.
-constexpr std::int64_t kManyKeys = 5;
+// Sums of some columns over the cells near each of a block's, axis after axis, (64, columns) in Morton order. Of few
+// columns this is less work than near each key. `cube` is scratch.
+class SumsOfBlock {
+ public:
+  SumsOfBlock(const double* values, int columns, double weight)
+      : values_(values), columns_(columns), weight_(weight), sums_(static_cast<std::size_t>(64 * columns)) {}
 
-// sums: (64, columns), in Morton order, of the values in the 27 cells round each of a block's. `cube` is scratch.
-void neighbour_sums_of_block(const BlocksRound& round, const double* values, int columns, std::vector<double>& cube,
-                             double* sums) {
-  constexpr std::int32_t kPlaces = kWide * kWide * kWide;
-  cube.assign(static_cast<std::size_t>(kPlaces * columns), 0.0);
-  round.for_each([&](std::int32_t row, std::int32_t place) {
-    for (int k = 0; k < columns; ++k) {
-      cube[static_cast<std::size_t>(kPlaces * k + place)] = values[columns * std::int64_t{row} + k];
-    }
-  });
-  for (int k = 0; k < columns; ++k) {
-    double along_z[kWide][kWide][kEdge], along_y[kWide][kEdge][kEdge];
-    for (std::int32_t x = 0; x < kWide; ++x) {
-      for (std::int32_t y = 0; y < kWide; ++y) {
-        const double* line = &cube[static_cast<std::size_t>(kPlaces * k + (kWide * x + y) * kWide)];
-        for (std::int32_t z = 0; z < kEdge; ++z) along_z[x][y][z] = line[z] + line[z + 1] + line[z + 2];
+  void move_to(const BlocksRound& round) {
+    for (int k = 0; k < columns_; ++k) {
+      double cube[kWide][kWide][kWide] = {}, along_z[kWide][kWide][kEdge], along_y[kWide][kEdge][kEdge];
+      round.for_each([&](std::int32_t row, std::int32_t place) {
+        (&cube[0][0][0])[place] = values_[columns_ * std::int64_t{row} + k];
+      });
+      const auto near = [&](double before, double own, double after) { return weight_ * (before + after) + own; };
+      for (int x = 0; x < kWide; ++x) {
+        for (int y = 0; y < kWide; ++y)
+          for (int z = 0; z < kEdge; ++z) along_z[x][y][z] = near(cube[x][y][z], cube[x][y][z + 1], cube[x][y][z + 2]);
+        for (int y = 0; y < kEdge; ++y)
+          for (int z = 0; z < kEdge; ++z)
+            along_y[x][y][z] = near(along_z[x][y][z], along_z[x][y + 1][z], along_z[x][y + 2][z]);
       }
-      for (std::int32_t y = 0; y < kEdge; ++y) {
-        for (std::int32_t z = 0; z < kEdge; ++z) {
-          along_y[x][y][z] = along_z[x][y][z] + along_z[x][y + 1][z] + along_z[x][y + 2][z];
-        }
+      for (int i = 0; i < 64; ++i) {
+        const std::int32_t x = part_coordinate(i, 0), y = part_coordinate(i, 1), z = part_coordinate(i, 2);
+        sums_[static_cast<std::size_t>(columns_ * i + k)] =
+            near(along_y[x][y][z], along_y[x + 1][y][z], along_y[x + 2][y][z]);
       }
-    }
-    for (int i = 0; i < 64; ++i) {
-      const std::int32_t x = part_coordinate(i, 0), y = part_coordinate(i, 1), z = part_coordinate(i, 2);
-      sums[columns * std::int64_t{i} + k] = along_y[x][y][z] + along_y[x + 1][y][z] + along_y[x + 2][y][z];
     }
   }
-}
 
-// Whether more than kManyKeys of the ascending keys round keys[i] lie in its block: it depends on the keys alone.
-bool in_crowd(const std::uint64_t* keys, std::int64_t count, std::int64_t i) {
-  const std::uint64_t block_key = CellBlocks::block_key(keys[i]);
-  std::int64_t found = 0;
-  for (std::int64_t k = i; k >= 0 && found <= kManyKeys && CellBlocks::block_key(keys[k]) == block_key; --k) ++found;
-  for (std::int64_t k = i + 1; k < count && found <= kManyKeys && CellBlocks::block_key(keys[k]) == block_key; ++k)
-    ++found;
-  return found > kManyKeys;
+  const double* of(std::uint64_t key) const { return sums_.data() + columns_ * static_cast<std::int64_t>(key & 63); }
+
+ private:
+  const double* values_;
+  int columns_;
+  double weight_;
+  std::vector<double> sums_;
+};
+
+// The same sums from a corner that lies `steps` before: of (a + x)(b + y) that of xy + a y + b x + a b.
+template <typename T>
+void move_moments(const T* steps, T* sums) {
+  T* product = sums + 4;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = i; j < 3; ++j, ++product)
+      *product += steps[i] * sums[1 + j] + steps[j] * (sums[1 + i] + steps[i] * sums[0]);
+  }
+  for (int axis = 0; axis < 3; ++axis) sums[1 + axis] += steps[axis] * sums[0];
 }
 
 }  // namespace
@@ -165,38 +164,100 @@ void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std
   });
 }
 
+Moments merge_sums(const std::uint64_t* keys, const std::int64_t* sums, std::int64_t count, double leaf_size_m) {
+  constexpr int kColumns = kSums - 1;
+  const double quantum_m = leaf_size_m / static_cast<double>(kQuanta);
+  Moments merged;
+  std::int64_t total[kColumns];
+  for (std::int64_t i = 0; i < count;) {
+    const std::uint64_t parent = keys[i] >> 3;
+    std::fill(total, total + kColumns, std::int64_t{0});
+    for (; i < count && keys[i] >> 3 == parent; ++i) {
+      // Moved to the corner that the cells share: in integers, which is exact.
+      std::int64_t own[kColumns], steps[3];
+      std::copy_n(sums + kSums * i, kColumns, own);
+      for (int axis = 0; axis < 3; ++axis) steps[axis] = static_cast<std::int64_t>(keys[i] >> axis & 1) * kQuanta;
+      move_moments(steps, own);
+      for (int k = 0; k < kColumns; ++k) total[k] += own[k];
+    }
+    std::int32_t cell[3];
+    double corner_m[3], numbers[kColumns];
+    for (int axis = 0; axis < 3; ++axis) {
+      cell[axis] = static_cast<std::int32_t>(morton_coordinate(parent, axis)) - kAxisBias / 2;
+      corner_m[axis] = 2.0 * cell[axis] * static_cast<double>(kQuanta) * quantum_m;
+    }
+    for (int k = 0; k < kColumns; ++k) {
+      const double unit = k == 0 ? 1 : k < 4 ? quantum_m : k < 10 ? quantum_m * quantum_m : 1 / kDirectionQuanta;
+      numbers[k] = static_cast<double>(total[k]) * unit;
+    }
+    move_moments(corner_m, numbers);
+    merged.keys.push_back(lattice_key(cell));
+    merged.numbers.insert(merged.numbers.end(), numbers, numbers + kColumns);
+  }
+  return merged;
+}
+
+void mean_rays(const std::uint64_t* keys, const std::int64_t* sums, std::int64_t count, double leaf_size_m,
+               const MeanRays& means, int num_threads) {
+  constexpr double kLeast = 1e-6;  // length of a mean of unit directions. A shorter one has no meaningful direction
+  const double quantum_m = leaf_size_m / static_cast<double>(kQuanta);
+  parallel_blocks(count, 1 << 13, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const std::int64_t* own = sums + kSums * i;
+      const auto returns = static_cast<double>(own[0]);
+      double direction[3], length2 = 0;
+      for (int axis = 0; axis < 3; ++axis) {
+        const std::int64_t cell = static_cast<std::int32_t>(morton_coordinate(keys[i], axis)) - kAxisBias;
+        const double quanta = static_cast<double>(own[1 + axis]) / returns + static_cast<double>(cell * kQuanta);
+        means.points[3 * i + axis] = static_cast<float>(quanta * quantum_m);
+        direction[axis] = static_cast<double>(own[10 + axis]) / (kDirectionQuanta * returns);
+        length2 += direction[axis] * direction[axis];
+      }
+      const double length = std::sqrt(length2);
+      for (int axis = 0; axis < 3; ++axis)
+        means.directions[3 * i + axis] = length > kLeast ? static_cast<float>(direction[axis] / length)
+                                         : axis == 2     ? -1.0F
+                                                         : 0.0F;
+      means.ranges_m[i] = static_cast<float>(static_cast<double>(own[13]) * quantum_m / returns);
+      means.counts[i] = static_cast<float>(own[0]);
+    }
+  });
+}
+
 void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
                     int columns, double weight, double* sums, int num_threads) {
   const double weights[4] = {1, weight, std::pow(weight, 2), std::pow(weight, 3)};
-  std::fill(sums, sums + columns * count, 0.0);
+  const bool of_blocks = columns <= kFewColumns;
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
     BlocksRound round(cells);
+    SumsOfBlock block(values, of_blocks ? columns : 0, weight);
     std::uint64_t block_key = kEmptyKey;
-    bool add_up_block = false;
-    std::vector<double> block_sums(static_cast<std::size_t>(64 * columns)), cube;
+    std::int32_t rows[kWide * kWide * kWide];
     for (std::int64_t i = begin; i < end; ++i) {
+      double* own = sums + columns * i;
       if (CellBlocks::block_key(keys[i]) != block_key) {
         block_key = CellBlocks::block_key(keys[i]);
         round.move_to(block_key);
-        add_up_block = weight == 1 && in_crowd(keys, count, i);
-        if (add_up_block) neighbour_sums_of_block(round, values, columns, cube, block_sums.data());
+        if (of_blocks) {
+          block.move_to(round);
+        } else {
+          std::fill(std::begin(rows), std::end(rows), -1);
+          round.for_each([&](std::int32_t row, std::int32_t place) { rows[place] = row; });
+        }
       }
-      if (add_up_block) {
-        const double* own = block_sums.data() + columns * static_cast<std::int64_t>(keys[i] & 63);
-        std::copy(own, own + columns, sums + columns * i);
+      if (of_blocks) {
+        std::copy_n(block.of(keys[i]), columns, own);
         continue;
       }
-      std::int32_t cell[3];
-      for (int axis = 0; axis < 3; ++axis) {
-        cell[axis] = static_cast<std::int32_t>(morton_coordinate(keys[i], axis)) & (kEdge - 1);
-      }
+      std::fill_n(own, columns, 0.0);
+      const std::int32_t* near = rows + kNextTo.places[keys[i] & 63];
       for (int x = -1; x <= 1; ++x) {
         for (int y = -1; y <= 1; ++y) {
           for (int z = -1; z <= 1; ++z) {
-            const std::int32_t row = round.row(cell[0] + x, cell[1] + y, cell[2] + z);
+            const std::int32_t row = near[(kWide * x + y) * kWide + z];
             if (row < 0) continue;
             const double w = weights[x * x + y * y + z * z];
-            for (int k = 0; k < columns; ++k) sums[columns * i + k] += w * values[columns * std::int64_t{row} + k];
+            for (int k = 0; k < columns; ++k) own[k] += w * values[columns * std::int64_t{row} + k];
           }
         }
       }

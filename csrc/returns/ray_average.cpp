@@ -9,6 +9,7 @@
 
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_walk.hpp"
+#include "util/large_array.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
@@ -50,32 +51,42 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
                   std::int8_t* sides, int num_threads) {
   if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
   check_rays(rays.points, rays.directions, rays.count, table.leaf_size_m(), truncation_m);
-  const CellBlocks leaves(table.leaf_keys().data(), static_cast<std::int64_t>(table.leaf_keys().size()));
   const auto size_m = static_cast<float>(table.leaf_size_m()), limit_m = static_cast<float>(truncation_m),
              quanta = kQuanta / limit_m;  // in 1 m
 
-  const auto add_ray = [&](std::int64_t i, std::vector<Sum>& sums) {
-    NearbyRows leaf_rows(leaves);
+  const auto add_ray = [&](std::int64_t i, LargeVector<Sum>& sums) {
+    NearbyRows leaf_rows(table.leaves());
     const float *n = rays.normals + 3 * i, *p = rays.points + 3 * i;
     const auto weight = static_cast<std::uint32_t>(rays.weights[i]);
-    const float dx = size_m * n[0], dy = size_m * n[1], dz = size_m * n[2];
+    float steps_m[8];  // from the first corner of a cell to each of them
+    for (int c = 0; c < 8; ++c)
+      steps_m[c] = size_m * (static_cast<float>(c & 1) * n[0] + static_cast<float>(c >> 1 & 1) * n[1] +
+                             static_cast<float>(c >> 2) * n[2]);
     CellWalk cell(p, rays.directions + 3 * i, -truncation_m, truncation_m, table.leaf_size_m());
     for (; cell.inside(); cell.next()) {
       const std::int32_t leaf = leaf_rows.row(cell.key());
       if (leaf < 0) continue;
       const std::int32_t* rows = table.cells()[static_cast<std::size_t>(leaf)].rows;
-      float lower = 0;  // of the cell's first corner
+      float lower_m = 0;
       for (int axis = 0; axis < 3; ++axis)
-        lower += n[axis] * (static_cast<float>(cell.coordinate(axis)) * size_m - p[axis]);
+        lower_m += n[axis] * (static_cast<float>(cell.coordinate(axis)) * size_m - p[axis]);
+      // All corners at once, without branches.
+      std::int32_t cut[8];
+      std::uint32_t positive[8], in_front[8], behind[8];
       for (int c = 0; c < 8; ++c) {
-        const float distance_m = lower + (c & 1 ? dx : 0) + (c & 2 ? dy : 0) + (c & 4 ? dz : 0);
-        const float cut_m = std::min(std::max(distance_m, -limit_m), limit_m);
+        const float distance_m = lower_m + steps_m[c], at_least_m = distance_m < -limit_m ? -limit_m : distance_m;
+        cut[c] = static_cast<std::int32_t>(quanta * (at_least_m < limit_m ? at_least_m : limit_m));
+        positive[c] = distance_m > 0 ? weight : 0;
+        in_front[c] = distance_m > size_m ? weight : 0;
+        behind[c] = distance_m < -size_m ? weight : 0;
+      }
+      for (int c = 0; c < 8; ++c) {
         Sum& sum = sums[static_cast<std::size_t>(rows[c])];
+        sum.distance += std::int64_t{weight} * cut[c];
         sum.weight += weight;
-        sum.positive += distance_m > 0 ? weight : 0;
-        sum.in_front += distance_m > size_m ? weight : 0;
-        sum.behind += distance_m < -size_m ? weight : 0;
-        sum.distance += std::int64_t{weight} * static_cast<std::int32_t>(quanta * cut_m);
+        sum.positive += positive[c];
+        sum.in_front += in_front[c];
+        sum.behind += behind[c];
       }
     }
   };
@@ -84,16 +95,16 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   const auto num_rows = static_cast<std::size_t>(table.num_rows());
   const std::int64_t most = std::min<std::int64_t>(kMaxGroups, resolve_num_threads(num_threads));
   const std::int64_t num_groups = std::clamp<std::int64_t>(rays.count / kRaysOfGroup, 1, most);
-  std::vector<std::vector<Sum>> groups(static_cast<std::size_t>(num_groups));
+  std::vector<LargeVector<Sum>> groups(static_cast<std::size_t>(num_groups));
   parallel_tasks(num_groups, num_threads, [&](std::int64_t g) {
-    std::vector<Sum>& sums = groups[static_cast<std::size_t>(g)];
+    LargeVector<Sum>& sums = groups[static_cast<std::size_t>(g)];
     sums.resize(num_rows);
     for (std::int64_t i = rays.count * g / num_groups; i < rays.count * (g + 1) / num_groups; ++i) add_ray(i, sums);
   });
   parallel_blocks(table.num_rows(), 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (auto row = static_cast<std::size_t>(begin); row < static_cast<std::size_t>(end); ++row) {
       Sum total;
-      for (const std::vector<Sum>& sums : groups) total += sums[row];
+      for (const LargeVector<Sum>& sums : groups) total += sums[row];
       const double weight = static_cast<double>(total.weight) * static_cast<double>(quanta);
       distances_m[row] = total.weight > 0 ? static_cast<float>(static_cast<double>(total.distance) / weight) : 0;
       sides[row] = total.side();

@@ -24,9 +24,8 @@ void grid_distances(const VertexTable& table, const float* distances_m, const st
                     std::int64_t num_corners, int parts, float* found_m, int num_threads) {
   if (table.encoding() != Encoding::kOctree) throw std::invalid_argument("only an octree has vertices in space");
   if (parts < 1) throw std::invalid_argument("parts must be at least 1");
-  const CellBlocks leaves(table.leaf_keys().data(), static_cast<std::int64_t>(table.leaf_keys().size()));
   parallel_blocks(num_corners, kCorners, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    NearbyRows rows(leaves);
+    NearbyRows rows(table.leaves());
     for (std::int64_t i = begin; i < end; ++i) {
       std::int32_t cell[3];
       int part[3], on_border = 0;  // bit `axis`: the cell before has the corner, too

@@ -23,7 +23,7 @@ using std::int64_t;
 using std::size_t;
 using std::uint64_t;
 
-using Keys = std::vector<uint64_t>;
+using Keys = UninitialisedVector<uint64_t>;
 constexpr int64_t min_block = 1 << 14;  // below that a thread costs more than it does
 
 struct KeyFormat {

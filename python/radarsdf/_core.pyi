@@ -23,6 +23,7 @@ __all__: list[str] = [
     "MAX_FREQUENCIES",
     "MAX_LEVELS",
     "NUM_SPHERICAL_HARMONICS",
+    "QUANTA",
     "RAY_COLUMNS",
     "RAY_DIRECTION",
     "RAY_INTENSITY",
@@ -49,6 +50,8 @@ __all__: list[str] = [
     "marching_cubes_dense_backward",
     "marching_cubes_dense_with_edges",
     "marching_cubes_sparse",
+    "mean_rays",
+    "merge_sums",
     "mesh_components",
     "mlp",
     "mlp_backward",
@@ -57,6 +60,7 @@ __all__: list[str] = [
     "openmp_version",
     "principal_axes",
     "random_bytes",
+    "scan_rays",
     "set_instruction_set",
     "soap_memory_size",
     "soap_step",
@@ -339,7 +343,9 @@ class VertexTable:
         """
         Morton keys of the occupied leaf cells (C,) uint64, ascending.
         """
-    def leaf_vertices(self) -> tuple[numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int32]]:
+    def leaf_vertices(
+        self, num_threads: typing.SupportsInt | typing.SupportsIndex = 0
+    ) -> tuple[numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int32]]:
         """
         Of an octree: lattice coordinates (V, 3) int32 of the leaf cells' vertices, in the order of the feature matrix, whose first V rows are theirs, and the vertices (C, 8) int32 of each cell, in C order.
         """
@@ -1176,6 +1182,30 @@ def marching_cubes_sparse(
     level: typing.SupportsFloat | typing.SupportsIndex,
     num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
 ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32]]: ...
+def mean_rays(
+    keys: numpy.typing.NDArray[numpy.uint64],
+    sums: numpy.typing.NDArray[numpy.int64],
+    leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> tuple[
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+]:
+    """
+    Of the returns in each leaf cell, from `sums` (C, 14) of `sum_returns`: mean points (C, 3) and unit directions (C, 3), ranges (C,) and number (C,), float32, local frame, m.
+    """
+
+def merge_sums(
+    keys: numpy.typing.NDArray[numpy.uint64],
+    sums: numpy.typing.NDArray[numpy.int64],
+    leaf_size_m: typing.SupportsFloat | typing.SupportsIndex,
+) -> tuple[numpy.typing.NDArray[numpy.uint64], numpy.typing.NDArray[numpy.float64]]:
+    """
+    Keys (P,) uint64, ascending, of the cells twice as large as leaf cells with these `keys` (C,), ascending, and moments (P, 13) float64 of their returns, local frame, m, from `sums` (C, 14) of `sum_returns`.
+    """
+
 def mesh_components(
     faces: numpy.typing.NDArray[numpy.int32], num_vertices: typing.SupportsInt | typing.SupportsIndex
 ) -> tuple[numpy.typing.NDArray[numpy.int32], numpy.typing.NDArray[numpy.int64]]: ...
@@ -1286,6 +1316,20 @@ def random_bytes(
     Random bytes (rows, columns), those of a dropout with this seed.
     """
 
+def scan_rays(
+    points: numpy.typing.NDArray[numpy.float64],
+    rotation: numpy.typing.NDArray[numpy.float64],
+    position: numpy.typing.NDArray[numpy.float64],
+    seen_from: numpy.typing.NDArray[numpy.float64],
+    min_range_m: typing.SupportsFloat | typing.SupportsIndex,
+    max_range_m: typing.SupportsFloat | typing.SupportsIndex,
+) -> tuple[
+    numpy.typing.NDArray[numpy.bool], numpy.ndarray, numpy.ndarray, numpy.typing.NDArray[numpy.float32]
+]:
+    """
+    Which of the `points` (N, 3) of a scan, sensor frame, m, lie within the ranges from the sensor, (N,) bool, and these K returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. `rotation` (3, 3) from the sensor to the world, `position` (3,) of the sensor and `seen_from` (3,), where the rays begin, local frame, m, float64.
+    """
+
 def set_instruction_set(name: str) -> None:
     """
     Chooses the kernels: for tests and benches; not while another call runs.
@@ -1377,6 +1421,7 @@ FEATURE_DIM: int = 8
 MAX_FREQUENCIES: int = 24
 MAX_LEVELS: int = 12
 NUM_SPHERICAL_HARMONICS: int = 16
+QUANTA: int = 65536
 RAY_COLUMNS: int = 8
 RAY_DIRECTION: int = 3
 RAY_INTENSITY: int = 7

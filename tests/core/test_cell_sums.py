@@ -33,10 +33,11 @@ def test_rows_are_positions_and_absent_cells_have_none():
     assert CellBlocks(np.zeros(0, np.uint64)).rows(keys_of(asked)).tolist() == [-1] * len(asked)
 
 
+@pytest.mark.parametrize("columns", [3, 5])
 @pytest.mark.parametrize("weight", [1.0, 0.7])
-def test_sums_round_a_key(weight):
+def test_sums_round_a_key(weight, columns):
     cells, asked = some_cells(), some_cells(1)
-    values = np.random.default_rng(2).normal(size=(len(cells), 3))
+    values = np.random.default_rng(2).normal(size=(len(cells), columns))
     apart = np.abs(cells[None] - asked[:, None])
     weights = np.where(apart.max(axis=2) <= 1, weight ** apart.sum(axis=2), 0.0)
     blocks = CellBlocks(keys_of(cells))

@@ -60,7 +60,7 @@ class SurfaceReturns:
         """Cleans `rays`, of which there may be `sums`, by ``config.returns``, and keeps those `inside`, (N,). None: all."""
         sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if sums is None else sums
         surfels = Surfels.of_sums(sums, num_threads)
-        means = None if config.train else MeanRays.of_sums(sums)
+        means = None if config.train else MeanRays.of_sums(sums, num_threads)
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
         kept, true = inside, None

@@ -224,8 +224,9 @@ def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = 
 def check_extent(rays: Rays, config: FitConfig) -> None:
     """Raises a ValueError if a return lies where there are no cells: one outlier must not be met in the middle of the work."""
     reach_m = config.metres(NEAR_BAND_CELLS if config.train else max(BAND_CELLS, TRUNCATION_CELLS))
-    far = np.abs(rays.points).max(axis=1) + reach_m > MAX_CELLS_FROM_ORIGIN * config.leaf_size_m
-    if far.any():
+    limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m - reach_m
+    if max(rays.points.max(initial=0), -rays.points.min(initial=0)) > limit_m:
+        far = np.abs(rays.points).max(axis=1) > limit_m
         msg = (
             f"{far.sum()} of {len(far)} returns are not within a million cells of {config.leaf_size_m} m of the sensors' mean position: "
             "drop them (max_range_m), or use larger cells"

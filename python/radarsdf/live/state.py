@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import GrowingSums, SumsChange
+from radarsdf._core import QUANTA, GrowingSums, SumsChange
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
 from radarsdf.live.regions import REGION_BITS, REGION_CELLS, Keys, region_places, regions_of
@@ -25,7 +25,7 @@ from radarsdf.returns.intensities import IntensityScale, Plausible
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
-from radarsdf.returns.sums import QUANTA, ScanSums, lattice_of
+from radarsdf.returns.sums import ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans

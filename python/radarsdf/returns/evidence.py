@@ -135,10 +135,10 @@ def bridged(
     """
     if max_cells == 0:
         return leaf_keys
-    near = CellBlocks(leaf_keys).rows(keys, num_threads) >= 0
-    keys, counts = keys[near], counts[near]
-    of_leaves = support_at(leaf_keys, keys, counts, num_threads)
     rows = CellBlocks(leaf_keys).rows(keys, num_threads)
+    near = rows >= 0
+    keys, counts, rows = keys[near], counts[near], rows[near]
+    of_leaves = support_at(leaf_keys, keys, counts, num_threads)
     least = np.maximum(1.0, _MIN_SUPPORT * _medians(leaf_keys, of_leaves)[rows])
     support = of_leaves[rows]
     # With more than the most, the mean with any other end is too high.

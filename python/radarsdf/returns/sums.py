@@ -6,12 +6,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import DIRECTION_QUANTA, CellBlocks, CellSet, cell_keys, count_scans, sum_returns
+from radarsdf._core import (
+    QUANTA,
+    CellBlocks,
+    CellSet,
+    cell_keys,
+    count_scans,
+    mean_rays,
+    merge_sums,
+    sum_returns,
+)
 from radarsdf.returns.rays import Rays
 
 MAX_CELLS_FROM_ORIGIN = 1_000_000
@@ -72,13 +80,10 @@ class ReturnCells:
         return np.bincount(self.cell_of_ray, minlength=len(self.keys)).astype(np.float64)
 
 
-QUANTA = 1 << 16
-"""Quanta in the edge of a leaf cell: 3 µm of 0.2 m, as float32 coordinates have at 50 m. Products of 10⁸ returns have room."""
-
 UPPER = [(i, j) for i in range(3) for j in range(i, 3)]
 """Axes of the products of coordinates, in their order."""
 
-_COUNT, _POSITION, _PRODUCTS, _DIRECTION, _RANGE = 0, slice(1, 4), slice(4, 10), slice(10, 13), 13
+_COUNT = 0
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,7 @@ class ScanSums:
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
         cells = ReturnCells.of(rays, leaf_size_m, num_threads)
-        corners, quantum_m = _corners(cells.keys), leaf_size_m / QUANTA
+        corners, quantum_m = lattice_of(cells.keys) * QUANTA, leaf_size_m / QUANTA
         sums = sum_returns(*rays.in_c_order(), cells.cell_of_ray, corners, quantum_m, num_threads)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         return cls(leaf_size_m, cells.keys, sums, scans)
@@ -128,61 +133,12 @@ class ScanSums:
     def counts(self) -> NDArray[np.float64]:
         return self.sums[:, _COUNT].astype(np.float64)
 
-    @property
-    def mean_points(self) -> NDArray[np.float64]:
-        """(C, 3) mean of the returns in each cell, local, m."""
-        quanta = self.sums[:, _POSITION] / self.counts[:, None] + _corners(self.keys)
-        means: NDArray[np.float64] = quanta * (self.leaf_size_m / QUANTA)
-        return means
-
-    @property
-    def mean_directions(self) -> NDArray[np.float64]:
-        """(C, 3) mean direction of the rays, no unit vector."""
-        means: NDArray[np.float64] = self.sums[:, _DIRECTION] / (DIRECTION_QUANTA * self.counts[:, None])
-        return means
-
-    @property
-    def mean_ranges_m(self) -> NDArray[np.float64]:
-        """(C,) mean range of the returns, m."""
-        means: NDArray[np.float64] = self.sums[:, _RANGE] * (self.leaf_size_m / QUANTA) / self.counts
-        return means
-
     def merged_moments(self) -> tuple[NDArray[np.uint64], NDArray[np.float64]]:
         """Keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
 
         Sums are of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3).
         """
-        keys = merged_keys(self.keys)
-        first = np.flatnonzero(np.diff(keys, prepend=keys[:1] + np.uint64(1)))
-        # Cells, not returns, are moved to the corner that they share: in integers, which is exact.
-        steps = np.stack([self.keys >> np.uint64(axis) & np.uint64(1) for axis in range(3)], 1)
-        inner = _moved(self.sums[:, :_RANGE], steps.astype(np.int64) * QUANTA)
-        merged = np.add.reduceat(inner, first) if len(first) else inner
-        keys = keys[first]
-        quantum_m = self.leaf_size_m / QUANTA
-        moments = merged.astype(np.float64)
-        moments[:, _POSITION] *= quantum_m
-        moments[:, _PRODUCTS] *= quantum_m**2
-        moments[:, _DIRECTION] /= DIRECTION_QUANTA
-        return keys, _moved(moments, 2 * _corners(keys) * quantum_m)
-
-
-def _moved(sums: NDArray[Any], steps: NDArray[Any]) -> NDArray[Any]:
-    """Sums (C, 13) of positions, which grow by `steps` (C, 3): Σ (a + x)(b + y) is Σ xy + a Σ y + b Σ x + n a b."""
-    moved = sums.copy()
-    moved[:, _POSITION] += steps * sums[:, :1]
-    for k, (i, j) in enumerate(UPPER, _PRODUCTS.start):
-        moved[:, k] += steps[:, i] * sums[:, 1 + j]
-        moved[:, k] += steps[:, j] * moved[:, 1 + i]
-    return moved
-
-
-def _corners(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """(C, 3) lower corners of leaf cells, quanta."""
-    return lattice_of(keys) * QUANTA
-
-
-_MIN_LENGTH = 1e-6  # of the mean of unit directions. A shorter one has no meaningful direction
+        return merge_sums(self.keys, np.ascontiguousarray(self.sums), self.leaf_size_m)
 
 
 @dataclass(frozen=True)
@@ -197,19 +153,11 @@ class MeanRays:
     ranges_m: NDArray[np.float32]  # (M,) mean range of the returns in each cell, m
 
     @classmethod
-    def of_sums(cls, sums: ScanSums) -> MeanRays:
-        directions = sums.mean_directions
-        lengths = np.linalg.norm(directions, axis=1)[:, None]
-        unit = directions / np.maximum(lengths, _MIN_LENGTH)
-        directions = np.where(lengths > _MIN_LENGTH, unit, [0.0, 0.0, -1.0])
-        return cls(
-            keys=sums.keys,
-            points=sums.mean_points.astype(np.float32),
-            directions=directions.astype(np.float32),
-            counts=sums.counts.astype(np.float32),
-            scans=sums.scans,
-            ranges_m=sums.mean_ranges_m.astype(np.float32),
+    def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> MeanRays:
+        points, directions, ranges_m, counts = mean_rays(
+            sums.keys, np.ascontiguousarray(sums.sums), sums.leaf_size_m, num_threads
         )
+        return cls(sums.keys, points, directions, counts, sums.scans, ranges_m)
 
     def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
         return MeanRays(**{name: column[part] for name, column in vars(self).items()})
