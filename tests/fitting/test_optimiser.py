@@ -88,8 +88,9 @@ def steps(cells, batches, threads, learning_rate=1e-2):
         for parts in batches:
             touched = []
             for points, weights in parts:
-                gradient = weights.expand(len(points), cells.interpolated_dim)
-                touched.append(Touched(points, kernels.locate(points, cells.table), gradient))
+                gradient = np.broadcast_to(weights, (len(points), cells.interpolated_dim)).copy()
+                located = kernels.locate(points, cells.table).numpy()
+                touched.append(Touched(points.numpy(), located, gradient))
             adam.step(touched, pool, meanwhile=lambda: None)
     return cells.features.detach().clone()
 

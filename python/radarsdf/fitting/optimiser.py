@@ -12,7 +12,7 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf._core import FEATURE_DIM
-from radarsdf.field.kernels import large_zeros, rows_view, view
+from radarsdf.field.kernels import large_zeros, view
 from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import ThreadPool
@@ -148,6 +148,7 @@ class RowAdam:
         # Of each row: mean and mean square of its gradients; the last step that changed it, and a mark of the core's.
         self._moments = large_zeros(rows, 2 * FEATURE_DIM, dtype=dtype)
         self._marks = large_zeros(rows, 2, dtype=torch.int32)
+        self._arrays = view(cells.features), self._moments.numpy(), self._marks.numpy()
         self._decays = torch.zeros(0, 2, dtype=dtype, device="cpu")
 
     @property
@@ -178,10 +179,8 @@ class RowAdam:
             # Denormal numbers would be slow, and make no difference compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         self._cells.table.begin_adam_step(
-            [(view(t.points), t.located.numpy(), rows_view(t.gradient)) for t in touched],
-            view(self._cells.features),
-            self._moments.numpy(),
-            self._marks.numpy(),
+            [(t.points, t.located, t.gradient) for t in touched],
+            *self._arrays,
             self._decays.numpy(),
             self.step_count,
             self.learning_rate,

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -86,12 +87,12 @@ class LossHistory:
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
         self._started_s = time.perf_counter() - before_s
 
-    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: Tensor) -> None:
+    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: NDArray[Any]) -> None:
         """Adds the losses of an iteration, after which so many are `done`, of samples with these labels (B,), m."""
         now_s = time.perf_counter() - self._started_s
         # Distances with the wrong sign have a cross-entropy of less than 1 + distance / sigma, and intensities from 0 to
         # 1 an absolute error of at most 1.
-        worst = {"sdf": 1 + float(sdf_m.abs().mean()) / self._sigma_m, "intensity": 1.0}
+        worst = {"sdf": 1 + float(np.abs(sdf_m).mean()) / self._sigma_m, "intensity": 1.0}
         self._recent *= _KEPT
         for row, name in enumerate(_WORST):
             if name in losses:
