@@ -1323,9 +1323,10 @@ def soap_step(
     memories: list[numpy.typing.NDArray[numpy.float32]],
     step: typing.SupportsInt | typing.SupportsIndex,
     learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+    pool: ThreadPool = None,
 ) -> None:
     """
-    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step.
+    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step. The threads of a `pool` share the matrices.
     """
 
 @typing.overload
@@ -1335,9 +1336,10 @@ def soap_step(
     memories: list[numpy.typing.NDArray[numpy.float64]],
     step: typing.SupportsInt | typing.SupportsIndex,
     learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+    pool: ThreadPool = None,
 ) -> None:
     """
-    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step.
+    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step. The threads of a `pool` share the matrices.
     """
 
 def sparse_lattice(

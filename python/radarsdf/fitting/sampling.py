@@ -119,7 +119,10 @@ class RaySampler:
         self._neighbours = neighbours
         self._generator = generator
         self._rays = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
-        self._runs, self._next = np.zeros(0, np.int32), 0  # runs of neighbours in random order; the next ray in it
+        self._runs, self._next = (
+            np.zeros(0, np.int32),
+            0,
+        )  # runs of neighbours in random order; the next ray in it
         self._order_from = generator.get_state()  # before the order was drawn
         near, labelled = near_and_labelled(config, batch_size)
         # Samples with labels come first, and a batch without them is in Morton order.
@@ -171,7 +174,9 @@ class RaySampler:
         batch, noise_rad = self._draw((count, count, 0), parts), self._config.training.cross_range_noise_rad
         if noise_rad > 0:
             # Noise in all directions is simpler. Along the beam it is small compared with the width of the band.
-            noise = torch.randn(count, 3, generator=self._generator, dtype=torch.float32, device="cpu").numpy()
+            noise = torch.randn(
+                count, 3, generator=self._generator, dtype=torch.float32, device="cpu"
+            ).numpy()
             batch.points[:] += noise * (noise_rad * batch.of_ray[:, RAY_RANGE, None])
         return batch
 

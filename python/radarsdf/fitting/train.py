@@ -328,7 +328,7 @@ class Training:
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
             move_networks = functools.partial(_move_networks, found, stage.optimisers, share)
             if rows is None:
-                move_networks()
+                move_networks(self._pool)
             else:
                 assert found.touched is not None
                 rows.learning_rate = share * rows.full_rate
@@ -355,12 +355,14 @@ class Training:
                 raise KeyboardInterrupt
 
 
-def _move_networks(found: Gradients, optimisers: list[Optimiser], share: float) -> None:
+def _move_networks(
+    found: Gradients, optimisers: list[Optimiser], share: float, pool: ThreadPool | None = None
+) -> None:
     """Changes the networks by the gradients."""
     total = iter(found.by_parameters)
     for optimiser in optimisers:
         optimiser.learning_rate = share * optimiser.full_rate
-        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))))
+        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))), pool)
 
 
 def _nothing() -> None:
