@@ -54,15 +54,9 @@ class Version:
 
     def seconds(self, **case: Any) -> float:
         """Wall time of a fit, with its mesh if the case has one."""
-        assert self._child.stdin is not None
-        assert self._child.stdout is not None
-        self._child.stdin.write(json.dumps(case) + "\n")
-        self._child.stdin.flush()
-        line = self._child.stdout.readline()
-        if not line:
-            msg = "the process of a version has ended: see its error above"
-            raise ValueError(msg)
-        return float(line)
+        assert self._child.stdin and self._child.stdout  # noqa: PT018 - pipes
+        print(json.dumps(case), file=self._child.stdin, flush=True)
+        return float(self._child.stdout.readline())  # of no line, whose reason is above, a ValueError
 
     def close(self) -> None:
         self._child.communicate()
@@ -91,7 +85,7 @@ def speed(options: argparse.Namespace) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         packages = {"own": _OWN}
         if options.against is not None:
-            packages["other"] = _packages(options.against, Path(folder) / "other")
+            packages["other"] = packages_of(options.against, Path(folder) / "other")
         for scene in options.cases:
             scans = getattr(radarsdf.simulate, scene)(seed=3, frames=frames)
             path = Path(folder) / f"{scene}.npz"
@@ -116,7 +110,7 @@ def speed(options: argparse.Namespace) -> Iterator[Row]:
                             yield dict(row)
 
 
-def _packages(path: Path, folder: Path) -> Path:
+def packages_of(path: Path, folder: Path) -> Path:
     """The folder that holds the package of a checkout or of a wheel.
 
     Raises

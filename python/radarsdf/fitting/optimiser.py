@@ -63,7 +63,7 @@ class Adam(Optimiser):
             value.copy_(state[name])
 
     @torch.no_grad()
-    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:
+    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:  # noqa: ARG002
         self._step.add_(1)
         torch._fused_adam_(  # the kernel has no public name
             self.parameters,
