@@ -98,6 +98,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "type": float, "nargs": 2, "metavar": ("M", "DEG"), "default": (0.0, 0.0), "help": "random walk of the poses, a step"
     },
     "refine": {"action": "store_true", "help": "refine the poses of both days"},
+    "against": {"type": Path, "metavar": "PATH", "help": "another version: a wheel, or a checkout that is built in place"},
     "seeds": {"type": int, "nargs": "*", "help": "seeds of simulated scenes"},
 }  # fmt: skip
 

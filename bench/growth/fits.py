@@ -136,9 +136,9 @@ SURFEL_COLUMNS = {
     "ghosts_cpu_s": Column("ghosts: processor, s"),
     "ghosts_wall_s": Column("time, s"),
     "ghosts_grown_mb": Column("MB", digits=0),
-    "looks_cpu_s": Column("visibility counts: processor, s"),
-    "looks_wall_s": Column("time, s "),
-    "looks_grown_mb": Column("MB ", digits=0),
+    "visibility_cpu_s": Column("visibility counts: processor, s"),
+    "visibility_wall_s": Column("time, s "),
+    "visibility_grown_mb": Column("MB ", digits=0),
     "ghosts": Column("ghosts", digits=0),
     "leaf_cells": Column("leaf cells", digits=0),
 }

@@ -13,6 +13,7 @@
 #include "bindings/layer_arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "field/field_loss.hpp"
+#include "field/ray_samples.hpp"
 
 namespace radarsdf {
 namespace {
@@ -207,9 +208,53 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       "`intensity_gradients` only.");
 }
 
+template <typename T>
+void check_below(const Array<T>& numbers, std::int64_t end, const char* message) {
+  const T* n = numbers.data();
+  if (std::any_of(n, n + numbers.size(), [&](T number) { return number < 0 || number >= end; })) {
+    throw std::invalid_argument(message);
+  }
+}
+
+void bind_samples(py::module_& m) {
+  using namespace py::literals;
+  m.def(
+      "draw_samples",
+      [](const Array<float>& rays, const Array<std::int64_t>& places, const Array<std::int32_t>& ray,
+         const Array<std::int32_t>& number, const Array<std::uint8_t>& kind, const Array<float>& segments,
+         std::uint64_t seed) {
+        if (rays.ndim() != 2 || rays.shape(1) < kRayIntensity || rays.shape(1) > kRayColumns) {
+          throw std::invalid_argument("rays must have shape (N, 7) or (N, 8)");
+        }
+        const std::int64_t count = check_column(ray, "ray"), columns = rays.shape(1);
+        if (check_column(number, "number") != count || check_column(kind, "kind") != count) {
+          throw std::invalid_argument("ray, number and kind must have the same length");
+        }
+        check_shape(segments, segments.shape(0), 4, "segments");
+        check_below(places, rays.shape(0), "places must be rows of rays");
+        check_below(ray, check_column(places, "places"), "ray must lie in [0, len(places))");
+        check_below(kind, segments.shape(0), "kind must be a row of segments");
+        static_assert(sizeof(RaySegment) == 4 * sizeof(float));
+        const SampleLayout layout{ray.data(), number.data(), kind.data(),
+                                  reinterpret_cast<const RaySegment*>(segments.data()), count};
+        const TakenRays taken{rays.data(), columns, places.data()};
+        Array<float> points(std::vector<std::int64_t>{count, 3}), sdf_m(count);
+        Array<float> of_ray(std::vector<std::int64_t>{count, columns});
+        draw_samples(taken, layout, seed, points.mutable_data(), sdf_m.mutable_data(), of_ray.mutable_data());
+        return std::make_tuple(points, sdf_m, of_ray);
+      },
+      "rays"_a.noconvert(), "places"_a.noconvert(), "ray"_a.noconvert(), "number"_a.noconvert(), "kind"_a.noconvert(),
+      "segments"_a.noconvert(), "seed"_a,
+      "Random samples on `rays` (N, 7 or 8) float32: points (B, 3), m, signed distances along the ray to the return (B,), "
+      "m, and rows of `rays`. Sample i is on ray `places[ray[i]]`; its random number, found by `seed` and `number[i]`, is "
+      "uniform in row `kind[i]` of `segments` (K, 4): start and length in metres, each a constant and a factor on the "
+      "range.");
+}
+
 }  // namespace
 
 void bind_field_loss(py::module_& m) {
+  bind_samples(m);
   py::class_<AnyFieldLoss> cls(
       m, "FieldLoss",
       "The losses of batches and their gradients, as the package's Field and its losses define "

@@ -39,7 +39,7 @@ void bind_networks(py::module_& m) {
         T *kept = hidden ? hidden->mutable_data() : nullptr, *result = out.mutable_data();
         {
           const py::gil_scoped_release release;
-          mlp(layers, inputs, count, kept, result, num_threads);
+          mlp(ForwardWeights<T>(layers), inputs, count, kept, result, num_threads);
         }
         return hidden ? py::object(*hidden) : py::none();
       },
@@ -66,8 +66,10 @@ void bind_networks(py::module_& m) {
           throw std::invalid_argument("there must be one of input_grads, or None, for each of the inputs");
         }
         std::vector<Columns<T>> by_inputs;
+        std::vector<MlpInput> wanted;
         for (std::size_t i = 0; i < inputs.size(); ++i) {
           by_inputs.push_back({nullptr, 0, inputs[i].width});
+          wanted.push_back({inputs[i].width, input_grads[i].has_value()});
           if (!input_grads[i]) continue;
           check_shape(*input_grads[i], count, inputs[i].width, "input_grads");
           by_inputs[i].stride = row_stride(*input_grads[i], "input_grads");
@@ -76,7 +78,7 @@ void bind_networks(py::module_& m) {
         const Columns<const T> grad{out_grad.data(), row_stride(out_grad, "out_grad"), layers.back().outputs};
         const T* kept = hidden.data();
         const py::gil_scoped_release release;
-        mlp_backward(layers, inputs, count, kept, grad, by_layers, by_inputs, num_threads);
+        mlp_backward(BackwardWeights<T>(layers, wanted), inputs, count, kept, grad, by_layers, by_inputs, num_threads);
       },
       "inputs"_a.noconvert(), "weights"_a.noconvert(), "biases"_a.noconvert(), "hidden"_a.noconvert(),
       "out_grad"_a.noconvert(), "weight_grads"_a.noconvert(), "bias_grads"_a.noconvert(), "input_grads"_a.noconvert(),

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "bindings/arrays.hpp"
+#include "bindings/held_thread_pool.hpp"
 #include "bindings/subjects.hpp"
 #include "field/soap.hpp"
 
@@ -17,7 +18,7 @@ void bind_step(py::module_& m) {
   m.def(
       "soap_step",
       [](std::vector<Array<T>>& weights, const std::vector<Array<T>>& gradients, std::vector<Array<T>>& memories,
-         std::int64_t step, double learning_rate) {
+         std::int64_t step, double learning_rate, HeldThreadPool* pool) {
         if (step < 1) throw std::invalid_argument("step must be at least 1");
         if (gradients.size() != weights.size() || memories.size() != weights.size()) {
           throw std::invalid_argument("there must be a gradient and a memory for each matrix of weights");
@@ -34,11 +35,20 @@ void bind_step(py::module_& m) {
               {weights[i].mutable_data(), gradients[i].data(), memories[i].mutable_data(), rows, columns});
         }
         const py::gil_scoped_release release;
-        for (const SoapMatrix<T>& matrix : matrices) soap_step(matrix, step, learning_rate);
+        const auto move = [&](std::int64_t i) {
+          soap_step(matrices[static_cast<std::size_t>(i)], step, learning_rate);
+        };
+        const auto count = static_cast<std::int64_t>(matrices.size());
+        if (pool != nullptr) {
+          pool->pool().run(count, move);
+        } else {
+          for (std::int64_t i = 0; i < count; ++i) move(i);
+        }
       },
       "weights"_a.noconvert(), "gradients"_a.noconvert(), "memories"_a.noconvert(), "step"_a, "learning_rate"_a,
+      "pool"_a = py::none(),
       "Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers "
-      "each, are zero before the first step.");
+      "each, are zero before the first step. The threads of a `pool` share the matrices.");
 }
 
 }  // namespace

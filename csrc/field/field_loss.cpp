@@ -64,6 +64,9 @@ FieldLoss<T>::FieldLoss(const FieldParameters<T>& parameters, const LossOptions&
 
 template <typename T>
 struct FieldLoss<T>::Job {
+  explicit Job(PassWeights<T> prepared) : weights(std::move(prepared)) {}
+
+  PassWeights<T> weights;
   std::vector<PassInput<T>> parts;
   std::vector<NetworkGradients<T>> by_networks;  // of each part
   std::vector<FieldLosses> sums;                 // of each part
@@ -94,7 +97,7 @@ void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const F
                          bool trains, bool sees, ThreadPool& pool) {
   if (sees && parameters_.intensity.empty()) throw std::invalid_argument("there is no intensity network");
   if (job_) throw std::logic_error("the batch before this one is not finished");
-  const auto job = std::make_shared<Job>();
+  const auto job = std::make_shared<Job>(PassWeights<T>(parameters_, trains, sees));
   std::int64_t count = 0, num_seen = 0;
   for (const LossPart& part : batch.parts) {
     const std::int64_t seen = options_.intensity_in_free_space ? part.count : part.num_labelled;
@@ -131,7 +134,7 @@ void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const F
                                  job->sees ? &job->by_networks[i].intensity : nullptr,
                                  {to.located + part.before * parameters_.table->num_levels(),
                                   job->trains ? to.interpolated + part.before * parameters_.levels() : nullptr}};
-    job->sums[i] = run_pass(parameters_, options_, part, request);
+    job->sums[i] = run_pass(parameters_, job->weights, options_, part, request);
   });
   job_ = job;
 }

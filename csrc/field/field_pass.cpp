@@ -7,6 +7,7 @@
 #include <memory>
 #include <utility>
 
+#include "field/padding.hpp"
 #include "kernels/fourier_kernels.hpp"
 #include "util/large_array.hpp"
 #include "util/random_bytes.hpp"
@@ -25,9 +26,10 @@ Matrix<T> matrix(std::int64_t rows, std::int64_t columns) {
 template <typename T>
 class Pass {
  public:
-  Pass(const FieldParameters<T>& field, const LossOptions& options, const PassInput<T>& part,
-       const PassRequest<T>& request)
+  Pass(const FieldParameters<T>& field, const PassWeights<T>& weights, const LossOptions& options,
+       const PassInput<T>& part, const PassRequest<T>& request)
       : field_(field),
+        weights_(weights),
         options_(options),
         part_(part),
         request_(request),
@@ -43,9 +45,9 @@ class Pass {
     const std::int64_t outputs = 1 + feature_;
     out_ = matrix<T>(part_.count, outputs);
     const Matrix<T> hidden = trains ? matrix<T>(part_.count, mlp_hidden_columns(field_.sdf)) : nullptr;
-    std::vector<Columns<const T>> inputs = {{encoding_.get(), dim(), cells_}};
-    if (waves_ > 0) inputs.push_back({encoding_.get() + cells_, dim(), waves_});
-    mlp(field_.sdf, inputs, part_.count, hidden.get(), out_.get(), 1);
+    std::vector<Columns<const T>> inputs = {{encoding_.get(), row(), cells_}};
+    if (waves_ > 0) inputs.push_back({encoding_.get() + cells_, row(), waves_});
+    mlp(weights_.sdf, inputs, part_.count, hidden.get(), out_.get(), 1);
 
     FieldLosses losses{0, 0};
     if (request_.intensity != nullptr) losses.intensity = intensity_loss(trains);
@@ -58,8 +60,8 @@ class Pass {
     T* cells_grad = own ? own.get() : request_.by_features.interpolated;
     std::vector<Columns<T>> input_grads = {{cells_grad, cells_, cells_}};
     if (waves_ > 0) input_grads.push_back({nullptr, 0, waves_});
-    mlp_backward(field_.sdf, inputs, part_.count, hidden.get(), {out_grad_.get(), outputs, outputs}, *request_.sdf,
-                 input_grads, 1);
+    mlp_backward(*weights_.sdf_backward, inputs, part_.count, hidden.get(), {out_grad_.get(), outputs, outputs},
+                 *request_.sdf, input_grads, 1);
     add_cells(cells_grad);
     if (own) spread(own.get());
     return losses;
@@ -68,22 +70,26 @@ class Pass {
  private:
   bool sums_levels() const { return field_.table->encoding() == Encoding::kOctree; }
   std::int64_t dim() const { return cells_ + waves_; }
+  std::int64_t row() const { return padded(dim()); }  // of the encoding, as the products take it
 
   void encode() {
-    encoding_ = matrix<T>(part_.count, dim());
+    encoding_ = matrix<T>(part_.count, row());
+    for (std::int64_t i = 0; i < part_.count; ++i) {
+      std::fill_n(encoding_.get() + i * row() + dim(), row() - dim(), T(0));
+    }
     const Matrix<T> own = sums_levels() ? matrix<T>(part_.count, levels_) : nullptr;
     radarsdf::encode(*field_.table, field_.features, part_.points, part_.count, request_.by_features.located,
-                     own ? own.get() : encoding_.get(), own ? levels_ : dim(), 1);
+                     own ? own.get() : encoding_.get(), own ? levels_ : row(), 1);
     for (std::int64_t i = 0; own && i < part_.count; ++i) {
       for (std::int64_t d = 0; d < cells_; ++d) {
         T sum = 0;
         for (std::int64_t at = d; at < levels_; at += cells_) sum += own[i * levels_ + at];
-        encoding_[i * dim() + d] = sum;
+        encoding_[i * row() + d] = sum;
       }
     }
     if (waves_ > 0) {
       fourier(part_.points, part_.count, field_.frequencies.half_width_m, field_.frequencies.first,
-              field_.frequencies.count, encoding_.get() + cells_, dim(), 1);
+              field_.frequencies.count, encoding_.get() + cells_, row(), 1);
     }
   }
 
@@ -123,16 +129,20 @@ class Pass {
     const std::int64_t count = part_.num_seen, width = field_.intensity[0].inputs;
     const std::int64_t links = feature_ + field_.sees.sdf;  // columns that the SDF network gives
     const std::int64_t rest = dim() + links;                // the columns from here on are data and need no gradient
-    const Matrix<T> x = matrix<T>(count, width);
-    drop(part_.dropout[0], cells_, encoding_.get(), dim(), x.get(), width);
-    drop(part_.dropout[1], waves_, encoding_.get() + cells_, dim(), x.get() + cells_, width);
-    for (std::int64_t i = 0; i < count; ++i) fill(i, x.get() + i * width + dim());
+    const std::int64_t row_of_x = padded(width);
+    const Matrix<T> x = matrix<T>(count, row_of_x);
+    drop(part_.dropout[0], cells_, encoding_.get(), row(), x.get(), row_of_x);
+    drop(part_.dropout[1], waves_, encoding_.get() + cells_, row(), x.get() + cells_, row_of_x);
+    for (std::int64_t i = 0; i < count; ++i) {
+      fill(i, x.get() + i * row_of_x + dim());
+      std::fill_n(x.get() + i * row_of_x + width, row_of_x - width, T(0));
+    }
     if (field_.sees.view_direction) {
       const Matrix<T> directions = matrix<T>(count, 3);
       for (std::int64_t i = 0; i < count; ++i) {
         std::copy_n(part_.rays + i * part_.ray_stride + kRayDirection, 3, directions.get() + 3 * i);
       }
-      spherical_harmonics(directions.get(), count, x.get() + rest, width, 1);
+      spherical_harmonics(directions.get(), count, x.get() + rest, row_of_x, 1);
     }
 
     std::vector<Columns<const T>> inputs;
@@ -144,7 +154,7 @@ class Pass {
     std::int64_t first = 0;
     const auto add = [&](std::int64_t columns, T* gradient) {
       if (columns == 0) return;
-      inputs.push_back({x.get() + first, width, columns});
+      inputs.push_back({x.get() + first, row_of_x, columns});
       input_grads.push_back({gradient, columns, columns});
       first += columns;
     };
@@ -155,7 +165,7 @@ class Pass {
 
     const Matrix<T> predicted = matrix<T>(count, 1);
     const Matrix<T> hidden = matrix<T>(count, mlp_hidden_columns(field_.intensity));
-    mlp(field_.intensity, inputs, count, hidden.get(), predicted.get(), 1);
+    mlp(*weights_.intensity, inputs, count, hidden.get(), predicted.get(), 1);
     const T share = static_cast<T>(request_.shares.intensity);
     double sum = 0;
     for (std::int64_t i = 0; i < count; ++i) {
@@ -165,8 +175,8 @@ class Pass {
       sum += static_cast<double>(std::abs(error));
       predicted[i] = error > 0 ? share : error < 0 ? -share : T(0);
     }
-    mlp_backward(field_.intensity, inputs, count, hidden.get(), {predicted.get(), 1, 1}, *request_.intensity,
-                 input_grads, 1);
+    mlp_backward(*weights_.intensity_backward, inputs, count, hidden.get(), {predicted.get(), 1, 1},
+                 *request_.intensity, input_grads, 1);
     return sum;
   }
 
@@ -212,6 +222,7 @@ class Pass {
   }
 
   const FieldParameters<T>& field_;
+  const PassWeights<T>& weights_;
   const LossOptions& options_;
   const PassInput<T>& part_;
   const PassRequest<T>& request_;
@@ -223,14 +234,29 @@ class Pass {
 }  // namespace
 
 template <typename T>
-FieldLosses run_pass(const FieldParameters<T>& field, const LossOptions& options, const PassInput<T>& part,
-                     const PassRequest<T>& request) {
-  return Pass<T>(field, options, part, request).run();
+PassWeights<T>::PassWeights(const FieldParameters<T>& field, bool trains, bool sees) : sdf(field.sdf) {
+  if (trains) sdf_backward.emplace(field.sdf, std::vector<MlpInput>{{field.cells(), true}, {field.waves(), false}});
+  if (!sees) return;
+  const std::int64_t links = field.feature() + field.sees.sdf;
+  const std::int64_t rest = field.intensity_inputs() - field.cells() - field.waves() - links;
+  intensity.emplace(field.intensity);
+  intensity_backward.emplace(
+      field.intensity,
+      std::vector<MlpInput>{{field.cells(), trains}, {field.waves(), false}, {links, trains}, {rest, false}});
 }
 
-template FieldLosses run_pass(const FieldParameters<float>&, const LossOptions&, const PassInput<float>&,
-                              const PassRequest<float>&);
-template FieldLosses run_pass(const FieldParameters<double>&, const LossOptions&, const PassInput<double>&,
-                              const PassRequest<double>&);
+template <typename T>
+FieldLosses run_pass(const FieldParameters<T>& field, const PassWeights<T>& weights, const LossOptions& options,
+                     const PassInput<T>& part, const PassRequest<T>& request) {
+  return Pass<T>(field, weights, options, part, request).run();
+}
+
+#define RADARSDF_INSTANTIATE(T)                                                                       \
+  template struct PassWeights<T>;                                                                     \
+  template FieldLosses run_pass(const FieldParameters<T>&, const PassWeights<T>&, const LossOptions&, \
+                                const PassInput<T>&, const PassRequest<T>&);
+RADARSDF_INSTANTIATE(float)
+RADARSDF_INSTANTIATE(double)
+#undef RADARSDF_INSTANTIATE
 
 }  // namespace radarsdf

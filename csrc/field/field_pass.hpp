@@ -5,6 +5,7 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <vector>
 
 #include "field/field_loss.hpp"
@@ -34,9 +35,20 @@ struct PassRequest {
   FeatureGradients<T> by_features;                  // `interpolated` is null where they are frozen
 };
 
+// Weights of the networks, prepared once for all parts of a batch.
+template <typename T>
+struct PassWeights {
+  // `trains`: features and SDF network; `sees`: there is a loss of intensities.
+  PassWeights(const FieldParameters<T>& field, bool trains, bool sees);
+
+  ForwardWeights<T> sdf;
+  std::optional<ForwardWeights<T>> intensity;
+  std::optional<BackwardWeights<T>> sdf_backward, intensity_backward;
+};
+
 // Sums over the samples of a part.
 template <typename T>
-FieldLosses run_pass(const FieldParameters<T>& field, const LossOptions& options, const PassInput<T>& part,
-                     const PassRequest<T>& request);
+FieldLosses run_pass(const FieldParameters<T>& field, const PassWeights<T>& weights, const LossOptions& options,
+                     const PassInput<T>& part, const PassRequest<T>& request);
 
 }  // namespace radarsdf

@@ -47,105 +47,71 @@ void gather(const std::vector<Columns<const T>>& matrices, std::int64_t first, s
   }
 }
 
+// Whether the inputs are columns of one matrix whose rows are as long as padded ones.
 template <typename T>
-class Forward {
- public:
-  Forward(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs)
-      : layers_(layers), inputs_(inputs), offsets_(hidden_offsets(layers)) {
-    for (const Layer<T>& layer : layers) {
-      const std::int64_t columns = padded(layer.outputs);
-      weights_.push_back(zeros<T>(layer.inputs * columns));
-      biases_.push_back(zeros<T>(columns));
-      for (std::int64_t n = 0; n < layer.outputs; ++n) {
-        for (std::int64_t k = 0; k < layer.inputs; ++k) {
-          weights_.back()[k * columns + n] = layer.weights[n * layer.inputs + k];
-        }
-      }
-      std::copy_n(layer.biases, layer.outputs, biases_.back().begin());
+bool side_by_side(const std::vector<Columns<const T>>& inputs) {
+  const T* next = inputs[0].data;
+  for (const Columns<const T>& input : inputs) {
+    if (input.data != next || input.stride != inputs[0].stride) return false;
+    next += input.width;
+  }
+  return padded(next - inputs[0].data) <= inputs[0].stride;
+}
+
+// Rows [first, first + rows) into `hidden` (rows, hidden columns) and `results` (rows, padded outputs).
+template <typename T>
+void forward_tile(const ForwardWeights<T>& weights, const std::vector<Columns<const T>>& inputs, std::int64_t first,
+                  std::int64_t rows, T* hidden, T* results) {
+  const ProductKernel<T> kernel = RADARSDF_KERNEL(product_kernel<T>)();
+  const std::int64_t hidden_columns = weights.offsets.back();
+  for (std::size_t i = 0; i < weights.layers.size(); ++i) {
+    const bool last = i + 1 == weights.layers.size();
+    Product<T> product{};
+    product.a_depth = 1;
+    product.b = weights.transposed[i].data();
+    product.b_row = product.columns = padded(weights.layers[i].outputs);
+    product.c = last ? results : hidden + weights.offsets[i];
+    product.c_row = last ? product.columns : hidden_columns;
+    product.rows = rows;
+    product.biases = weights.biases[i].data();
+    if (i > 0) {
+      product.a = hidden + weights.offsets[i - 1];
+      product.a_row = hidden_columns;
+      product.depth = weights.layers[i].inputs;
+      product.rectify = !last;
+      kernel.multiply(product);
+      continue;
+    }
+    for (std::size_t part = 0; part < inputs.size(); ++part) {
+      product.a = inputs[part].data + first * inputs[part].stride;
+      product.a_row = inputs[part].stride;
+      product.depth = inputs[part].width;
+      product.add = part > 0;
+      product.rectify = !last && part + 1 == inputs.size();
+      kernel.multiply(product);
+      product.b += product.depth * product.columns;
     }
   }
-
-  // Rows [first, first + rows) into `hidden` (rows, hidden columns) and `results` (rows, padded outputs).
-  void tile(std::int64_t first, std::int64_t rows, T* hidden, T* results) const {
-    for (std::size_t i = 0; i < layers_.size(); ++i) {
-      const bool last = i + 1 == layers_.size();
-      Product<T> product{};
-      product.a_depth = 1;
-      product.b = weights_[i].data();
-      product.b_row = product.columns = padded(layers_[i].outputs);
-      product.c = last ? results : hidden + offsets_[i];
-      product.c_row = last ? product.columns : offsets_.back();
-      product.rows = rows;
-      product.biases = biases_[i].data();
-      if (i > 0) {
-        product.a = hidden + offsets_[i - 1];
-        product.a_row = offsets_.back();
-        product.depth = layers_[i].inputs;
-        product.rectify = !last;
-        kernel_.multiply(product);
-        continue;
-      }
-      for (std::size_t part = 0; part < inputs_.size(); ++part) {
-        product.a = inputs_[part].data + first * inputs_[part].stride;
-        product.a_row = inputs_[part].stride;
-        product.depth = inputs_[part].width;
-        product.add = part > 0;
-        product.rectify = !last && part + 1 == inputs_.size();
-        kernel_.multiply(product);
-        product.b += product.depth * product.columns;
-      }
-    }
-  }
-
- private:
-  const std::vector<Layer<T>>& layers_;
-  const std::vector<Columns<const T>>& inputs_;
-  std::vector<std::int64_t> offsets_;
-  std::vector<std::vector<T>> weights_, biases_;  // of each layer: transposed; both padded
-  ProductKernel<T> kernel_ = RADARSDF_KERNEL(product_kernel<T>)();
-};
+}
 
 template <typename T>
 class Backward {
  public:
-  Backward(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, const T* hidden,
+  Backward(const BackwardWeights<T>& weights, const std::vector<Columns<const T>>& inputs, const T* hidden,
            Columns<const T> out_grad, const std::vector<Columns<T>>& input_grads, bool by_layers)
-      : layers_(layers),
+      : weights_(weights),
+        layers_(weights.layers),
         inputs_(inputs),
         hidden_(hidden),
         out_grad_(out_grad),
         input_grads_(input_grads),
         by_layers_(by_layers),
-        offsets_(hidden_offsets(layers)) {
-    for (std::size_t i = 0; i < layers.size(); ++i) {
-      const Layer<T>& layer = layers[i];
-      std::vector<Columns<const T>> wanted;  // columns of the weights, one for each input whose gradient is asked for
-      std::int64_t columns = 0, offset = 0;
-      for (std::size_t part = 0; part < (i == 0 ? inputs.size() : 1); ++part) {
-        const std::int64_t width = i == 0 ? inputs[part].width : layer.inputs;
-        if (i > 0 || input_grads[part].data) {
-          wanted.push_back({layer.weights + offset, layer.inputs, width});
-          columns += width;
-        }
-        offset += width;
-      }
-      columns_.push_back(padded(columns));
-      weights_.push_back(zeros<T>(layer.outputs * columns_.back()));
-      gather(wanted, 0, layer.outputs, columns_.back(), weights_.back().data());
-      sums_at_.push_back(sums_at_.back() + layer.outputs * padded(layer.inputs) + padded(layer.outputs));
-      widest_ = std::max({widest_, padded(layer.outputs), padded(layer.inputs)});
-    }
-  }
+        gathers_(by_layers && !side_by_side(inputs)) {}
 
-  // Numbers in the sums of all rows: of each layer the gradients by its weights (outputs, padded inputs), then by its
-  // biases (padded outputs).
-  std::int64_t num_sums() const { return sums_at_.back(); }
-  std::int64_t sums_at(std::size_t layer) const { return sums_at_[layer]; }
-
-  // Adds those of rows [begin, end) to `sums`, and writes the gradients by the inputs.
+  // Adds the sums of rows [begin, end) to `sums`, and writes the gradients by the inputs.
   void rows(std::int64_t begin, std::int64_t end, T* sums) const {
-    std::vector<T> inputs = zeros<T>(by_layers_ ? kTile * padded(layers_[0].inputs) : 0);
-    std::vector<T> grads[2] = {zeros<T>(kTile * widest_), zeros<T>(kTile * widest_)};
+    std::vector<T> inputs = zeros<T>(gathers_ ? kTile * padded(layers_[0].inputs) : 0);
+    std::vector<T> grads[2] = {zeros<T>(kTile * weights_.widest), zeros<T>(kTile * weights_.widest)};
     for (std::int64_t first = begin; first < end; first += kTile) {
       tile(first, std::min(kTile, end - first), inputs.data(), grads, sums);
     }
@@ -153,21 +119,23 @@ class Backward {
 
  private:
   void tile(std::int64_t first, std::int64_t rows, T* inputs, std::vector<T> (&grads)[2], T* sums) const {
-    const std::int64_t input_columns = padded(layers_[0].inputs);
-    if (by_layers_) gather(inputs_, first, rows, input_columns, inputs);
+    const std::vector<std::int64_t>&offsets = weights_.offsets, &columns = weights_.columns;
+    const T* input = gathers_ ? inputs : inputs_[0].data + first * inputs_[0].stride;
+    const std::int64_t input_row = gathers_ ? padded(layers_[0].inputs) : inputs_[0].stride;
+    if (gathers_) gather(inputs_, first, rows, input_row, inputs);
     const T* grad = out_grad_.data + first * out_grad_.stride;  // by the outputs of layer i
     std::int64_t grad_row = out_grad_.stride;
     for (std::size_t i = layers_.size(); i-- > 0;) {
-      const T* before = i > 0 ? hidden_ + first * offsets_.back() + offsets_[i - 1] : inputs;
-      const std::int64_t before_row = i > 0 ? offsets_.back() : input_columns;
-      if (by_layers_) add_layer(i, rows, grad, grad_row, before, before_row, sums + sums_at_[i]);
-      if (columns_[i] == 0) return;
+      const T* before = i > 0 ? hidden_ + first * offsets.back() + offsets[i - 1] : input;
+      const std::int64_t before_row = i > 0 ? offsets.back() : input_row;
+      if (by_layers_) add_layer(i, rows, grad, grad_row, before, before_row, sums + weights_.sums_at[i]);
+      if (columns[i] == 0) return;
       Product<T> product{};
       product.a = grad;
       product.a_row = grad_row;
       product.a_depth = 1;
-      product.b = weights_[i].data();
-      product.b_row = product.columns = product.c_row = columns_[i];
+      product.b = weights_.weights[i].data();
+      product.b_row = product.columns = product.c_row = columns[i];
       product.c = grads[i % 2].data();
       product.rows = rows;
       product.depth = layers_[i].outputs;
@@ -221,19 +189,55 @@ class Backward {
     }
   }
 
+  const BackwardWeights<T>& weights_;
   const std::vector<Layer<T>>& layers_;
   const std::vector<Columns<const T>>& inputs_;
   const T* hidden_;
   Columns<const T> out_grad_;
   const std::vector<Columns<T>>& input_grads_;
-  bool by_layers_;
-  std::vector<std::int64_t> offsets_, columns_, sums_at_ = {0};
-  std::vector<std::vector<T>> weights_;  // of each layer, the columns whose gradient is asked for, padded
-  std::int64_t widest_ = 0;
+  bool by_layers_, gathers_;
   ProductKernel<T> kernel_ = RADARSDF_KERNEL(product_kernel<T>)();
 };
 
 }  // namespace
+
+template <typename T>
+ForwardWeights<T>::ForwardWeights(const std::vector<Layer<T>>& own_layers)
+    : layers(own_layers), offsets(hidden_offsets(own_layers)) {
+  for (const Layer<T>& layer : layers) {
+    const std::int64_t columns = padded(layer.outputs);
+    transposed.push_back(zeros<T>(layer.inputs * columns));
+    biases.push_back(zeros<T>(columns));
+    for (std::int64_t n = 0; n < layer.outputs; ++n) {
+      for (std::int64_t k = 0; k < layer.inputs; ++k) {
+        transposed.back()[static_cast<std::size_t>(k * columns + n)] = layer.weights[n * layer.inputs + k];
+      }
+    }
+    std::copy_n(layer.biases, layer.outputs, biases.back().begin());
+  }
+}
+
+template <typename T>
+BackwardWeights<T>::BackwardWeights(const std::vector<Layer<T>>& own_layers, const std::vector<MlpInput>& inputs)
+    : layers(own_layers), offsets(hidden_offsets(own_layers)) {
+  for (std::size_t i = 0; i < layers.size(); ++i) {
+    const Layer<T>& layer = layers[i];
+    std::vector<Columns<const T>> wanted;
+    std::int64_t sum = 0, offset = 0;
+    for (const MlpInput& input : i == 0 ? inputs : std::vector<MlpInput>{{layer.inputs, true}}) {
+      if (input.wanted) {
+        wanted.push_back({layer.weights + offset, layer.inputs, input.width});
+        sum += input.width;
+      }
+      offset += input.width;
+    }
+    columns.push_back(padded(sum));
+    weights.push_back(zeros<T>(layer.outputs * columns.back()));
+    gather(wanted, 0, layer.outputs, columns.back(), weights.back().data());
+    sums_at.push_back(sums_at.back() + layer.outputs * padded(layer.inputs) + padded(layer.outputs));
+    widest = std::max({widest, padded(layer.outputs), padded(layer.inputs)});
+  }
+}
 
 template <typename T>
 std::int64_t mlp_hidden_columns(const std::vector<Layer<T>>& layers) {
@@ -241,16 +245,16 @@ std::int64_t mlp_hidden_columns(const std::vector<Layer<T>>& layers) {
 }
 
 template <typename T>
-void mlp(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, std::int64_t count,
-         T* hidden, T* out, int num_threads) {
-  const Forward<T> forward(layers, inputs);
-  const std::int64_t hidden_columns = mlp_hidden_columns(layers), outputs = layers.back().outputs;
+void mlp(const ForwardWeights<T>& weights, const std::vector<Columns<const T>>& inputs, std::int64_t count, T* hidden,
+         T* out, int num_threads) {
+  const std::int64_t hidden_columns = weights.offsets.back(), outputs = weights.layers.back().outputs;
   parallel_blocks(count, kMinRows, num_threads, [&](std::int64_t begin, std::int64_t end) {
     std::vector<T> scratch = zeros<T>(hidden ? 0 : kTile * hidden_columns);
     std::vector<T> results = zeros<T>(kTile * padded(outputs));
     for (std::int64_t first = begin; first < end; first += kTile) {
       const std::int64_t rows = std::min(kTile, end - first);
-      forward.tile(first, rows, hidden ? hidden + first * hidden_columns : scratch.data(), results.data());
+      T* kept = hidden ? hidden + first * hidden_columns : scratch.data();
+      forward_tile(weights, inputs, first, rows, kept, results.data());
       for (std::int64_t r = 0; r < rows; ++r) {
         std::copy_n(results.data() + r * padded(outputs), outputs, out + (first + r) * outputs);
       }
@@ -259,38 +263,42 @@ void mlp(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>
 }
 
 template <typename T>
-void mlp_backward(const std::vector<Layer<T>>& layers, const std::vector<Columns<const T>>& inputs, std::int64_t count,
+void mlp_backward(const BackwardWeights<T>& weights, const std::vector<Columns<const T>>& inputs, std::int64_t count,
                   const T* hidden, Columns<const T> out_grad, const std::vector<LayerGradients<T>>& layer_grads,
                   const std::vector<Columns<T>>& input_grads, int num_threads) {
   const bool by_layers = !layer_grads.empty();
-  const Backward<T> backward(layers, inputs, hidden, out_grad, input_grads, by_layers);
+  const std::vector<Layer<T>>& layers = weights.layers;
+  const std::int64_t num_sums = weights.sums_at.back();
+  const Backward<T> backward(weights, inputs, hidden, out_grad, input_grads, by_layers);
   const std::int64_t chunks = std::clamp<std::int64_t>((count + kChunkRows - 1) / kChunkRows, 1, kMaxChunks);
-  std::vector<T> sums = zeros<T>(by_layers ? chunks * backward.num_sums() : 0);
+  std::vector<T> sums = zeros<T>(by_layers ? chunks * num_sums : 0);
   parallel_tasks(chunks, num_threads, [&](std::int64_t chunk) {
-    T* own = by_layers ? sums.data() + chunk * backward.num_sums() : nullptr;
+    T* own = by_layers ? sums.data() + chunk * num_sums : nullptr;
     backward.rows(count * chunk / chunks, count * (chunk + 1) / chunks, own);
   });
   if (!by_layers) return;
-  for (std::int64_t i = backward.num_sums(); i < chunks * backward.num_sums(); ++i) {
-    sums[i % backward.num_sums()] += sums[i];
+  for (std::int64_t i = num_sums; i < chunks * num_sums; ++i) {
+    sums[i % num_sums] += sums[i];
   }
   for (std::size_t i = 0; i < layers.size(); ++i) {
     const Layer<T>& layer = layers[i];
-    const T* sum = sums.data() + backward.sums_at(i);
-    T* weights = layer_grads[i].weights;
+    const T* sum = sums.data() + weights.sums_at[i];
+    T* to = layer_grads[i].weights;
     for (std::int64_t n = 0; n < layer.outputs; ++n, sum += padded(layer.inputs)) {
-      weights = std::copy_n(sum, layer.inputs, weights);
+      to = std::copy_n(sum, layer.inputs, to);
     }
     std::copy_n(sum, layer.outputs, layer_grads[i].biases);
   }
 }
 
-#define RADARSDF_INSTANTIATE(T)                                                                                     \
-  template std::int64_t mlp_hidden_columns(const std::vector<Layer<T>>&);                                           \
-  template void mlp(const std::vector<Layer<T>>&, const std::vector<Columns<const T>>&, std::int64_t, T*, T*, int); \
-  template void mlp_backward(const std::vector<Layer<T>>&, const std::vector<Columns<const T>>&, std::int64_t,      \
-                             const T*, Columns<const T>, const std::vector<LayerGradients<T>>&,                     \
-                             const std::vector<Columns<T>>&, int);
+#define RADARSDF_INSTANTIATE(T)                                                                                       \
+  template std::int64_t mlp_hidden_columns(const std::vector<Layer<T>>&);                                             \
+  template struct ForwardWeights<T>;                                                                                  \
+  template struct BackwardWeights<T>;                                                                                 \
+  template void mlp(const ForwardWeights<T>&, const std::vector<Columns<const T>>&, std::int64_t, T*, T*, int);       \
+  template void mlp_backward(const BackwardWeights<T>&, const std::vector<Columns<const T>>&, std::int64_t, const T*, \
+                             Columns<const T>, const std::vector<LayerGradients<T>>&, const std::vector<Columns<T>>&, \
+                             int);
 RADARSDF_INSTANTIATE(float)
 RADARSDF_INSTANTIATE(double)
 #undef RADARSDF_INSTANTIATE

@@ -3,6 +3,7 @@
 #include "kernels/fourier_kernels.hpp"
 
 #include <math.h>  // not <cmath>, whose inline overloads could leave this copy's instruction set
+#include <string.h>
 
 #ifndef RADARSDF_ISA
 #error "RADARSDF_ISA names the instruction set that this copy is compiled for"
@@ -44,20 +45,20 @@ inline void sincos_pi(T t, T* sine, T* cosine) {
 template <typename T>
 void encode(const T* points, T inverse_half_width, int first, int count, T* out, std::int64_t stride,
             std::int64_t begin, std::int64_t end) {
+  constexpr int kLanes = 8;            // whole vectors: the last numbers of a shorter loop would be single ones
+  T angles[3 * kMaxFrequencies] = {};  // in units of pi; scaling by a power of two is exact
+  T sines[3 * kMaxFrequencies], cosines[3 * kMaxFrequencies];
   for (std::int64_t n = begin; n < end; ++n) {
-    T angles[3 * kMaxFrequencies];  // in units of pi; scaling by a power of two is exact
     T scale = static_cast<T>(1 << first);
     for (int k = 0; k < count; ++k, scale *= 2) {
       for (int axis = 0; axis < 3; ++axis) angles[3 * k + axis] = points[3 * n + axis] * inverse_half_width * scale;
     }
-    T* sines = out + n * stride;
-    T* cosines = sines + 3 * count;
-    for (int i = 0; i < 3 * count; ++i) {
-      T sine, cosine;
-      sincos_pi(angles[i], &sine, &cosine);
-      sines[i] = sine;
-      cosines[i] = cosine;
+    for (int i = 0; i < 3 * count; i += kLanes) {
+      for (int lane = i; lane < i + kLanes; ++lane) sincos_pi(angles[lane], &sines[lane], &cosines[lane]);
     }
+    T* own = out + n * stride;
+    memcpy(own, sines, sizeof(T) * static_cast<size_t>(3 * count));
+    memcpy(own + 3 * count, cosines, sizeof(T) * static_cast<size_t>(3 * count));
   }
 }
 

@@ -17,6 +17,13 @@ constexpr int kVectorBytes = 16, kRows = 4;
 constexpr int kVectors =
     2;  // side by side. Two multipliers with a latency of four need eight sums at once: kRows · kVectors or more
 
+// Loops over a block's sums: left as loops, they would keep the sums in memory.
+#if defined(__GNUC__) && !defined(__clang__)
+#define RADARSDF_UNROLL _Pragma("GCC unroll 16")
+#else
+#define RADARSDF_UNROLL
+#endif
+
 // A block of c, whose sums stay in registers.
 template <int kBlockRows, int kBlockVectors, typename T>
 inline void block(const Product<T>& p, std::int64_t row, std::int64_t column) {
@@ -25,10 +32,16 @@ inline void block(const Product<T>& p, std::int64_t row, std::int64_t column) {
   const T* a = p.a + row * p.a_row;
   const T* b = p.b + column;
   T* c = p.c + row * p.c_row + column;
+  // Copies: a store into c could change the product itself.
+  const std::int64_t c_row = p.c_row, positive_row = p.positive_row;
+  const T* positive = p.positive ? p.positive + row * positive_row + column : nullptr;
+  const bool rectify = p.rectify;
   Vector sums[kBlockRows][kBlockVectors];
+  RADARSDF_UNROLL
   for (int r = 0; r < kBlockRows; ++r) {
+    RADARSDF_UNROLL
     for (int v = 0; v < kBlockVectors; ++v) {
-      sums[r][v] = p.add      ? load_vector<Vector>(c + r * p.c_row + v * kLanes)
+      sums[r][v] = p.add      ? load_vector<Vector>(c + r * c_row + v * kLanes)
                    : p.biases ? load_vector<Vector>(p.biases + column + v * kLanes)
                               : Vector{};
     }
@@ -41,15 +54,14 @@ inline void block(const Product<T>& p, std::int64_t row, std::int64_t column) {
       for (int v = 0; v < kBlockVectors; ++v) sums[r][v] += factor * factors[v];
     }
   }
+  RADARSDF_UNROLL
   for (int r = 0; r < kBlockRows; ++r) {
+    RADARSDF_UNROLL
     for (int v = 0; v < kBlockVectors; ++v) {
       Vector sum = sums[r][v];
-      if (p.rectify) sum = not_negative<T>(sum);
-      if (p.positive) {
-        const T* positive = p.positive + (row + r) * p.positive_row + column + v * kLanes;
-        sum = where_positive<T>(load_vector<Vector>(positive), sum);
-      }
-      store_vector(c + r * p.c_row + v * kLanes, sum);
+      if (rectify) sum = not_negative<T>(sum);
+      if (positive) sum = where_positive<T>(load_vector<Vector>(positive + r * positive_row + v * kLanes), sum);
+      store_vector(c + r * c_row + v * kLanes, sum);
     }
   }
 }

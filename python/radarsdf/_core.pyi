@@ -41,6 +41,7 @@ __all__: list[str] = [
     "compiler",
     "count_scans",
     "count_visibility",
+    "draw_samples",
     "find_free_space",
     "fit_cell_means",
     "fourier",
@@ -993,6 +994,23 @@ def count_visibility(
     For each leaf cell (C,) the number of scans with a ray through its cube of 8 x 8 x 8 leaf cells, or to there: (C,) uint32. `leaf_keys` (C,) uint64, ascending; `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m; `scans` (N,) int32, ascending.
     """
 
+def draw_samples(
+    rays: numpy.typing.NDArray[numpy.float32],
+    places: numpy.typing.NDArray[numpy.int64],
+    ray: numpy.typing.NDArray[numpy.int32],
+    number: numpy.typing.NDArray[numpy.int32],
+    kind: numpy.typing.NDArray[numpy.uint8],
+    segments: numpy.typing.NDArray[numpy.float32],
+    seed: typing.SupportsInt | typing.SupportsIndex,
+) -> tuple[
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+]:
+    """
+    Random samples on `rays` (N, 7 or 8) float32: points (B, 3), m, signed distances along the ray to the return (B,), m, and rows of `rays`. Sample i is on ray `places[ray[i]]`; its random number, found by `seed` and `number[i]`, is uniform in row `kind[i]` of `segments` (K, 4): start and length in metres, each a constant and a factor on the range.
+    """
+
 def find_free_space(
     points: numpy.typing.NDArray[numpy.float32],
     directions: numpy.typing.NDArray[numpy.float32],
@@ -1349,9 +1367,10 @@ def soap_step(
     memories: list[numpy.typing.NDArray[numpy.float32]],
     step: typing.SupportsInt | typing.SupportsIndex,
     learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+    pool: ThreadPool = None,
 ) -> None:
     """
-    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step.
+    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step. The threads of a `pool` share the matrices.
     """
 
 @typing.overload
@@ -1361,9 +1380,10 @@ def soap_step(
     memories: list[numpy.typing.NDArray[numpy.float64]],
     step: typing.SupportsInt | typing.SupportsIndex,
     learning_rate: typing.SupportsFloat | typing.SupportsIndex,
+    pool: ThreadPool = None,
 ) -> None:
     """
-    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step.
+    Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step. The threads of a `pool` share the matrices.
     """
 
 def sparse_lattice(

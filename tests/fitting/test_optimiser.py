@@ -57,15 +57,16 @@ def network_and_gradients(seed):
     return network, [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(50)]
 
 
-def test_soap_goes_on_from_its_state():
+def test_soap_goes_on_from_its_state_and_threads_change_no_bit():
     whole, gradients = network_and_gradients(1)
     resumed = [p.detach().clone().requires_grad_() for p in whole]
     soap, first, second = Soap(whole, 1e-2), Soap(resumed, 1e-2), Soap(resumed, 1e-2)
-    for i, step in enumerate(gradients):
-        soap.step(step)
-        (first if i < 20 else second).step(step)
-        if i == 19:
-            second.restore({name: value.clone() for name, value in first.state().items()})
+    with ThreadPool(3) as pool:
+        for i, step in enumerate(gradients):
+            soap.step(step)
+            (first if i < 20 else second).step(step, pool)
+            if i == 19:
+                second.restore({name: value.clone() for name, value in first.state().items()})
     for a, b in zip(whole, resumed, strict=True):
         assert torch.equal(a, b)
 
@@ -88,8 +89,9 @@ def steps(cells, batches, threads, learning_rate=1e-2):
         for parts in batches:
             touched = []
             for points, weights in parts:
-                gradient = weights.expand(len(points), cells.interpolated_dim)
-                touched.append(Touched(points, kernels.locate(points, cells.table), gradient))
+                gradient = np.broadcast_to(weights, (len(points), cells.interpolated_dim)).copy()
+                located = kernels.locate(points, cells.table).numpy()
+                touched.append(Touched(points.numpy(), located, gradient))
             adam.step(touched, pool, meanwhile=lambda: None)
     return cells.features.detach().clone()
 

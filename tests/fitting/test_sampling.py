@@ -27,9 +27,9 @@ def rays():
     return prepare(points, np.stack([pose([10.0 * i, i, 1], 0.3 * i) for i in range(4)]))
 
 
-def sampler(rays, batch_size=256, seed=0, **settings):
+def sampler(rays, batch_size=256, seed=0, neighbours=1, **settings):
     config = FitConfig(**grouped(**settings))
-    return RaySampler(rays, config, batch_size, torch.Generator().manual_seed(seed))
+    return RaySampler(rays, config, batch_size, torch.Generator().manual_seed(seed), neighbours)
 
 
 def rows_of(points, samples):
@@ -81,9 +81,9 @@ def test_ranges_of_the_samples(rays):
     assert min(lowest_share) >= 0.3 - 1e-5
 
 
-@pytest.mark.parametrize("batch_size", [100, 128, 1000])
-def test_each_ray_is_seen_equally_often(rays, batch_size):
-    draw = sampler(rays, batch_size)
+@pytest.mark.parametrize(("batch_size", "neighbours"), [(100, 1), (128, 7), (1000, 1)])
+def test_each_ray_is_seen_equally_often(rays, batch_size, neighbours):
+    draw = sampler(rays, batch_size, neighbours=neighbours)
     seen = np.zeros((2, NUM_RAYS), int)
     batches = 4 * NUM_RAYS * 2 // batch_size
     for _ in range(batches):
@@ -149,7 +149,11 @@ def test_parts_are_the_batch_each_with_its_share(rays, parts):
     for counts, total in ((sizes, 250), (near, 125)):  # without intensities, all near samples have labels
         assert sum(counts) == total
         assert max(counts) - min(counts) <= 2
-    # The same rays, each kind in the same order.
+    # The same rays and the same random numbers, each kind in the same order.
+    sdf_m = [part.sdf_m[: part.num_labelled] for part in found] + [
+        part.sdf_m[part.num_labelled :] for part in found
+    ]
+    assert torch.equal(torch.cat(sdf_m), whole.sdf_m)
     near = torch.cat([part.of_ray[: part.num_labelled] for part in found])
     free = torch.cat([part.of_ray[part.num_labelled :] for part in found])
     assert torch.equal(torch.cat([near, free]), whole.of_ray)

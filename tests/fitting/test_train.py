@@ -19,7 +19,7 @@ from radarsdf.returns.rays import prepare
 
 from .extreme import CASES, fitted, free_and_solid
 
-NONE = torch.zeros(1)
+NONE = np.zeros(1)
 
 
 def history(config=None, **iterations):
@@ -47,15 +47,15 @@ def test_the_bound_of_the_distances_is_one():
         for wrong in (-distances_m, torch.zeros(500)):
             loss = float(sdf_loss(wrong / config.sigma_m, distances_m, config.sigma_m))
             losses = history()
-            losses.add({"sdf": loss}, {"sdf": 1}, distances_m)
+            losses.add({"sdf": loss}, {"sdf": 1}, distances_m.numpy())
             assert losses.fault() is None
         longer = float(sdf_loss(-2 * distances_m / config.sigma_m - 9, distances_m, config.sigma_m))
-        losses.add({"sdf": 2 * longer}, {"sdf": 2}, distances_m)
+        losses.add({"sdf": 2 * longer}, {"sdf": 2}, distances_m.numpy())
         assert "wrong sign" in losses.fault()
 
 
 def test_a_few_bad_iterations_are_no_divergence_and_the_count_goes_on():
-    sdf_m = torch.full((8,), 0.1)  # one sigma: at worst 2
+    sdf_m = np.full(8, 0.1)  # one sigma: at worst 2
     losses, again = history(), history()
     for i in range(100):
         found = {"sdf": 50.0 if i in (3, 4) else 0.3, "intensity": 20.0 if i == 5 else 0.02}

@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -57,9 +58,9 @@ def intensity_loss(predicted: Tensor, label: Tensor) -> Tensor:
 class Touched:
     """Samples of a batch, and the gradient by their interpolated features. The features of cells that hold a sample are touched."""
 
-    points: Tensor  # (N, 3) samples, local frame, m
-    located: Tensor  # (N, num_levels) int32, rows of the cells that hold them
-    gradient: Tensor  # (N, 8 · num_levels), with respect to the interpolated features
+    points: NDArray[Any]  # (N, 3) samples, local frame, m
+    located: NDArray[np.int32]  # (N, num_levels), rows of the cells that hold them
+    gradient: NDArray[Any]  # (N, 8 · num_levels), with respect to the interpolated features
 
 
 @dataclass(frozen=True)
@@ -130,6 +131,7 @@ class CoreGradients(GradientBackend):
             sigma_m=field.sigma_m,
             intensity_in_free_space=config.training.intensity_in_free_space,
         )
+        self._located: NDArray[np.int32] | None = None
         self._by_sdf = [torch.from_numpy(gradient) for gradient in self._loss.sdf_gradients]
         self._by_intensity = [torch.from_numpy(gradient) for gradient in self._loss.intensity_gradients]
 
@@ -137,16 +139,18 @@ class CoreGradients(GradientBackend):
         return min(max(batch_size // _PART, 1), _MOST_PARTS)
 
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        cells, pool, count = self._field.cells, self._pool.core_threads, len(batch.points)
-        located = torch.empty((count, cells.table.num_levels), dtype=torch.int32, device="cpu")
-        touched = Touched(batch.points, located, batch.points.new_empty((count, cells.interpolated_dim)))
-        arguments: dict[str, Any] = {"points": batch.points.numpy(), "sdf_m": batch.sdf_m.numpy()}
-        arguments |= {"parts": batch.parts, "pool": pool}
+        cells, pool, touched = self._field.cells, self._pool.core_threads, self._touched_by(batch)
+        arguments: dict[str, Any] = {
+            "points": batch.points,
+            "sdf_m": batch.sdf_m,
+            "parts": batch.parts,
+            "pool": pool,
+        }
         if losses != "intensity":
-            arguments |= {"located": located.numpy(), "interpolated_grad": touched.gradient.numpy()}
+            arguments |= {"located": touched.located, "interpolated_grad": touched.gradient}
         if losses != "sdf":
             dropout = [(dropout.seed, dropout.keep) for _, dropout in self._draw_dropouts()]
-            arguments |= {"rays": batch.of_ray.numpy(), "dropout": dropout}
+            arguments |= {"rays": batch.of_ray, "dropout": dropout}
         if losses == "sdf":
             self._loss.begin_sdf(**arguments, weight=1.0)
         elif losses == "joint":
@@ -166,10 +170,16 @@ class CoreGradients(GradientBackend):
         if self._moves_rows:
             return Gradients(found, networks, touched), result
         by_features = torch.zeros_like(cells.features)
-        cells.table.scatter(
-            batch.points.numpy(), located.numpy(), touched.gradient.numpy(), by_features.numpy(), pool
-        )
+        cells.table.scatter(batch.points, touched.located, touched.gradient, by_features.numpy(), pool)
         return Gradients(found, [by_features, *networks], None), result
+
+    def _touched_by(self, batch: Batch) -> Touched:
+        """Arrays for the cells of a batch and their gradients, which the next one of this size overwrites."""
+        count, cells = len(batch.points), self._field.cells
+        if self._located is None or len(self._located) != count:
+            self._located = np.empty((count, cells.table.num_levels), np.int32)
+            self._interpolated_grad = np.empty((count, cells.interpolated_dim), batch.points.dtype)
+        return Touched(batch.points, self._located, self._interpolated_grad)
 
 
 def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
@@ -190,7 +200,7 @@ class AutogradGradients(GradientBackend):
         if losses != "sdf" and (dropouts := self._draw_dropouts()):
             seen = [self._num_seen(samples) for samples in parts]
             of_encodings = [
-                torch.split_with_sizes(dropout.factors(sum(seen), columns, batch.points.dtype), seen)
+                torch.split_with_sizes(dropout.factors(sum(seen), columns, parts[0].points.dtype), seen)
                 for columns, dropout in dropouts
             ]
             factors = [list(of_part) for of_part in zip(*of_encodings, strict=True)]

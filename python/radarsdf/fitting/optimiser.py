@@ -12,7 +12,7 @@ from torch import Tensor
 
 from radarsdf import _core
 from radarsdf._core import FEATURE_DIM
-from radarsdf.field.kernels import large_zeros, rows_view, view
+from radarsdf.field.kernels import large_zeros, view
 from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
 from radarsdf.threads import ThreadPool
@@ -37,8 +37,8 @@ class Optimiser(ABC):
         """Restores a :meth:`state`. ValueError: no optimiser of these parameters can have it."""
 
     @abstractmethod
-    def step(self, gradients: Sequence[Tensor]) -> None:
-        """Changes the parameters by `gradients`, which are in the same order."""
+    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:
+        """Changes the parameters by `gradients`, which are in the same order; on the threads of `pool`, if it is idle."""
 
 
 class Adam(Optimiser):
@@ -63,7 +63,7 @@ class Adam(Optimiser):
             value.copy_(state[name])
 
     @torch.no_grad()
-    def step(self, gradients: Sequence[Tensor]) -> None:
+    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:  # noqa: ARG002
         self._step.add_(1)
         torch._fused_adam_(  # the kernel has no public name
             self.parameters,
@@ -99,6 +99,7 @@ class Soap(Optimiser):
         matrices = _at(self._matrices, self.parameters)
         self._weights = [view(p) for p in matrices]
         self._memories = [p.new_zeros(_core.soap_memory_size(*p.shape)) for p in matrices]
+        self._memory_views = [memory.numpy() for memory in self._memories]
 
     def state(self) -> dict[str, Tensor]:
         state = {f"memory.{i}": memory for i, memory in enumerate(self._memories)}
@@ -115,16 +116,17 @@ class Soap(Optimiser):
         self._adam.restore({k: state[f"adam.{k}"] for k in self._adam.state()})
         self.step_count = count
 
-    def step(self, gradients: Sequence[Tensor]) -> None:
+    def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:
         self.step_count += 1
         self._adam.learning_rate = self.learning_rate
         self._adam.step(_at(self._others, gradients))
         _core.soap_step(
             weights=self._weights,
             gradients=[g.numpy() for g in _at(self._matrices, gradients)],
-            memories=[memory.numpy() for memory in self._memories],
+            memories=self._memory_views,
             step=self.step_count,
             learning_rate=self.learning_rate,
+            pool=None if pool is None else pool.core_threads,
         )
 
 
@@ -148,6 +150,7 @@ class RowAdam:
         # Of each row: mean and mean square of its gradients; the last step that changed it, and a mark of the core's.
         self._moments = large_zeros(rows, 2 * FEATURE_DIM, dtype=dtype)
         self._marks = large_zeros(rows, 2, dtype=torch.int32)
+        self._arrays = view(cells.features), self._moments.numpy(), self._marks.numpy()
         self._decays = torch.zeros(0, 2, dtype=dtype, device="cpu")
 
     @property
@@ -178,10 +181,8 @@ class RowAdam:
             # Denormal numbers would be slow, and make no difference compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         self._cells.table.begin_adam_step(
-            [(view(t.points), t.located.numpy(), rows_view(t.gradient)) for t in touched],
-            view(self._cells.features),
-            self._moments.numpy(),
-            self._marks.numpy(),
+            [(t.points, t.located, t.gradient) for t in touched],
+            *self._arrays,
             self._decays.numpy(),
             self.step_count,
             self.learning_rate,

@@ -14,9 +14,9 @@ from torch import Tensor
 from radarsdf._core import (
     RAY_DIRECTION,
     RAY_INTENSITY,
-    RAY_POINT,
     RAY_RANGE,
     cell_keys,
+    draw_samples,
     gather_rows,
     random_bytes,
     stable_order,
@@ -64,7 +64,7 @@ class Samples:
 
     @property
     def directions(self) -> Tensor:
-        return _directions(self.of_ray)
+        return self.of_ray[:, RAY_DIRECTION:RAY_RANGE]
 
     @property
     def ranges_m(self) -> Tensor:
@@ -79,14 +79,15 @@ class Samples:
 class Batch:
     """Samples in parts, one part after the other. Each part is the work of one thread."""
 
-    points: Tensor  # (B, 3), see :class:`Samples`
-    sdf_m: Tensor  # (B,)
-    of_ray: Tensor  # (B, 7 or 8)
+    points: NDArray[np.float32]  # (B, 3), see :class:`Samples`
+    sdf_m: NDArray[np.float32]  # (B,)
+    of_ray: NDArray[np.float32]  # (B, 7 or 8)
     parts: list[tuple[int, int]]  # number of samples of each part, and how many of the first ones have labels
 
     def split(self) -> list[Samples]:
         sizes, labelled = map(list, zip(*self.parts, strict=True))
-        columns = [torch.split_with_sizes(column, sizes) for column in (self.points, self.sdf_m, self.of_ray)]
+        arrays = map(torch.from_numpy, (self.points, self.sdf_m, self.of_ray))
+        columns = [torch.split_with_sizes(column, sizes) for column in arrays]
         # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
         shares = ([count / max(sum(counts), 1) for count in counts] for counts in (sizes, labelled))
         return [
@@ -117,24 +118,27 @@ class RaySampler:
         self._config = config
         self._neighbours = neighbours
         self._generator = generator
-        rows = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
-        self._rays = torch.from_numpy(rows)
-        self._order, self._next = np.zeros(0, np.int64), 0
+        self._rays = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
+        self._runs, self._next = (
+            np.zeros(0, np.int32),
+            0,
+        )  # runs of neighbours in random order; the next ray in it
         self._order_from = generator.get_state()  # before the order was drawn
         near, labelled = near_and_labelled(config, batch_size)
         # Samples with labels come first, and a batch without them is in Morton order.
         self._counts = (near if intensities is None else labelled, near, batch_size - near)
-        self._layouts: dict[int, _Layout] = {}
+        self._layouts: dict[tuple[int, ...], _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
         """The order of the rays, as a state of the generator, and the position in it: -1 before the first batch."""
-        following = self._next if len(self._order) else -1
+        following = self._next if len(self._runs) else -1
         following_ray = torch.tensor(following, dtype=torch.int64, device="cpu")
         return {"order_from": self._order_from, "next": following_ray}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         following = int(state["next"])
-        if not -1 <= following <= len(self._rays):
+        most = len(self._rays) + self._neighbours
+        if not -1 <= following <= most:
             msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
             raise ValueError(msg)
         if following >= 0:
@@ -145,56 +149,47 @@ class RaySampler:
     def _draw_order(self) -> None:
         self._order_from = self._generator.get_state()
         count = -(-len(self._rays) // self._neighbours)
-        runs = torch.randperm(count, generator=self._generator, device="cpu").numpy()
-        order = (runs[:, None] * self._neighbours + np.arange(self._neighbours)).ravel()
-        self._order = order[order < len(self._rays)]
-        self._next = 0
+        runs = torch.randperm(count, generator=self._generator, dtype=torch.int32, device="cpu")
+        self._runs, self._next = runs.numpy(), 0
 
-    def _take(self, count: int) -> Tensor:
+    def _take(self, count: int) -> NDArray[np.int64]:
         """Rows of the next `count` rays of the random order, ascending: in Morton order of their returns."""
         # A whole pass takes every ray once, in any order: of few rays, a batch would draw hundreds of orders.
         passes, count = divmod(count, len(self._rays))
         parts = [np.repeat(np.arange(len(self._rays)), passes)] if passes else []
         while count > 0:
-            if self._next >= len(self._order):
+            if self._next >= len(self._runs) * self._neighbours:
                 self._draw_order()
-            part = self._order[self._next : self._next + count]
+            places = np.arange(self._next, min(self._next + count, len(self._runs) * self._neighbours))
+            run, of_run = np.divmod(places, self._neighbours)
+            part = self._runs[run] * np.int64(self._neighbours) + of_run
             self._next += len(part)
+            part = part[part < len(self._rays)]  # the last run may be shorter
             count -= len(part)
             parts.append(part)
-        return torch.from_numpy(np.sort(np.concatenate(parts)))
-
-    def _uniform(self, count: int) -> Tensor:
-        return torch.rand(count, generator=self._generator, dtype=torch.float32, device="cpu")
+        return np.sort(np.concatenate(parts))
 
     def spread(self, count: int, parts: int = 1) -> Batch:
         """`count` samples in the near band, in `parts`, with the sensor's angular noise across the beam."""
-        places, noise_rad = self._take(count), self._config.training.cross_range_noise_rad
-        sdf_m = (2 * self._uniform(count) - 1) * self._config.metres(NEAR_BAND_CELLS)
-        ray = self._rays.index_select(0, places)
-        points = _returns(ray) - sdf_m[:, None] * _directions(ray)
+        batch, noise_rad = self._draw((count, count, 0), parts), self._config.training.cross_range_noise_rad
         if noise_rad > 0:
             # Noise in all directions is simpler. Along the beam it is small compared with the width of the band.
-            noise = torch.randn(points.shape, generator=self._generator, dtype=torch.float32, device="cpu")
-            points += noise * (noise_rad * ray[:, RAY_RANGE, None])
-        near = [share(count, part, parts) for part in range(parts)]
-        return Batch(points, sdf_m, ray, list(zip(near, near, strict=True)))
+            noise = torch.randn(
+                count, 3, generator=self._generator, dtype=torch.float32, device="cpu"
+            ).numpy()
+            batch.points[:] += noise * (noise_rad * batch.of_ray[:, RAY_RANGE, None])
+        return batch
 
     def batch(self, parts: int = 1) -> Batch:
         """`batch_size` samples, in `parts`, each with its share of near and free samples."""
-        if parts not in self._layouts:
-            self._layouts[parts] = _Layout.of(self._counts, parts, self._config)
-        layout = self._layouts[parts]
-        places = self._take(max(self._counts)).index_select(0, layout.index)
-        ray = self._rays.index_select(0, places)
-        range_m = ray[:, RAY_RANGE]
-        start_m, length_m = (
-            torch.addcmul(constant, of_range, range_m) for constant, of_range in (layout.start, layout.length)
-        )
-        # Random numbers are drawn for the whole batch and then divided, so samples do not depend on `parts`.
-        sdf_m = torch.addcmul(start_m, length_m, self._uniform(len(places)).index_select(0, layout.order))
-        points = torch.addcmul(_returns(ray), sdf_m[:, None], _directions(ray), value=-1)
-        return Batch(points, sdf_m, ray, layout.parts)
+        return self._draw(self._counts, parts)
+
+    def _draw(self, counts: tuple[int, int, int], parts: int) -> Batch:
+        if (key := (*counts, parts)) not in self._layouts:
+            self._layouts[key] = _Layout.of(counts, parts, self._config)
+        layout, places, seed = self._layouts[key], self._take(max(counts)), draw_seed(self._generator)
+        of_samples = layout.ray, layout.number, layout.kind, layout.segments
+        return Batch(*draw_samples(self._rays, places, *of_samples, seed), layout.parts)
 
 
 def _in_morton_order(
@@ -211,14 +206,6 @@ def _in_morton_order(
     return rows
 
 
-def _returns(rays: Tensor) -> Tensor:
-    return rays[:, RAY_POINT:RAY_DIRECTION]
-
-
-def _directions(rays: Tensor) -> Tensor:
-    return rays[:, RAY_DIRECTION:RAY_RANGE]
-
-
 def share(count: int, part: int, parts: int) -> int:
     """How many of `count` things the `part`-th of `parts` gets."""
     return count * (part + 1) // parts - count * part // parts
@@ -228,10 +215,11 @@ def share(count: int, part: int, parts: int) -> int:
 class _Layout:
     """The order of the B samples of a batch, each drawn uniformly from a segment of its ray: part by part, near ones first."""
 
-    index: Tensor  # (B,) int64, row of each sample's ray among the rays that were taken
-    order: Tensor  # (B,) int64, row of each sample if all near samples of the batch came first, then all free ones
-    start: tuple[Tensor, Tensor]  # (B,) c and d: the segment starts c + d · range in front of the return, m,
-    length: tuple[Tensor, Tensor]  # (B,) and has the length c + d · range, m, towards the sensor
+    ray: NDArray[np.int32]  # (B,) row of each sample's ray among the rays that were taken
+    # (B,) of its random number: its row if all near samples of the batch came first, so that no sample depends on `parts`
+    number: NDArray[np.int32]
+    kind: NDArray[np.uint8]  # (B,) row of its segment
+    segments: NDArray[np.float32]  # (2, 4) of near and of free samples, see the core's ``draw_samples``
     parts: list[tuple[int, int]]  # see :class:`Batch`
 
     @classmethod
@@ -246,16 +234,14 @@ class _Layout:
         of_kinds = [near_rays[chosen], near_rays[~chosen], free_rays]
         shares = [[share(len(kind), part, parts) for part in range(parts)] for kind in of_kinds]
         sizes = [size for part in zip(*shares, strict=True) for size in part]
-        kinds = torch.from_numpy(np.repeat(np.tile([0, 1, 2], parts), sizes))
-        order = kinds.argsort(stable=True).argsort()
-        index = torch.from_numpy(np.concatenate(of_kinds))[order]
-        # From the sensor: near samples in range ± near_band, free ones in [free_from · range, range + free_beyond].
+        kinds = np.repeat(np.tile([0, 1, 2], parts), sizes)
+        number = kinds.argsort(kind="stable").argsort().astype(np.int32)
+        ray = np.concatenate(of_kinds).astype(np.int32)[number]
+        # From the return to the sensor: near samples in ± near_band, free ones in [-free_beyond, (1 - free_from) · range].
         band_m, beyond_m = config.metres(NEAR_BAND_CELLS), config.metres(FREE_BEYOND_CELLS)
-        segments = [[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]]
-        ends = torch.tensor(segments, dtype=torch.float32, device="cpu")[(kinds == 2).long()]
-        start, of_range, length, length_of_range = ends.T.contiguous()
+        segments = np.float32([[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]])
         sizes_and_labels = [(sum(part), part[0]) for part in zip(*shares, strict=True)]
-        return cls(index, order, (start, of_range), (length, length_of_range), sizes_and_labels)
+        return cls(ray, number, (kinds == 2).astype(np.uint8), segments, sizes_and_labels)
 
 
 def _spread(count: int, of: int) -> NDArray[np.int64]:
@@ -264,6 +250,11 @@ def _spread(count: int, of: int) -> NDArray[np.int64]:
     jittered = numbers + numbers * _GOLDEN % 1
     spread: NDArray[np.int64] = np.minimum(jittered * of // max(count, 1), of - 1).astype(np.int64)
     return spread
+
+
+def draw_seed(generator: torch.Generator) -> int:
+    """A random seed of the core's random numbers."""
+    return int(torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator))
 
 
 @dataclass(frozen=True)
@@ -276,8 +267,7 @@ class Dropout:
     @classmethod
     def draw(cls, dropout: float, generator: torch.Generator) -> Dropout:
         """`dropout`: probability that a number is dropped."""
-        seed = torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator)
-        return cls(int(seed), round(256 * (1 - dropout)))
+        return cls(draw_seed(generator), round(256 * (1 - dropout)))
 
     def factors(self, rows: int, columns: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """(rows, columns): 0 for dropped numbers, 256 / keep for the others, so that the mean is 1."""

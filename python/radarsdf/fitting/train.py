@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -86,12 +87,12 @@ class LossHistory:
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
         self._started_s = time.perf_counter() - before_s
 
-    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: Tensor) -> None:
+    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: NDArray[Any]) -> None:
         """Adds the losses of an iteration, after which so many are `done`, of samples with these labels (B,), m."""
         now_s = time.perf_counter() - self._started_s
         # Distances with the wrong sign have a cross-entropy of less than 1 + distance / sigma, and intensities from 0 to
         # 1 an absolute error of at most 1.
-        worst = {"sdf": 1 + float(sdf_m.abs().mean()) / self._sigma_m, "intensity": 1.0}
+        worst = {"sdf": 1 + float(np.abs(sdf_m).mean()) / self._sigma_m, "intensity": 1.0}
         self._recent *= _KEPT
         for row, name in enumerate(_WORST):
             if name in losses:
@@ -327,7 +328,7 @@ class Training:
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
             move_networks = functools.partial(_move_networks, found, stage.optimisers, share)
             if rows is None:
-                move_networks()
+                move_networks(self._pool)
             else:
                 assert found.touched is not None
                 rows.learning_rate = share * rows.full_rate
@@ -354,12 +355,14 @@ class Training:
                 raise KeyboardInterrupt
 
 
-def _move_networks(found: Gradients, optimisers: list[Optimiser], share: float) -> None:
+def _move_networks(
+    found: Gradients, optimisers: list[Optimiser], share: float, pool: ThreadPool | None = None
+) -> None:
     """Changes the networks by the gradients."""
     total = iter(found.by_parameters)
     for optimiser in optimisers:
         optimiser.learning_rate = share * optimiser.full_rate
-        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))))
+        optimiser.step(list(itertools.islice(total, len(optimiser.parameters))), pool)
 
 
 def _nothing() -> None:
