@@ -17,7 +17,7 @@ from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.posed import PosedScans, pose_sigmas
-from radarsdf.poses.refine import _by_biases, _plan
+from radarsdf.poses.refine import _by_biases
 from radarsdf.poses.rigid import (
     alignment,
     between,
@@ -307,13 +307,6 @@ def test_common_errors_of_steps_are_those_of_one_inverse():
     whole = np.linalg.inv(np.block([[hessian, by.T], [by, np.diag(own + 1)]]))[:12, :12]
     added = whole - np.linalg.inv(hessian)
     assert_allclose(found, [added[:6, :6], added[6:, 6:]], atol=1e-12)
-
-
-def test_rounds_go_from_short_windows_and_coarse_cells_to_all_scans():
-    of_all = [(20, 4), (20, 4), (20, 2), (20, 2)] + [(20, 1)] * 12
-    assert _plan(20, 8) == [(8, 4), (8, 2), (16, 4), (16, 2), *of_all]
-    assert _plan(8, 8)[0] == (8, 4)
-    assert _plan(20, 20) == of_all
 
 
 def test_motions_of_a_tracked_drive():
