@@ -273,9 +273,9 @@ def test_presets():
     assert FitConfig().trains_intensity
 
 
-def test_what_is_told_to_prepare():
-    told = {"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3}
-    assert FitConfig(returns=told).preparation == told | {"lattice": WorldLattice(0.2, 32)}
+def test_settings_of_the_preparation():
+    ranges = {"min_range_m": 1.0, "max_range_m": 50.0, "accumulate_scans": 3}
+    assert FitConfig(returns=ranges).preparation == ranges | {"lattice": WorldLattice(0.2, 32)}
 
 
 def test_rows_move_unless_normals_are_learnt_with_the_geometry():

@@ -166,7 +166,7 @@ def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) >= 3
 
 
-def test_maps_without_passages_and_poses_of_maps_are_refused(maps, drives):
+def test_maps_without_free_space_and_poses_of_maps_are_refused(maps, drives):
     drive = drives[0]
     blind = radarsdf.fit(drive.points[:4], drive.poses[:4], config=radarsdf.FitConfig.quick())
     with pytest.raises(ValueError, match="after has no free-space crossings"):

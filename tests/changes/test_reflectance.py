@@ -75,7 +75,7 @@ def test_another_gain_and_another_frame_are_no_change(drives, maps):
     assert found.report["areas_m2"]["reflectance_changed"] < 0.0025 * found.report["compared_m2"]
 
 
-def test_without_intensities_nothing_is_said_of_them(drives, maps):
+def test_without_intensities_none_are_reported(drives, maps):
     blind = radarsdf.fit(drives[2].points, drives[2].poses, config=QUICK)
     found = radarsdf.compare(maps[0], blind)
     assert len(blind.view_statistics().counts) == 0

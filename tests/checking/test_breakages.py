@@ -52,7 +52,7 @@ SEVERITIES = {
 
 
 @pytest.mark.parametrize("way", sorted(set(WAYS) - NOT_HERE))
-def test_a_way_breaks_the_data_and_is_named(good, way, request):
+def test_a_breakage_is_named(good, way, request):
     finding, broken = WAYS[way]
     if finding.startswith(("intensity", "duplicate", "below")):
         request.getfixturevalue("right_frames")

@@ -62,7 +62,7 @@ def test_heights_that_are_off_from_scan_to_scan_are_found_in_metres():
     assert added_m(scans.points, poses) == pytest.approx(0.03, rel=0.5)
 
 
-def test_a_way_back_that_has_drifted_is_found():
+def test_a_return_trip_that_has_drifted_is_found():
     scans = radarsdf.simulate.wall(frames=20, seed=1)
     points, rng = list(scans.points), np.random.default_rng(0)
     points += [scan + rng.normal(0, 1e-3, scan.shape) for scan in reversed(scans.points)]

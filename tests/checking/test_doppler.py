@@ -39,7 +39,7 @@ def one_scan(moving=0.3, sigma=0.08, count=2000):
 def drive():
     """Scans along a turn, with Doppler from their poses and a tenth of the returns moving."""
     every = radarsdf.simulate.wall(frames=90)
-    # Uneven speed: else no clock could be told from another.
+    # Uneven speed: else no clock could be distinguished from another.
     chosen = np.cumsum(np.round(2 + 1.2 * np.sin(np.arange(40) / 4)).astype(int))
     chosen = chosen[chosen < 90]
     points, poses = [every.points[i] for i in chosen], every.poses[chosen]
@@ -110,7 +110,7 @@ def test_returns_in_one_direction_have_a_velocity_along_it():
 
 
 @pytest.mark.usefixtures("right_frames")
-def test_good_doppler_says_only_what_moves(drive):
+def test_good_doppler_reports_only_moving_returns(drive):
     points, poses, doppler, times = drive
     found = radarsdf.check(points, poses, doppler_mps=doppler, times_s=times)
     assert set(named(found).values()) == {"note"}
@@ -166,7 +166,7 @@ def test_doppler_that_contradicts_poses_or_intensities_is_named(drive):
 
 
 @pytest.mark.parametrize("name", ["r0009_0024", "r0133_0142"])
-def test_what_moves_is_what_the_flags_of_recorded_drives_say(name):
+def test_moving_returns_agree_with_the_flags_of_recorded_drives(name):
     with np.load(recorded_scans(name)) as file:
         points, doppler, static, frame = (file[k] for k in ("points", "doppler", "static", "frame"))
     rows = [np.flatnonzero(frame == i) for i in range(frame.max() + 1)]

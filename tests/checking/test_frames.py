@@ -42,8 +42,8 @@ def test_positions_that_stay_while_the_scans_change_are_named(good, how):
     points, poses = good.points, good.poses
     held = np.repeat(poses[:1], len(poses), axis=0) if how == "equal" else with_positions(poses, 0)
     (found,) = check_still(checked_input(points, held))
-    told = len(points) >= 24  # so many scans show that the sensor moved
-    assert (found.name, found.severity) == ("poses_stand_still", "error" if told else "warning")
+    moved = len(points) >= 24  # so many scans show that the sensor moved
+    assert (found.name, found.severity) == ("poses_stand_still", "error" if moved else "warning")
 
 
 def room_of(poses, rng, returns=250, noise_m=0.1):

@@ -41,7 +41,7 @@ def test_good_intensities_are_at_most_noted(good):
     assert {"noise", "cost"} <= set(names)
 
 
-def test_what_is_wild_is_counted_and_named(good):
+def test_intensity_outliers_are_counted_and_named(good):
     points, poses, intensities = good
     whole = np.concatenate(intensities)
     broken = replaced(intensities, 50, -9999.0)

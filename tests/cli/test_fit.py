@@ -36,7 +36,7 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     assert radar_map.config == radarsdf.FitConfig.quick()
 
 
-def test_a_fit_says_the_same_to_people_and_to_programs(tmp_path, capsys):
+def test_a_fit_reports_the_same_as_text_and_as_json(tmp_path, capsys):
     scans = radarsdf.simulate.wall(frames=6)
     rng = np.random.default_rng(0)
     doppler = []

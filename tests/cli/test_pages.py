@@ -17,7 +17,7 @@ from .calls import FAST, call, files, refusal
 
 
 @pytest.mark.parametrize("command", ["fit", "report", "view"])
-def test_what_to_install_is_said_before_the_work(
+def test_missing_packages_are_named_before_the_work(
     command, scans_file, map_file, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, "viser", None)

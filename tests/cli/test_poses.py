@@ -84,7 +84,7 @@ def test_scans_without_poses_get_some(drive, unposed, tmp_path, capsys):
     assert "--find" in refusal(capsys, tmp_path, "poses", unposed, out, *again, status=2)
 
 
-def test_a_fit_mends_the_poses(drive, drifted_file, tmp_path, capsys):
+def test_a_fit_refines_the_poses(drive, drifted_file, tmp_path, capsys):
     plain, mended = (
         values(capsys, "fit", drifted_file, "-o", tmp_path / f"{i}.safetensors", "--quick", *words)
         for i, words in enumerate([(), ("--refine",)])

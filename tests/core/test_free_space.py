@@ -43,7 +43,7 @@ def searched(points, directions, ranges_m, passed_m, scans):
     return np.minimum(passed, 7), returns
 
 
-def test_passages_are_those_of_a_plain_search():
+def test_crossings_are_those_of_a_plain_search():
     rays = rays_of(300, 9)
     free_space = found(rays)
     free_space.check()

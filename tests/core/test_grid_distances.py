@@ -30,7 +30,7 @@ def distances_at(field, corners, parts, num_threads=1):
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_corners_inside_a_cell_have_what_the_field_says_there(parts):
+def test_corners_inside_a_cell_have_the_value_of_the_field(parts):
     rng = np.random.default_rng(1)
     cells = rng.integers(-6, 6, (200, 3))
     field = grid_field(cells)

@@ -46,10 +46,10 @@ def system(table, points, normals, information):
     for away_m in (-LEAF_M, 0.0, LEAF_M):
         places = points.astype(np.float64) + away_m * normals
         cells = leaves.rows(cell_keys(np.ascontiguousarray(places, np.float32), LEAF_M))
-        for place, cell, told in zip(places, cells, information, strict=True):
+        for place, cell, precision in zip(places, cells, information, strict=True):
             if cell < 0:
                 continue
-            row, weight = np.zeros(len(corners)), 2 * LEAF_M * np.sqrt(told / 3)
+            row, weight = np.zeros(len(corners)), 2 * LEAF_M * np.sqrt(precision / 3)
             for corner in of_cells[cell]:
                 row[corner] = weight * np.prod(1 - np.abs(place / LEAF_M - corners[corner]))
             rows.append(row)

@@ -63,7 +63,7 @@ def scans_of(count, seed=0):
 
 
 @pytest.mark.parametrize("kind", ["any", "along axes", "in planes", "short", "far"])
-def test_looks_are_those_of_a_plain_search(kind):
+def test_visibility_is_that_of_a_plain_search(kind):
     rays = rays_of(kind, 3000)
     cells, keys = cells_near(rays[0])
     scans = np.sort(np.random.default_rng(1).integers(0, 30, 3000)).astype(np.int32)

@@ -194,7 +194,7 @@ def scene(num, rng):
     return points, sensors, 60 + 5 * np.sin(points[:, 0]) + 25 * view[:, 1]
 
 
-def test_knn_is_the_weighted_mean_it_says():
+def test_knn_is_the_weighted_mean_of_its_neighbours():
     rng = np.random.default_rng(1)
     points, sensors, intensity = scene(300, rng)
     x, at, _ = scene(20, rng)

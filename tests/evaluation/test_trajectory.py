@@ -15,7 +15,7 @@ from ..poses.drift import trajectory
 WHOLE = moved(np.eye(4)[None], np.array([[30.0, -20, 10, 0.4, -0.3, 2.1]]))[0]
 
 
-def test_the_same_way_in_another_world_has_no_error():
+def test_the_same_trajectory_in_another_frame_has_no_error():
     true = trajectory(50)
     for align in ("positions", "poses"):
         metrics = trajectory_metrics(WHOLE @ true, true, align=align)

@@ -55,7 +55,7 @@ def views(points):
         ({"log_range": True}, "ranges_m", 1),
     ],
 )
-def test_the_intensity_network_sees_what_it_is_told_to(setting, seen, width):
+def test_the_intensity_network_uses_the_chosen_inputs(setting, seen, width):
     config = BARE.override(encoding={"fourier_count": 1}, networks=setting)
     network = IntensityNetwork(config)
     network.initialise(torch.Generator().manual_seed(0))

@@ -127,7 +127,7 @@ def test_ctrl_c_ends_a_long_call_of_the_core():
     assert work_s < 0.6 * whole_s
 
 
-def test_the_command_saves_the_map_so_far_and_says_so_in_one_line(tmp_path):
+def test_the_command_saves_the_map_so_far_and_reports_it_in_one_line(tmp_path):
     scene = ground_and_wall()
     write_scans(tmp_path / "scans.npz", Scans(scene.points, scene.poses, scene.intensities, None))
     code = (

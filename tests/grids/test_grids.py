@@ -268,7 +268,7 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
         made(np.ones((2, 2, 2)), [7000.0, 0, 0], 0.2).save(tmp_path / "far.bt")
 
 
-def test_a_map_without_passages_says_so(scene):
+def test_a_map_without_free_space_is_refused(scene):
     quick = radarsdf.FitConfig.quick()
     radar_map = radarsdf.fit(scene.points, scene.poses, config=quick, progress=False)
     with pytest.raises(ValueError, match=r"returns\.free_space"):

@@ -53,7 +53,7 @@ def test_with_the_record_time_they_are_as_far_apart_as_their_stamps(tmp_path):
     assert 0.02 <= scans.imu.times_s[0] - START_S <= 0.05
 
 
-def test_the_bag_says_how_it_sits_on_the_radar(tmp_path):
+def test_the_bag_gives_its_rotation_on_the_radar(tmp_path):
     path = a_bag(tmp_path, transforms=True)
     assert_allclose(read(path, UNPOSED).imu.R_sensor_imu, MOUNTING[:3, :3].T, atol=1e-12)
     given = read(path, UNPOSED, R_sensor_imu=np.eye(3)).imu

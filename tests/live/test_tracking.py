@@ -107,7 +107,7 @@ def test_what_cannot_be_followed_is_refused_and_leaves_nothing(drive):
     assert add(live, 4).pose.tobytes() == add(other, 4).pose.tobytes()
 
 
-def test_the_way_along_a_wall_is_not_guessed():
+def test_motion_along_a_wall_is_not_guessed():
     scans = radarsdf.simulate.wall(seed=91, frames=24)
     live = LiveMap(SETTINGS)
 

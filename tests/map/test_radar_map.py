@@ -142,7 +142,7 @@ def test_gradient_is_the_derivative_of_the_distance(sharp_map):
     assert np.median(gradient[x[:, 0] < 19.5, 2]) > 0.5
 
 
-def test_repr_says_what_it_is_and_what_its_file_takes(scene, sharp_map, tmp_path):
+def test_repr_has_the_size_of_map_and_file(scene, sharp_map, tmp_path):
     cells = sharp_map.report["leaf_cells"]
     assert (
         repr(sharp_map)

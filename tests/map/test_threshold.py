@@ -64,7 +64,7 @@ def test_a_patch_that_one_scan_of_few_saw_is_kept(of_few):
     assert triangles_near(default, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
 
 
-def test_the_mesh_says_what_it_was_kept_from_and_what_that_costs(of_many):
+def test_the_mesh_has_its_threshold_and_expectations(of_many):
     default = of_many.mesh(**MESH)
     threshold = Threshold.of_mesh(default.metadata)
     given = of_many.mesh(min_confidence=threshold.min_confidence, **MESH)

@@ -67,7 +67,7 @@ def tilt(poses, up):
     return float(np.degrees(np.arccos(np.clip(z, -1, 1))).max())
 
 
-def test_velocities_tell_how_it_sits_there(ride, imu):
+def test_velocities_determine_its_rotation(ride, imu):
     times_s, poses, velocities = ride
     found = ImuAlignment.of(imu, velocities, times_s + LATE_S)
     assert angle(found.R_sensor_imu, R_SENSOR_IMU) < min(3, 3 * np.degrees(found.sigma_rad))
@@ -134,7 +134,7 @@ def test_axes_that_are_given_stay(ride, imu):
     assert tilt(poses, found.up) < 1.5
 
 
-def test_another_motion_tells_nothing(ride, imu):
+def test_another_motion_is_not_used(ride, imu):
     times_s, _, velocities = ride
     for other in (
         dataclasses.replace(

@@ -74,7 +74,7 @@ def test_doppler_and_returns_find_the_poses(drive, found):
     assert 0.04 < found.report["moving"] / sum(map(len, drive.points)) < 0.2
 
 
-def test_errors_are_as_large_as_the_covariance_says(drive, found):
+def test_errors_agree_with_the_covariance(drive, found):
     middle = len(drive.poses) // 2
     whole = drive.poses[middle] @ np.linalg.inv(found.poses[middle])
     off = (whole @ found.poses)[:, :3, 3] - drive.poses[:, :3, 3]
@@ -118,7 +118,7 @@ def test_a_gap_is_bridged(drive, motion):
     assert errors(found.poses, true)[0] < 0.005 * length_m(true)
 
 
-def test_a_drive_that_goes_on_elsewhere_is_in_two_pieces(drive):
+def test_a_drive_that_goes_on_elsewhere_has_two_segments(drive):
     other = first(radarsdf.simulate.hugin, 10, seed=63, frames=20)
     motions = [measured_motion(scene) for scene in (drive, other)]
     found = radarsdf.odometry(
@@ -132,7 +132,7 @@ def test_a_drive_that_goes_on_elsewhere_is_in_two_pieces(drive):
     assert errors(found.poses[12:], other.poses)[0] < 0.1
 
 
-def test_scans_alone_are_enough_where_they_tell(drive, motion):
+def test_scans_alone_are_enough_where_they_observe_the_motion(drive, motion):
     points, true = only(drive, range(20))
     found = radarsdf.odometry(points, times_s=motion.times_s[:20])
     assert not found.report["doppler"]

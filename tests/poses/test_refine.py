@@ -58,7 +58,7 @@ def test_true_poses_come_back_to_the_bit(street):
     assert "are kept" in found.report["verdict"]
 
 
-def test_errors_are_as_large_as_the_covariance_says(street, refined):
+def test_errors_agree_with_the_covariance(street, refined):
     middle = len(street.poses) // 2
     whole = street.poses[middle] @ np.linalg.inv(refined.poses[middle])
     errors = (whole @ refined.poses)[:, :3, 3] - street.poses[:, :3, 3]
@@ -82,7 +82,7 @@ def test_the_bits_do_not_depend_on_threads(street):
     np.testing.assert_array_equal(one.covariance, three.covariance)
 
 
-def test_a_plane_tells_heights_and_says_that_it_tells_no_more():
+def test_a_plane_observes_heights_and_nothing_else():
     rng = np.random.default_rng(0)
     given = np.tile(np.eye(4), (8, 1, 1))
     given[:, 0, 3] = np.arange(8.0)

@@ -128,7 +128,7 @@ def test_save_picture_has_the_colors_of_the_scalar(tmp_path):
     assert (imread(plain)[..., :3] < 0.9).any()
 
 
-def test_without_matplotlib_the_message_says_what_to_install(tmp_path, monkeypatch):
+def test_without_matplotlib_the_error_names_what_to_install(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"] + ["matplotlib"]:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match='pip install "matplotlib>='):

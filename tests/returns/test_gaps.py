@@ -65,7 +65,7 @@ def test_badly_supported_and_dense_ends_are_not_bridged():
 
 
 @pytest.mark.parametrize("max_cells", [1, 2, 4])
-def test_as_a_search_of_all_pairs_says(max_cells):
+def test_as_a_search_of_all_pairs(max_cells):
     rng = np.random.default_rng(max_cells)
     rays = rays_to(rng.integers(-6, 6, (150, 3)))
     leaf_keys = leaf_keys_of(rays)

@@ -34,7 +34,7 @@ def test_the_noise_is_found_in_the_data(range_m, angle_rad):
 
 
 @pytest.mark.parametrize("roll_rad", [0.0, 0.5 * np.pi])
-def test_elevation_is_told_from_azimuth(roll_rad):
+def test_elevation_noise_is_separated_from_azimuth_noise(roll_rad):
     """A sensor that lies on its side has its azimuth where others have their elevation."""
     points, poses, _ = a_wall(0.05, 0.004, noise_elevation_rad=0.012, scans=16)
     roll = np.eye(4)

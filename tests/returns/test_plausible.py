@@ -56,7 +56,7 @@ WILD = {
 
 
 @pytest.mark.parametrize("case", WILD.values(), ids=WILD)
-def test_what_is_wild_is_left_out_and_nothing_else(case):
+def test_only_outliers_are_left_out(case):
     share, values = case
     rng = np.random.default_rng(1)
     intensities = decibels(rng).astype(np.float32)
@@ -67,7 +67,7 @@ def test_what_is_wild_is_left_out_and_nothing_else(case):
 
 
 @pytest.mark.parametrize("most", [1 << 15, 2000], ids=["all", "some"])
-def test_parts_tell_what_the_whole_tells(monkeypatch, most):
+def test_parts_have_the_limits_of_the_whole(monkeypatch, most):
     monkeypatch.setattr(plausible, "_MOST", most)
     intensities = decibels(np.random.default_rng(0)).astype(np.float32)
     intensities[12_345] = 1e9  # those that stand for all need not hold it

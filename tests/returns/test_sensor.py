@@ -45,7 +45,7 @@ def test_limits_counts_and_thresholds():
     assert sensor.beam_rad == pytest.approx((0.02355, 0.0471), rel=1e-3)
 
 
-def test_rays_tell_what_their_scans_tell():
+def test_a_sensor_of_rays_is_that_of_scans():
     points, intensities = scans()
     turns = np.radians([10, 80, -130])
     poses = np.stack([pose([3.0 * i, 5, -i], turn) for i, turn in enumerate(turns)])

@@ -63,7 +63,7 @@ def test_side_lobes_keep_range_and_azimuth_and_add_returns():
     assert np.abs(own[:, None] - range_and_azimuth).max(axis=2).min(axis=1).max() < 1e-4
 
 
-def test_clutter_lies_where_its_share_says():
+def test_clutter_follows_its_shares():
     sensor = replace(QUIET, clutter_per_scan=4000.0, threshold_db=40.0, clutter_power_db=6.0)
     scene, distance_m = wall_ahead(40.0), 40.0
 

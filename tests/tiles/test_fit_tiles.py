@@ -243,7 +243,7 @@ def test_a_map_of_which_all_tiles_fail_is_an_error(drive, tmp_path):
         run_fits(out, progress=False)
 
 
-def test_a_full_disk_is_said_and_what_was_done_is_kept(drive, folder, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_finished_tiles_are_kept(drive, folder, tmp_path, monkeypatch):
     out = tmp_path / "city"
     names = [tile.name for tile in plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG).tiles]
     with pytest.raises(ValueError, match=r"no tile of .* is done"):

@@ -144,7 +144,7 @@ def test_a_copy_is_the_same_map(city, points, tmp_path):
         city.save(tmp_path / "copy")
 
 
-def test_echoes_of_tiles_are_those_of_one_map(drive, tmp_path):
+def test_view_statistics_of_tiles_are_those_of_one_map(drive, tmp_path):
     """Where tiles overlap, a return is in several of them, and counts once."""
     config = CONFIG.override(returns={"free_space": True})
     radarsdf.fit_tiles(drive, tmp_path / "city", tile_size=TILE_M, halo=6.4, config=config, progress=False)

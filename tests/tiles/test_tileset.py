@@ -76,7 +76,7 @@ def test_small_components_go_unless_they_reach_a_border(city, tmp_path):
             assert away_m[component].min() < 1e-3
 
 
-def test_a_file_in_the_way_is_said_before_the_work(city, tmp_path):
+def test_a_file_in_the_way_is_refused_before_the_work(city, tmp_path):
     (tmp_path / "city").write_text("not a folder")
     with pytest.raises(FileExistsError):
         city.export(tmp_path / "city.json", 0.2, progress=False)

@@ -37,13 +37,13 @@ def test_what_moves_is_found(drive):
     for sign in (1, -1):  # sensors differ in it
         found = MovingReturns.of(scans.points, [sign * values for values in doppler])
         assert found.why_none is None
-        told, true = np.concatenate(found.masks), np.concatenate(moves)
-        assert told[true].mean() > 0.99
-        assert told[~true].mean() < 0.01
-        assert found.count == told.sum()
+        found_moving, true = np.concatenate(found.masks), np.concatenate(moves)
+        assert found_moving[true].mean() > 0.99
+        assert found_moving[~true].mean() < 0.01
+        assert found.count == found_moving.sum()
 
 
-def test_a_fit_leaves_it_out_and_says_how_many(drive):
+def test_a_fit_leaves_moving_returns_out_and_counts_them(drive):
     scans, doppler, _ = drive
     expected = MovingReturns.of(scans.points, doppler).count
     for given in (
@@ -113,11 +113,13 @@ def test_intensities_stay_with_their_returns(drive):
 
 
 @pytest.mark.parametrize("name", ["r0009_0024", "r0057_0068", "r0133_0142", "r0144_0167", "r0309_0320"])
-def test_what_moves_in_recorded_drives_is_what_their_flags_say(name):
+def test_moving_returns_of_recorded_drives_agree_with_their_flags(name):
     with np.load(recorded_scans(name)) as file:
         rows = [np.flatnonzero(file["frame"] == i) for i in range(len(file["poses"]))]
         points, doppler, static = ([file[k][r] for r in rows] for k in ("points", "doppler", "static"))
     found = MovingReturns.of(points, doppler)
-    wrong = np.concatenate([told == flags for told, flags in zip(found.masks, static, strict=True)])
+    wrong = np.concatenate(
+        [found_moving == flags for found_moving, flags in zip(found.masks, static, strict=True)]
+    )
     assert found.why_none is None
     assert wrong.mean() < 0.1
