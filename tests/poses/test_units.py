@@ -9,11 +9,15 @@ import dataclasses
 import numpy as np
 import pytest
 import radarsdf
+from radarsdf import FitConfig
 from radarsdf.io import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.rigid import aligned
+from radarsdf.poses.tracking import Drive, doppler_factor
 from radarsdf.simulate import measured_motion
+
+from bench.kinds import KINDS
 
 from .drift import first, position_error_m
 
@@ -49,6 +53,27 @@ def test_speeds_in_other_units_are_left_out(drive, motion):
     checked = CheckedScans.of(drive.points, [100 * speeds for speeds in motion.doppler_mps], motion.times_s)
     assert checked.velocities is None
     assert "Doppler in m/s" in checked.notes[0]
+
+
+def test_speeds_that_returns_contradict_are_left_out(drive, motion):
+    """Poses with half the steps had a standard deviation of centimetres."""
+    speeds = [0.5 * speeds for speeds in motion.doppler_mps]
+    found = radarsdf.odometry(drive.points, doppler_mps=speeds, times_s=motion.times_s)
+    assert not found.report["doppler"]
+    (note,) = found.report["notes"]
+    assert "the returns show 2.0 times" in note
+    assert position_error_m(aligned(found.poses, drive.poses), drive.poses) < 0.1
+
+
+def test_speeds_that_returns_cannot_contradict_are_kept():
+    """Scans drawn together by a fifth agree as well."""
+    yard = KINDS["yard"](seed=2, frames=24)
+    motion = measured_motion(yard, seed=2)
+    checked = CheckedScans.of(yard.points, motion.doppler_mps, motion.times_s)
+    drive = Drive(checked.scans, checked.times_s, checked.velocities, None)
+    assert doppler_factor(drive, FitConfig(num_threads=1), 1) == 1
+    doubled = dataclasses.replace(drive, velocities=checked.velocities.scaled(2.0))
+    assert doppler_factor(doubled, FitConfig(num_threads=1), 1) == pytest.approx(0.5, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -91,10 +91,11 @@ class SensorVelocities:
         """Median of the speeds."""
         return float(np.median(np.linalg.norm(self.mean_mps, axis=1)))
 
-    @property
-    def turned(self) -> SensorVelocities:
-        """For a radar whose Doppler is positive if the sensor comes nearer."""
-        return dataclasses.replace(self, mean_mps=-self.mean_mps)
+    def scaled(self, factor: float, sigma: float = 0.0) -> SensorVelocities:
+        """Times a factor, whose deviation is such a share of it. -1: for a radar whose Doppler is positive if the sensor comes nearer."""
+        mean = factor * self.mean_mps
+        covariance = factor**2 * self.covariance + sigma**2 * mean[:, :, None] * mean[:, None, :]
+        return dataclasses.replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
         """(3, 3) of the translation from scan `i` to the next one, m²: of both velocities, and a Brownian bridge between them."""

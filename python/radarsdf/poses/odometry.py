@@ -22,7 +22,15 @@ from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats
-from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed
+from radarsdf.poses.tracking import (
+    LATERAL_MPS2,
+    LEAST_OBSERVED,
+    WINDOW,
+    Drive,
+    Tracked,
+    doppler_factor,
+    followed,
+)
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
@@ -130,21 +138,27 @@ def odometry(
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
     if velocities is not None:
         sign = doppler_sign(checked.scans, velocities, times_s)
-        velocities = velocities.turned if sign < 0 else velocities
+        velocities = velocities.scaled(-1.0) if sign < 0 else velocities
     if imu is None and isinstance(points, Scans):
         imu = points.imu
-    inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
-    limits = config.returns
+    limits, notes = config.returns, [*checked.notes]
     with ThreadPool(config.num_threads) as pool:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-        drive = Drive(scans, times_s, velocities, inertial.gyroscope)
+        drive = Drive(scans, times_s, velocities, None)
+        if (factor := doppler_factor(drive, config, pool.num_threads)) != 1:
+            velocities = None
+            notes.append(
+                f"{NOT_USED}: the returns show {factor:.1f} times its speeds. Give it in m/s, and times in s."
+            )
+        inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
+        drive = dataclasses.replace(drive, velocities=velocities, gyroscope=inertial.gyroscope)
         try:
             drive, tracked = followed(drive, config, pool.num_threads, progress)
         except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
             drive, tracked = followed(drive, config, pool.num_threads, progress)
-        notes = [*checked.notes, *inertial.notes]
+        notes += inertial.notes
         _check_measured(tracked, drive, notes)
         segments = np.array([found.segment for found in tracked])
         poses, covariance = _together(drive, tracked, segments, config, pool.num_threads)

@@ -145,7 +145,7 @@ def refine_poses(
     motions: list[Motion] = [Motion.of(given, sigma_m, sigma_rad, times_s)]
     if velocities is not None and times_s is not None:
         if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
-            velocities = velocities.turned
+            velocities = velocities.scaled(-1.0)
         motion = DopplerMotion.by(velocities, times_s, given)
         if (unexplained := unexplained_motion(motion, given)) < _CONTRADICTED:
             motions.append(motion)
