@@ -61,6 +61,7 @@ _SLOW_TURN_RAD_S = 0.1
 _COMPARED, _FEW_COMPARED, _FIRST_COMPARED = 12, 6, 4
 # Deviation of that scale: from half of it, or twice, the returns of most scenes find the true one.
 _FREE_SCALE = 0.15
+_MOST_SCALE = 2.5  # further off, returns find other scales: 0.18 in a hall, where scans drawn together agree
 # Errors of the scale that returns find. Measured: 0.01 to 0.04 where they see all of the motion.
 _SAME_SCALE = 0.1
 _BY_CHANCE = 0.02  # probability that another scale seems to fit better
@@ -455,7 +456,10 @@ def doppler_factor(drive: Drive, config: FitConfig, num_threads: int) -> float:
             information += max(1 / variance - 2 / _FREE_SCALE**2, 0.0)
             off += (float(way @ (now.pose[:3, 3] - before.pose[:3, 3])) / squared_m2 - 1) / variance
     factor = 1 + off / max(information, 1.0)
-    if abs(factor - 1) < _SAME_SCALE + _ERRORS / np.sqrt(max(information, 1.0)) or factor <= 0:
+    if (
+        abs(factor - 1) < _SAME_SCALE + _ERRORS / np.sqrt(max(information, 1.0))
+        or not 1 / _MOST_SCALE < factor < _MOST_SCALE
+    ):
         return 1.0
     ahead, given = (
         np.nan_to_num([found.agreeing for found in tracked(by, 0.0)[_FIRST_COMPARED:]])
