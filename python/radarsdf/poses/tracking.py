@@ -61,7 +61,8 @@ _SLOW_TURN_RAD_S = 0.1
 _COMPARED, _FEW_COMPARED, _FIRST_COMPARED = 12, 6, 4
 # Deviation of that scale: from half of it, or twice, the returns of most scenes find the true one.
 _FREE_SCALE = 0.15
-_MOST_SCALE = 2.5  # further off, returns find other scales: 0.18 in a hall, where scans drawn together agree
+# Further off, returns find other scales: 0.18 in a hall, where scans that are drawn together agree.
+_MOST_SCALE = 2.5
 # Errors of the scale that returns find. Measured: 0.01 to 0.04 where they see all of the motion.
 _SAME_SCALE = 0.1
 _BY_CHANCE = 0.02  # probability that another scale seems to fit better
