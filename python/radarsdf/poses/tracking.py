@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.special import ndtr
 from scipy.stats import t as student
 from tqdm import tqdm
 
@@ -36,7 +35,6 @@ _MOST_RETURNS, _SEARCHED = 2000, 250  # returns of a scan that are registered, a
 # segment begins where dead reckoning leads.
 _MOST_RADII, _MOST_RECKONED_M = 10.0, 1e4
 _FOLLOWED = 12  # best poses of a search
-_SPAN, _MOST_SHIFTS = 4.0, 40  # standard deviations, and steps, by which the best one of them is shifted
 _ELSEWHERE = 500  # poses that show what agrees by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
 _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
@@ -44,8 +42,6 @@ _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimat
 # three times as long as a scan.
 _NOISE_RETURNS = 10_000
 _SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells: further than returns of one thing reach
-# Cells along the least certain axis, of which the best one is where a scan may be instead of where it was found.
-_ELSEWHERE_ALONG = tuple(sign * shift for shift in range(1, 7) for sign in (1, -1))
 _SURE = 0.05  # cells: deviation of an expected translation that needs no returns
 _LEAST_VARIANCE = 1e-12
 # Initial priors. The drive's own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
@@ -63,12 +59,12 @@ LATERAL_MPS2 = 2.0
 _SLOW_TURN_RAD_S = 0.1
 # Steps that show the scale of Doppler, and the fewest; the first scan that is compared with enough before it.
 _COMPARED, _FEW_COMPARED, _FIRST_COMPARED = 12, 6, 4
-_FREE_SCALE = (
-    0.15  # deviation of that scale: from half of it, or twice, the returns of most scenes find the true one
-)
-_SAME_SCALE = (
-    0.1  # errors of the scale that returns find. Measured: 0.01 to 0.04 where they see all of the motion
-)
+# Deviation of that scale: from half of it, or twice, the returns of most scenes find the true one.
+_FREE_SCALE = 0.15
+# Further off, returns find other scales: 0.18 in a hall, where scans that are drawn together agree.
+_MOST_SCALE = 2.5
+# Errors of the scale that returns find: 0.01 to 0.04 where they see all of the motion, up to 0.22 in tunnels and yards.
+_SAME_SCALE = 0.25
 _BY_CHANCE = 0.02  # probability that another scale seems to fit better
 _TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
 
@@ -204,20 +200,13 @@ class Tracker:
             return covariance
         information = []
         for shift in _SHIFTS:
-            hessian = self._normal_equations(self._planes[-1], scan, _shifted(pose, shift * cell_m * axis))[0]
+            shifted = pose.copy()
+            shifted[:3, 3] += shift * cell_m * axis
+            hessian = self._normal_equations(self._planes[-1], scan, shifted)[0]
             variance = axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis
             information.append(1 / variance if variance > 0 else 0.0)
         chance = min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
-        of_returns = 1 / max((1 - chance) * (1 / left - 1 / before), 1e-12)
-        # Where things repeat themselves, the scan may as well be elsewhere.
-        poses = np.stack([_shifted(pose, shift * cell_m * axis) for shift in _ELSEWHERE_ALONG])
-        means = self._planes[-1].scores(scan, poses, self._variances).mean(axis=1)
-        rival = self._settled(scan, *2 * (poses[np.argmax(means)],), prior)[0]
-        apart_m = float(axis @ (rival - pose)[:3, 3])
-        if abs(apart_m) > 0.5 * cell_m:
-            here, there = self._planes[-1].scores(scan, np.stack([pose, rival]), self._variances)
-            of_returns += float(ndtr(-_margins(here, there[None])[0])) * apart_m**2
-        widened = 1 / (1 / before + 1 / of_returns) - left
+        widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
         covariance = covariance.copy()
         covariance[:3, :3] += max(widened, 0.0) * np.outer(axis, axis)
         return covariance
@@ -257,37 +246,14 @@ class Tracker:
         elsewhere = np.flatnonzero(_apart_m(poses, poses[best[0]], radius_m) > 2 * capture_m)
         best += elsewhere[_best(means[elsewhere])].tolist()
         found = [self._fitted(scan, expected, turns[i], poses[i]) for i in best]
-        # The candidates are too few to find each place that looks the same, and shifts of one of them are not.
-        middle = found[int(np.argmax(scores(np.stack([one.pose for one in found])).mean(axis=1)))]
-        shifted = self._shifted_across(middle.pose, expected, capture_m, radius_m)
-        found += [
-            self._fitted(scan, expected, middle.turn, shifted[i]) for i in _best(scores(shifted).mean(axis=1))
-        ]
         at = np.stack([one.pose for one in found])
         chance = scores(self._elsewhere(radius_m))
         of_found, by_chance = scores(at), chance[_best(chance.mean(axis=1))]
         first = int(np.argmax(of_found.mean(axis=1)))
         rivals = of_found[_apart_m(at, at[first], radius_m) > capture_m]
-        return (
-            found[first]
-            if (_margins(of_found[first], np.concatenate([by_chance, rivals])) > _ERRORS).all()
-            else None
-        )
-
-    def _shifted_across(
-        self, pose: Floats, expected: PredictedStep, capture_m: float, radius_m: float
-    ) -> Floats:
-        """(K, 4, 4) a pose shifted in the plane in which the sensor may have moved furthest, at most as far as it sees."""
-        variances, axes = np.linalg.eigh(self._in_world(expected.covariance())[:3, :3])
-        reach = np.minimum(_SPAN * np.sqrt(variances[1:]) / capture_m, radius_m / capture_m)
-        first, second = (
-            np.arange(-n, n + 1) * capture_m for n in np.minimum(reach, _MOST_SHIFTS).astype(int)
-        )
-        shifts = np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
-        shifts = shifts[np.abs(shifts).max(axis=1) > capture_m]
-        poses = np.tile(pose, (len(shifts), 1, 1))
-        poses[:, :3, 3] += np.einsum("ki,ji->kj", shifts, axes[:, 1:])
-        return poses
+        gains = of_found[first] - np.concatenate([by_chance, rivals])
+        clear = gains.mean(axis=1) > _ERRORS * gains.std(axis=1) / np.sqrt(len(sample))
+        return found[first] if clear.all() else None
 
     def _elsewhere(self, reach_m: float) -> Floats:
         """(_ELSEWHERE, 4, 4) upright poses near those of the last scans, in any other direction."""
@@ -305,19 +271,6 @@ class Tracker:
 def begun(pose: Floats, segment: int = 0) -> Tracked:
     """A scan that a segment of the drive begins with, at this pose (4, 4)."""
     return Tracked(pose, np.zeros((6, 6)), np.nan, segment, np.zeros(3))
-
-
-def _margins(scores: Floats, others: Floats) -> Floats:
-    """(K,) by how many standard errors returns have higher scores (N,) at one pose than at others (K, N)."""
-    gains = scores - others
-    margins: Floats = gains.mean(axis=1) / np.maximum(gains.std(axis=1) / np.sqrt(len(scores)), 1e-12)
-    return margins
-
-
-def _shifted(pose: Floats, shift_m: Floats) -> Floats:
-    found = pose.copy()
-    found[:3, 3] += shift_m
-    return found
 
 
 def _removed_share(prior: Floats, covariance: Floats) -> float:
@@ -504,7 +457,10 @@ def doppler_factor(drive: Drive, config: FitConfig, num_threads: int) -> float:
             information += max(1 / variance - 2 / _FREE_SCALE**2, 0.0)
             off += (float(way @ (now.pose[:3, 3] - before.pose[:3, 3])) / squared_m2 - 1) / variance
     factor = 1 + off / max(information, 1.0)
-    if abs(factor - 1) < _SAME_SCALE + _ERRORS / np.sqrt(max(information, 1.0)) or factor <= 0:
+    if (
+        abs(factor - 1) < _SAME_SCALE + _ERRORS / np.sqrt(max(information, 1.0))
+        or not 1 / _MOST_SCALE < factor < _MOST_SCALE
+    ):
         return 1.0
     ahead, given = (
         np.nan_to_num([found.agreeing for found in tracked(by, 0.0)[_FIRST_COMPARED:]])
