@@ -68,9 +68,9 @@ def counted(out: Path) -> dict[str, Counter[str]]:
         raise RuntimeError(failure(done))
     # One thread, and none that waits in a loop.
     env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "RADARSDF_ISA": isa()}
-    tool = ["valgrind", "--tool=callgrind", "--instr-atstart=no", f"--callgrind-out-file={out}/counts"]
+    callgrind = ["valgrind", "--tool=callgrind", "--instr-atstart=no", f"--callgrind-out-file={out}/counts"]
     child = [sys.executable, "-m", "bench.instructions", "--child", str(switch)]
-    subprocess.run([*tool, "--quiet", *child], cwd=ROOT, env=env, check=True)
+    subprocess.run([*callgrind, "--quiet", *child], cwd=ROOT, env=env, check=True)
     cases = {}
     for path in out.glob("counts.*"):
         text = path.read_text()
@@ -150,7 +150,7 @@ def _count_steps(training: Training, name: bytes, switch: ctypes.CDLL) -> None:
         elif number == 2 + _STEPS:
             switch.stop(name)
 
-    training.history.add = add_and_switch  # type: ignore[method-assign]
+    training.history.add = add_and_switch  # type: ignore[assignment, method-assign]
 
 
 def main() -> None:
