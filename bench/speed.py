@@ -69,7 +69,7 @@ def _child(path: Path) -> None:
         points, intensities = np.split(file["points"], own), np.split(file["intensities"], own)
     for line in sys.stdin:
         case = json.loads(line)
-        config = {"default": FitConfig, "quick": FitConfig.quick}[case["preset"]]()
+        config = FitConfig.quick() if case["preset"] == "quick" else FitConfig()
         values = intensities if case.get("intensities") else None
         with timed() as taken:
             config = config.override(num_threads=case["threads"])

@@ -126,7 +126,7 @@ class Soap(Optimiser):
             memories=self._memory_views,
             step=self.step_count,
             learning_rate=self.learning_rate,
-            pool=None if pool is None else pool.core_threads,
+            **({} if pool is None else {"pool": pool.core_threads}),
         )
 
 

@@ -239,7 +239,8 @@ class _Layout:
         ray = np.concatenate(of_kinds).astype(np.int32)[number]
         # From the return to the sensor: near samples in ± near_band, free ones in [-free_beyond, (1 - free_from) · range].
         band_m, beyond_m = config.metres(NEAR_BAND_CELLS), config.metres(FREE_BEYOND_CELLS)
-        segments = np.float32([[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]])
+        rows = [[-band_m, 0, 2 * band_m, 0], [-beyond_m, 0, beyond_m, 1 - FREE_FROM]]
+        segments = np.array(rows, np.float32)
         sizes_and_labels = [(sum(part), part[0]) for part in zip(*shares, strict=True)]
         return cls(ray, number, (kinds == 2).astype(np.uint8), segments, sizes_and_labels)
 
