@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: MIT
 #include <pybind11/stl.h>
 
+#include <optional>
 #include <vector>
 
 #include "bindings/arrays.hpp"
@@ -18,7 +19,7 @@ void bind_step(py::module_& m) {
   m.def(
       "soap_step",
       [](std::vector<Array<T>>& weights, const std::vector<Array<T>>& gradients, std::vector<Array<T>>& memories,
-         std::int64_t step, double learning_rate, HeldThreadPool* pool) {
+         std::int64_t step, double learning_rate, std::optional<HeldThreadPool*> pool) {
         if (step < 1) throw std::invalid_argument("step must be at least 1");
         if (gradients.size() != weights.size() || memories.size() != weights.size()) {
           throw std::invalid_argument("there must be a gradient and a memory for each matrix of weights");
@@ -39,8 +40,8 @@ void bind_step(py::module_& m) {
           soap_step(matrices[static_cast<std::size_t>(i)], step, learning_rate);
         };
         const auto count = static_cast<std::int64_t>(matrices.size());
-        if (pool != nullptr) {
-          pool->pool().run(count, move);
+        if (pool) {
+          (*pool)->pool().run(count, move);
         } else {
           for (std::int64_t i = 0; i < count; ++i) move(i);
         }

@@ -1367,7 +1367,7 @@ def soap_step(
     memories: list[numpy.typing.NDArray[numpy.float32]],
     step: typing.SupportsInt | typing.SupportsIndex,
     learning_rate: typing.SupportsFloat | typing.SupportsIndex,
-    pool: ThreadPool = None,
+    pool: ThreadPool | None = None,
 ) -> None:
     """
     Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step. The threads of a `pool` share the matrices.
@@ -1380,7 +1380,7 @@ def soap_step(
     memories: list[numpy.typing.NDArray[numpy.float64]],
     step: typing.SupportsInt | typing.SupportsIndex,
     learning_rate: typing.SupportsFloat | typing.SupportsIndex,
-    pool: ThreadPool = None,
+    pool: ThreadPool | None = None,
 ) -> None:
     """
     Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers each, are zero before the first step. The threads of a `pool` share the matrices.
