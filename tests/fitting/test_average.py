@@ -9,6 +9,8 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.field.grid_field import GridField
+from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 
 from ..conftest import ground_and_wall
@@ -78,3 +80,12 @@ def test_the_mesh_of_stored_corners_is_that_of_the_field():
         assert np.median(off_m) < 1e-4
         assert np.quantile(off_m, 0.99) < 0.005  # on the border, where the other is evaluated a hair inside
     assert one.metadata["leaf_cells"] == one.metadata["leaf_cells_searched"]
+
+
+def test_ghosts_of_a_part_are_those_of_the_whole():
+    scans = radarsdf.simulate.hugin(frames=8, seed=3)
+    rays = prepare(scans.points, scans.poses)
+    inside = rays.points[:, 0] < np.median(rays.points[:, 0])
+    whole, part = (SurfaceReturns.of(rays, FitConfig.quick(), 1, some).true for some in (None, inside))
+    assert not whole.all()
+    np.testing.assert_array_equal(part, whole)

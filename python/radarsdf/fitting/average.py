@@ -64,15 +64,15 @@ class SurfaceReturns:
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
         kept, true = inside, None
-        if means is not None and inside is not None:
-            leaf_cells = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
-            means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
         if config.returns.drop_ghosts:
             of_ghosts = find_ghosts(surfels, rays if means is None else means, noise, num_threads)
             true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)]
             kept = true if inside is None else true & inside
             if means is not None:
                 means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
+        if means is not None and inside is not None:
+            leaf_cells = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
+            means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
         if config.train and config.returns.onto_planes:
             rays = onto_surfels(surfels, rays, noise, num_threads)
         return cls(rays if kept is None else rays.select(kept), surfels, noise, means, true)
