@@ -141,7 +141,7 @@ def test_scans_alone_are_enough_where_they_observe_the_motion(drive, motion):
 
 def test_a_wall_alone_is_refused():
     wall = first(radarsdf.simulate.wall, 14, seed=5, frames=40)
-    with pytest.raises(ValueError, match="returns alone do not tell"):
+    with pytest.raises(ValueError, match="returns alone do not observe"):
         radarsdf.odometry(wall.points, times_s=np.arange(14) / 10)
     motion = measured_motion(wall)
     found = radarsdf.odometry(wall.points, times_s=motion.times_s, doppler_mps=motion.doppler_mps)
@@ -179,7 +179,7 @@ def test_hardly_any_returns_have_poses_as_well(counts):
     try:
         found = radarsdf.odometry(scans, doppler_mps=speeds, times_s=np.arange(len(counts)))
     except ValueError as error:
-        assert "returns alone do not tell" in str(error)  # noqa: PT017 - where the Doppler tells no velocity
+        assert "returns alone do not observe" in str(error)  # noqa: PT017 - where the Doppler tells no velocity
     else:
         assert np.isfinite(found.poses).all()
         assert found.covariance.shape == (len(counts), 6, 6)

@@ -81,7 +81,7 @@ class SurfaceReturns:
 def occupied_cells(
     surface: SurfaceReturns, config: FitConfig, num_threads: int
 ) -> tuple[NDArray[np.uint64], ReturnsOfCells]:
-    """Keys (C,), ascending, of the leaf cells that rays cross near their returns or that bridge gaps; and what returns tell."""
+    """Keys (C,), ascending, of the leaf cells that rays cross near their returns or that bridge gaps; evidence of the returns."""
     if surface.means is None:
         keys = near_leaf_keys(surface.rays, config, num_threads)
         returns = _returns_of_rays(surface, config, num_threads)
@@ -105,20 +105,19 @@ def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[n
 
 
 def _returns_of_rays(surface: SurfaceReturns, config: FitConfig, num_threads: int) -> ReturnsOfCells:
-    """What the returns of each leaf cell tell, return by return."""
+    """Precision, numbers of scans and of returns of each leaf cell, summed over returns."""
     rays = surface.rays
     cells = ReturnCells.of(rays, config.leaf_size_m, num_threads)
     information = 1 / surface.noise.variances_m2(rays.ranges_m)
     of_cells = np.bincount(cells.cell_of_ray, information, len(cells.keys)).astype(np.float32)
     scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
     found = ReturnsOfCells(cells.keys, of_cells, scans, cells.counts)
-    ranges_m = np.zeros(len(cells.keys), np.float32)
-    ranges_m[cells.cell_of_ray] = rays.ranges_m  # any return of the cell
-    return found.with_uncertain_poses(ranges_m, config.returns)
+    ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m, len(cells.keys)) / cells.counts
+    return found.with_uncertain_poses(ranges_m.astype(np.float32), config.returns)
 
 
 def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
-    """What the returns of each leaf cell tell, by their mean rays."""
+    """The same by mean rays."""
     # The returns of a cell are at nearly the same range if they are of the same sensor position.
     information = means.counts / noise.variances_m2(means.ranges_m)
     counts = means.counts.astype(np.float64)

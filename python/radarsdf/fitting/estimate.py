@@ -192,7 +192,9 @@ def skipped_parts(
     now_s, surface_s = seconds(network), seconds(False, train=True)
     skipped = []
     if not config.train:
-        skipped.append(("training of the surface: it is averaged", surface_s - now_s))
+        skipped.append(
+            ("training of the surface: returns are averaged, and not moved onto planes", surface_s - now_s)
+        )
     if not config.returns.free_space:
         saved_s = _S_PER_RETURN_OF_FREE_SPACE * returns
         skipped.append(("free space, which grids and comparisons need (returns.free_space)", saved_s))

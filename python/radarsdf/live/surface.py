@@ -199,7 +199,7 @@ class GrowingSurface:
     def _derive_distances(self, changed: Keys, noise: SensorNoise, num_threads: int) -> Keys:
         """Derives distances and evidence again where they depend on changed leaf cells. Returns the regions, ascending.
 
-        A ray counts in the cells of its band; the corners of the last one have others round them. Cells that come or go tell
+        A ray counts in the cells of its band; the corners of the last one have others round them. Cells that come or go show
         which rays count at the corners of those round them, and smoothing carries what is known there.
         """
         config = self._config

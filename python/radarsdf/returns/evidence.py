@@ -16,7 +16,7 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
 
 CELLS_OF_SURFACE = 9
-"""A plane crosses about so many of a cell and the 26 cells round it."""
+"""A plane crosses about so many of a cell and the 26 cells around it."""
 
 BLOCK_BITS = np.uint64(9)
 """Bits by which the key of a leaf cell is longer than that of the block whose visibility is counted."""
@@ -26,7 +26,7 @@ BLOCK_BITS = np.uint64(9)
 class Evidence:
     """Evidence of a surface in each leaf cell, in the order of the cells' keys.
 
-    `information` and `hits` are sums over a leaf cell and the 26 cells round it.
+    `information` and `hits` are sums over a leaf cell and the 26 cells around it.
     """
 
     information: NDArray[np.float32]  # (C,) 1 / variance of the position that the returns give together, m⁻²
@@ -46,7 +46,7 @@ class Evidence:
         num_threads: int = 0,
         visibility: VisibilityCounts | None = None,
     ) -> Evidence:
-        """Evidence in the leaf cells with these keys (C,), ascending. `rays` are all: those of false returns see cells, too."""
+        """Evidence in the leaf cells with these keys (C,), ascending. `rays` are all: those of ghosts count as visibility."""
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
         if visibility is not None:
@@ -57,7 +57,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class ReturnsOfCells:
-    """What the returns in each leaf cell tell, in the order of their keys."""
+    """Precision, number of scans and of returns in each leaf cell, in the order of their keys."""
 
     keys: NDArray[np.uint64]  # (M,) Morton keys of the leaf cells with returns, ascending
     information: NDArray[np.float32]  # (M,) 1 / variance of the position that its returns give together, m⁻²
@@ -115,7 +115,7 @@ def support_at(
 
 
 # Measured on simulated and real scans.
-# Share of the median support of the block. Returns with less are too often false to tell where a surface goes on.
+# Share of the median support of the block. Returns with less are too often false to show where a surface continues.
 _MIN_SUPPORT = 0.5
 # Mean support of the two ends of a bridge, at most. A surface crosses about nine of the 27 cells. With one
 # return in each of these or more, an empty cell is most likely a real gap.

@@ -21,7 +21,7 @@ MOST_SCANS = 7
 
 _LEVELS = 3  # of a block: 2³ cells an edge
 _PLANES, _WORDS = 4, 8
-_SIGMAS = 2.0  # a ray tells what it passed up to so many standard deviations of its return before it
+_SIGMAS = 2.0  # a ray crosses free space up to so many standard deviations of its return before it
 _INSIDE = np.arange(BLOCK_CELLS**3, dtype=np.uint64)
 
 

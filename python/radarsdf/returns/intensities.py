@@ -19,8 +19,8 @@ _GAP = 3.0  # times as far from the median as any other. Tails have gaps, too
 _CHANCE = 1e-3  # that so many of a tail lie beyond
 _RARE = 0.03  # share of the returns. More are another kind of returns ...
 _FEW = 3  # ... unless they have no more different values than this: sentinels
-_FEWEST = 128  # returns; fewer do not tell what is usual
-_MOST = 1 << 15  # returns that tell it
+_FEWEST = 128  # returns; fewer do not determine the usual range
+_MOST = 1 << 15  # returns that determine it
 _THINNED = 7  # times fewer of more than these. Few sensors repeat anything after seven returns
 
 

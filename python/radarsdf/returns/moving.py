@@ -26,7 +26,7 @@ from radarsdf.scans import Scans
 FloatArray = NDArray[np.float64]
 
 MIN_DOPPLER_RETURNS = 10
-"""Fewer returns of a scan tell no velocity."""
+"""Fewer returns of a scan determine no velocity."""
 
 # Of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999.
 _DRAWS = 64
@@ -44,7 +44,7 @@ _FOLDS = (-1.0, 0.0, 1.0)  # intervals by which all three returns of a draw may 
 
 @dataclass(frozen=True)
 class SensorVelocity:
-    """What the Doppler of one scan says."""
+    """The velocity that the Doppler of one scan gives."""
 
     velocity_mps: FloatArray  # (3,) of the sensor in its own frame. NaN if the returns do not agree on one
     covariance: FloatArray  # (3, 3) m²/s², large in directions that no return measures
@@ -224,7 +224,7 @@ class MovingReturns:
 
 @dataclass(frozen=True)
 class StaticReturns:
-    """The returns of F scans without those that move, as far as Doppler tells them."""
+    """The returns of F scans without those that move, as far as Doppler shows them."""
 
     points: Iterable[ArrayLike]  # F arrays (N_i, 3), sensor frame, m
     intensities: Iterable[ArrayLike] | None  # F arrays (N_i,), sensor units
@@ -239,7 +239,7 @@ class StaticReturns:
         doppler_mps: Sequence[ArrayLike] | None,
         config: ReturnsConfig,
     ) -> StaticReturns:
-        """All returns, if there is no Doppler or ``config.drop_moving`` says so; else see :meth:`MovingReturns.of`."""
+        """All returns, if there is no Doppler or ``config.drop_moving`` is False; else see :meth:`MovingReturns.of`."""
         if doppler_mps is None or not config.drop_moving:
             return cls(points, intensities, 0, None)
         points = list(one_for_each_scan(points, "points"))

@@ -17,7 +17,7 @@ from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 
 NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
-"""Settings of returns that say the numbers of :class:`SensorNoise`, in their order."""
+"""Settings of returns that fix the numbers of :class:`SensorNoise`, in their order."""
 
 # Measured: so many give each deviation to 1 to 3 % of what all returns give, twice as many to 1 to 1.5 %.
 _RETURNS = 20_000

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Intensities in closed form: a regression on what the radar equation says, and means in cells of what it leaves."""
+"""Intensities in closed form: a regression on the terms of the radar equation, and means of its residuals in cells."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ROUNDS = 2  # four are no better
 _MOST_RETURNS, _MOST_ASKED = 200_000, 50_000
 _GROUPS = np.array([[2.5, 0.25, 0.12]])  # a kind of cells, as above
 _CORRELATION = 0.1  # of the returns in a group: n of them count n / (1 + 0.1 (n - 1)) times
-_LEAST_MEAN = 0.005  # of the range of intensities. A third of the means are smaller: they tell nothing
+_LEAST_MEAN = 0.005  # of the range of intensities. A third of the means are smaller: they predict nothing
 
 # With a network, the answer is the mean of two: the network's, and `_NETWORK_TIMES` that with what it leaves in closed
 # form. Half of what it leaves, since the rest is noise of the returns that it was trained on; and half of its answer,

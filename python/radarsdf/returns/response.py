@@ -32,7 +32,7 @@ _ANGLES_RAD = np.linspace(0, np.pi / 2, 2001)  # at which the response to the in
 _BASE = 5  # coefficients that do not belong to the incidence
 NUM_COEFFICIENTS = _BASE + 4 + len(_LOBES_RAD)
 
-# What the regression of all returns leaves, by range and elevation, which tell the ground from what stands on it: means
+# What the regression of all returns leaves, by range and elevation, which separate the ground from what stands on it: means
 # in bins of a table, smoothed with normal kernels, from wide ones to narrow ones.
 TABLE_SHAPE = (48, 96)
 _LOG_RANGES = (np.log10(0.5), np.log10(200.0))  # of the table, m
@@ -135,7 +135,7 @@ def _bins(log_range: NDArray[np.floating], up: NDArray[np.floating]) -> NDArray[
     low, high = np.array(_LOG_RANGES) - np.log10(_REFERENCE_RANGE_M)
     row = np.clip((log_range - low) * (rows / (high - low)), 0, rows - 1)
     column = np.clip((up + 1) * (columns / 2), 0, columns - 1)
-    # A place that is no number has no bin. Its answer is no number, whatever the table says.
+    # A place that is no number has no bin. Its answer is no number, whatever the table holds.
     row, column = (np.nan_to_num(place).astype(np.int32) for place in (row, column))
     bins: NDArray[np.int32] = row * np.int32(columns) + column
     return bins

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a radar can see: field of view, resolution, detection threshold and noise, as its own scans tell."""
+"""What a radar can see: field of view, resolution, detection threshold and noise, estimated from its own scans."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class Sensor:
         limits: dict[str, Any] = {"min_range_m": min_range_m, "max_range_m": max_range_m}
         rays = prepare(points, poses, intensities, whole=False, **limits)
         if len(rays) == 0:
-            msg = "no return lies within the ranges: a sensor cannot be told from its scans"
+            msg = "no return lies within the ranges: a sensor cannot be estimated from its scans"
             raise ValueError(msg)
         if rays.intensities is not None:
             kept = Plausible.of(rays.intensities).kept(rays.intensities)
