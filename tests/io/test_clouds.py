@@ -135,9 +135,9 @@ def test_text(tmp_path, text):
     check(tmp_path / "a.csv")
 
 
-def test_compressed_pcd_says_what_to_do(tmp_path):
-    write_pcd(tmp_path / "0.pcd", COLUMNS, DATA="binary_compressed")
-    with pytest.raises(ValueError, match="its DATA is binary_compressed: save it as binary"):
+def test_a_pcd_of_another_form_is_refused_with_what_to_do(tmp_path):
+    write_pcd(tmp_path / "0.pcd", COLUMNS, DATA="draco")
+    with pytest.raises(ValueError, match="its DATA is draco: save it as binary"):
         read_points(tmp_path / "0.pcd")
 
 
