@@ -245,8 +245,10 @@ void bind_samples(py::module_& m) {
       },
       "rays"_a.noconvert(), "places"_a.noconvert(), "ray"_a.noconvert(), "number"_a.noconvert(), "kind"_a.noconvert(),
       "segments"_a.noconvert(), "seed"_a,
-      "Random samples on `rays` (N, 7 or 8) float32: points (B, 3), m, signed distances along the ray to the return (B,), "
-      "m, and rows of `rays`. Sample i is on ray `places[ray[i]]`; its random number, found by `seed` and `number[i]`, is "
+      "Random samples on `rays` (N, 7 or 8) float32: points (B, 3), m, signed distances along the ray to the return "
+      "(B,), "
+      "m, and rows of `rays`. Sample i is on ray `places[ray[i]]`; its random number, found by `seed` and `number[i]`, "
+      "is "
       "uniform in row `kind[i]` of `segments` (K, 4): start and length in metres, each a constant and a factor on the "
       "range.");
 }
