@@ -145,8 +145,9 @@ void networks(int threads, Results& results) {
                                                           {narrow.data(), kNarrow, kNarrow}};
   std::vector<T> hidden(static_cast<std::size_t>(radarsdf::mlp_hidden_columns(layers) * kPoints));
   std::vector<T> out(grad.size()), first_grad(first.size()), second_grad(second.size()), wide_grad(wide.size());
-  radarsdf::mlp(layers, inputs, kPoints, hidden.data(), out.data(), threads);
-  radarsdf::mlp_backward<T>(layers, inputs, kPoints, hidden.data(), {grad.data(), kOutputs, kOutputs},
+  radarsdf::mlp(radarsdf::ForwardWeights<T>(layers), inputs, kPoints, hidden.data(), out.data(), threads);
+  const radarsdf::BackwardWeights<T> backward(layers, {{kWide, true}, {kNarrow, false}});
+  radarsdf::mlp_backward<T>(backward, inputs, kPoints, hidden.data(), {grad.data(), kOutputs, kOutputs},
                             {{first_grad.data(), first_grad.data() + kHidden * (kWide + kNarrow)},
                              {second_grad.data(), second_grad.data() + kOutputs * kHidden}},
                             {{wide_grad.data(), kWide, kWide}, {nullptr, 0, kNarrow}}, threads);
