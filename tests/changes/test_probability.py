@@ -131,7 +131,7 @@ def test_errors_of_distances_are_found_besides_changes():
         (-0.3, False, -5, 5, MOVED),
         (-0.3, True, -5, 5, UNSEEN),
         (-0.3, True, -5, -5, SAME),
-        (-0.3, False, 5, -5, SAME),  # hidden: rays do not tell
+        (-0.3, False, 5, -5, SAME),  # hidden: rays do not show it
     ],
 )
 def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):

@@ -182,7 +182,7 @@ def test_velocities_between_scans_that_have_one():
     assert_allclose(
         found.step_covariance(3, 2.0), found.covariance[3:5].sum(axis=0) + np.diag(found.change) * 8 / 12
     )
-    assert doppler_sign(scans[:2], found.select(slice(0, 2)), times_s[:2]) == 1  # one pair tells nothing
+    assert doppler_sign(scans[:2], found.select(slice(0, 2)), times_s[:2]) == 1  # one pair is not enough
     assert found.usual_mps == pytest.approx(np.sqrt([50, 65]).mean(), abs=1e-2)
     noise = [rng.uniform(-50, 50, 60) for _ in scans]
     assert SensorVelocities.of(scans, speeds[:3] + noise[:2] + speeds[5:], times_s).found.sum() == 3

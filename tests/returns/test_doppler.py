@@ -60,7 +60,7 @@ def test_a_velocity_is_the_least_squares_solution_of_the_returns_that_agree(dire
     np.testing.assert_allclose(found.velocity_mps, solution, atol=1e-5)
     variance = squares[0] / (len(a) - 3)
     np.testing.assert_allclose(found.covariance, variance * np.linalg.inv(a.T @ a), rtol=1e-3)
-    # Nine returns tell no velocity, ten do; nor do they if seven of ten move on their own.
+    # Nine returns determine no velocity, ten do; nor do they if seven of ten move on their own.
     few = np.flatnonzero(found.static)[:10]
     assert sensor_velocity(x[few], speeds[few]).found
     assert not sensor_velocity(x[few[:9]], speeds[few[:9]]).found

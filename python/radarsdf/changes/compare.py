@@ -63,8 +63,8 @@ def compare(
     before : Map
         The earlier map, fitted with ``returns.free_space``, which is the default of :class:`FitConfig`.
     after : Map, iterable of F arrays, or Scans
-        The later map, fitted likewise; or new scans as :func:`fit` takes them, which are first fitted with `FitConfig.quick`, with the ranges,
-        errors of poses and leaf cells of `before`.
+        The later map, fitted likewise; or new scans as :func:`fit` takes them, which are first fitted with
+        ``FitConfig.quick()``, and the ranges, errors of poses and leaf cells of `before`.
     poses : (F, 4, 4) array_like, optional
         Of new scans: T_world_sensor, m.
     intensities : iterable of F arrays (N_i,), optional

@@ -41,7 +41,7 @@ _ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.
 # Points in the world frame agree as badly if the poses move them forwards as if backwards. Measured: at most 0.06; on good
 # recordings of a sensor with coarse cells, 0.15 and more.
 _FORWARDS_GAIN = 0.1
-_EQUAL = 0.8  # of the best gain: mistakes that agree about as well are indistinguishable: the most common one is named
+_EQUAL = 0.8  # of the best gain: mistakes that agree about as well are indistinguishable. The most common one is named
 _NOT_BEHIND = 2.5  # standard errors
 # Standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's.
 _FIELD_OF_VIEW_STAYS = -1.5

@@ -117,7 +117,7 @@ def _returns_of_rays(surface: SurfaceReturns, config: FitConfig, num_threads: in
 
 
 def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
-    """The same by mean rays."""
+    """Precision, numbers of scans and of returns of each leaf cell, by its mean ray."""
     # The returns of a cell are at nearly the same range if they are of the same sensor position.
     information = means.counts / noise.variances_m2(means.ranges_m)
     counts = means.counts.astype(np.float64)

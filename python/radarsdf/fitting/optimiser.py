@@ -126,7 +126,7 @@ class Soap(Optimiser):
             memories=self._memory_views,
             step=self.step_count,
             learning_rate=self.learning_rate,
-            **({} if pool is None else {"pool": pool.core_threads}),
+            pool=None if pool is None else pool.core_threads,
         )
 
 

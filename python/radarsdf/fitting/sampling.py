@@ -119,10 +119,8 @@ class RaySampler:
         self._neighbours = neighbours
         self._generator = generator
         self._rays = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
-        self._runs, self._next = (
-            np.zeros(0, np.int32),
-            0,
-        )  # runs of neighbours in random order; the next ray in it
+        self._runs = np.zeros(0, np.int32)  # runs of neighbours, in random order
+        self._next = 0  # ray in that order
         self._order_from = generator.get_state()  # before the order was drawn
         near, labelled = near_and_labelled(config, batch_size)
         # Samples with labels come first, and a batch without them is in Morton order.
@@ -137,8 +135,7 @@ class RaySampler:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         following = int(state["next"])
-        most = len(self._rays) + self._neighbours
-        if not -1 <= following <= most:
+        if not -1 <= following <= len(self._rays) + self._neighbours:
             msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
             raise ValueError(msg)
         if following >= 0:

@@ -435,9 +435,9 @@ def doppler_factor(drive: Drive, config: FitConfig, num_threads: int) -> float:
     count = min(_COMPARED, len(durations_s))
     if drive.velocities is None or count < _FEW_COMPARED:
         return 1.0
-    ways_m = np.linalg.norm(drive.velocities.mean_mps[:-1], axis=1) * durations_s
-    ways_m[durations_s > 2 * np.median(durations_s)] = 0.0
-    begin = int(np.argmax(np.convolve(ways_m, np.ones(count), "valid")))
+    lengths_m = np.linalg.norm(drive.velocities.mean_mps[:-1], axis=1) * durations_s
+    lengths_m[durations_s > 2 * np.median(durations_s)] = 0.0
+    begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
     rows = slice(begin, begin + count + 1)
     velocities, scans, times_s = drive.velocities.select(rows), drive.scans[rows], drive.times_s[rows]
     cell_m = plane_cell_m(drive.scans, config.leaf_size_m)
@@ -449,23 +449,23 @@ def doppler_factor(drive: Drive, config: FitConfig, num_threads: int) -> float:
     free, information, off = tracked(1.0, _FREE_SCALE), 0.0, 0.0
     motion = DopplerMotion.by(velocities, times_s, np.stack([found.pose for found in free]))
     for step, before, now in zip(motion.steps, free, free[1:], strict=False):
-        way = before.pose[:3, :3] @ step[:3, 3]
-        squared_m2 = float(way @ way)
+        moved_m = before.pose[:3, :3] @ step[:3, 3]
+        squared_m2 = float(moved_m @ moved_m)
         if now.segment == before.segment and squared_m2 > 0:
-            variance = float(way @ now.covariance[:3, :3] @ way) / squared_m2**2
+            variance = float(moved_m @ now.covariance[:3, :3] @ moved_m) / squared_m2**2
             # That of the mean of two velocities was known before.
             information += max(1 / variance - 2 / _FREE_SCALE**2, 0.0)
-            off += (float(way @ (now.pose[:3, 3] - before.pose[:3, 3])) / squared_m2 - 1) / variance
+            off += (float(moved_m @ (now.pose[:3, 3] - before.pose[:3, 3])) / squared_m2 - 1) / variance
     factor = 1 + off / max(information, 1.0)
     if (
         abs(factor - 1) < _SAME_SCALE + _ERRORS / np.sqrt(max(information, 1.0))
         or not 1 / _MOST_SCALE < factor < _MOST_SCALE
     ):
         return 1.0
-    ahead, given = (
+    rescaled, measured = (
         np.nan_to_num([found.agreeing for found in tracked(by, 0.0)[_FIRST_COMPARED:]])
         for by in (factor, 1.0)
     )
-    gains = ahead - given
+    gains = rescaled - measured
     needed = float(student.ppf(1 - _BY_CHANCE, len(gains) - 1)) * gains.std(ddof=1) / np.sqrt(len(gains))
     return factor if gains.mean() > needed else 1.0
