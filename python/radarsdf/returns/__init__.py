@@ -1,5 +1,5 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What is computed from the returns before the training: rays, noise, surfels, ghosts, support, gaps."""
+"""Quantities computed from the returns before training: rays, noise, surfels, ghosts, support, gaps."""
 
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime

@@ -16,10 +16,10 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
 
 CELLS_OF_SURFACE = 9
-"""A plane crosses about so many of a cell and the 26 cells around it."""
+"""Approximate number of cells that a plane crosses in a 3 × 3 × 3 neighbourhood."""
 
 BLOCK_BITS = np.uint64(9)
-"""Bits by which the key of a leaf cell is longer than that of the block whose visibility is counted."""
+"""Bits of a leaf cell's Morton key below those of its visibility block (8 × 8 × 8 leaf cells)."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class Evidence:
     `information` and `hits` are sums over a leaf cell and the 26 cells around it.
     """
 
-    information: NDArray[np.float32]  # (C,) 1 / variance of the position that the returns give together, m⁻²
-    # (C,) number of scans with returns, added up over the cells. A scan of many returns in a cell counts once there: their
-    # errors have causes in common.
+    information: NDArray[np.float32]  # (C,) 1 / variance of the position estimated from all returns, m⁻²
+    # (C,) number of scans with returns, summed over the cells. Several returns of a scan in a cell count once there, because
+    # their errors are correlated.
     hits: NDArray[np.uint32]
-    # (C,) number of scans with a ray through the cube of 8 × 8 × 8 leaf cells that the cell is in, or to there
+    # (C,) number of scans with a ray through or into the block of 8 × 8 × 8 leaf cells that contains the cell
     visibility: NDArray[np.uint32]
 
     @classmethod
@@ -46,7 +46,7 @@ class Evidence:
         num_threads: int = 0,
         visibility: VisibilityCounts | None = None,
     ) -> Evidence:
-        """Evidence in the leaf cells with these keys (C,), ascending. `rays` are all: those of ghosts count as visibility."""
+        """Compute evidence for leaf cells with ascending keys (C,). `rays` include those of ghosts, which count for visibility."""
         near = CellBlocks(leaf_keys).rows(returns.keys, num_threads) >= 0
         information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
         if visibility is not None:
@@ -57,10 +57,10 @@ class Evidence:
 
 @dataclass(frozen=True)
 class ReturnsOfCells:
-    """Precision, number of scans and of returns in each leaf cell, in the order of their keys."""
+    """Information, number of scans and number of returns of each leaf cell, in the order of the keys."""
 
     keys: NDArray[np.uint64]  # (M,) Morton keys of the leaf cells with returns, ascending
-    information: NDArray[np.float32]  # (M,) 1 / variance of the position that its returns give together, m⁻²
+    information: NDArray[np.float32]  # (M,) 1 / variance of the position estimated from its returns, m⁻²
     scans: NDArray[np.uint32]  # (M,) number of different scans with returns
     counts: NDArray[np.float64]  # (M,) number of returns
 
@@ -68,11 +68,11 @@ class ReturnsOfCells:
         return ReturnsOfCells(self.keys[part], self.information[part], self.scans[part], self.counts[part])
 
     def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
-        """The same with the errors of the poses in `config`. `ranges_m` (M,): of a return in each cell, m."""
+        """Include the pose uncertainty of `config`. `ranges_m` (M,): mean range of the returns in each cell, m."""
         if config.pose_sigma_m == 0 and config.pose_sigma_rad == 0:
             return self
-        # The error of a pose is common to the returns of a scan. So the variance of a cell gets that of a pose over the
-        # number of scans, as many times as a surface has cells among 27.
+        # All returns of a scan share its pose error, so its variance is divided by the number of scans only. The evidence
+        # sums 27 cells, of which a surface crosses nine: each gets nine times this variance, to keep the sum correct.
         pose_m2 = config.pose_sigma_m**2 + np.square(np.float32(config.pose_sigma_rad) * ranges_m)
         variances_m2 = 1 / self.information + CELLS_OF_SURFACE * pose_m2 / self.scans
         return dataclasses.replace(self, information=(1 / variances_m2).astype(np.float32))
@@ -83,10 +83,10 @@ class VisibilityCounts:
     """Number of scans whose rays reach each block of 8 × 8 × 8 leaf cells."""
 
     keys: NDArray[np.uint64]  # (B,) Morton keys of leaf cells without their last nine bits, ascending
-    scans: NDArray[np.uint32]  # (B,) number of scans with a ray through each block, or to there
+    scans: NDArray[np.uint32]  # (B,) number of scans with a ray through or into each block
 
     def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint32]:
-        """(C,) of the blocks that leaf cells with these Morton keys (C,), ascending, are in."""
+        """Return the counts (C,) of the blocks that contain leaf cells with ascending Morton keys (C,)."""
         if len(self.keys) == 0:
             return np.zeros(len(leaf_keys), np.uint32)
         blocks = leaf_keys >> BLOCK_BITS
@@ -97,7 +97,7 @@ class VisibilityCounts:
 def evidence_sums(
     returns: ReturnsOfCells, leaf_keys: NDArray[np.uint64], num_threads: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """`information` and `hits` of :class:`Evidence`, (C,), in the leaf cells with these keys (C,), ascending."""
+    """Compute `information` and `hits` of :class:`Evidence`, (C,) each, for leaf cells with ascending keys (C,)."""
     columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)
     sums = CellBlocks(returns.keys).neighbour_sums(leaf_keys, columns, 1.0, num_threads)
     return sums[:, 0].astype(np.float32), sums[:, 1].astype(np.uint32)
@@ -109,16 +109,16 @@ _MOST = float(np.iinfo(np.uint16).max)
 def support_at(
     leaf_keys: NDArray[np.uint64], keys: NDArray[np.uint64], counts: NDArray[np.float64], num_threads: int = 0
 ) -> NDArray[np.float64]:
-    """Support (C,) of leaf cells: returns in each and the 26 cells around it, up to 65535. `counts` (M,): of cells with `keys` (M,)."""
+    """Return the support (C,): returns in each leaf cell and its 26 neighbours, at most 65535. `counts`: at `keys`, (M,)."""
     sums = CellBlocks(keys).neighbour_sums(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
     return np.minimum(sums[:, 0], _MOST)
 
 
 # Measured on simulated and real scans.
-# Share of the median support of the block. Returns with less are too often false to show where a surface continues.
+# Relative to the median support of the block. Cells with less are too often false to indicate that a surface continues.
 _MIN_SUPPORT = 0.5
-# Mean support of the two ends of a bridge, at most. A surface crosses about nine of the 27 cells. With one
-# return in each of these or more, an empty cell is most likely a real gap.
+# Largest mean support of the two ends of a bridge. A surface crosses about nine of the 27 cells. If each of
+# these has at least one return, an empty cell is most likely a real gap.
 _MAX_SUPPORT = 9.0
 
 
@@ -129,9 +129,9 @@ def bridged(
     max_cells: int,
     num_threads: int = 0,
 ) -> NDArray[np.uint64]:
-    """Adds to `leaf_keys` (C,), ascending, at most `max_cells` on a line between two cells with returns, in 13 directions.
+    """Add gaps of at most `max_cells` between two cells with returns, along 13 directions, to ascending `leaf_keys` (C,).
 
-    `counts` (M,): returns in the cells with `keys` (M,), ascending.
+    `counts` (M,): number of returns in the cells with ascending `keys` (M,).
     """
     if max_cells == 0:
         return leaf_keys
@@ -141,22 +141,22 @@ def bridged(
     of_leaves = support_at(leaf_keys, keys, counts, num_threads)
     least = np.maximum(1.0, _MIN_SUPPORT * _medians(leaf_keys, of_leaves)[rows])
     support = of_leaves[rows]
-    # With more than the most, the mean with any other end is too high.
+    # An end with more support than this exceeds the limit with any other end.
     used = (support >= least) & (support + least < 2 * _MAX_SUPPORT)
     return bridge_cells(leaf_keys, keys[used], support[used], max_cells, 2 * _MAX_SUPPORT, num_threads)
 
 
 def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(C,) median of the `support` (C,) of the leaf cells with returns around them in the block of each cell."""
-    # Of a block, not of the map: what is added must not depend on how many returns there are elsewhere.
+    """Return the median (C,) of the nonzero `support` (C,) in the block of each cell."""
+    # Per block, not over the map: the cells added must not depend on the number of returns elsewhere.
     block = leaf_keys >> np.uint64(3 * (LATTICE_BLOCK_CELLS.bit_length() - 1))
-    starts = np.flatnonzero(np.diff(block, prepend=~block[:1]))  # cells of a block follow each other
-    # Sorted within blocks: the number of the block counts more than the support.
+    starts = np.flatnonzero(np.diff(block, prepend=~block[:1]))  # the cells of a block are contiguous
+    # Sort within blocks: the block number forms the high bits, the support the low ones.
     number = np.repeat(np.arange(len(starts), dtype=np.uint64), np.diff(starts, append=len(block)))
     ordered = np.sort(number << np.uint64(16) | support.astype(np.uint64)) & np.uint64(0xFFFF)
     ends = np.append(starts[1:], len(block))
     zeros = np.add.reduceat(ordered == 0, starts)
-    first = starts + zeros  # of those with returns; if there are none, medians are of no use
+    first = starts + zeros  # first nonzero support; if there is none, the median is not used
     last = np.maximum(ends - 1, first)
     middle = np.minimum([(first + last) // 2, (first + last + 1) // 2], len(block) - 1)
     return ordered[middle].mean(axis=0)[number.astype(np.int64)]  # type: ignore[no-any-return]

@@ -17,21 +17,21 @@ from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 BLOCK_CELLS = 8
 """Edge of a block, leaf cells."""
 MOST_SCANS = 7
-"""The number of scans that passed a cell is counted up to here."""
+"""Largest number of crossing scans that is counted for a cell."""
 
-_LEVELS = 3  # of a block: 2³ cells an edge
+_LEVELS = 3  # octree levels of a block: 2³ cells along an edge
 _PLANES, _WORDS = 4, 8
-_SIGMAS = 2.0  # a ray crosses free space up to so many standard deviations of its return before it
+_SIGMAS = 2.0  # standard deviations before a return at which the free space of its ray ends
 _INSIDE = np.arange(BLOCK_CELLS**3, dtype=np.uint64)
 
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The leaf cells that rays passed, in blocks of 8 × 8 × 8."""
+    """Free-space crossings of leaf cells, in blocks of 8 × 8 × 8."""
 
     keys: NDArray[np.uint64]  # (B,) Morton keys of the blocks' leaf cells without the last 9 bits, ascending
-    # (B, 4, 8) a bit for each of the 512 leaf cells of a block, in Morton order. Planes 0 to 2: the bits of the number of
-    # scans with a ray through the cell, up to 7. Plane 3: whether there are returns in it.
+    # (B, 4, 8) bit planes of the 512 leaf cells of a block, in Morton order. Planes 0 to 2: the number of scans with a
+    # ray through the cell, at most 7. Plane 3: whether the cell has returns.
     planes: NDArray[np.uint64]
 
     @classmethod
@@ -43,9 +43,9 @@ class FreeSpace:
         box_cells: NDArray[np.int64] | None = None,
         num_threads: int = 0,
     ) -> FreeSpace:
-        """What `rays`, without those to false returns, crossed in the box [lower, upper), (2, 3) leaf cells. None: anywhere."""
-        # Up to two standard deviations before the return, and where its angles are known to one cell: beyond that, it
-        # cannot be said which cell a ray crossed.
+        """Compute the crossings of `rays` to true returns in the box [lower, upper), (2, 3) leaf cells; None for no limit."""
+        # Rays end two standard deviations before the return, and where the angular error exceeds one cell: beyond
+        # that, the crossed cell is uncertain.
         before_m = rays.ranges_m - np.float32(_SIGMAS) * np.sqrt(noise.variances_m2(rays.ranges_m))
         known_m = np.float32(leaf_size_m / noise.angle_rad)
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
@@ -60,7 +60,7 @@ class FreeSpace:
         return cls(np.zeros(0, np.uint64), np.zeros((0, _PLANES, _WORDS), np.uint64))
 
     def check(self) -> None:
-        """Raises a ValueError unless arrays of a file are what they should be."""
+        """Raise a ValueError if the arrays read from a file are inconsistent."""
         if (
             self.keys.ndim != 1
             or self.planes.shape != (len(self.keys), _PLANES, _WORDS)
@@ -72,7 +72,7 @@ class FreeSpace:
     def dense(
         self, lower: ArrayLike, shape: tuple[int, int, int]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Scans that crossed, up to 7, and whether there are returns, for leaf cells from `lower` (3,) on, in arrays of this shape."""
+        """Return dense arrays of crossing scans, at most 7, and of whether there are returns, from leaf cell `lower` (3,) on."""
         first = np.asarray(lower, np.int64)
         last = first + np.asarray(shape)
         begin, end = first // BLOCK_CELLS, -(-last // BLOCK_CELLS)  # blocks that the box touches
@@ -87,7 +87,7 @@ class FreeSpace:
         return inside & np.uint8(MOST_SCANS), inside > MOST_SCANS
 
     def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint8]:
-        """(N,) number of scans that crossed the leaf cells with these Morton keys (N,), up to 7."""
+        """Return the number (N,) of scans that crossed the leaf cells with Morton keys (N,), at most 7."""
         if len(self.keys) == 0:
             return np.zeros(len(leaf_keys), np.uint8)
         blocks, bit = leaf_keys >> np.uint64(3 * _LEVELS), leaf_keys & _INSIDE[-1]
@@ -98,13 +98,13 @@ class FreeSpace:
 
 
 def block_numbers(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """(B, 3) numbers of blocks with these keys (B,): block i begins at leaf cell 8 i."""
+    """Return the block coordinates (B, 3) of `keys` (B,): block i begins at leaf cell 8 i."""
     numbers: NDArray[np.int64] = lattice_of(keys << np.uint64(3 * _LEVELS)) // BLOCK_CELLS
     return numbers
 
 
 def unpacked(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
-    """(B, 8, 8, 8) of the cells of blocks: the number of scans that passed, and 8 more where there are returns."""
+    """Unpack bit planes to (B, 8, 8, 8) cells: the number of crossing scans, plus 8 where there are returns."""
     bits = np.unpackbits(planes.astype("<u8").view(np.uint8), axis=-1, bitorder="little")
     weights = np.array([1, 2, 4, 8], np.uint8)[:, None]
     cells: NDArray[np.uint8] = (bits * weights).sum(axis=1, dtype=np.uint8)

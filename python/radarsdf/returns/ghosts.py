@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Finds ghosts: returns behind a surface that their rays crossed.
+"""Detection of ghosts: returns behind a surface that their rays crossed.
 
 A mirror, such as a metal wall, reflects the radar's beam to an object. The radar places the object behind the
-mirror, in the direction of the beam. From all sensor positions, these returns are at the same place. So
-neither the number of returns there nor the rays of other returns show that they are false.
+mirror, in the direction of the beam. These returns lie at the same place for all sensor positions, so neither
+the number of returns there nor the rays of other returns reveal that they are false.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MeanRays
 
-# Measured: of ghosts more than 0.4 m off a surface 67 to 69 % are dropped, of true returns 0.4 to 1.4 % (fences: 4.9 %).
-# A ghost is farther behind the surface than these two together, since noise puts returns of the surface
-# itself behind it.
-_MARGIN = 0.25  # cells of surfels
-_SIGMAS = 2.0  # standard deviations of the noise
-_MIN_OPACITY = 0.5  # of a surface: share of the rays to it that end there. A hedge lets most rays through.
-# A trunk, a rail or the end of a wall fills a part of a surfel's cell. What lies evenly on a strip reaches √3 standard
-# deviations across it from its middle. A ray farther from the centre misses it; along a strip some do not, but what
-# is narrow mirrors little. Surfaces that fill the cell reach beyond it.
+# Measured: drops 67 to 69 % of the ghosts more than 0.4 m from a surface, and 0.4 to 1.4 % of true returns (fences: 4.9 %).
+# A ghost lies behind the surface by more than the sum of these two, because noise moves returns of the
+# surface itself behind it.
+_MARGIN = 0.25  # surfel cells
+_SIGMAS = 2.0  # noise standard deviations
+_MIN_OPACITY = 0.5  # share of the rays reaching a surface that end there. A hedge lets most rays through.
+# A trunk, a rail or the end of a wall fills part of a surfel's cell. A uniform strip extends √3 standard deviations to
+# either side of its middle. A ray farther from the centre counts as a miss, also along the strip, where it may hit: narrow
+# objects reflect little. Surfaces that fill the cell extend beyond it.
 _REACH_SIGMAS = 3**0.5
-# Share of the returns round a ghost that are behind a surface too. Round a noisy return it is lower.
+# Share of the returns near a ghost that are behind a surface too. It is lower near a noisy return.
 _MIN_SHARE = 0.5
 
 
 def find_ghosts(
     surfels: Surfels, rays: Rays | MeanRays, noise: SensorNoise, num_threads: int = 0
 ) -> NDArray[np.bool_]:
-    """(C,) bool, which cells of `surfels` hold ghosts. `rays`: all, or the mean rays of leaf cells, which are fewer."""
+    """Return a mask (C,) of the cells of `surfels` that hold ghosts. `rays`: all, or the fewer mean rays of leaf cells."""
     if isinstance(rays, MeanRays):
         cell_of_ray, weights = surfels.cells_of_leaves(rays.keys, num_threads), rays.counts
     else:
@@ -63,9 +63,9 @@ def first_crossed(
     *,
     beyond_returns: bool = True,
 ) -> NDArray[np.int32]:
-    """(N,) row in `planes`, rows of surfels, of the first that each ray crosses from its front, or -1.
+    """Return the index (N,) into `planes` (rows of surfels) of the first that each ray crosses from its front, or -1.
 
-    `beyond_returns`: it also crosses one where the plane continues, in the cell of the surfel, beyond the returns.
+    `beyond_returns`: planes extend over the whole cell of the surfel, beyond its returns.
     """
     variances = surfels.variances[planes]
     reach_m = np.full(len(planes), np.inf) if beyond_returns else _REACH_SIGMAS * np.sqrt(variances[:, 1])
@@ -90,7 +90,7 @@ def first_crossed(
 def are_opaque(
     surfels: Surfels, planes: NDArray[np.int64], passed: NDArray[np.float64], num_threads: int = 0
 ) -> NDArray[np.bool_]:
-    """(P,) which of `planes`, rows of flat surfels, most rays end at. `passed` (C,): rays whose first one is that of each cell."""
+    """Return a mask (P,) of `planes` (rows of flat surfels) that stop most rays. `passed` (C,): first crossings by cell."""
     cells = surfels.cell_of_plane[planes]
     support = surfels.support[cells]
     passed_near = surfels.blocks.neighbour_sums(
@@ -108,14 +108,14 @@ def are_behind(
     noise: SensorNoise,
     num_threads: int = 0,
 ) -> NDArray[np.bool_]:
-    """(N,) which rays end behind one of `planes`, rows of opaque surfels. `crosses` (N,): which cross any flat one."""
+    """Return a mask (N,) of rays that end behind `planes` (rows of opaque surfels). `crosses` (N,): rays that cross a flat one."""
     behind, chosen = crosses.copy(), rays.select(np.flatnonzero(crosses))
     behind[crosses] = first_crossed(surfels, planes, chosen, noise, num_threads, beyond_returns=False) >= 0
     return behind
 
 
 def mostly_behind(surfels: Surfels, behind: NDArray[np.float64], num_threads: int = 0) -> NDArray[np.bool_]:
-    """(C,) the cells round which most returns are `behind` (C,) a surface, in number."""
+    """Return a mask (C,) of cells in whose neighbourhood most returns lie behind a surface; `behind` (C,) counts them."""
     columns = np.stack([behind, surfels.counts], 1)
     sums = surfels.blocks.neighbour_sums(surfels.keys, columns, 1.0, num_threads)
     ghosts: NDArray[np.bool_] = sums[:, 0] > _MIN_SHARE * sums[:, 1]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Which intensities are outliers, and the scale of the others."""
+"""Detection of intensity outliers, and the scale of the inliers."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from torch import Tensor
 
 from radarsdf.checks import real_array
 
-# An intensity is left out if it lies beyond a gap, and farther than the tail of the others reaches but by chance.
-_GAP = 3.0  # times as far from the median as any other. Tails have gaps, too
-_CHANCE = 1e-3  # that so many of a tail lie beyond
-_RARE = 0.03  # share of the returns. More are another kind of returns ...
-_FEW = 3  # ... unless they have no more different values than this: sentinels
-_FEWEST = 128  # returns; fewer do not determine the usual range
-_MOST = 1 << 15  # returns that determine it
-_THINNED = 7  # times fewer of more than these. Few sensors repeat anything after seven returns
+# An intensity is an outlier if it lies beyond a gap and significantly outside the extrapolated tail of the inliers.
+_GAP = 3.0  # ratio of distances from the median across a gap. Tails have gaps, too
+_CHANCE = 1e-3  # significance level: probability that a tail extends so far
+_RARE = 0.03  # largest share of outliers. A larger group is another kind of returns ...
+_FEW = 3  # ... unless it has at most this many distinct values: sentinels
+_FEWEST = 128  # fewest returns that determine the usual range
+_MOST = 1 << 15  # size of the sample that determines it
+_THINNED = 7  # factor by which a larger sample is thinned. Few sensors have a period of seven returns
 
 
 @dataclass(frozen=True)
 class Plausible:
-    """Limits of the intensities that can belong to the others, sensor units."""
+    """Limits of inlier intensities, sensor units."""
 
     low: float
     high: float
@@ -41,12 +41,12 @@ class Plausible:
         return (intensities >= np.float64(self.low)) & (intensities <= np.float64(self.high))
 
     def kept(self, intensities: NDArray[Any]) -> NDArray[Any]:
-        """The intensities (N,); NaN in place of those beyond the limits."""
+        """Return the intensities (N,) with NaN in place of those beyond the limits."""
         return np.where(self.holds(intensities), intensities, intensities.dtype.type(np.nan))
 
 
 class Intensities:
-    """Intensities that come a part at a time: some of them, the lowest and the highest."""
+    """Streaming sample of intensities, with the lowest and the highest."""
 
     def __init__(self) -> None:
         self._some: NDArray[Any] = np.zeros(0, np.float32)
@@ -54,7 +54,7 @@ class Intensities:
         self.low, self.high = math.inf, -math.inf
 
     def add(self, intensities: NDArray[Any]) -> None:
-        """The next ones (N,), sensor units; NaN for none."""
+        """Add intensities (N,), sensor units; NaN where missing."""
         none = np.isnan(intensities)
         known = intensities[~none] if none.any() else intensities
         if len(known) == 0:
@@ -77,7 +77,7 @@ class Intensities:
 
 
 def _farthest(distances: NDArray[Any], count: int) -> float:
-    """How far from the median one of `count` intensities can be, by the distances (M,) of some, ascending."""
+    """Return the largest inlier distance from the median of `count` intensities, from a sample of distances (M,), ascending."""
     of_all = len(distances)
     distances = distances[distances > 0]  # half of the returns may have the same intensity
     gaps = np.flatnonzero(distances[1:] > _GAP * distances[:-1]) + 1
@@ -86,7 +86,7 @@ def _farthest(distances: NDArray[Any], count: int) -> float:
         different = 1 + np.count_nonzero(np.diff(beyond))
         if len(beyond) > _RARE * of_all and different > _FEW:
             continue
-        # n of a tail lie beyond with this chance, nearly, where so large a share is expected there (Poisson).
+        # Share beyond a distance at which n tail values lie beyond it with probability `_CHANCE`, about (Poisson).
         share = len(beyond) / (math.e * count) * _CHANCE ** (1 / len(beyond))
         if beyond[0] > _reach(usual, share):
             return _GAP * float(usual[-1])
@@ -94,10 +94,10 @@ def _farthest(distances: NDArray[Any], count: int) -> float:
 
 
 def _reach(distances: NDArray[Any], share: float) -> float:
-    """How far from the median such a `share` of the returns lies, by the distances (M,) of others, ascending.
+    """Extrapolate the distance from the median beyond which a `share` of returns lies, from distances (M,), ascending.
 
-    An exponential tail grows by the same length with each quartering of the share, a heavy one by longer and longer ones. A
-    lighter one than exponential is taken for that: returns are of several kinds.
+    Each quartering of the share extends an exponential tail by the same length, and a heavy tail by growing lengths. A tail
+    lighter than exponential is treated as exponential, because returns are of several kinds.
     """
     quarter, second, third = (float(distances[len(distances) * (4**k - 1) // 4**k]) for k in (1, 2, 3))
     step, before = third - second, second - quarter
@@ -112,21 +112,21 @@ def _reach(distances: NDArray[Any], share: float) -> float:
 
 @dataclass(frozen=True)
 class IntensityScale:
-    """The range of the training intensities, which becomes [0, 1]."""
+    """Range of the training intensities, mapped to [0, 1]."""
 
     low: float  # lowest training intensity, sensor units
     high: float  # highest training intensity, sensor units
 
     @classmethod
     def of(cls, intensities: NDArray[np.float32] | None) -> IntensityScale | None:
-        """The range of `intensities` (N,), sensor units, NaN where there is none. None if there are none at all."""
+        """Build from `intensities` (N,), sensor units, NaN where missing. None without intensities."""
         if intensities is None:
             return None
         return cls(float(np.nanmin(intensities)), float(np.nanmax(intensities)))
 
     @classmethod
     def between(cls, intensity_range: ArrayLike) -> IntensityScale:
-        """A range (low, high) that is given. Raises a ValueError unless it is finite and ascending."""
+        """Build from a range (low, high). Raise a ValueError unless it is finite and ascending."""
         ends = real_array(intensity_range, "intensity_range")
         if ends.shape != (2,) or not -np.inf < ends[0] < ends[1] < np.inf:
             msg = "intensity_range must be two finite numbers, the lower one first"
@@ -134,11 +134,11 @@ class IntensityScale:
         return cls(*ends.tolist())
 
     def to_unit(self, intensities: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Intensities (N,) from sensor units to [0, 1]. Those beyond the range are moved to its ends, NaN stays."""
+        """Scale intensities (N,) from sensor units to [0, 1], clipped to the range; NaN stays."""
         unit = (intensities - np.float32(self.low)) / np.float32(self.high - self.low)
         clipped: NDArray[np.float32] = np.clip(unit, 0, 1).astype(np.float32)
         return clipped
 
     def to_sensor(self, unit: Tensor) -> Tensor:
-        """Intensities (N,) from [0, 1] to sensor units."""
+        """Scale intensities (N,) from [0, 1] to sensor units."""
         return self.low + (self.high - self.low) * unit

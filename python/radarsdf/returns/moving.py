@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Velocity of the sensor from the Doppler of a scan, and the returns that move.
+"""Velocity of the sensor from the Doppler of a scan, and moving returns.
 
 A static return in direction d of a sensor with velocity v has the Doppler ``-d·v``, negative where the sensor approaches.
-Three returns give v; the v on which most returns agree is refined by least squares. The method is that of C. Doer and
-G. Trommer, "An EKF Based Approach to Radar Inertial Odometry", MFI 2020, written anew.
+RANSAC over draws of three returns gives v, which least squares refines. The method is that of C. Doer and G. Trommer,
+"An EKF Based Approach to Radar Inertial Odometry", MFI 2020; the implementation is independent.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from radarsdf.scans import Scans
 FloatArray = NDArray[np.float64]
 
 MIN_DOPPLER_RETURNS = 10
-"""Fewer returns of a scan determine no velocity."""
+"""Minimum number of returns of a scan that determine a velocity."""
 
-# Of three returns. With 40 % moving, one without them is among 38 draws with a probability of 0.9999.
+# RANSAC draws of three returns. With 40 % moving, 38 draws contain one without moving returns with probability 0.9999.
 _DRAWS = 64
-_SIGMA_MPS = 0.15  # a return is off if its Doppler differs by three times the noise, and by at least this
+_SIGMA_MPS = 0.15  # a return is an outlier if its residual exceeds three times the noise and this
 _LEAST_SIGMA_MPS = 1e-3
 _ROUNDS = 4
-_MIN_AGREEING = 0.4  # share of the returns that must agree on a velocity
-_FILLER = 0.2  # share of all returns with one and the same speed, from which on it may be none
-# Share from which on the other returns are too few to distinguish a sensor that stands still from one that does not measure.
+_MIN_AGREEING = 0.4  # minimum share of inliers
+_FILLER = 0.2  # share of returns with the same speed from which on it may be a fill value
+# Share from which on the other returns are too few to distinguish a stationary sensor from one that measures no Doppler.
 _ONLY_FILLER = 0.9
-# Deviation of any velocity. Across the directions of all returns, as the vertical of a flat field of view, nothing else is known.
+# Prior standard deviation of a velocity component. It is all that is known of unobserved ones, as the vertical of a flat scan.
 _ANY_MPS = 100.0
-_FOLDS = (-1.0, 0.0, 1.0)  # intervals by which all three returns of a draw may be folded
+_FOLDS = (-1.0, 0.0, 1.0)  # ambiguity intervals by which the three returns of a draw may be aliased
 
 
 @dataclass(frozen=True)
 class SensorVelocity:
-    """The velocity that the Doppler of one scan gives."""
+    """Velocity of the sensor estimated from the Doppler of one scan."""
 
-    velocity_mps: FloatArray  # (3,) of the sensor in its own frame. NaN if the returns do not agree on one
-    covariance: FloatArray  # (3, 3) m²/s², large in directions that no return measures
-    static: NDArray[np.bool_]  # (N,) whether each return agrees with it. All False without a velocity
+    velocity_mps: FloatArray  # (3,) in the sensor frame. NaN if the returns do not agree
+    covariance: FloatArray  # (3, 3) m²/s², large in unobserved directions
+    static: NDArray[np.bool_]  # (N,) inliers of the velocity. All False without a velocity
 
     @property
     def found(self) -> bool:
@@ -58,10 +58,10 @@ class SensorVelocity:
 def sensor_velocity(
     points: NDArray[Any], doppler_mps: NDArray[Any], *, interval_mps: float | None = None
 ) -> SensorVelocity:
-    """The velocity of the sensor in one scan of returns (N, 3) with `doppler_mps` (N,), positive away from the sensor.
+    """Estimate the velocity of the sensor from a scan (N, 3) with `doppler_mps` (N,), positive away from the sensor.
 
-    NaN with fewer than 10 returns, or if less than 40 % of them agree. A component that no return measures is 0 m/s, with a
-    deviation of 100 m/s. `interval_mps`: width of the interval into which the sensor folds speeds.
+    NaN with fewer than 10 returns, or if less than 40 % of them are inliers. An unobserved component is 0 m/s, with a standard
+    deviation of 100 m/s. `interval_mps`: width of the ambiguity interval into which the sensor aliases speeds.
     """
     x, speeds = np.asarray(points, np.float64), np.asarray(doppler_mps, np.float64)
     ranges = np.linalg.norm(x, axis=1)
@@ -75,7 +75,7 @@ def sensor_velocity(
     measured = speeds[rows]
 
     def residuals(velocities: FloatArray) -> FloatArray:
-        """(K, M) differences of the measured speeds from those of velocities (K, 3)."""
+        """Return the residuals (K, M) of the measured speeds for velocities (K, 3)."""
         off: FloatArray = measured - product(velocities, away_columns)
         return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
 
@@ -90,7 +90,7 @@ def sensor_velocity(
         normal = normal_matrix(away[agrees], away[agrees]) + weak * np.eye(3)
         right = normal_matrix(away[agrees], off[agrees, None])[:, 0] - weak * velocity
         velocity = velocity + np.linalg.solve(normal, right)
-        # The median is not drawn by what moves.
+        # The median is robust against moving returns.
         sigma = min(1.4826 * float(np.median(np.abs(residuals(velocity[None])[0][agrees]))), _SIGMA_MPS)
         sigma = max(sigma, _LEAST_SIGMA_MPS)
     static = np.zeros(len(x), bool)
@@ -107,7 +107,7 @@ def _most_agreed(
     residuals: Callable[[FloatArray], FloatArray],
     interval_mps: float | None,
 ) -> FloatArray:
-    """The velocity (3,) of those of random draws of three returns with which most returns agree."""
+    """Return the velocity (3,) with the most inliers among random draws of three returns (RANSAC)."""
     rng = np.random.default_rng(0)
     drawn = rng.integers(0, len(measured), (_DRAWS, 3))
     speeds = measured[drawn]
@@ -123,12 +123,12 @@ def _most_agreed(
 
 
 def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
-    """Width of the interval into which the sensor seems to fold speeds, m/s: None if the speeds do not fill one."""
+    """Estimate the width of the ambiguity interval of the speeds, m/s. None if the speeds do not fill one."""
     speeds = np.concatenate([np.asarray(values, np.float64) for values in doppler_mps])
     speeds = speeds[np.isfinite(speeds)]
     if len(speeds) < 100:
         return None
-    # Folded speeds reach both ends of the interval, which lie about as far from 0.
+    # Aliased speeds reach both ends of the interval, which is nearly symmetric about 0.
     low, high = float(speeds.min()), float(speeds.max())
     edge = 0.05 * (high - low)
     symmetric = 0 < -low < 1.25 * high and high < -1.25 * low
@@ -144,23 +144,23 @@ def sensor_velocities(
     doppler_mps: Sequence[NDArray[Any]],
     others_mps: Sequence[NDArray[Any]] = (),
 ) -> list[SensorVelocity]:
-    """The velocity in each of K scans of one sensor. `others_mps`: speeds of other scans, which help to find the folding interval."""
+    """Estimate the velocity in each of K scans of a sensor. `others_mps`: further speeds to find the ambiguity interval."""
     interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None
     choices = [
         [sensor_velocity(x, v, interval_mps=folded) for x, v in zip(points, doppler_mps, strict=True)]
         for folded in ((None, interval) if interval else (None,))
     ]
     agreeing = [sum(int(velocity.static.sum()) for velocity in found) for found in choices]
-    # Folding lets more returns agree by chance, so that it must explain clearly more.
+    # Aliasing lets more returns agree by chance, so it must explain clearly more of them.
     return choices[-1] if agreeing[-1] > 1.2 * agreeing[0] else choices[0]
 
 
 def without_filler(
     points: Sequence[NDArray[Any]], doppler_mps: Sequence[NDArray[Any]]
 ) -> tuple[list[FloatArray], str | None]:
-    """Doppler of K scans with NaN where a driver wrote a fixed value because it measured none, and a note on that."""
-    # Many equal speeds are a filler if the other returns show a velocity that contradicts them, or if there are hardly any
-    # others: a sensor that stands still and resolves speeds coarsely has many equal ones, too.
+    """Replace the fill value that a driver writes for unmeasured Doppler of K scans by NaN. Also return a note, or None."""
+    # Many equal speeds are a fill value if the velocity of the other returns contradicts them, or if there are hardly any
+    # others: a stationary sensor with a coarse speed resolution has many equal ones, too.
     speeds = [np.asarray(values, np.float64) for values in doppler_mps]
     values, counts = np.unique(np.concatenate([v[np.isfinite(v)] for v in speeds]), return_counts=True)
     if len(values) == 0 or counts.max() < _FILLER * counts.sum():
@@ -183,20 +183,20 @@ def without_filler(
     return speeds, None
 
 
-_MIN_SHARE_WITH_VELOCITY = 0.5  # of the scans that have enough returns
-_MAX_MOVING = 0.4  # share of the returns; if more disagree, it is the Doppler that is not understood
+_MIN_SHARE_WITH_VELOCITY = 0.5  # minimum share of the scans with enough returns that have a velocity
+_MAX_MOVING = 0.4  # maximum share of the returns; if more disagree, the Doppler is misinterpreted
 
 
 @dataclass(frozen=True)
 class MovingReturns:
-    """Which returns of F scans move."""
+    """Moving returns of F scans."""
 
-    masks: list[NDArray[np.bool_]]  # F arrays (N_i,). All False where a scan gives no velocity of the sensor
-    why_none: str | None  # why none are named although there is Doppler, in words
+    masks: list[NDArray[np.bool_]]  # F arrays (N_i,). All False for a scan without a velocity of the sensor
+    why_none: str | None  # why Doppler was not used, in words
 
     @classmethod
     def of(cls, points: Sequence[ArrayLike], doppler_mps: Sequence[ArrayLike]) -> MovingReturns:
-        """The returns (N_i, 3), sensor frame, m, whose Doppler (N_i,), m/s or NaN, of either sign, disagrees with a static world."""
+        """Build from scans (N_i, 3), sensor frame, m, and Doppler (N_i,), m/s, either sign, NaN where missing."""
         scans, _, _ = check_scans(points)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
         none = [np.zeros(len(scan), bool) for scan in scans]
@@ -224,12 +224,12 @@ class MovingReturns:
 
 @dataclass(frozen=True)
 class StaticReturns:
-    """The returns of F scans without those that move, as far as Doppler shows them."""
+    """Returns of F scans without the moving ones that Doppler reveals."""
 
     points: Iterable[ArrayLike]  # F arrays (N_i, 3), sensor frame, m
     intensities: Iterable[ArrayLike] | None  # F arrays (N_i,), sensor units
-    moving: int  # number of returns that were left out
-    why_none: str | None  # as of :class:`MovingReturns`
+    moving: int  # number of returns left out
+    why_none: str | None  # see :class:`MovingReturns`
 
     @classmethod
     def of(
@@ -239,7 +239,7 @@ class StaticReturns:
         doppler_mps: Sequence[ArrayLike] | None,
         config: ReturnsConfig,
     ) -> StaticReturns:
-        """All returns, if there is no Doppler or ``config.drop_moving`` is False; else see :meth:`MovingReturns.of`."""
+        """Drop moving returns, see :meth:`MovingReturns.of`; keep all without Doppler or ``config.drop_moving``."""
         if doppler_mps is None or not config.drop_moving:
             return cls(points, intensities, 0, None)
         points = list(one_for_each_scan(points, "points"))
@@ -251,7 +251,7 @@ class StaticReturns:
 
 
 def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
-    """F arrays (N_i,) of numbers. Raises TypeError or ValueError where they are none, or do not fit to the scans."""
+    """Return F arrays (N_i,). Raise a TypeError or ValueError if they are not numbers or do not match the scans."""
     speeds = [
         real_array(values, f"doppler_mps of scan {i}")
         for i, values in enumerate(one_for_each_scan(doppler_mps, "doppler_mps"))
@@ -261,7 +261,7 @@ def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike])
 
 
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
-    """The static returns within the ranges of a fit, each seen from where its scan was taken. Intensity outliers are NaN."""
+    """Return rays of the static returns within the ranges of a fit, without accumulating scans. Intensity outliers are NaN."""
     static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
     limits: dict[str, Any] = {
         "min_range_m": config.returns.min_range_m,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Noise of the sensor, estimated from its returns, and returns moved onto planes as far as it explains."""
+"""Noise of the sensor, estimated from its returns, and noise reduction by moving returns onto planes."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 
 NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
-"""Settings of returns that fix the numbers of :class:`SensorNoise`, in their order."""
+"""Settings of ``config.returns`` that fix the fields of :class:`SensorNoise`, in their order."""
 
-# Measured: so many give each deviation to 1 to 3 % of what all returns give, twice as many to 1 to 1.5 %.
+# Sample size. Measured: each deviation is within 1 to 3 % of that of all returns, with twice as many within 1 to 1.5 %.
 _RETURNS = 20_000
-_MIN_RETURNS = 100  # with fewer, the result is the guess that the estimate starts from
-_SIGMAS2 = 6.0  # variances. A larger squared residual is an outlier
-# The variance of a normal distribution is so many times its variance without these outliers.
+_MIN_RETURNS = 100  # with fewer, the result is the initial guess
+_SIGMAS2 = 6.0  # gate on squared residuals, variances
+# Ratio of the variance of a normal distribution to its variance within this gate.
 _TRUNCATION = 1.05
 _ROUNDS = 10
-_SETTLED = 0.01  # change of a variance. The returns that were drawn make more of a difference
+_SETTLED = 0.01  # relative change of the variances at convergence. The sampling error is larger
 _FIRST_ANGLE_RAD = 0.01
-_MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, to divide by
+_MIN_SINE = 1e-6  # of the angle between a ray and the z axis of its sensor, against division by zero
 
 
 @dataclass(frozen=True)
@@ -45,42 +45,42 @@ class SensorNoise:
 
     @property
     def variances(self) -> list[float]:
-        """Along the beam, m², in azimuth and in elevation, rad²."""
+        """Variances along the beam, m², in azimuth and in elevation, rad²."""
         squares: list[float] = np.square(dataclasses.astuple(self)).tolist()
         return squares
 
     @property
     def settings(self) -> dict[str, float]:
-        """As settings of returns, of a fit that need not estimate it."""
+        """Settings of ``config.returns`` with which a fit does not estimate the noise."""
         return dict(zip(NOISE_SETTINGS, dataclasses.astuple(self), strict=True))
 
     @property
     def angle_rad(self) -> float:
-        """Across the beam, root mean square of azimuth and elevation, rad."""
+        """Standard deviation across the beam: root mean square of azimuth and elevation, rad."""
         return float(np.hypot(self.azimuth_rad, self.elevation_rad) / np.sqrt(2))
 
     def variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N,) variance of returns at these ranges (N,), along the beam and across it together, m²."""
+        """Return the sum (N,) of the variances along and across the beam at ranges (N,), m²."""
         across_m = np.float32(self.angle_rad) * ranges_m
         variances: NDArray[np.float32] = np.float32(self.range_m**2) + np.square(across_m)
         return variances
 
     def mean_variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(N,) mean of the variances along the three axes, of returns at these ranges (N,), m²."""
+        """Return the mean (N,) of the variances along the three axes at ranges (N,), m²."""
         across_rad2 = self.azimuth_rad**2 + self.elevation_rad**2
         sums: NDArray[np.float64] = self.range_m**2 + across_rad2 * np.square(ranges_m, dtype=np.float64)
         return sums / 3
 
 
 def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> SensorNoise:
-    """Estimates the noise of the sensor from the distances of returns to their surfels.
+    """Estimate the noise of the sensor from the distances of returns to their surfels.
 
-    The variance across a plane is the sum of the three variances, each times the squared share of its axis in
-    the plane's normal. Across the beam, the deviation is an angle times the range. The three deviations are
-    fitted to the squared distances by weighted least squares. What is given in `config` stays as it is.
+    The variance across a plane is the sum of the three variances, each weighted by the squared component of the
+    plane's normal along its axis. Across the beam, the deviation is an angle times the range. The three variances
+    are fitted to the squared distances by weighted least squares. Those set in `config` are kept fixed.
 
-    A surfel of leaf cells of 0.2 m is 1.2 m wide, so noise of more than some 0.4 m is underestimated. The
-    roughness of a surface counts as noise. Measured on simulated scenes: 0.7 to 1.2 times the true deviation.
+    A surfel of leaf cells of 0.2 m is 1.2 m wide, so noise above about 0.4 m is underestimated. Surface roughness
+    counts as noise. Measured on simulated scenes: 0.7 to 1.2 times the true deviation.
     """
     known = np.array([getattr(config, name) for name in NOISE_SETTINGS], np.float64)
     free = np.isnan(known)
@@ -97,7 +97,7 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
         unexplained = residual2 - np.einsum("k,kn->n", sigma2[~free], shares[~free])
         least = np.array([0.025 * surfels.cell_size_m, 1e-3, 1e-3]) ** 2
         wanted = shares[free]
-        for _ in range(_ROUNDS):  # the weights are the variances of the round before
+        for _ in range(_ROUNDS):  # weights from the variances of the previous iteration
             before = sigma2[free]
             variance = np.einsum("k,kn->n", sigma2, shares)
             weights = (residual2 < _SIGMAS2 * variance) / np.square(variance)
@@ -113,25 +113,25 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
 def variances_across(
     rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64], noise: SensorNoise
 ) -> NDArray[np.float64]:
-    """(M,) variances of the returns in these `rows` (M,) across planes with `normals` (M, 3), m²."""
+    """Return the variances (M,) of the returns in `rows` (M,) across planes with `normals` (M, 3), m²."""
     shares = _shares(rays, rows, normals)
     variances: NDArray[np.float64] = np.einsum("k,kn->n", np.array(noise.variances), shares)
     return variances
 
 
 def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, M) factors of the variances along the beam, in azimuth and in elevation, across planes."""
+    """Return the factors (3, M) of the three noise variances in the variance across planes."""
     ranges2 = np.square(rays.ranges_m[rows].astype(np.float64))
     up, normal = rays.up_of_scan[rays.scans[rows]].T, normals.T
     along = rays.directions[rows].T.astype(np.float64)
-    azimuth = _cross(up, along)  # where it grows
+    azimuth = _cross(up, along)  # direction of increasing azimuth
     azimuth /= np.maximum(np.sqrt(_dot(azimuth, azimuth)), _MIN_SINE)
     elevation = _cross(along, azimuth)
     shares = [np.square(_dot(axis, normal)) for axis in (along, azimuth, elevation)]
     return np.stack([shares[0], shares[1] * ranges2, shares[2] * ranges2])
 
 
-# Vectors in columns (3, M): a row of three takes NumPy three times as long.
+# Vectors are columns (3, M): NumPy takes three times as long on rows of three.
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -144,13 +144,13 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: int = 0) -> Rays:
-    """The rays with each return moved towards the surfel of its cell, if there is a flat one.
+    """Move each return towards the surfel of its cell, if that is flat.
 
-    A plane through dozens of returns has much less noise than one return. But a surface is no plane: where
-    the returns scatter more than their noise explains, the rest is the shape of the surface. So a return keeps
-    the share τ² / (τ² + σ²) of its distance from the plane, with the variance σ² of its noise across the plane
-    and the variance τ² of the surface, which is that of the returns less their mean σ². This is the best linear
-    estimate of its true distance (Wiener, 1949). Along the plane, the return keeps its position.
+    A plane through dozens of returns has much less noise than one return. But a surface is not a plane: scatter
+    of the returns beyond their noise is the shape of the surface. So a return keeps the share τ² / (τ² + σ²) of
+    its distance from the plane, with the variance σ² of its noise across the plane and the variance τ² of the
+    surface, which is that of the returns minus their mean σ². This is the best linear estimate of its true
+    distance (Wiener, 1949). Along the plane, the return keeps its position.
     """
     points, directions, ranges_m = move_onto_planes(
         *rays.in_c_order(),

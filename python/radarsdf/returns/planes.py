@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Planes through the returns of a cell and its neighbourhood (surfels)."""
+"""Surfels: planes fitted to the returns of a cell and its neighbourhood."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from radarsdf.returns.sums import UPPER, ScanSums, merged_keys
 # Measured by the F-score of returns moved onto surfels: flatness 0.25 and 0.8 are 0.0 to 0.7 points worse; cells of 0.3 and
 # 0.5 m find 87 and 92 % of the ghosts of `hugin`, but 0.5 m only 77 % of those of `oculii`.
 LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m with leaf cells of 0.2 m
-# Weight of a cell that shares a face. One that shares an edge has its square, a corner its cube.
+# Weight of a neighbour that shares a face; its square for one that shares an edge, its cube for a corner.
 NEIGHBOUR_WEIGHT = 0.7
-MAX_FLATNESS = 0.5  # smallest variance over the middle one. A surfel with more is not flat.
-MIN_SUPPORT = 12.0  # weighted returns in the 27 cells of a surfel
+MAX_FLATNESS = 0.5  # largest ratio of the smallest to the middle variance of a flat surfel
+MIN_SUPPORT = 12.0  # minimum weighted number of returns in the 27 cells of a surfel
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Cells twice as large as leaf cells, and surfels of those with enough returns in and round them."""
+    """Cells twice as large as leaf cells, with a surfel where the neighbourhood has enough returns."""
 
     cell_size_m: float  # edge of a cell, m
     keys: NDArray[np.uint64]  # (C,) Morton keys of the cells that hold returns, ascending
     blocks: CellBlocks  # finds the row of a cell from its key
     counts: NDArray[np.float64]  # (C,) number of returns in each cell
-    support: NDArray[np.float64]  # (C,) number of returns in a cell and, with less weight, the 26 around it
+    support: NDArray[np.float64]  # (C,) weighted number of returns in a cell and its 26 neighbours
     cell_of_plane: NDArray[np.int64]  # (P,) row of the cell of each surfel, ascending
     centres: NDArray[np.float64]  # (P, 3) weighted mean of the returns, local, m
     normals: NDArray[np.float64]  # (P, 3) unit vectors towards the sensors
-    variances: NDArray[np.float64]  # (P, 3) of the returns along the principal axes, ascending, m²
-    widest: NDArray[np.float32] | None = None  # (P, 3) unit vectors along which they spread most, in a batch
+    variances: NDArray[np.float64]  # (P, 3) variances of the returns along the principal axes, ascending, m²
+    widest: NDArray[np.float32] | None = None  # (P, 3) principal axes of the largest variance, unit vectors, in a batch
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
@@ -47,7 +47,7 @@ class Surfels:
         keys, of_cells = sums.merged_moments()
         blocks = CellBlocks(keys)
         support = neighbour_support(blocks, keys, of_cells, num_threads)
-        # Most cells have few returns. Surfels for all of them would take most of the time and the memory.
+        # Most cells have few returns: surfels for all of them would dominate time and memory.
         cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
         centres, normals, widest, variances = neighbour_planes(
             blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
@@ -61,37 +61,37 @@ class Surfels:
         return flat
 
     def clutter_ratio(self) -> float:
-        """Share of the returns that lie on no thin surface, of those in a cell with a surfel. 0 without surfels."""
-        # Measured: 0.02 to 0.06 on simulated scenes without clutter, whole or of every tenth scan; 0.27 to 0.44 on five
-        # real drives.
+        """Return the share of the returns in cells with a surfel whose surfel is not flat. 0 without surfels."""
+        # Measured: 0.02 to 0.06 on simulated scenes without clutter, with all scans or every tenth; 0.27 to 0.44 on
+        # five real drives.
         returns = self.counts[self.cell_of_plane]
         total = float(returns.sum())
         return 1 - float(returns[self.is_flat()].sum()) / total if total else 0.0
 
     def returns_per_cell(self) -> float:
-        """Mean number of returns in a cell, to which false returns are proportional. 0 without cells."""
+        """Return the mean number of returns per cell, to which false returns are proportional. 0 without cells."""
         return float(self.counts.sum()) / len(self.keys) if len(self.keys) else 0.0
 
     def cells_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
-        """(N,) row of the cell of each of the `points` (N, 3), local, m. -1: it holds no return."""
+        """Return the row (N,) of the cell of each of the `points` (N, 3), local, m; -1 for a cell without returns."""
         keys = cell_keys(np.ascontiguousarray(points), self.cell_size_m, num_threads)
         return self.blocks.rows(keys, num_threads)
 
     def cells_of_leaves(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.int32]:
-        """(M,) row of the cell that each leaf cell with one of these Morton keys (M,) is in. -1: it holds no return."""
+        """Return the row (M,) of the cell that contains each leaf cell with Morton keys (M,); -1 without returns."""
         return self.blocks.rows(merged_keys(leaf_keys), num_threads)
 
     def flat_planes_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
-        """(N,) row of the surfel of the cell of each of the `points` (N, 3), local, m. -1: it has none that is flat."""
+        """Return the row (N,) of the flat surfel in the cell of each of the `points` (N, 3), local, m; -1 without one."""
         return self._flat_planes(self.cells_at(points, num_threads))
 
     def flat_planes_of_leaves(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.int32]:
-        """(M,) likewise, of the cell that each leaf cell with one of these Morton keys (M,) is in."""
+        """Return the row (M,) of the flat surfel in the cell that contains each leaf cell with Morton keys (M,); -1 without one."""
         return self._flat_planes(self.cells_of_leaves(leaf_keys, num_threads))
 
     def _flat_planes(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
         flat = np.flatnonzero(self.is_flat())
-        planes = np.full(len(self.keys) + 1, -1, np.int32)  # the last one is for the row -1, of no cell
+        planes = np.full(len(self.keys) + 1, -1, np.int32)  # the last entry serves row -1, no cell
         planes[self.cell_of_plane[flat]] = flat
         return planes[cells]
 
@@ -99,7 +99,7 @@ class Surfels:
 def neighbour_support(
     blocks: CellBlocks, keys: NDArray[np.uint64], of_cells: NDArray[np.float64], num_threads: int = 0
 ) -> NDArray[np.float64]:
-    """(K,) weighted number of returns in and around cells with these `keys` (K,). `of_cells`: moments of those of `blocks`."""
+    """Return the weighted number (K,) of returns in the neighbourhoods of `keys` (K,). `of_cells`: moments by cell of `blocks`."""
     counts = np.ascontiguousarray(of_cells[:, :1])
     support: NDArray[np.float64] = blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     return support
@@ -112,7 +112,7 @@ def neighbour_planes(
     cell_size_m: float,
     num_threads: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
-    """Centres, normals, widest directions and variances (K, 3) of the surfels of the cells with these `keys` (K,); see :func:`neighbour_support`."""
+    """Return centres, normals, widest axes and variances (K, 3) of the surfels at `keys` (K,); see :func:`neighbour_support`."""
     moments = blocks.neighbour_sums(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
     means = moments[:, 1:10] / moments[:, :1]
     centres = means[:, :3].copy()
@@ -122,6 +122,6 @@ def neighbour_planes(
     variances, axes = principal_axes(covariance, num_threads)
     normals = axes[:, :, 0]
     normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
-    # The least is the resolution of float32 coordinates.
+    # The lower bound is the resolution of float32 coordinates.
     widest = axes[:, :, 2].astype(np.float32)
     return centres, normals, widest, np.maximum(variances, (0.0025 * cell_size_m) ** 2)

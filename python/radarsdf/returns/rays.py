@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Checks radar scans and turns them into rays in one local frame, as a fit needs them."""
+"""Validation of radar scans and their conversion to rays in one local frame."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
 
 _LOG = logging.getLogger("radarsdf.returns")
-_PADDING = 8  # rows that repeat the one before. Sensors with coarse cells repeat some
+_PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repeat some
 
 
 @dataclass(frozen=True)
 class Rays:
     """All returns of a fit, in the local frame: world axes, with `origin` subtracted.
 
-    float32 resolves 0.06 mm at 500 m, but only 0.5 m at UTM coordinates. That is why there is a local frame.
+    float32 resolves 0.06 mm at 500 m, but only 0.5 m at UTM coordinates, hence the local frame.
     """
 
     origin: NDArray[np.float64]
@@ -44,29 +44,29 @@ class Rays:
     directions: NDArray[np.float32]  # (N, 3) unit vectors from the sensor to the return
     ranges_m: NDArray[np.float32]  # (N,) distance of the return from the sensor
     intensities: NDArray[np.float32] | None
-    """(N,) sensor units; NaN where it cannot belong to the others. None if there are no intensities."""
+    """(N,) sensor units; NaN where missing or an outlier. None without intensities."""
     scans: NDArray[np.int32]  # (N,) scan of each return
     up_of_scan: NDArray[np.float64]  # (F, 3) z axis of the sensor in each scan, local frame
-    num_given: int  # number of returns that the scans hold, with those out of range
+    num_given: int  # number of returns in the scans, including those out of range
 
     def __len__(self) -> int:
         return len(self.points)
 
     @property
     def with_intensity(self) -> NDArray[np.bool_]:
-        """Mask (N,) of the returns whose intensity is known and can belong to the others."""
+        """Mask (N,) of the returns with an intensity that is not an outlier."""
         if self.intensities is None:
             return np.zeros(len(self), np.bool_)
         return ~np.isnan(self.intensities)
 
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
-        """The rays of a slice, a mask (N,) bool, or row numbers (M,), in that order."""
+        """Select rays by a slice, a mask (N,) or row indices (M,), in this order."""
         rows = part
         if isinstance(part, np.ndarray) and part.dtype == np.bool_:
             rows = np.flatnonzero(part)
 
         def chosen(array: NDArray[Any]) -> NDArray[Any]:
-            # `take` with row numbers needs a third of the time of an index or a mask.
+            # `take` with row indices needs a third of the time of indexing with them or a mask.
             return array[rows] if isinstance(rows, slice) else array.take(rows, axis=0)
 
         return dataclasses.replace(
@@ -83,18 +83,18 @@ class Rays:
         return points, directions, np.ascontiguousarray(self.ranges_m)
 
     def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns, and for each the sensor position it was seen from: (N, 3) and (N, 3) float64, world, m."""
+        """Return the returns and their sensor positions, (N, 3) each, float64, world, m."""
         points = self.points.astype(np.float64) + self.origin
         return points, points - self.directions.astype(np.float64) * self.ranges_m[:, None]
 
 
 def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor itself, and no padding."""
-    # Column by column: along rows of three NumPy takes ten times as long.
+    """Return a mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor, not padding."""
+    # By column: NumPy takes ten times as long along rows of three.
     finite, other = np.abs(scan) <= MAX_POSITION_M, scan != 0
     returns: NDArray[np.bool_] = finite[:, 0] & finite[:, 1] & finite[:, 2]
     returns &= other[:, 0] | other[:, 1] | other[:, 2]
-    # Drivers fill a cloud of fixed size with one point: a row that is repeated at once, many times, among others.
+    # Drivers pad a cloud of fixed size with one point: a long run of equal rows among other rows.
     again = scan[1:, 0] == scan[:-1, 0]
     if np.count_nonzero(again) >= _PADDING:
         again &= (scan[1:] == scan[:-1]).all(axis=1)
@@ -107,10 +107,10 @@ def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
 
 @dataclass
 class LeftOut:
-    """What of the scans cannot be used."""
+    """Rows and scans that cannot be used."""
 
     given: int = 0  # number of rows
-    rows: int = 0  # number of rows that are no returns: see :func:`measured`
+    rows: int = 0  # number of rows that are not returns: see :func:`measured`
     empty: list[int] = dataclasses.field(default_factory=list)  # scans without returns
     poses: list[int] = dataclasses.field(default_factory=list)  # scans whose pose is not a rigid transform
 
@@ -129,9 +129,9 @@ class LeftOut:
 def check_scans(
     points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None = None
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None, LeftOut]:
-    """Scans (N_i, 3) and intensities (N_i,) as arrays, if :func:`prepare` takes them; else its ValueError.
+    """Convert scans (N_i, 3) and intensities (N_i,) to arrays. Raise the ValueError of :func:`prepare` if they are invalid.
 
-    Rows that are no returns become 0 0 0, and intensities that are not finite NaN: arrays of a scan keep their length.
+    Rows that are not returns become 0 0 0 and non-finite intensities NaN, so that the arrays keep their length.
     """
     scans, left_out = [], LeftOut()
     for i, given in enumerate(one_for_each_scan(points, "points")):
@@ -157,14 +157,14 @@ def check_scans(
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths (N,) of vectors (N, 3). The same bits as np.linalg.norm in a fifth of the time."""
+    """Return the lengths (N,) of vectors (N, 3), bit-identical to np.linalg.norm in a fifth of the time."""
     x, y, z = vectors.T
     lengths: NDArray[np.float64] = np.sqrt(x * x + y * y + z * z)
     return lengths
 
 
 def middle_scan(scan: int, scans: int, accumulate_scans: int) -> int:
-    """The scan from whose position the returns of a `scan` count as seen, of so many `scans`."""
+    """Return the index of the scan whose position serves as that of `scan` in a group of accumulated scans."""
     first = scan - scan % accumulate_scans
     return (first + min(first + accumulate_scans, scans) - 1) // 2
 
@@ -189,16 +189,16 @@ def prepare(
     lattice: WorldLattice | None = None,
     whole: bool = True,
 ) -> Rays:
-    """Checks scans and turns them into rays in the local frame, scan by scan.
+    """Check scans and convert them to rays in the local frame, scan by scan.
 
     `points`, `intensities`: F arrays (N_i, 3), sensor frame, m, and (N_i,), sensor units; `poses` (F, 4, 4) T_world_sensor, m.
-    The default `origin` is the mean sensor position, moved to the next corner of a block of the `lattice`, so that different
-    scans share their cells. `whole` False: these are a part of the scans, of which none need be within the ranges; of whole
-    scans, intensities that are outliers become NaN.
+    The default `origin` is the mean sensor position, rounded to the nearest block corner of the `lattice`, so that maps of
+    different scans share their cells. `whole` False: the scans are a part of a set, which need not have returns within the
+    ranges, and intensity outliers are not replaced by NaN.
 
-    Rows that are no returns (not finite, 0 0 0, padding) and scans whose pose is not rigid are left out, with a warning of the
-    logger ``radarsdf.returns``. A ValueError if lengths or shapes do not match, half of the poses or more are not rigid, all
-    intensities are equal or are too far apart for float32, or no return is within the ranges.
+    Rows that are not returns (not finite, 0 0 0, padding) and scans with a pose that is not rigid are dropped, with a warning
+    of the logger ``radarsdf.returns``. Raises a ValueError if lengths or shapes do not match, half of the poses or more are
+    not rigid, intensities are all equal or too far apart for float32, or no return is within the ranges.
     """
     scans, values, left_out = check_scans(points, intensities)
     num_scans = len(scans)
@@ -248,7 +248,7 @@ def prepare(
 
 
 def check_range(low: float, high: float) -> None:
-    """Raises a ValueError if intensities from `low` to `high`, sensor units, are all equal or too far apart for float32."""
+    """Raise a ValueError if intensities from `low` to `high`, sensor units, are all equal or too far apart for float32."""
     if low == high:
         msg = f"all intensities are {low}: leave them out if the sensor does not measure them"
         raise ValueError(msg)
@@ -266,7 +266,7 @@ def rays_from(
     scans: NDArray[np.int32],
     up_of_scan: NDArray[np.float64],
 ) -> Rays:
-    """Rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest is as of :class:`Rays`."""
+    """Build rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest as in :class:`Rays`."""
     away = points - sensors
     ranges_m = np.maximum(_lengths(away), 1e-6)
     return Rays(

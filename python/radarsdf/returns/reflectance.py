@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Intensities in closed form: a regression on the terms of the radar equation, and means of its residuals in cells."""
+"""Closed-form intensities: a regression on the terms of the radar equation, plus cell means of its residuals."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 
 Float32 = NDArray[np.float32]
 
-# Kinds of cells: edge in leaf cells, step of the direction's components, step of the incidence in rad. Materials differ
-# in how the echo falls with the incidence, so cells by incidence are what helps most on simulated scenes, cells by
-# direction on real drives. Chosen on `hugin`, `oculii` and `wall` of seeds 1 and 2, on a few scans of them, and on three
-# drives.
+# Kinds of cells: edge in leaf cells, bin width of the direction's components, bin width of the incidence in rad. Materials
+# differ in how the echo decreases with incidence, so cells by incidence help most on simulated scenes, cells by direction
+# on real drives. Tuned on `hugin`, `oculii` and `wall` with seeds 1 and 2, on few scans of them, and on three drives.
 _KINDS = np.array([
     [40, 0, 0], [6, 0, 0], [2, 0, 0],
     [80, 0, 0.07], [16, 0, 0.1], [6, 0, 0.1],
@@ -32,16 +31,16 @@ _KINDS = np.array([
 _TILINGS = 4  # two have 1 to 2 % more error, eight 0 to 1 % less
 _SHRINKAGE = 4.0  # 3 to 10 differ by less than 1 %
 _ROUNDS = 2  # four are no better
-# Of more returns, those that are close and seen alike are one, with 1 to 2 % more error: means of each would take 128
-# bytes for a return. A network, which is asked for each, takes longer than means, and leaves less to them.
+# More returns are grouped by place and view, with 1 to 2 % more error: ungrouped means would take 128 bytes a return. A
+# network, evaluated for each group, takes longer than means and has smaller residuals.
 _MOST_RETURNS, _MOST_ASKED = 200_000, 50_000
 _GROUPS = np.array([[2.5, 0.25, 0.12]])  # a kind of cells, as above
-_CORRELATION = 0.1  # of the returns in a group: n of them count n / (1 + 0.1 (n - 1)) times
-_LEAST_MEAN = 0.005  # of the range of intensities. A third of the means are smaller: they predict nothing
+_CORRELATION = 0.1  # intra-group correlation: the effective number of n returns is n / (1 + 0.1 (n - 1))
+_LEAST_MEAN = 0.005  # smallest stored mean, share of the intensity range. A third are smaller and predict nothing
 
-# With a network, the answer is the mean of two: the network's, and `_NETWORK_TIMES` that with what it leaves in closed
-# form. Half of what it leaves, since the rest is noise of the returns that it was trained on; and half of its answer,
-# since it is no better than the closed form on real drives.
+# With a network, the prediction averages the network's and `_NETWORK_TIMES` the network's plus its closed-form residual.
+# Half of the residual, since the rest is noise of the returns that the network was trained on; and half of the network's
+# prediction, since it is no better than the closed form on real drives.
 _NETWORK_TIMES = 0.5
 _CLOSED_TIMES = 0.5
 
@@ -50,19 +49,19 @@ Ask = Callable[[Float32, Float32, Float32], Float32]
 
 @dataclass(frozen=True)
 class Reflectance:
-    """A quantity of the returns of a fit, as a function of place, direction, range and incidence.
+    """Closed-form intensity as a function of place, direction, range and incidence.
 
-    It is their intensity in [0, 1], or what is added to the answer of a network.
+    It predicts the intensity in [0, 1], or the residual of a network.
     """
 
     leaf_size_m: float  # edge of a leaf cell, m
-    coefficients: NDArray[np.float64]  # (3, 14) of :class:`~radarsdf.returns.response.Response`
-    table: Float32  # (48, 96) of what the first of them leaves, by range and elevation
+    coefficients: NDArray[np.float64]  # (3, 14), see :class:`~radarsdf.returns.response.Response`
+    table: Float32  # (48, 96) residuals of the first of them by range and elevation
     plane_keys: NDArray[np.uint64]  # (P,) Morton keys of the surfels' cells with a plane, ascending
     normals: Float32  # (P, 3) unit normals of these planes, local frame
     mean_keys: NDArray[np.uint64]  # (M,) keys of the cells with means
-    means: NDArray[np.float16]  # (M,) means in them of what the regression leaves
-    network_share: float = 0.0  # factor on the intensity network's answer, to which the quantity is added
+    means: NDArray[np.float16]  # (M,) means of the regression's residuals in them
+    network_share: float = 0.0  # factor on the intensity network's prediction, to which this is added
 
     @cached_property
     def _response(self) -> Response:
@@ -74,17 +73,17 @@ class Reflectance:
 
     @cached_property
     def _cells(self) -> CellMeans:
-        """Finds the means. Made by the first query: a fit has no need of it."""
+        """Lookup of the means, built by the first query: a fit does not need it."""
         means = self.means.astype(np.float32)
         return CellMeans(_in_metres(_KINDS, self.leaf_size_m), _TILINGS, self.mean_keys, means)
 
     def check(self) -> None:
-        """Raises a ValueError if keys are not in order, or shapes do not match."""
+        """Raise a ValueError if keys are not ascending, or shapes do not match."""
         shapes = self.coefficients.shape, self.table.shape, self.normals.shape
         if shapes != ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3)):
             msg = "the reflectance has arrays of wrong shapes"
             raise ValueError(msg)
-        _ = self._planes, self._cells  # which check the keys
+        _ = self._planes, self._cells  # their constructors check the keys
 
     @classmethod
     def of(
@@ -96,10 +95,10 @@ class Reflectance:
         ask: Ask | None = None,
         num_threads: int = 0,
     ) -> Reflectance:
-        """The reflectance of `rays`, with ghosts: a sensor sees these again.
+        """Fit the reflectance of `rays`, ghosts included: a sensor sees them again.
 
-        `unit` (N,): their intensities, scaled to [0, 1]. `surfels`: of the same returns, or of more. `ask`: intensities (M,)
-        by a network at points (M, 3) seen along directions (M, 3) from ranges (M,). None: there is no network.
+        `unit` (N,): their intensities, scaled to [0, 1]. `surfels`: of these returns or a superset. `ask`: predicts intensities
+        (M,) of points (M, 3) along directions (M, 3) from ranges (M,) by a network. None without a network.
         """
         flat = np.flatnonzero(surfels.is_flat())
         normals = surfels.normals.astype(np.float32)
@@ -116,14 +115,14 @@ class Reflectance:
         response = Response.of(unit, directions, ranges_m, incidence, kinds)
         left = unit - response.at(directions, ranges_m, incidence, kinds)
         incidence = groups.means(incidence)
-        del plane, kinds  # of each return
+        del plane, kinds  # per-return arrays: frees memory
         kinds_m, columns = _in_metres(_KINDS, leaf_size_m), (groups.points, groups.directions, incidence)
         values, options = (
             (groups.means(left), groups.weights),
             (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads),
         )
         keys, means, explained = fit_cell_means(kinds_m, _TILINGS, *columns, *values, *options)
-        # The cells have means, and the error that counts is the absolute one, whose centre is the median.
+        # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
         coefficients = response.coefficients.copy()
         coefficients[:, 0] += np.median(left - groups.of_returns(explained))
         return cls(
@@ -138,9 +137,9 @@ class Reflectance:
         )
 
     def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
-        """The quantity (N,) at points (N, 3), local frame, m, seen along directions (N, 3), unit vectors."""
+        """Predict values (N,) at points (N, 3), local frame, m, along directions (N, 3), unit vectors, from ranges (N,), m."""
         size_m = LEAVES_PER_SURFEL * self.leaf_size_m
-        limit_m = MAX_CELLS_FROM_ORIGIN * self.leaf_size_m  # farther points have no key, and no cell
+        limit_m = MAX_CELLS_FROM_ORIGIN * self.leaf_size_m  # farther points have neither key nor cell
         near = np.ascontiguousarray(np.clip(np.nan_to_num(points), -limit_m, limit_m))
         directions = np.ascontiguousarray(directions)
         rows = self._planes.rows(cell_keys(near, size_m, num_threads), num_threads)
@@ -155,7 +154,7 @@ def _in_metres(kinds: NDArray[np.float64], leaf_size_m: float) -> NDArray[np.flo
 
 
 def _incidence(normals: Float32, plane: NDArray[np.int32], directions: Float32) -> Float32:
-    """Angles (N,) between the direction and the normal of the plane of each return, rad; NaN without a plane, -1."""
+    """Return the angles (N,) between the direction and the normal of the plane of each return, rad; NaN for plane -1."""
     if len(normals) == 0:
         return np.full(len(plane), np.nan, np.float32)
     cosine = np.abs(np.einsum("ni,ni->n", normals[plane], directions))
@@ -171,9 +170,9 @@ def _unit_vectors(directions: Float32) -> Float32:
 
 @dataclass(frozen=True)
 class _Groups:
-    """Returns that are close and seen alike. A group is one return, unless there are many."""
+    """Returns grouped by place and view. With few returns, each is its own group."""
 
-    rows: NDArray[np.int32] | None  # (N,) row of each return's group. None: each is alone
+    rows: NDArray[np.int32] | None  # (N,) row of each return's group. None: one group a return
     points: Float32  # (G, 3) mean point, local frame, m
     directions: Float32  # (G, 3) mean direction
     counts: NDArray[np.float64]  # (G,) number of returns

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How strong a return is by its range, its elevation and the incidence, wherever it is: a robust regression."""
+"""Robust regression of intensity on range, elevation and incidence, independent of the place."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from radarsdf.products import normal_matrix, product
 
 Float32 = NDArray[np.float32]
 
-# A return lies on no surface that is known, on a level one or on a steep one. The ground is another material than walls,
-# and echoes are weak where it is seen at grazing angles: regressions of their own have up to 9 % less error, regression
-# alone. A place without a plane may be one that no scan has seen, so its regression is of all returns. That of those
-# without a plane would take each for clutter.
+# A return lies on no known surface, on a level one or on a steep one. The ground is of another material than walls and
+# its echoes are weak at grazing angles: separate regressions reduce the error of the regression by up to 9 %. A place
+# without a plane may be unobserved, so its regression is over all returns. One over the returns without a plane would
+# treat each as clutter.
 NO_SURFACE, LEVEL, STEEP = 0, 1, 2
 NUM_KINDS = 3
-_LEVEL_COSINE = 0.7  # of the normal's elevation; 0.5 to 0.7 differ by less than 1 %
-_FEWEST = 50  # regressed returns of a kind; it has the regression of all where there are fewer
+_LEVEL_COSINE = 0.7  # minimum |z| of the normal of a level surface; 0.5 to 0.7 differ by less than 1 %
+_FEWEST = 50  # minimum number of sampled returns of a kind for a regression of its own
 
 _LOBES_RAD = np.radians([3, 6, 12, 25, 50])  # standard deviations of specular lobes
 _MIN_COSINE = 0.02
-_MOST_REGRESSED = 8_000  # returns, evenly spread: enough for fourteen numbers
+_MOST_REGRESSED = 8_000  # size of the evenly spaced sample of returns: enough for fourteen coefficients
 _REWEIGHTINGS = 2  # three are no better
 _REFERENCE_RANGE_M = 10.0
-_ROWS_AT_ONCE = 1 << 18  # all at once, the columns would take 80 bytes a return
-_ANGLES_RAD = np.linspace(0, np.pi / 2, 2001)  # at which the response to the incidence is tabulated
-_BASE = 5  # coefficients that do not belong to the incidence
+_ROWS_AT_ONCE = 1 << 18  # chunk size: all columns at once would take 80 bytes a return
+_ANGLES_RAD = np.linspace(0, np.pi / 2, 2001)  # grid of the tabulated response to the incidence
+_BASE = 5  # number of coefficients that do not depend on the incidence
 NUM_COEFFICIENTS = _BASE + 4 + len(_LOBES_RAD)
 
-# What the regression of all returns leaves, by range and elevation, which separate the ground from what stands on it: means
-# in bins of a table, smoothed with normal kernels, from wide ones to narrow ones.
+# Residuals of the regression over all returns, by range and elevation, which separate the ground from objects on it: bin
+# means, smoothed with Gaussian kernels from wide to narrow.
 TABLE_SHAPE = (48, 96)
 _LOG_RANGES = (np.log10(0.5), np.log10(200.0))  # of the table, m
 # Standard deviations in log10(range) and sine of elevation.
@@ -43,13 +43,13 @@ _TABLE_SHRINKAGE = 1.0  # 0.5 to 2 differ by up to 2 %
 
 @dataclass(frozen=True)
 class Response:
-    """A quantity of returns as a function of range, elevation, incidence and the kind of surface."""
+    """Intensity as a function of range, elevation, incidence and the kind of surface."""
 
-    coefficients: NDArray[np.float64]  # (3, 14) of the regression of each kind of surface
-    table: Float32  # (48, 96) by range and elevation, of what the first of them leaves
+    coefficients: NDArray[np.float64]  # (3, 14) of the regression for each kind of surface
+    table: Float32  # (48, 96) residuals of the first of them by range and elevation
 
     @classmethod
-    @np.errstate(under="ignore")  # of lobes and kernels far from their middle
+    @np.errstate(under="ignore")  # lobes and kernels underflow far from their centre
     def of(
         cls,
         values: Float32,
@@ -58,7 +58,7 @@ class Response:
         incidence_rad: Float32,
         kinds: NDArray[np.int8],
     ) -> Response:
-        """The response of returns with these `values` (N,); the others as for :meth:`at`."""
+        """Fit the response to `values` (N,) of returns; the other arguments are those of :meth:`at`."""
         some = slice(None, None, -(-len(values) // _MOST_REGRESSED))
         chosen, y = kinds[some], values[some].astype(np.float64)
         rays = _of_ray(directions[some], ranges_m[some]).astype(np.float64)
@@ -70,7 +70,7 @@ class Response:
             own = chosen == kind
             if np.count_nonzero(own) >= _FEWEST:
                 of_incidence = _of_incidence(incidence_rad[some][own].astype(np.float64))
-                # Both have a column of ones: the ridge shares it out.
+                # Both have a column of ones: the ridge makes the system regular.
                 coefficients[kind] = _regression(np.concatenate([rays[own], of_incidence], axis=1), y[own])
         return cls(coefficients, table.astype(np.float32))
 
@@ -78,7 +78,7 @@ class Response:
     def at(
         self, directions: Float32, ranges_m: Float32, incidence_rad: Float32, kinds: NDArray[np.int8]
     ) -> Float32:
-        """The quantity (N,) seen along directions (N, 3) from ranges (N,), m, at an incidence (N,) on a kind of surface (N,)."""
+        """Predict values (N,) along directions (N, 3) from ranges (N,), m, at incidence angles (N,) on kinds of surface (N,)."""
         of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
         tables = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in self.coefficients]
         found = np.empty(len(kinds), np.float32)
@@ -90,7 +90,7 @@ class Response:
                 if kind == NO_SURFACE:
                     values += self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
                 else:
-                    # The nearest angle of the table: to interpolate would take more time than all else.
+                    # Nearest tabulated angle: interpolation would dominate the time.
                     nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
                     values += tables[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
                 found[own] = values
@@ -98,8 +98,8 @@ class Response:
 
 
 def kinds_of(normals: Float32, plane: NDArray[np.int32]) -> NDArray[np.int8]:
-    """Kind of surface (N,) that each return lies on: of the row `plane` (N,) of `normals` (P, 3); -1: of none."""
-    # The last one is the kind of row -1.
+    """Return the kind of surface (N,) of each return from the row `plane` (N,) of its normal in `normals` (P, 3); -1: none."""
+    # The last entry serves row -1.
     of_plane = np.full(len(normals) + 1, NO_SURFACE, np.int8)
     of_plane[:-1] = np.where(np.abs(normals[:, 2]) > _LEVEL_COSINE, LEVEL, STEEP)
     kinds: NDArray[np.int8] = of_plane[plane]
@@ -107,42 +107,42 @@ def kinds_of(normals: Float32, plane: NDArray[np.int32]) -> NDArray[np.int8]:
 
 
 def _weighted_sum(weights: NDArray[np.float64], columns: Float32) -> Float32:
-    """(N,) sum of `columns` (K, N). Not a product of matrices: that has other last bits for other N or other threads."""
+    """Sum `columns` (K, N) to (N,). Not a matrix product, whose rounding depends on N and the number of threads."""
     found = np.zeros(columns.shape[1], np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):  # a query that is not finite has an answer that is not
+    with np.errstate(invalid="ignore", over="ignore"):  # the result of a non-finite query is non-finite
         for weight, column in zip(weights.astype(np.float32), columns, strict=True):
             found += weight * column
     return found
 
 
 def _of_incidence(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Columns (N, 9): 1, the cosine, its square and logarithm, and the lobes."""
+    """Return columns (N, 9): 1, the cosine, its square and logarithm, and the lobes."""
     cosine = np.maximum(np.cos(angle_rad), _MIN_COSINE)
     lobes = [np.exp(-0.5 * (angle_rad / width) ** 2) for width in _LOBES_RAD]
     return np.stack([np.ones_like(cosine), cosine, cosine**2, np.log10(cosine), *lobes], axis=-1)
 
 
 def _of_ray(directions: Float32, ranges_m: Float32) -> Float32:
-    """Columns (N, 5): 1, the logarithm of the range and its square, the elevation's sine and its square."""
+    """Return columns (N, 5): 1, the logarithm of the range and its square, the sine of the elevation and its square."""
     log_range = np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
     up = directions[:, 2]
     return np.stack([np.ones_like(up), log_range, log_range**2, up, up**2], axis=1)
 
 
 def _bins(log_range: NDArray[np.floating], up: NDArray[np.floating]) -> NDArray[np.int32]:
-    """Number of the table's bin (N,) of each logarithm of the range over 10 m and sine of the elevation."""
+    """Return the bin (N,) of the table for each log10(range / 10 m) and sine of the elevation."""
     rows, columns = TABLE_SHAPE
     low, high = np.array(_LOG_RANGES) - np.log10(_REFERENCE_RANGE_M)
     row = np.clip((log_range - low) * (rows / (high - low)), 0, rows - 1)
     column = np.clip((up + 1) * (columns / 2), 0, columns - 1)
-    # A place that is no number has no bin. Its answer is no number, whatever the table holds.
+    # NaN has no bin: any will do, since the prediction is NaN whatever the table holds.
     row, column = (np.nan_to_num(place).astype(np.int32) for place in (row, column))
     bins: NDArray[np.int32] = row * np.int32(columns) + column
     return bins
 
 
 def _regression(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients with the least absolute error, nearly: least squares, in which what is far off counts less."""
+    """Fit coefficients by iteratively reweighted least squares, approximately minimising the absolute error."""
     weights = np.ones(len(values))
     ridge = np.eye(design.shape[1]) * (1e-3 * np.sqrt(len(values)) + 1e-6 * float((design**2).sum()))
     for _ in range(_REWEIGHTINGS):
@@ -156,7 +156,7 @@ def _regression(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDA
 
 
 def _smooth_means(bins: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means of values (N,) in their bins, smoothed: a bin with few returns has the mean of a wider kernel."""
+    """Return smoothed bin means of `values` (N,): bins with few returns shrink to the mean of a wider kernel."""
     weights, means = np.ones(len(values)), np.zeros(TABLE_SHAPE)
     steps = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
     for _ in range(2):
@@ -172,7 +172,7 @@ def _smooth_means(bins: NDArray[np.int32], values: NDArray[np.float64]) -> NDArr
 
 
 def _kernel(size: int, deviation_bins: float) -> NDArray[np.float64]:
-    """(size, size) weights of bins by their distance; 1 of the bin itself."""
+    """Return Gaussian weights (size, size) by the distance of bins; 1 on the diagonal."""
     place = np.arange(size) / deviation_bins
     weights: NDArray[np.float64] = np.exp(-0.5 * (place[:, None] - place) ** 2)
     return weights

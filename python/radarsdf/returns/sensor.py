@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a radar can see: field of view, resolution, detection threshold and noise, estimated from its own scans."""
+"""Sensor model: field of view, resolution, detection threshold and noise, estimated from scans."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from radarsdf.returns.intensities import Plausible
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays, prepare
 
-# Of the returns: what lies beyond in azimuth, in elevation or in range is taken for a stray one.
+# Quantile of azimuth, elevation and range at either end, beyond which returns count as outliers.
 _STRAY = 0.002
-_MAX_RETURNS = 20_000  # they give angles to 0.2° and ranges to 1 % of what all returns give
+_MAX_RETURNS = 20_000  # sample size: angles within 0.2° and ranges within 1 % of those of all returns
 _RANGE_BINS = 8
-_WEAKEST = 0.01  # share of the returns in a bin of ranges that is below the threshold there
+_WEAKEST = 0.01  # quantile of the intensities in a range bin that is the threshold there
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))  # of a normal distribution, standard deviations
 _MAX_RANGE_M = 1e6
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A radar, as its scans show it. Sensor frame: x forward, y left, z up.
+    """Model of a radar. Sensor frame: x forward, y left, z up.
 
-    Azimuth is the angle from x towards y, elevation that above the xy plane. A sensor is made of scans by :meth:`of`, or of
-    numbers; ``dataclasses.replace`` changes one.
+    Azimuth is the angle from x towards y, elevation the angle above the xy plane. Estimate a sensor from scans by :meth:`of`,
+    or construct it from numbers; ``dataclasses.replace`` changes one.
 
     Raises
     ------
@@ -48,12 +48,12 @@ class Sensor:
     range_m: tuple[float, float]
     """Nearest and farthest return, m."""
     returns_per_scan: float
-    """Number of returns in a scan, the median."""
+    """Median number of returns in a scan."""
     noise: SensorNoise
     """Standard deviations of the position of a return."""
     thresholds: tuple[tuple[float, float], ...] = ()
-    """Range, m, ascending, and the weakest intensity that is detected there, sensor units. Between them it is
-    interpolated. Empty: the sensor measures no intensities."""
+    """Pairs of a range, m, ascending, and the weakest intensity detected there, sensor units, interpolated
+    linearly. Empty: the sensor measures no intensities."""
 
     def __post_init__(self) -> None:
         limits = {"azimuth_rad": math.pi, "elevation_rad": math.pi / 2, "range_m": _MAX_RANGE_M}
@@ -81,17 +81,17 @@ class Sensor:
         return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
 
     def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
-        """Interpolate the weakest intensity that is detected.
+        """Interpolate the detection threshold.
 
         Parameters
         ----------
         ranges_m : (N,) ndarray
-            Ranges, m. Beyond the first and the last of `thresholds`, theirs count.
+            Ranges, m. Beyond the ends of `thresholds`, their values are constant.
 
         Returns
         -------
         (N,) ndarray of float64
-            Intensities, sensor units. -inf if the sensor has no `thresholds`.
+            Weakest detected intensities, sensor units. -inf if the sensor has no `thresholds`.
         """
         if not self.thresholds:
             return np.full(len(ranges_m), -np.inf)
@@ -117,7 +117,7 @@ class Sensor:
         return np.stack([cosine * x, cosine * y, np.sin(elevation_rad)], axis=1)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the numbers as a dict that JSON can store. :meth:`from_dict` is the inverse."""
+        """Convert to a dict that JSON can store. :meth:`from_dict` is the inverse."""
         return dataclasses.asdict(self) | {"thresholds": [list(step) for step in self.thresholds]}
 
     @classmethod
@@ -127,7 +127,7 @@ class Sensor:
         Parameters
         ----------
         described : dict
-            Values by the names of the attributes; `noise` is a dict, too.
+            Values by attribute name; `noise` is a dict, too.
 
         Raises
         ------
@@ -146,9 +146,9 @@ class Sensor:
         min_range_m: float = 0.0,
         max_range_m: float | None = None,
     ) -> Sensor:
-        """The sensor that took scans (N_i, 3), sensor frame, m, with intensities (N_i,), sensor units; NaN where there is none.
+        """Estimate from scans (N_i, 3) in the sensor frame, m, and intensities (N_i,), sensor units, NaN where missing.
 
-        Returns outside the ranges do not count. A ValueError if none is left, or all are in one direction.
+        Returns outside the ranges are ignored. Raises a ValueError if none is left, or all are in one direction.
         """
         poses = np.tile(np.eye(4), (len(points), 1, 1))
         limits: dict[str, Any] = {"min_range_m": min_range_m, "max_range_m": max_range_m}
@@ -163,11 +163,11 @@ class Sensor:
 
     @classmethod
     def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
-        """The sensor that took `rays`, with poses (F, 4, 4) T_world_sensor, m."""
+        """Estimate from `rays` of scans with poses (F, 4, 4) T_world_sensor, m."""
         T_world_sensor, _ = usable_poses(poses, len(rays.up_of_scan))
         rows = np.arange(0, len(rays), -(-len(rays) // _MAX_RETURNS))
         scans = rays.scans[rows]
-        # Coordinate by coordinate: a matrix for each return takes three times as long.
+        # By coordinate: a matrix for each return takes three times as long.
         from_sensor = rays.points[rows].T - (T_world_sensor[:, :3, 3] - rays.origin)[scans].T
         R = T_world_sensor[:, :3, :3]
         x, y, z = (sum(R[:, j, i][scans] * from_sensor[j] for j in range(3)) for i in range(3))
@@ -196,9 +196,9 @@ def _pair(values: Any, name: str) -> tuple[float, float]:
 
 
 def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Lower and upper end of most values."""
+    """Return robust lower and upper limits."""
     low, high = np.quantile(values, [_STRAY, 1 - _STRAY])
-    if low == high:  # of very few returns
+    if low == high:  # very few returns
         low -= 1e-3 * max(abs(low), 1e-3)
     return float(low), float(high)
 
@@ -206,7 +206,7 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
 def _thresholds(
     ranges_m: NDArray[np.float64], intensities: NDArray[np.float64]
 ) -> tuple[tuple[float, float], ...]:
-    """Middle of each bin of ranges with as many returns, and the weakest intensity there, apart from stray ones."""
+    """Return the median range and the robust weakest intensity of range bins with equal counts."""
     order = np.argsort(ranges_m)
     bins = [part for part in np.array_split(order, _RANGE_BINS) if len(part)]
     of_bins = ((np.median(ranges_m[part]), np.quantile(intensities[part], _WEAKEST)) for part in bins)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Integer sums over the returns of each leaf cell, and the mean rays that follow from them."""
+"""Integer sums over the returns of each leaf cell, and mean rays computed from them."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from radarsdf.returns.rays import Rays
 MAX_CELLS_FROM_ORIGIN = 1_000_000
 """Farthest cell along each axis. A Morton key has 21 bits for each axis."""
 
-_AXIS_BITS = 21  # of a key, interleaved with those of the other axes
-_QUARTER = np.uint64(0b111 << (3 * (_AXIS_BITS - 2)))  # bits of a key: in which quarter of the axes
+_AXIS_BITS = 21  # bits of a key for each axis, interleaved
+_QUARTER = np.uint64(0b111 << (3 * (_AXIS_BITS - 2)))  # second highest bit of each axis
 _COMPACTED = (
     (2, 0x10C30C30C30C30C3),
     (4, 0x100F00F00F00F00F),
     (8, 0x001F0000FF0000FF),
     (16, 0x001F00000000FFFF),
     (32, 0x1FFFFF),
-)  # how far to shift, and which bits to keep then
+)  # steps of the Morton decoding: shift, and mask of the bits kept
 
 
 def lattice_of(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Lattice coordinates (N, 3) of the cells with these Morton keys (N,)."""
+    """Decode Morton keys (N,) to lattice coordinates (N, 3)."""
     coordinates = np.empty((len(keys), 3), np.int64)
     for axis in range(3):
         bits = keys >> np.uint64(axis) & np.uint64(0x1249249249249249)
@@ -48,9 +48,9 @@ def lattice_of(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
 
 
 def merged_keys(keys: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Morton keys (N,) of the cells twice as large that the cells with these keys (N,) are in. Their order stays."""
+    """Return the Morton keys (N,) of the parent cells, twice as large, of cells with keys (N,), in the same order."""
     halved = keys >> np.uint64(3)
-    # Coordinates count from -2²⁰, of these cells, too: half of that was shifted out.
+    # Coordinates of the parents have the offset 2²⁰ too; the shift halved it.
     quarters = halved & _QUARTER
     merged: NDArray[np.uint64] = (halved ^ _QUARTER) | quarters << np.uint64(3)
     return merged
@@ -58,10 +58,10 @@ def merged_keys(keys: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 @dataclass(frozen=True)
 class ReturnCells:
-    """The cells that hold returns."""
+    """Cells with returns."""
 
     keys: NDArray[np.uint64]  # (C,) Morton keys of the cells, ascending
-    blocks: CellBlocks  # finds the row of a cell from its key
+    blocks: CellBlocks  # lookup of the row of a cell by its key
     cell_of_ray: NDArray[np.int32]  # (N,) row of each return's cell
 
     @classmethod
@@ -81,23 +81,23 @@ class ReturnCells:
 
 
 UPPER = [(i, j) for i in range(3) for j in range(i, 3)]
-"""Axes of the products of coordinates, in their order."""
+"""Axes of the upper-triangular products of coordinates, in order."""
 
 _COUNT = 0
 
 
 @dataclass(frozen=True)
 class ScanSums:
-    """Sums over the returns of scans in each leaf cell, in integers.
+    """Integer sums over the returns of scans in each leaf cell.
 
-    What a scan adds depends on nothing but the scan. So a map of all scans at once, one that gets them one after another,
-    and one that a scan was taken out of again, have the same sums to the last bit, in any order.
+    The contribution of a scan depends on the scan alone. So sums are bit-identical whether scans are added at once, one after
+    another in any order, or removed again.
     """
 
     leaf_size_m: float  # edge of a leaf cell, m
     keys: NDArray[np.uint64]  # (C,) Morton keys of the leaf cells with returns, ascending
-    # (C, 14) of 1, x, y, z, xx, xy, xz, yy, yz, zz, the direction (3) of the ray, and its range. Positions are in quanta from
-    # the corner of the cell, ranges in quanta, directions times DIRECTION_QUANTA.
+    # (C, 14) sums of 1, x, y, z, xx, xy, xz, yy, yz, zz, the direction (3) of the ray, and its range. Positions are in quanta
+    # from the corner of the cell, ranges in quanta, directions times DIRECTION_QUANTA.
     sums: NDArray[np.int64]
     scans: NDArray[np.uint32]  # (C,) number of different scans with returns
 
@@ -134,22 +134,22 @@ class ScanSums:
         return self.sums[:, _COUNT].astype(np.float64)
 
     def merged_moments(self) -> tuple[NDArray[np.uint64], NDArray[np.float64]]:
-        """Keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
+        """Return the keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
 
-        Sums are of 1, of x, y, z, local, m, of xx, xy, xz, yy, yz, zz, m², and of the direction (3).
+        The sums are those of 1; x, y, z, local, m; xx, xy, xz, yy, yz, zz, m²; and the direction (3).
         """
         return merge_sums(self.keys, np.ascontiguousarray(self.sums), self.leaf_size_m)
 
 
 @dataclass(frozen=True)
 class MeanRays:
-    """The mean ray of each cell. Measured: the average over them is as good as over all, two to three times as many."""
+    """Mean ray of each cell. Measured: averaging them is as good as averaging all rays, two to three times as many."""
 
     keys: NDArray[np.uint64]  # (M,) Morton keys of the cells, ascending
     points: NDArray[np.float32]  # (M, 3) mean of the returns in each cell, local, m
-    directions: NDArray[np.float32]  # (M, 3) mean of their rays, unit vectors; downwards without one
+    directions: NDArray[np.float32]  # (M, 3) mean of their directions, unit vectors; downwards if that is zero
     counts: NDArray[np.float32]  # (M,) number of returns in each cell
-    scans: NDArray[np.uint32]  # (M,) number of different scans that they are of
+    scans: NDArray[np.uint32]  # (M,) number of different scans with returns in each cell
     ranges_m: NDArray[np.float32]  # (M,) mean range of the returns in each cell, m
 
     @classmethod
@@ -163,7 +163,7 @@ class MeanRays:
         return MeanRays(**{name: column[part] for name, column in vars(self).items()})
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
-        """(C,) uint64, ascending Morton keys of the leaf cells that rays cross within `reach_m` of their returns."""
+        """Return ascending Morton keys (C,) of the leaf cells that rays cross within `reach_m` of their returns."""
         cells = CellSet(leaf_size_m)
         cells.insert_rays(self.points, self.directions, reach_m, num_threads)
         return cells.sorted_keys(num_threads)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""View statistics of intensity: mean intensities by place and view, which two maps can compare."""
+"""View statistics of intensity: mean intensities by place and view, comparable between maps."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ Float32 = NDArray[np.float32]
 Floating = NDArray[np.floating]
 
 PLACE_CELLS = 3
-"""Returns that are so close, leaf cells, and are seen alike, have one mean."""
-# Steps of the direction's components, and of the logarithm of the range: how strong an echo is hardly differs within one.
+"""Edge of the cells in which returns of similar view share a mean, leaf cells."""
+# Bin widths of the direction's components and of the logarithm of the range: an echo hardly varies within one.
 _DIRECTION_STEP, _LOG_RANGE_STEP = 0.25, 0.3
-_UNITS = 127  # of a direction's components in 8 bits
-_MOST = 2**16 - 1  # returns of a mean that are counted
+_UNITS = 127  # scale of a direction's components in 8 bits
+_MOST = 2**16 - 1  # largest stored count
 
 
 def rows_of_views(
     points: Floating, directions: Floating, ranges_m: Floating, leaf_size_m: float
 ) -> tuple[NDArray[np.int32], int]:
-    """The group (N,) by place and view of returns at points (N, 3), m, seen along directions (N, 3), and how many there are."""
-    # The core's third step is of any number.
+    """Return the group (N,) by place and view of returns at points (N, 3), m, along directions (N, 3), and their number."""
+    # The third bin width of the core applies to any quantity.
     kind = np.array([[PLACE_CELLS * leaf_size_m, _DIRECTION_STEP, _LOG_RANGE_STEP]])
     log_ranges = np.log(np.maximum(ranges_m, 1e-6))
     return cell_rows(kind, *(np.ascontiguousarray(a, np.float32) for a in (points, directions, log_ranges)))
@@ -41,14 +41,14 @@ _COLUMNS = ("points", "directions", "ranges_m", "intensities", "counts")
 
 @dataclass(frozen=True)
 class ViewStatisticsAt:
-    """Means of returns that are close and seen alike, in the world."""
+    """View statistics in the world frame."""
 
     points: NDArray[np.float64]  # (G, 3) mean place, m
     directions: NDArray[np.float64]  # (G, 3) unit vectors from the sensor
     ranges_m: NDArray[np.float64]  # (G,) mean range
     intensities: NDArray[np.float64]  # (G,) mean intensity, sensor units
-    counts: NDArray[np.float64]  # (G,) returns
-    sigma: float  # standard deviation of single returns from the mean of those that are close and seen alike
+    counts: NDArray[np.float64]  # (G,) number of returns
+    sigma: float  # standard deviation of single returns from the mean of their group
 
     def select(self, chosen: NDArray[np.bool_]) -> ViewStatisticsAt:
         return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
@@ -63,14 +63,14 @@ class ViewStatisticsAt:
 
 @dataclass(frozen=True)
 class ViewStatistics:
-    """Means of returns that are close and seen alike, as a map keeps them: 23 bytes each."""
+    """View statistics in the compact form that a map stores: 23 bytes each."""
 
     points: Float32  # (G, 3) mean place, local frame, m
     directions: NDArray[np.int8]  # (G, 3) mean direction from the sensor, a unit vector times 127
     ranges_m: NDArray[np.float16]  # (G,) mean range
-    intensities: Float32  # (G,) mean intensity, of which the range of the training intensities is [0, 1]
-    counts: NDArray[np.int16]  # (G,) returns, up to 65,535, as a number without a sign
-    sigma: float  # standard deviation of single returns from the mean of those that are close and seen alike
+    intensities: Float32  # (G,) mean intensity, scaled to [0, 1]
+    counts: NDArray[np.int16]  # (G,) number of returns, at most 65,535, as the bits of an uint16
+    sigma: float  # standard deviation of single returns from the mean of their group
 
     @classmethod
     def of(cls, rays: Rays, unit: Float32, leaf_size_m: float) -> ViewStatistics:
@@ -102,7 +102,7 @@ class ViewStatistics:
         return cls(empty, empty.astype(np.int8), none.astype(np.float16), none, none.astype(np.int16), 0.0)
 
     def check(self, leaf_size_m: float) -> None:
-        """Raises a ValueError unless arrays of a file are what they should be."""
+        """Raise a ValueError if the arrays read from a file are inconsistent."""
         count, limit_m = len(self.counts), MAX_CELLS_FROM_ORIGIN * leaf_size_m
         shapes = [getattr(self, name).shape for name in _COLUMNS]
         if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
@@ -114,7 +114,7 @@ class ViewStatistics:
             raise ValueError(msg)
 
     def in_world(self, origin: NDArray[np.float64], low: float, high: float) -> ViewStatisticsAt:
-        """In the world, where the local frame has its origin (3,), m. `low`, `high`: 0 and 1 in units of the sensor."""
+        """Convert to the world frame. `origin` (3,): of the local frame, m. `low`, `high`: values of 0 and 1, sensor units."""
         width = high - low
         return ViewStatisticsAt(
             self.points.astype(np.float64) + origin,
