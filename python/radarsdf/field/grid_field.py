@@ -34,14 +34,14 @@ class GridField(Field):
         values = self.distances_m.index_select(0, corners).view(-1, 2, 2, 2)
         place = points * (
             1 / self.table.leaf_size_m
-        )  # as the core divides, or a point could be in another cell
+        )  # the core's rounding, or a point could be in another cell
         x, y, z = (place - place.detach().floor()).unbind(1)
         values = torch.lerp(values[:, 0], values[:, 1], x[:, None, None])
         values = torch.lerp(values[:, 0], values[:, 1], y[:, None])
         return torch.where(inside, torch.lerp(values[:, 0], values[:, 1], z), 0.0)
 
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
-        # The closed form knows no limits, and what is beyond those of the returns was never measured.
+        # The closed form is unbounded; intensities beyond the range of the returns were never measured.
         return self._closed_form(points, directions, ranges_m).clamp(0, 1)
 
     def leaf_corners(self) -> LeafCorners:
@@ -50,5 +50,5 @@ class GridField(Field):
 
     @cached_property
     def _corners_of_cells(self) -> Tensor:
-        """(C, 8) int32, rows of `distances_m`, in C order of the corners."""
+        """Rows (C, 8) of `distances_m`, int32, in C order of the corners."""
         return torch.from_numpy(self.table.leaf_vertices()[1])

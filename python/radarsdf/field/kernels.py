@@ -4,10 +4,9 @@
 
 They are :class:`torch.autograd.Function`, not ``torch.library`` operators. Measured at 16, 1024 and 8192
 points, forward and backward of an operator take 10 to 17 µs more (at 16 points 40 to 47 instead of 30 µs).
-And an operator could only get the vertex table through a global registry.
+An operator could also get the vertex table only through a global registry.
 
-The core gets tensors as NumPy views of the same memory. Results have the same bits with any number of
-threads.
+The core gets tensors as NumPy views of the same memory. Results are bit-identical with any number of threads.
 """
 
 from __future__ import annotations
@@ -29,28 +28,28 @@ _CACHE_LINE = 64  # bytes
 
 
 def view(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """A NumPy view in C order, as the core takes it. A tensor in another order is copied."""
+    """Return a NumPy view in C order, as the core expects. A tensor in another order is copied."""
     return tensor.detach().contiguous().numpy()
 
 
 def rows_view(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """Like :func:`view`, but does not copy a block of columns of a larger matrix."""
+    """Return a view like :func:`view`, without copying a block of columns of a larger matrix."""
     tensor = tensor.detach()
     return (tensor if tensor.stride(1) == 1 and tensor.stride(0) > 0 else tensor.contiguous()).numpy()
 
 
 def large_zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Zeros of this shape in huge memory pages, for random access."""
-    # NumPy asks for huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a million rows
+    """Return zeros in huge memory pages, for random access."""
+    # NumPy requests huge pages from 4 MB on, PyTorch does not. With small pages, a step of Adam on a map of a million rows
     # takes 1.5 times as long.
     like = torch.empty(0, dtype=dtype, device="cpu").numpy()
     numbers = np.zeros(math.prod(shape) + _CACHE_LINE, like.dtype)
-    first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # else a row would lie in two lines
+    first = -numbers.ctypes.data % _CACHE_LINE // numbers.itemsize  # or a row would span two lines
     return torch.from_numpy(numbers[first : first + math.prod(shape)].reshape(shape))
 
 
 def threads() -> int:
-    """Threads that the core uses in a call: as many as PyTorch in the calling thread."""
+    """Return the number of threads for the core: that of PyTorch in the calling thread."""
     return torch.get_num_threads()
 
 
@@ -69,7 +68,7 @@ def _interpolate(
 def scatter(
     table: VertexTable, points: Tensor, located: Tensor, directions: Tensor | None, out_grad: Tensor
 ) -> Tensor:
-    """Gradient of Σ interpolated · out_grad by the features, (num_rows, 8); with `directions` of their derivatives along these."""
+    """Return the gradient (num_rows, 8) of Σ interpolated · out_grad by the features, or of its derivatives along `directions`."""
     features_grad = points.new_zeros((table.num_rows, FEATURE_DIM))
     places = _places(points, located, directions)
     table.scatter(*places, rows_view(out_grad), features_grad.numpy(), threads())
@@ -91,8 +90,8 @@ def _coordinate_gradient(
 
 
 # The core computes y = W(x) F (interpolate), W(x)^T g (scatter) and d(y . g)/dx (coordinate_gradient). With a
-# direction v, all three use dW/dx . v instead of W. Their derivatives are again such sums, so these are
-# enough to differentiate twice.
+# direction v, all three use dW/dx . v instead of W. Their derivatives have the same form, so these suffice
+# for second derivatives.
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
@@ -123,7 +122,7 @@ class _InterpolateBackward(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None]:
         ctx.save_for_backward(out_grad, features, points, located)
         ctx.table = table
-        ctx.set_materialize_grads(False)  # an unused gradient is then None, not zeros to interpolate
+        ctx.set_materialize_grads(False)  # unused gradients are None, not zeros to interpolate
         return (
             scatter(table, points, located, None, out_grad) if needs_features else None,
             _coordinate_gradient(table, features, points, located, None, out_grad) if needs_points else None,
@@ -179,17 +178,17 @@ class _Fourier(torch.autograd.Function):
 
 
 def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
-    """Features at points: bilinear in each plane of a tri-quadtree, then summed (3QFP); trilinear in an octree.
+    """Interpolate features: bilinearly in each plane of a tri-quadtree, then summed (3QFP); trilinearly in an octree.
 
     From features (table.num_rows, 8), float32 or float64, at points (N, 3) of the same type, local frame, m, to
-    (N, 8 · num_levels), finest level first. Zero at a level at which the point is in no occupied cell. It can be
-    differentiated twice, by features and points; the gradient by points is the one inside their cell.
+    (N, 8 · num_levels), finest level first. Zero at levels at which the point is in no occupied cell. Twice
+    differentiable by features and points; the gradient by points is the one inside their cell.
     """
     return _Interpolate.apply(features, points, table)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
-    """:func:`interpolate` without gradients, and the result of :func:`locate`, (N, num_levels) int32."""
+    """Return :func:`interpolate` without gradients, and the result of :func:`locate`."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
     out = points.new_empty((points.shape[0], FEATURE_DIM * table.num_levels))
     table.encode(view(features), view(points), located.numpy(), out.numpy(), threads())
@@ -197,19 +196,19 @@ def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor
 
 
 def locate(points: Tensor, table: VertexTable) -> Tensor:
-    """Rows (N, num_levels) int32, finest level first, of the occupied cells that hold points (N, 3), local, m; -1: none."""
+    """Return the rows (N, num_levels) int32, finest level first, of the occupied cells of points (N, 3), local, m; -1: none."""
     located = torch.empty((points.shape[0], table.num_levels), dtype=torch.int32, device="cpu")
     table.locate(view(points), located.numpy(), threads())
     return located
 
 
 def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequencies: int) -> Tensor:
-    """Sines, then cosines, of 2^k·π·points / half_width_m from k = first_frequency on: (N, 6 · num_frequencies)."""
+    """Return sines, then cosines, of 2^k·π·points / half_width_m for k from `first_frequency` on: (N, 6 · num_frequencies)."""
     return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    """Real spherical harmonics of degree 0 to 3 of unit vectors (N, 3): (N, 16). Not differentiable."""
+    """Return real spherical harmonics (N, 16) of degree 0 to 3 of unit vectors (N, 3). Not differentiable."""
     if directions.requires_grad:
         msg = "spherical_harmonics has no gradient with respect to the directions"
         raise NotImplementedError(msg)
@@ -219,19 +218,19 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 def mlp(inputs: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Linear layers with ReLU between them, which can be differentiated any number of times: (N, outputs of the last layer).
+    """Apply linear layers with ReLU between them, arbitrarily often differentiable: (N, outputs of the last layer).
 
-    `inputs`: (N, width) each, side by side the input of the first layer. `layers`: weights (outputs, inputs) and biases
+    `inputs`: (N, width) each, concatenated to the input of the first layer. `layers`: weights (outputs, inputs) and biases
     (outputs,), like those of ``torch.nn.Linear``. The bits of a row do not depend on the other rows.
     """
-    # The core takes a few rows at a time through all layers. PyTorch, which takes all rows through one layer
-    # after the other, needs 1.5 times as long. It also makes a dozen calls, each of which waits for the
-    # interpreter's lock, so two threads would train hardly faster than one.
+    # The core processes a few rows at a time through all layers. PyTorch, which processes all rows layer by
+    # layer, takes 1.5 times as long. It also makes a dozen calls, each of which acquires the GIL, so two
+    # threads would train hardly faster than one.
     return _MLP.apply(len(layers), *(t for layer in layers for t in layer), *inputs)  # type: ignore[no-any-return, no-untyped-call]
 
 
 class _MLP(torch.autograd.Function):
-    # `tensors` are weight and bias of each layer, then the inputs.
+    # `tensors`: weight and bias of each layer, then the inputs.
     @staticmethod
     def forward(ctx: Any, num_layers: int, *tensors: Tensor) -> Tensor:
         inputs = tensors[2 * num_layers :]
@@ -254,7 +253,7 @@ class _MLP(torch.autograd.Function):
             found = iter(torch.autograd.grad(out, chosen, out_grad, create_graph=True))
             return None, *(next(found) if w else None for w in wanted)
         split = 2 * ctx.num_layers
-        by_layers = any(wanted[:split])  # the core computes all of them: that takes little longer than one
+        by_layers = any(wanted[:split])  # the core computes all layers, hardly slower than one
         computed = [w or (by_layers and i < split) for i, w in enumerate(wanted)]
         grads = [
             torch.empty_like(t, memory_format=torch.contiguous_format) if c else None
@@ -270,13 +269,13 @@ class _MLP(torch.autograd.Function):
 
 
 def _views(num_layers: int, tensors: Sequence[Tensor]) -> tuple[list[Any], list[Any], list[Any]]:
-    """Inputs, weights and biases as the core takes them."""
+    """Return inputs, weights and biases as views for the core."""
     layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
     return [rows_view(x) for x in inputs], [view(w) for w in layers[::2]], [view(b) for b in layers[1::2]]
 
 
 def _plain(num_layers: int, tensors: Sequence[Tensor]) -> Tensor:
-    """The same network in PyTorch operations, which autograd can differentiate any number of times."""
+    """Evaluate the network by PyTorch operations, which autograd can differentiate arbitrarily often."""
     x = torch.cat(list(tensors[2 * num_layers :]), 1)
     for i in range(num_layers):
         x = functional.linear(x if i == 0 else torch.relu(x), tensors[2 * i], tensors[2 * i + 1])

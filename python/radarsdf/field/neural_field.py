@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The field of stage 2: encodings and networks, and their widths as functions of the configuration."""
+"""The field of stage 2: encodings and networks, with widths set by the configuration."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.kernels import fourier, interpolate, large_zeros, mlp, spherical_harmonics
 
-NUM_LEVELS = 3  # of cells (3QFP)
-_FEATURE_STD = 0.05  # standard deviation of the features at the start (3QFP)
+NUM_LEVELS = 3  # levels of cells (3QFP)
+_FEATURE_STD = 0.05  # initial standard deviation of the features (3QFP)
 SDF_HIDDEN = (32, 32)  # widths of the hidden layers of the SDF network (3QFP)
 # Half of the longest Fourier wavelength, leaf cells (3QFP: 409.6 m).
 FOURIER_HALF_WIDTH_CELLS = 2048.0
@@ -31,13 +31,13 @@ FOURIER_HALF_WIDTH_CELLS = 2048.0
 class Geometry:
     """Inputs and outputs of the SDF network at N points."""
 
-    encoding: tuple[Tensor, ...]  # (N, width) each: by the cells, then the Fourier encoding if there is one
+    encoding: tuple[Tensor, ...]  # (N, width) each: features of the cells, and the Fourier encoding if used
     logit: Tensor  # (N,) signed distance / sigma, positive in free space
     feature: Tensor  # (N, geometry_feature_dim), an input of the intensity network
     normals: Tensor | None  # (N, 3) unit vectors towards free space, if the intensity network uses them
 
     def first(self, count: int, factors: Sequence[Tensor] | None) -> Geometry:
-        """The part for the first `count` points; `factors`: dropout, what each part of the encoding is multiplied by."""
+        """Return the first `count` points, with each part of the encoding multiplied by its dropout `factors`."""
         normals = None if self.normals is None else self.normals[:count]
         encoding = tuple(part[:count] for part in self.encoding)
         if factors is not None:
@@ -46,10 +46,10 @@ class Geometry:
 
 
 class VertexFeatures(nn.Module):
-    """A learnable feature, 8 floats, at each vertex of the occupied cells, interpolated inside the cells.
+    """Learnable features, 8 floats at each vertex of the occupied cells, interpolated inside the cells.
 
-    On quadtrees in the planes xy, xz and yz, summed over the planes (3QFP, ICRA 2024), or at the corners of an octree's cells
-    (SHINE-Mapping, ICRA 2023). The cells of each level are twice as large as those of the level before.
+    They lie on quadtrees in the planes xy, xz and yz, summed over the planes (3QFP, ICRA 2024), or at the corners of an
+    octree's cells (SHINE-Mapping, ICRA 2023). Cells double in size from level to level.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class VertexFeatures(nn.Module):
         nn.init.normal_(self.features, std=_FEATURE_STD, generator=generator)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Encoding of points (N, 3), local frame, m: levels side by side, (N, 8 · num_levels), of an octree their sum, (N, 8)."""
+        """Encode points (N, 3), local frame, m: levels concatenated, (N, 8 · num_levels), or summed for an octree, (N, 8)."""
         found = interpolate(self.features, points, self.table)
         return (
             found.view(len(points), found.shape[1] // FEATURE_DIM, FEATURE_DIM).sum(1)
@@ -80,9 +80,9 @@ class VertexFeatures(nn.Module):
 
 
 class NeuralField(Field):
-    """Features of cells and a Fourier encoding, from which two networks compute signed distance and intensity.
+    """Features of cells and a Fourier encoding, decoded to signed distance and intensity by two networks.
 
-    `leaf_keys` (C,): Morton keys of the occupied leaf cells, ascending. `with_intensity`: whether there is a second network.
+    `leaf_keys` (C,): Morton keys of the occupied leaf cells, ascending. `with_intensity`: whether to add the second network.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class NeuralField(Field):
         self.intensity_network = IntensityNetwork(config) if with_intensity else None
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Draws the weights of the networks, then the features (3QFP)."""
+        """Draw the weights of the networks, then the features (3QFP)."""
         self.sdf_network.initialise(generator)
         if self.intensity_network is not None:
             self.intensity_network.initialise(generator)
@@ -112,23 +112,23 @@ class NeuralField(Field):
         return self.num_frequencies == 0 or shortest_m >= 2 * self.table.leaf_size_m
 
     def encode(self, points: Tensor) -> tuple[Tensor, ...]:
-        """The inputs of the SDF network, (N, width) each, at points (N, 3), local frame, m."""
+        """Return the inputs of the SDF network, (N, width) each, at points (N, 3), local frame, m."""
         cells = self.cells(points)
         if self.num_frequencies == 0:
             return (cells,)
         return cells, fourier(points, self.half_width_m, 0, self.num_frequencies)
 
     def logit(self, points: Tensor) -> Tensor:
-        """Signed distance / sigma (N,), positive in free space, at points (N, 3), local frame, m."""
+        """Return signed distances / sigma (N,), positive in free space, at points (N, 3), local frame, m."""
         return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
 
     def sdf(self, points: Tensor) -> Tensor:
         return self.logit(points) * self.sigma_m
 
     def geometry(self, points: Tensor, *, frozen: bool = True) -> Geometry:
-        """Inputs of the intensity network at points (N, 3), local, m. `frozen`: no gradient reaches features and SDF network."""
+        """Return the inputs of the intensity network at points (N, 3), local, m. `frozen`: detach features and SDF network."""
         wants_normals = self.intensity_network is not None and self.intensity_network.normals
-        # A normal is the gradient of the logit, so it needs an autograd graph even if the field is frozen.
+        # A normal is the gradient of the logit: it needs an autograd graph even if the field is frozen.
         with torch.set_grad_enabled((torch.is_grad_enabled() and not frozen) or wants_normals):
             if wants_normals:
                 points = points.detach().requires_grad_()
@@ -150,12 +150,12 @@ class NeuralField(Field):
         if share > 0:
             assert self.intensity_network is not None
             unit += share * self.intensity_network(self.geometry(points), directions, ranges_m)
-        # The closed form knows no limits, and what is beyond those of the training was never measured.
+        # The closed form is unbounded; intensities beyond the training range were never measured.
         return unit if closed is None else unit.clamp(0, 1)
 
 
 class Network(nn.Module):
-    """Linear layers with ReLU between them. They have no memory until they are initialised or loaded."""
+    """Linear layers with ReLU between them, without memory until they are initialised or loaded."""
 
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
@@ -168,9 +168,9 @@ class Network(nn.Module):
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
-        """Draws weights and biases like ``torch.nn.Linear``, but from `generator`."""
+        """Draw weights and biases like ``torch.nn.Linear``, but from `generator`."""
         for layer in self._linear():
-            # Not to_empty(), which imports SymPy: a second.
+            # Not to_empty(): it imports SymPy, which takes a second.
             layer.weight, layer.bias = (
                 nn.Parameter(torch.empty(p.shape, dtype=p.dtype, device="cpu"))
                 for p in (layer.weight, layer.bias)
@@ -183,30 +183,29 @@ class Network(nn.Module):
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def _run(self, inputs: Sequence[Tensor]) -> Tensor:
-        """Output of the layers for `inputs`, (N, width) each, side by side."""
+        """Apply the layers to the concatenated `inputs`, (N, width) each."""
         layers = [(layer.weight, layer.bias) for layer in self._linear()]
         return mlp([x for x in inputs if x.shape[1] > 0], layers)
 
 
 class SDFNetwork(Network):
-    """From the encoding of a point to signed distance / sigma, positive in free space, and a feature."""
+    """Decoder of the encoding of a point to signed distance / sigma, positive in free space, and a feature."""
 
     def __init__(self, config: FitConfig) -> None:
         super().__init__(sdf_widths(config))
 
     def forward(self, encoding: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Logit (N,) and geometry feature (N, geometry_feature_dim) of encodings (N, width), side by side."""
+        """Return logits (N,) and geometry features (N, geometry_feature_dim) of concatenated encodings (N, width)."""
         out = self._run(encoding)
-        # The gradient of out[:, 0] is a matrix filled up with zeros. squeeze avoids it if there is only one
-        # column.
+        # The gradient of out[:, 0] is a matrix padded with zeros, which squeeze avoids for a single column.
         return out.squeeze(1) if out.shape[1] == 1 else out[:, 0], out[:, 1:]
 
 
 class IntensityNetwork(Network):
-    """Intensity of the return that a sensor gets from a point, scaled to about [0, 1].
+    """Decoder of the intensity that a sensor measures at a point, scaled to about [0, 1].
 
-    By the radar equation, P ∝ σ / r⁴, it depends on the range as well as on the direction. In dB it is linear
-    in log r, so log r is the input.
+    By the radar equation, P ∝ σ / r⁴, it depends on range and direction. In dB it is linear in log r, which is
+    therefore the input.
     """
 
     def __init__(self, config: FitConfig) -> None:
@@ -217,7 +216,7 @@ class IntensityNetwork(Network):
         self.normals = networks.normals
 
     def forward(self, geometry: Geometry, directions: Tensor, ranges_m: Tensor) -> Tensor:
-        """Scaled intensity (N,), seen along unit vectors (N, 3) from ranges (N,), m."""
+        """Return scaled intensities (N,) along unit vectors (N, 3) from ranges (N,), m."""
         inputs = [*geometry.encoding, geometry.feature, geometry.logit[:, None]]
         if self.normals:
             assert geometry.normals is not None
@@ -230,23 +229,23 @@ class IntensityNetwork(Network):
 
 
 def cells_width(config: FitConfig) -> int:
-    """Width of the encoding by the cells. A tri-quadtree puts levels side by side, an octree adds them."""
+    """Return the width of the encoding by cells: a tri-quadtree concatenates levels, an octree sums them."""
     return FEATURE_DIM * (NUM_LEVELS if config.encoding.kind == "tri-quadtree" else 1)
 
 
 def fourier_width(config: FitConfig) -> int:
-    """Width of the Fourier encoding: sine and cosine of three coordinates for each frequency."""
+    """Return the width of the Fourier encoding: sine and cosine of three coordinates for each frequency."""
     return 6 * config.encoding.fourier_count
 
 
 def sdf_widths(config: FitConfig) -> tuple[int, ...]:
-    """Widths of the input, the hidden layers and the output of the SDF network."""
+    """Return the widths of the input, the hidden layers and the output of the SDF network."""
     inputs = cells_width(config) + fourier_width(config)
     return (inputs, *SDF_HIDDEN, 1 + config.networks.geometry_feature_dim)
 
 
 def intensity_widths(config: FitConfig) -> tuple[int, ...]:
-    """Widths of the input, the hidden layers and the output of the intensity network."""
+    """Return the widths of the input, the hidden layers and the output of the intensity network."""
     networks = config.networks
     inputs = (
         cells_width(config)
@@ -261,5 +260,5 @@ def intensity_widths(config: FitConfig) -> tuple[int, ...]:
 
 
 def weights_of(widths: tuple[int, ...]) -> int:
-    """Number of weights of a network without its biases. So many multiplications it takes for one point."""
+    """Return the number of weights without biases, which is the number of multiplications for a point."""
     return sum(inputs * outputs for inputs, outputs in itertools.pairwise(widths))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Stage 1: what follows from the returns without training. Cells, distances at their corners, evidence, reflectance."""
+"""Stage 1, without training: leaf cells, signed distances at their corners, evidence, and closed-form reflectance."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from radarsdf.returns.reflectance import Float32, Reflectance
 from radarsdf.returns.sums import MeanRays, ReturnCells, ScanSums
 
 BAND_CELLS = 2.0
-"""Leaf cells from a return, along its ray, up to which cells belong to the map of stage 1."""
+"""Reach of the map of stage 1 along a ray, before and behind its return, leaf cells."""
 TRUNCATION_CELLS = 3.0
-"""Distances are truncated here, and a ray counts up to this far before and behind its return, leaf cells (VDBFusion: 3
-voxels). Measured: 4 and 5 are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real ones."""
-# Iterations of smoothing. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
+"""Truncation distance, and reach of a ray before and behind its return, leaf cells (VDBFusion: 3 voxels). Measured: 4 and 5
+are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real ones."""
+# Smoothing iterations. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
 # many 0.0 to 0.3 worse.
 _SMOOTHINGS = 24
 CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
-"""Leaf cells, along each axis, over which :func:`average_at_corners` carries what is known."""
+"""Reach of the smoothing in :func:`average_at_corners` along each axis, leaf cells."""
 
 
 @dataclass(frozen=True)
 class SurfaceReturns:
-    """The returns that the surface is made of, and what is known of them."""
+    """Returns from which the surface is fitted, with their surfels and noise."""
 
-    rays: Rays  # without ghosts; if a field is trained on them, moved towards the flat surfel of their cell
+    rays: Rays  # without ghosts; for training, moved towards the flat surfel of their cell
     surfels: Surfels  # of all returns
     noise: SensorNoise
-    means: MeanRays | None  # of the leaf cells, without ghosts, to average. None: a field is trained
-    true: NDArray[np.bool_] | None  # (N,) which of all rays end at no ghost. None: ghosts were not looked for
+    means: MeanRays | None  # mean rays of the leaf cells without ghosts, to average. None for training
+    true: NDArray[np.bool_] | None  # (N,) False for ghosts among all rays. None if ghosts are not detected
 
     @classmethod
     def of(
@@ -57,7 +57,7 @@ class SurfaceReturns:
         inside: NDArray[np.bool_] | None = None,
         sums: ScanSums | None = None,
     ) -> SurfaceReturns:
-        """Cleans `rays`, of which there may be `sums`, by ``config.returns``, and keeps those `inside`, (N,). None: all."""
+        """Clean `rays` as ``config.returns`` says and keep those `inside`, (N,); None for all. `sums`: of the rays, if known."""
         sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if sums is None else sums
         surfels = Surfels.of_sums(sums, num_threads)
         means = None if config.train else MeanRays.of_sums(sums, num_threads)
@@ -81,7 +81,7 @@ class SurfaceReturns:
 def occupied_cells(
     surface: SurfaceReturns, config: FitConfig, num_threads: int
 ) -> tuple[NDArray[np.uint64], ReturnsOfCells]:
-    """Keys (C,), ascending, of the leaf cells that rays cross near their returns or that bridge gaps; evidence of the returns."""
+    """Return the ascending keys (C,) of the leaf cells near returns or bridging gaps, and the returns of cells."""
     if surface.means is None:
         keys = near_leaf_keys(surface.rays, config, num_threads)
         returns = _returns_of_rays(surface, config, num_threads)
@@ -93,8 +93,8 @@ def occupied_cells(
 
 
 def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
-    """(C,) uint64, Morton keys of the leaf cells that a sample near the surface can fall into, ascending."""
-    # By points every half cell along the near band of each ray: random samples would make cells depend on the seed.
+    """Return the ascending Morton keys (C,) of the leaf cells that can contain a sample near the surface."""
+    # Points every half cell along the near band of each ray: random samples would make the cells depend on the seed.
     band_m = config.metres(NEAR_BAND_CELLS)
     steps = math.ceil(2 * band_m / (config.leaf_size_m / 2))
     cells = CellSet(config.leaf_size_m)
@@ -105,7 +105,7 @@ def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[n
 
 
 def _returns_of_rays(surface: SurfaceReturns, config: FitConfig, num_threads: int) -> ReturnsOfCells:
-    """Precision, numbers of scans and of returns of each leaf cell, summed over returns."""
+    """Compute information, scans and returns of each leaf cell from all returns."""
     rays = surface.rays
     cells = ReturnCells.of(rays, config.leaf_size_m, num_threads)
     information = 1 / surface.noise.variances_m2(rays.ranges_m)
@@ -117,8 +117,8 @@ def _returns_of_rays(surface: SurfaceReturns, config: FitConfig, num_threads: in
 
 
 def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
-    """Precision, numbers of scans and of returns of each leaf cell, by its mean ray."""
-    # The returns of a cell are at nearly the same range if they are of the same sensor position.
+    """Compute information, scans and returns of each leaf cell from its mean ray."""
+    # The returns of a cell have nearly the same range if they are seen from the same sensor position.
     information = means.counts / noise.variances_m2(means.ranges_m)
     counts = means.counts.astype(np.float64)
     found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
@@ -134,9 +134,9 @@ def average_surface(
     config: FitConfig,
     num_threads: int,
 ) -> GridField:
-    """The average of the rays' truncated signed distances (Curless and Levoy, 1996), smoothed.
+    """Compute the smoothed average of the rays' truncated signed distances (Curless and Levoy, 1996).
 
-    `leaf_keys` (C,): of the field, ascending. `means`, `returns`: of each cell with returns, in the same order.
+    `leaf_keys` (C,): of the field, ascending. `means` and `returns` have the same cells, in the same order.
     """
     field = GridField(leaf_keys, config.leaf_size_m, num_threads)
     normals = normals_at(means, surfels, num_threads)
@@ -146,11 +146,11 @@ def average_surface(
 
 
 def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> NDArray[np.float32]:
-    """(M, 3) of the planes at the ends of rays: of the surfel there if it is flat, else towards the sensor."""
+    """Return the normals (M, 3) of the planes at the ends of rays: of a flat surfel, else towards the sensor."""
     plane = surfels.flat_planes_of_leaves(rays.keys, num_threads)
     of_planes = surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0
     normals: NDArray[np.float32] = np.where(plane[:, None] >= 0, of_planes, -rays.directions)
-    # A surfel of returns from both sides of a thin wall faces one of them alone.
+    # A surfel with returns from both sides of a thin wall faces only one side.
     away = np.einsum("ij,ij->i", normals, rays.directions) > 0
     normals[away] *= -1
     return normals
@@ -164,14 +164,14 @@ def average_at_corners(
     config: FitConfig,
     num_threads: int,
 ) -> NDArray[np.float32]:
-    """(V,) smoothed average over rays of the distances to their planes, at the corners of the leaf cells of `table`, m.
+    """Return the smoothed average (V,) of the distances to the planes of rays, at the corners of the cells of `table`, m.
 
-    A ray counts at the corners of the cells that it crosses, up to `TRUNCATION_CELLS` before and behind its return. Its
-    value there is the corner's distance to the plane through its return with this normal, (M, 3). Smoothing moves the
-    average towards distances that agree with these planes and bend little (thin plates). Measured: 1.4 points of F-score
-    more than the average on simulated scenes, 1.8 on recorded drives; of every sixth scan 3.5 and 0.6.
+    A ray contributes to the corners of the cells that it crosses, up to `TRUNCATION_CELLS` before and behind its return. Its
+    value there is the distance of the corner to the plane through its return with its normal (M, 3). Smoothing (thin plates)
+    moves the average towards distances that agree with these planes and bend little. Measured: 1.4 points of F-score more
+    than the plain average on simulated scenes, 1.8 on recorded drives; with every sixth scan 3.5 and 0.6.
 
-    Distances depend on what is within `CELLS_SMOOTHED` of the cells of their rays, to the bit.
+    Distances depend only on what is within `CELLS_SMOOTHED` of the cells of their rays, to the last bit.
     """
     normals = np.ascontiguousarray(normals, np.float32)
     distances_m, sides = table.average_rays(
@@ -183,11 +183,11 @@ def average_at_corners(
 
 
 def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads: int) -> Reflectance:
-    """Intensities of `rays` in closed form, ghosts included, or what the network of the map leaves of them."""
+    """Fit intensities of `rays`, ghosts included, in closed form, or the residuals of the map's network."""
     scale = contents.intensity_scale
     assert scale is not None
     known = rays.with_intensity
-    if known.any() and not known.all():  # a tile may have none: its returns then count as the lowest
+    if known.any() and not known.all():  # a tile may have none: its returns then have the lowest intensity
         rays = rays.select(known)
     assert rays.intensities is not None
 

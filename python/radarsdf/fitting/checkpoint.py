@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The state of a fit in a file. A fit that goes on from it ends with the same bits as one without a stop."""
+"""Checkpoints of a fit. A resumed fit is bit-identical to an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 
 FORMAT = "radarsdf.checkpoint"
-_EVERY_S = 30.0  # seconds between two files, at least
-_NONE = object()  # where one of two configurations lacks a setting
-_SHARE = 0.02  # largest share of the time that is spent on writing
+_EVERY_S = 30.0  # minimum time between two writes, s
+_NONE = object()  # sentinel for a setting that one of two configurations lacks
+_SHARE = 0.02  # maximum share of the time spent on writing
 
 
 class Checkpoint:
-    """A file that the training writes its state to, every half minute or less often if writing takes long.
+    """File with the state of the training, written every half minute, or less often if writing is slow.
 
-    An existing file must be a checkpoint of the same fit: it holds the settings, and a digest of all returns and the scale of
-    their intensities. A ValueError if it is none, or of other scans, settings or version; an OSError if it cannot be read, or
-    its folder does not exist.
+    An existing file must be a checkpoint of the same fit: it stores the settings, and a digest of all returns and the scale of
+    their intensities. Raises a ValueError if it is not a checkpoint, or has other scans, settings or version; an OSError if it
+    cannot be read, or its folder does not exist.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Checkpoint:
         return time.monotonic() >= self._next_s
 
     def write(self, state: dict[str, Tensor]) -> None:
-        """Replaces the file. If that fails, there is only a warning, because the fit can go on without it."""
+        """Replace the file. Failure only warns, because the fit can continue without it."""
         started_s = time.monotonic()
         metadata = {"format": FORMAT, "identity": json.dumps(self._identity)}
         try:
@@ -69,7 +69,7 @@ class Checkpoint:
         self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _SHARE)
 
     def resume(self, training: Any) -> None:
-        """Restores a `Training` from the file, if there is one. A ValueError if it is damaged."""
+        """Restore a `Training` from the file, if it exists. Raise a ValueError if it is damaged."""
         if not self._path.exists():
             return
         expected: dict[str, Tensor] = training.state()
@@ -115,7 +115,7 @@ class Checkpoint:
 
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:
-    """Digest of all arrays of the scans that the training uses."""
+    """Return a digest of the arrays of the scans that the training uses."""
     digest = hashlib.blake2b(repr(scale).encode(), digest_size=16)
     for array in (rays.origin, rays.points, rays.directions, rays.ranges_m, rays.intensities):
         digest.update(b"-" if array is None else array.data if array.flags.c_contiguous else array.tobytes())

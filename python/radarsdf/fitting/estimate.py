@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Memory and time of a fit before it begins, what it skips, and errors where it cannot be done."""
+"""Estimates of the memory and time of a fit, its skipped parts, and checks of its feasibility."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import resolve_num_threads
 
-# Seconds of one thread, measured on the machine that BENCHMARK.md names. The estimates of twenty fits were 0.65 to 1.24
-# times their processor time: `python -m bench.estimates durations` repeats it.
+# Seconds of one thread, measured on the machine named in BENCHMARK.md. The estimates of twenty fits were 0.65 to 1.24
+# times their processor time; reproduce with `python -m bench.estimates durations`.
 _S_PER_RETURN, _S_PER_RETURN_OF_FREE_SPACE, _S_PER_CELL = 1.7e-6, 1e-6, 9.4e-7
 _S_PER_ITERATION, _S_PER_MOVED_ROW = 9.3e-4, 7.5e-9
 _S_PER_INPUT, _S_PER_MULTIPLICATION = 2.2e-9, 2.6e-11  # of a network, which all threads share
 
-# Bytes, measured as peaks of fits of 1e4 to 3e6 returns of a street: `python -m bench.estimates memory` repeats it.
-_ALWAYS = 35e6  # code that the fit loads, stacks and arenas of the threads
+# Bytes, measured as peaks of fits with 1e4 to 3e6 returns of a street; reproduce with `python -m bench.estimates memory`.
+_ALWAYS = 35e6  # loaded code, stacks and arenas of the threads
 _PER_RETURN, _PER_RETURN_CLEANED = 30.0, 200.0
 _PER_RETURN_OF_INTENSITY = 150.0
 _PER_CELL = 230.0
-_COPIES = 4  # of each feature: value, two moments of Adam, last finite value
+_COPIES = 4  # numbers for each feature: value, two moments of Adam, last finite value
 
-# Leaf cells for each one with returns, and rows of features for each leaf cell, in dense scans, and what sparse ones add.
-# Measured on `hugin`, `oculii` and `wall`, of 4 to all scans, with cells of 0.1 to 0.5 m: within a factor of 2.
+# Ratio of leaf cells to cells with returns, and of feature rows to leaf cells: in dense scans, and the addition in sparse
+# ones. Measured on `hugin`, `oculii` and `wall`, with 4 to all scans and cells of 0.1 to 0.5 m: within a factor of 2.
 _CELLS, _CELLS_AVERAGED = (1.4, 3.6), (1.9, 4.9)
 _ROWS, _ROWS_AVERAGED = {"tri-quadtree": (0.7, 1.3), "octree": (2.3, 2.5)}, (1.7, 1.5)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Memory and time that a fit will take."""
+    """Estimated memory and time of a fit."""
 
     peak_memory_bytes: int
-    """Peak above the memory that the process has before. Within a factor of 2."""
+    """Peak memory in addition to that of the process before. Within a factor of 2."""
     seconds: float
-    """Wall-clock time. Within a factor of 2 on the machine of the measurement."""
+    """Wall-clock time. Within a factor of 2 on the machine of BENCHMARK.md."""
     returns: int
     """Number of returns between `min_range_m` and `max_range_m`."""
     leaf_cells: int
@@ -76,7 +76,7 @@ def estimate(
     *,
     config: FitConfig | None = None,
 ) -> Estimate:
-    """Estimate memory and time of :func:`radarsdf.fit` from the numbers of returns and of cells that hold them.
+    """Estimate memory and time of :func:`radarsdf.fit` from the numbers of returns and of cells with returns.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def estimate(
 
 
 def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> Estimate:
-    """:func:`estimate` for rays, of which a map is made of those `inside`, (N,). None: all."""
+    """:func:`estimate` for rays of which those `inside`, (N,), are fitted; None for all."""
     threads = resolve_num_threads(config.num_threads)
     points = rays.points if inside is None else rays.points[inside]
     occupied = CellSet(config.leaf_size_m)
@@ -123,7 +123,7 @@ def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | Non
 
 
 def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) -> Estimate:
-    """Of a map of so many `returns` of the rays, which lie in `with_returns` leaf cells."""
+    """Estimate a map of a number of `returns` in `with_returns` leaf cells."""
     sparse = with_returns / returns
     of_dense, of_sparse = _CELLS if config.train else _CELLS_AVERAGED
     cells = round(with_returns * (of_dense + of_sparse * sparse**3))
@@ -135,7 +135,7 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
     )
     memory = _ALWAYS + returns * _PER_RETURN + cells * _PER_CELL
     if config.train:
-        # Gradients of all rows, unless only those of a batch move; through normals two for each thread, and their sum.
+        # Gradients of all rows, unless only touched rows move; with normals two for each thread, and their sum.
         normals = with_network and config.networks.normals
         all_rows = 3 * resolve_num_threads(config.num_threads) if normals else 1
         gradients = 0 if config.moves_rows(with_network) else all_rows
@@ -156,13 +156,13 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
 def seconds_of(
     config: FitConfig, schedule: Schedule, returns: int, cells: int, rows: int, with_network: bool
 ) -> float:
-    """Wall-clock seconds of a fit with so many returns, leaf cells and rows of features."""
+    """Estimate the wall-clock time of a fit, s, from numbers of returns, leaf cells and feature rows."""
     seconds = _S_PER_RETURN * returns + _S_PER_CELL * cells
     if not config.train:
         return seconds
     iterations = schedule.sdf_iterations
     later = max(0, schedule.intensity_iterations - iterations) if with_network else 0
-    # Forward and backward passes cost three forward ones, and nine where the loss has normals.
+    # A forward and a backward pass cost as much as three forward ones, and nine if the loss has normals.
     passes = 9 if config.networks.normals and with_network else 3
     of_field = passes * (iterations * schedule.batch_size + later * schedule.intensity_batch_size / 3)
     shared = of_field * (
@@ -179,7 +179,7 @@ def seconds_of(
 def skipped_parts(
     config: FitConfig, schedule: Schedule, *, returns: int, cells: int, rows: int, with_intensity: bool
 ) -> list[tuple[str, float]]:
-    """Parts of the method that a fit does not run, and the seconds that this saves."""
+    """List the parts of the method that a fit skips, and the seconds that this saves."""
 
     def seconds(network: bool, **changes: Any) -> float:
         changed = config.override(**changes)
@@ -209,9 +209,9 @@ def skipped_parts(
 
 
 def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> None:
-    """Raises a MemoryError if a fit needs more than `max_memory_bytes`, or than the system has left."""
+    """Raise a MemoryError if a fit needs more than `max_memory_bytes`, or than is available."""
     available = limit_bytes(config.max_memory_bytes)
-    # No more cells hold returns than there are returns. If so many are small enough, they need not be counted.
+    # There are at most as many cells with returns as returns. If this bound fits, cells need not be counted.
     if available is None or _estimate(rays, config, len(rays), len(rays)).peak_memory_bytes <= available:
         return
     expected = estimate_rays(rays, config, inside)
@@ -224,7 +224,7 @@ def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = 
 
 
 def check_extent(rays: Rays, config: FitConfig) -> None:
-    """Raises a ValueError if a return lies where there are no cells: one outlier must not be met in the middle of the work."""
+    """Raise a ValueError if a return lies beyond the range of cell keys, before the fit starts its work."""
     reach_m = config.metres(NEAR_BAND_CELLS if config.train else max(BAND_CELLS, TRUNCATION_CELLS))
     limit_m = MAX_CELLS_FROM_ORIGIN * config.leaf_size_m - reach_m
     if max(rays.points.max(initial=0), -rays.points.min(initial=0)) > limit_m:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From scans with poses to a map: what is given to a fit, checked and made into rays."""
+"""Entry point of fitting: checks the input and converts it to rays."""
 
 from __future__ import annotations
 
@@ -36,38 +36,37 @@ def fit(
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m. Of :class:`radarsdf.io.Scans`, their poses, intensities and
-        Doppler are used where none are given here.
+        (N_i, 3) each: the returns of one scan, sensor frame, m. :class:`radarsdf.io.Scans` supply poses, intensities and
+        Doppler unless these are passed separately.
     poses : array_like, optional
-        (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
+        (F, 4, 4) T_world_sensor, m, one for each scan. Required unless `points` are `Scans` with poses.
     intensities : iterable of F arrays, optional
-        (N_i,) each, sensor units. Without them the map has no intensity network. Those that cannot belong to the others,
-        such as -9999 in place of a measurement, are left out of the reflectance; the surface keeps their returns.
-        ``report["intensity_outliers"]`` counts them.
+        (N_i,) each, sensor units. Without them the map has no reflectance. Outliers, such as -9999 in place of a
+        measurement, are excluded from the reflectance; the surface keeps their returns. ``report["intensity_outliers"]``
+        counts them.
     doppler_mps : sequence of F arrays, optional
-        (N_i,) each: speed of each return along its ray, m/s; NaN where it was not measured. With them, returns that
-        move are left out; see ``config.returns.drop_moving``.
+        (N_i,) each: radial speed of each return, m/s; NaN where it was not measured. With Doppler, moving returns are
+        left out; see ``config.returns.drop_moving``.
     config : FitConfig, optional
-        Settings of the fit. ``FitConfig.paper()`` has the published ones.
+        Settings of the fit. ``FitConfig.paper()`` returns the published ones.
     progress : bool, optional
-        Whether to show a progress bar. By default only on a terminal.
+        Whether to show a progress bar. Default: only on a terminal.
     checkpoint : path-like, optional
-        File for the state of the training. It is written every half minute, and when the training is
-        interrupted or done. If it exists, a fit of the same scans with the same configuration and number of
-        threads goes on from it, and ends with the same bits as one without a stop. It is not removed when the
-        fit is done.
+        File for the state of the training, written every half minute, and when the training is interrupted or
+        done. If it exists, a fit of the same scans with the same configuration and number of threads resumes
+        from it, bit-identical to an uninterrupted fit. It is not removed at the end.
     origin : (3,) array_like, optional
-        Origin of the map's local frame, world, m. By default the sensors' mean position, moved to the next corner of a
-        block of ``config.lattice``: fits whose origins are such corners share their cells.
+        Origin of the map's local frame, world, m. Default: the mean sensor position, rounded to the nearest block corner
+        of ``config.lattice``. Fits with origins at block corners share their cells.
     intensity_range : (low, high), optional
-        Intensities that become 0 and 1 for the network, sensor units; those beyond are moved to its ends, but for those that
-        are left out. By default the lowest and the highest of the others.
+        Intensities scaled to 0 and 1, sensor units; others are clipped, except for outliers, which are left out. Default: the
+        range of the intensities without outliers.
 
     Returns
     -------
     RadarMap
-        Its ``report`` has the times and counts of the fit. The same input and seed give the same bits, with any
-        number of threads. Only where the gradients are PyTorch's (``networks.normals``) does the rounding depend on it.
+        Its ``report`` has the times and counts of the fit. Results are bit-identical for the same input and seed, with any
+        number of threads. Only with the gradients of PyTorch (``networks.normals``) does rounding depend on that number.
 
     Raises
     ------
@@ -75,13 +74,13 @@ def fit(
         If scans or poses are invalid (see :func:`radarsdf.returns.rays.prepare`), a return is too far away,
         the range of intensities is not ascending, or the `checkpoint` is damaged or from another fit.
     MemoryError
-        If the memory by :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the system has
-        left.
+        If the memory estimated by :func:`radarsdf.estimate` exceeds ``config.max_memory_bytes``, or what the
+        system has left.
     Interrupted
-        A KeyboardInterrupt, after Ctrl-C. Its ``radar_map`` is the map so far.
+        After Ctrl-C, a KeyboardInterrupt. Its ``radar_map`` is the map so far.
     Diverged
-        A FloatingPointError, if a loss or a parameter is not finite, or a loss is worse than any answer of the
-        right size. Its ``radar_map`` is the last good map.
+        If a loss or a parameter is not finite, or a loss exceeds the worst plausible prediction; a
+        FloatingPointError. Its ``radar_map`` is the last good map.
 
     Examples
     --------

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: MIT
 """Losses and gradients of a batch, by the compiled core or by PyTorch's autograd.
 
-:class:`AutogradGradients` is the reference: it differentiates the losses of this module by PyTorch. Only it
-has normals, which are gradients themselves. :class:`CoreGradients` calls the core once a batch and takes a half to a third of
-the time. Tests check that the two are equal up to rounding.
+:class:`AutogradGradients` is the reference: PyTorch differentiates the losses of this module. Only it supports
+normals, which are gradients themselves. :class:`CoreGradients` calls the core once a batch and takes a third to half of
+the time. Tests check that the two agree up to rounding.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from radarsdf.field.neural_field import Geometry, NeuralField, cells_width, four
 from radarsdf.fitting.sampling import Batch, Dropout, Samples
 from radarsdf.threads import ThreadPool
 
-# Dropout of the features and of the Fourier encoding before the intensity network. If the training uses each sample n times,
-# they are multiplied by n / (n + 2.5): the more often a sample is used, the more easily the network memorises it.
+# Dropout of the features and of the Fourier encoding before the intensity network, scaled by n / (n + 2.5) if the training
+# uses each sample n times: the more often a sample is used, the more easily the network memorises it.
 FEATURE_DROPOUT, FOURIER_DROPOUT = 0.85, 0.25
-# Samples in a part. Smaller parts divide better among threads and fit the cache, but each prepares the networks again: of
-# a joint batch of 4096 samples, 4, 8 and 16 parts took 1.02, 1.07 and 1.16 times as long as two.
+# Samples in a part. Smaller parts balance better among threads and fit the cache, but each prepares the networks again:
+# for a joint batch of 4096 samples, 4, 8 and 16 parts took 1.02, 1.07 and 1.16 times as long as two.
 _PART = 512
-_MOST_PARTS = 64  # each keeps gradients of the networks
+_MOST_PARTS = 64  # each stores gradients of the networks
 _Result = TypeVar("_Result")
 
 Losses = Literal["sdf", "joint", "intensity"]
-"""The sdf loss, by features and SDF network; both losses, by all; the intensity loss, by the intensity network alone."""
+"""Losses to train: "sdf" for features and SDF network, "joint" for all parameters, "intensity" for its network alone."""
 
 
 def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
-    """Binary cross-entropy of sigmoid(logit) against sigmoid(sdf / sigma), (B,) each (SHINE-Mapping).
+    """Compute the binary cross-entropy of sigmoid(logit) against sigmoid(sdf / sigma), (B,) each (SHINE-Mapping).
 
     The sigmoid gives errors near the surface the most weight.
     """
@@ -50,17 +50,17 @@ def sdf_loss(logit: Tensor, sdf_m: Tensor, sigma_m: float) -> Tensor:
 
 
 def intensity_loss(predicted: Tensor, label: Tensor) -> Tensor:
-    """Mean absolute error of scaled intensities (B,), 0 where the label is NaN. It gives outliers little weight (3QFPI)."""
+    """Compute the mean absolute error of scaled intensities (B,), robust to outliers (3QFPI); 0 where the label is NaN."""
     return functional.l1_loss(predicted, torch.where(label.isnan(), predicted.detach(), label))
 
 
 @dataclass(frozen=True)
 class Touched:
-    """Samples of a batch, and the gradient by their interpolated features. The features of cells that hold a sample are touched."""
+    """Samples of a batch, which touch the features of their cells, and the gradients of their interpolated features."""
 
     points: NDArray[Any]  # (N, 3) samples, local frame, m
-    located: NDArray[np.int32]  # (N, num_levels), rows of the cells that hold them
-    gradient: NDArray[Any]  # (N, 8 · num_levels), with respect to the interpolated features
+    located: NDArray[np.int32]  # (N, num_levels) rows of the cells that contain them
+    gradient: NDArray[Any]  # (N, 8 · num_levels) gradient of the interpolated features
 
 
 @dataclass(frozen=True)
@@ -69,14 +69,14 @@ class Gradients:
 
     losses: dict[str, float]  # "sdf", "intensity"
     by_parameters: list[Tensor]  # all features (without `touched`), SDF network, intensity network
-    touched: Touched | None  # the gradient for touched features, if only these move
+    touched: Touched | None  # gradient of the touched features, if only these move
 
 
 class GradientBackend(ABC):
     """Losses and gradients of batches.
 
-    The parameters of `field` must keep their memory. Gradients of a batch's parts are added in their order, so the threads
-    of `pool` change no bit.
+    The parameters of `field` must keep their memory. Gradients of a batch's parts are summed in order, so results do not
+    depend on the threads of `pool`.
     """
 
     def __init__(
@@ -93,11 +93,11 @@ class GradientBackend(ABC):
 
     @abstractmethod
     def num_parts(self, batch_size: int) -> int:
-        """The best number of parts of a batch with so many samples."""
+        """Return the best number of parts for a batch size."""
 
     @abstractmethod
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        """Gradients of these losses, and the result of `meanwhile`, which the calling thread runs while others work."""
+        """Return gradients of `losses`, and the result of `meanwhile`, which the calling thread runs while others work."""
 
     def state(self) -> dict[str, Tensor]:
         return {"generator": self._generator.get_state()}
@@ -106,7 +106,7 @@ class GradientBackend(ABC):
         self._generator.set_state(state["generator"])
 
     def _draw_dropouts(self) -> list[tuple[int, Dropout]]:
-        """Columns and dropout of each part of the encoding, for the intensity network alone."""
+        """Draw the dropout of each part of the encoding, with its width, for the intensity network alone."""
         if not self._config.networks.dropout or self._dropout_scale == 0:
             return []
         scale, generator = self._dropout_scale, self._generator
@@ -116,7 +116,7 @@ class GradientBackend(ABC):
 
 
 class CoreGradients(GradientBackend):
-    """Losses and gradients by the core's ``FieldLoss``, which checks the field's arrays once and reads them in each call."""
+    """Losses and gradients by the core's ``FieldLoss``, which validates the field's arrays once and reads them in each call."""
 
     def __init__(self, field: NeuralField, config: FitConfig, *others: Any) -> None:
         super().__init__(field, config, *others)
@@ -174,7 +174,7 @@ class CoreGradients(GradientBackend):
         return Gradients(found, [by_features, *networks], None), result
 
     def _touched_by(self, batch: Batch) -> Touched:
-        """Arrays for the cells of a batch and their gradients, which the next one of this size overwrites."""
+        """Return buffers for the cells of a batch and their gradients, reused by the next batch of this size."""
         count, cells = len(batch.points), self._field.cells
         if self._located is None or len(self._located) != count:
             self._located = np.empty((count, cells.table.num_levels), np.int32)
@@ -183,13 +183,13 @@ class CoreGradients(GradientBackend):
 
 
 def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
-    """Weights and biases of a network's layers, as views of their memory."""
+    """Return weights and biases of a network's layers, as views of their memory."""
     values = [kernels.view(parameter) for parameter in network.parameters()]
     return values[::2], values[1::2]
 
 
 class AutogradGradients(GradientBackend):
-    """Losses of the field, differentiated by PyTorch. Each part is the work of one thread."""
+    """Losses of the field, differentiated by PyTorch. One thread computes each part."""
 
     def num_parts(self, batch_size: int) -> int:
         return min(self._pool.num_threads, batch_size)
@@ -208,12 +208,12 @@ class AutogradGradients(GradientBackend):
         return _sum(list(self._pool.map(of_part, list(zip(parts, factors, strict=True))))), meanwhile()
 
     def _num_seen(self, samples: Samples) -> int:
-        """Number of samples, the first ones, that the intensity network sees."""
+        """Return the number of leading samples that the intensity network sees."""
         in_free_space = self._config.training.intensity_in_free_space
         return len(samples.points) if in_free_space else samples.num_labelled
 
     def _of_part(self, losses: Losses, part: tuple[Samples, list[Tensor] | None]) -> Gradients:
-        """`part`: samples, and what each part of the encoding of those that are seen is multiplied by."""
+        """Differentiate one part: samples, and dropout factors of the encoding of those that the network sees."""
         field, (samples, factors) = self._field, part
         found, parameters = {}, []
         if losses == "sdf":
@@ -232,7 +232,7 @@ class AutogradGradients(GradientBackend):
         return Gradients({name: float(loss.detach()) for name, loss in found.items()}, gradients, None)
 
     def _sdf_loss(self, logit: Tensor, samples: Samples) -> Tensor:
-        if len(logit) == 0:  # whose mean is not a number
+        if len(logit) == 0:  # the mean would be NaN
             return logit.sum()
         return sdf_loss(logit, samples.sdf_m, self._field.sigma_m) * samples.share
 
@@ -248,14 +248,14 @@ class AutogradGradients(GradientBackend):
         )
         if count == 0:
             return predicted.sum()
-        # What the mean over these counts in that of the whole batch.
+        # Weight of this mean in that of the whole batch.
         in_free_space = self._config.training.intensity_in_free_space
         share = samples.share if in_free_space else samples.labelled_share
         return intensity_loss(predicted, labels) * share
 
 
 def _sum(parts: Sequence[Gradients]) -> Gradients:
-    """Losses and gradients of all parts. Changes the first part's."""
+    """Sum losses and gradients of all parts, in place in the first part."""
     first, *others = parts
     for part in others:
         torch._foreach_add_(first.by_parameters, part.by_parameters)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Adam (Kingma and Ba, ICLR 2015) by PyTorch, and for features on the rows that a batch touches; SOAP for networks."""
+"""Optimisers: Adam (Kingma and Ba, ICLR 2015) by PyTorch, sparse Adam for touched feature rows, SOAP for networks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _EPSILON = 1e-15  # 3QFP
 
 
 class Optimiser(ABC):
-    """Changes `parameters` by their gradients. `learning_rate` is that of the next step, `full_rate` that of the start."""
+    """Base class. `learning_rate` applies to the next step, `full_rate` is the initial one."""
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         self.parameters = list(parameters)
@@ -30,21 +30,21 @@ class Optimiser(ABC):
 
     @abstractmethod
     def state(self) -> dict[str, Tensor]:
-        """All that the next steps depend on, except the parameters. Not copied."""
+        """Return all that the next steps depend on, except the parameters, without copying."""
 
     @abstractmethod
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores a :meth:`state`. ValueError: no optimiser of these parameters can have it."""
+        """Restore a :meth:`state`. Raise a ValueError if it is invalid for these parameters."""
 
     @abstractmethod
     def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:
-        """Changes the parameters by `gradients`, which are in the same order; on the threads of `pool`, if it is idle."""
+        """Update the parameters by `gradients`, in the same order, on the threads of `pool` if it is idle."""
 
 
 class Adam(Optimiser):
-    """Adam with the same bits as ``torch.optim.Adam(fused=True)``.
+    """Adam, bit-identical to ``torch.optim.Adam(fused=True)``.
 
-    That class imports PyTorch's compiler and SymPy. These 800 modules take a second, as long as a small fit.
+    That class imports PyTorch's compiler and SymPy: 800 modules, which take a second, as long as a small fit.
     """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
@@ -83,16 +83,16 @@ class Adam(Optimiser):
 
 
 class Soap(Optimiser):
-    """SOAP (Vyas et al., ICLR 2025) for the weights of hidden layers, and :class:`Adam` for all else of a network.
+    """SOAP (Vyas et al., ICLR 2025) for weight matrices, and :class:`Adam` for the other parameters of a network.
 
-    Adam scales each number of a gradient by itself, although the inputs of a layer depend on each other. SOAP does so
-    in a basis in which they hardly do. Measured: a network learns as much in a quarter to a half of Adam's steps.
+    Adam scales each component of a gradient by itself, although the inputs of a layer are correlated. SOAP does so in a
+    basis in which they hardly are. Measured: a network learns as much in a quarter to half of Adam's steps.
     """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         super().__init__(parameters, learning_rate)
         self.step_count = 0
-        # A layer with one output has one vector of weights: nothing to turn.
+        # A layer with one output has a weight vector: there is no basis to rotate.
         self._matrices = [i for i, p in enumerate(self.parameters) if p.ndim == 2 and min(p.shape) > 1]
         self._others = [i for i in range(len(self.parameters)) if i not in self._matrices]
         self._adam = Adam(_at(self._others, self.parameters), learning_rate)
@@ -135,11 +135,11 @@ def _at(places: Sequence[int], tensors: Sequence[Tensor]) -> list[Tensor]:
 
 
 class RowAdam:
-    """Adam for the features of cells. A step takes time for the touched rows, not for the whole map.
+    """Sparse Adam for the features of cells. The cost of a step is proportional to the touched rows, not to the map.
 
-    The mean and mean square of an untouched row decay as with a gradient of zero, but the row does not
-    change. Adam would go on to move it along its last gradient, by up to thirty times the learning rate.
-    Measured: the surface is as good without that, and a fit of `hugin` takes 4.2 s instead of 5.2.
+    The moments of an untouched row decay as with a gradient of zero, but the row does not change. Adam would continue to
+    move it along its last gradient, by up to thirty times the learning rate. Measured: the surface is as good without that,
+    and a fit of `hugin` takes 4.2 s instead of 5.2.
     """
 
     def __init__(self, cells: VertexFeatures, learning_rate: float) -> None:
@@ -147,7 +147,7 @@ class RowAdam:
         self.step_count = 0
         self._cells = cells
         rows, dtype = len(cells.features), cells.features.dtype
-        # Of each row: mean and mean square of its gradients; the last step that changed it, and a mark of the core's.
+        # For each row: first and second moment of its gradients; its last update step, and a mark used by the core.
         self._moments = large_zeros(rows, 2 * FEATURE_DIM, dtype=dtype)
         self._marks = large_zeros(rows, 2, dtype=torch.int32)
         self._arrays = view(cells.features), self._moments.numpy(), self._marks.numpy()
@@ -173,12 +173,12 @@ class RowAdam:
 
     @torch.no_grad()
     def step(self, touched: Sequence[Touched], pool: ThreadPool, meanwhile: Callable[[], None]) -> None:
-        """Changes the rows that batches touched. The calling thread runs `meanwhile` first, and then helps the others."""
+        """Update the rows touched by batches. The calling thread first runs `meanwhile`, then helps the others."""
         self.step_count += 1
         if self.step_count >= len(self._decays):
             powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64, device="cpu")[:, None]
             decays = torch.tensor([_BETAS], dtype=torch.float64, device="cpu") ** powers
-            # Denormal numbers would be slow, and make no difference compared with a gradient.
+            # Denormal numbers would be slow, and are negligible compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         self._cells.table.begin_adam_step(
             [(t.points, t.located, t.gradient) for t in touched],

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Samples on rays with their labels, drawn when they are needed."""
+"""Sampling of labelled points on rays, on demand."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _GOLDEN = 0.6180339887498949  # multiples of it are spread evenly over an interv
 
 
 def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
-    """How many samples of a batch of the sdf stage are near the surface, and how many of these have intensities as labels.
+    """Return the number of near-surface samples in a batch of the sdf stage, and how many have intensity labels.
 
     The intensity network needs no more of them in a large batch than in a batch of its own stage.
     """
@@ -47,7 +47,7 @@ def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
 
 
 def seen_jointly(config: FitConfig, batch_size: int) -> int:
-    """How many samples of a batch of the sdf stage the intensity network sees in a joint iteration."""
+    """Return the number of samples of a batch that the intensity network sees in a joint iteration."""
     return batch_size if config.training.intensity_in_free_space else near_and_labelled(config, batch_size)[1]
 
 
@@ -57,10 +57,10 @@ class Samples:
 
     points: Tensor  # (B, 3) float32, local frame, m
     sdf_m: Tensor  # (B,) label: distance along the ray to the return, m, positive in front of it
-    num_labelled: int  # of the first ones, the intensities are labels
+    num_labelled: int  # number of leading samples with intensity labels
     of_ray: Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; perhaps scaled intensity
-    share: float = 1.0  # of a part of a batch: what its mean counts in that of the whole; 0 without samples
-    labelled_share: float = 1.0  # the same of the samples with labels
+    share: float = 1.0  # weight of the mean of a part in that of the batch; 0 without samples
+    labelled_share: float = 1.0  # the same for the labelled samples
 
     @property
     def directions(self) -> Tensor:
@@ -77,18 +77,18 @@ class Samples:
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples in parts, one part after the other. Each part is the work of one thread."""
+    """Samples in consecutive parts. One thread processes each part."""
 
     points: NDArray[np.float32]  # (B, 3), see :class:`Samples`
     sdf_m: NDArray[np.float32]  # (B,)
     of_ray: NDArray[np.float32]  # (B, 7 or 8)
-    parts: list[tuple[int, int]]  # number of samples of each part, and how many of the first ones have labels
+    parts: list[tuple[int, int]]  # numbers of samples and of leading labelled samples of each part
 
     def split(self) -> list[Samples]:
         sizes, labelled = map(list, zip(*self.parts, strict=True))
         arrays = map(torch.from_numpy, (self.points, self.sdf_m, self.of_ray))
         columns = [torch.split_with_sizes(column, sizes) for column in arrays]
-        # Parts need not be equal, and of a small batch some are empty. Of n equal ones each counts 1 / n, to the last bit.
+        # Parts may differ in size, and some of a small batch are empty. Each of n equal parts has the exact share 1 / n.
         shares = ([count / max(sum(counts), 1) for count in counts] for counts in (sizes, labelled))
         return [
             Samples(x, sdf, num_labelled, of_ray, *shares_of_part)
@@ -97,12 +97,12 @@ class Batch:
 
 
 class RaySampler:
-    """Draws batches of samples from rays, N of them, with scaled intensities (N,) or none.
+    """Draw batches of samples from N rays, with scaled intensities (N,) or None.
 
-    Rays are taken in random order without replacement, and positions on them are random. A batch has one sample near the
-    surface and one in free space on each of its rays, instead of all twelve on a twelfth of the rays: so its gradient
-    covers more of the scene. So many `neighbours` that follow each other in Morton order of their returns are taken together:
-    in a large map, the rays of a batch would otherwise share no cache lines. The caller saves the state of the `generator`.
+    Rays are drawn in random order without replacement, with random positions on them. A batch has one sample near the
+    surface and one in free space on each of its rays, instead of all twelve on a twelfth of the rays, so its gradient covers
+    more of the scene. Runs of `neighbours` rays, consecutive in Morton order of their returns, are drawn together: in a large
+    map, the rays of a batch would otherwise share no cache lines. The caller saves the state of the `generator`.
     """
 
     def __init__(
@@ -120,15 +120,15 @@ class RaySampler:
         self._generator = generator
         self._rays = _in_morton_order(rays, intensities, config.leaf_size_m, num_threads)
         self._runs = np.zeros(0, np.int32)  # runs of neighbours, in random order
-        self._next = 0  # ray in that order
+        self._next = 0  # position of the next ray in that order
         self._order_from = generator.get_state()  # before the order was drawn
         near, labelled = near_and_labelled(config, batch_size)
-        # Samples with labels come first, and a batch without them is in Morton order.
+        # Labelled samples come first; a batch without labels is in Morton order.
         self._counts = (near if intensities is None else labelled, near, batch_size - near)
         self._layouts: dict[tuple[int, ...], _Layout] = {}
 
     def state(self) -> dict[str, Tensor]:
-        """The order of the rays, as a state of the generator, and the position in it: -1 before the first batch."""
+        """Return the order of the rays, as a generator state, and the position in it: -1 before the first batch."""
         following = self._next if len(self._runs) else -1
         following_ray = torch.tensor(following, dtype=torch.int64, device="cpu")
         return {"order_from": self._order_from, "next": following_ray}
@@ -150,8 +150,8 @@ class RaySampler:
         self._runs, self._next = runs.numpy(), 0
 
     def _take(self, count: int) -> NDArray[np.int64]:
-        """Rows of the next `count` rays of the random order, ascending: in Morton order of their returns."""
-        # A whole pass takes every ray once, in any order: of few rays, a batch would draw hundreds of orders.
+        """Return the rows of the next `count` rays of the random order, ascending: in Morton order of their returns."""
+        # A whole pass takes every ray once, in any order: with few rays, a batch would draw hundreds of permutations.
         passes, count = divmod(count, len(self._rays))
         parts = [np.repeat(np.arange(len(self._rays)), passes)] if passes else []
         while count > 0:
@@ -167,10 +167,10 @@ class RaySampler:
         return np.sort(np.concatenate(parts))
 
     def spread(self, count: int, parts: int = 1) -> Batch:
-        """`count` samples in the near band, in `parts`, with the sensor's angular noise across the beam."""
+        """Draw `count` samples in the near band, in `parts`, with the sensor's angular noise across the beam."""
         batch, noise_rad = self._draw((count, count, 0), parts), self._config.training.cross_range_noise_rad
         if noise_rad > 0:
-            # Noise in all directions is simpler. Along the beam it is small compared with the width of the band.
+            # Isotropic noise is simpler. Along the beam it is small compared with the width of the band.
             noise = torch.randn(
                 count, 3, generator=self._generator, dtype=torch.float32, device="cpu"
             ).numpy()
@@ -178,7 +178,7 @@ class RaySampler:
         return batch
 
     def batch(self, parts: int = 1) -> Batch:
-        """`batch_size` samples, in `parts`, each with its share of near and free samples."""
+        """Draw `batch_size` samples, in `parts`, each with its share of near and free samples."""
         return self._draw(self._counts, parts)
 
     def _draw(self, counts: tuple[int, int, int], parts: int) -> Batch:
@@ -192,8 +192,8 @@ class RaySampler:
 def _in_morton_order(
     rays: Rays, intensities: Tensor | None, leaf_size_m: float, num_threads: int
 ) -> NDArray[np.float32]:
-    """:attr:`Samples.of_ray` of all rays, in Morton order of their returns."""
-    # All numbers of a ray are in one row of 32 bytes, half a cache line: a batch reads them by one index_select.
+    """Return :attr:`Samples.of_ray` for all rays, in Morton order of their returns."""
+    # A ray is one row of 32 bytes, half a cache line: a batch reads it by one gather.
     order = stable_order(cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
     columns = [rays.points, rays.directions, rays.ranges_m[:, None]]
     if intensities is not None:
@@ -204,27 +204,27 @@ def _in_morton_order(
 
 
 def share(count: int, part: int, parts: int) -> int:
-    """How many of `count` things the `part`-th of `parts` gets."""
+    """Return the size of the `part`-th of `parts` of `count` items."""
     return count * (part + 1) // parts - count * part // parts
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """The order of the B samples of a batch, each drawn uniformly from a segment of its ray: part by part, near ones first."""
+    """Layout of the B samples of a batch, each uniform on a segment of its ray: by part, near samples first."""
 
-    ray: NDArray[np.int32]  # (B,) row of each sample's ray among the rays that were taken
-    # (B,) of its random number: its row if all near samples of the batch came first, so that no sample depends on `parts`
+    ray: NDArray[np.int32]  # (B,) row of each sample's ray among the rays drawn
+    # (B,) index of its random number: its row with all near samples of the batch first, so that samples do not depend on `parts`
     number: NDArray[np.int32]
     kind: NDArray[np.uint8]  # (B,) row of its segment
-    segments: NDArray[np.float32]  # (2, 4) of near and of free samples, see the core's ``draw_samples``
+    segments: NDArray[np.float32]  # (2, 4) of near and free samples, see the core's ``draw_samples``
     parts: list[tuple[int, int]]  # see :class:`Batch`
 
     @classmethod
     def of(cls, counts: tuple[int, int, int], parts: int, config: FitConfig) -> _Layout:
-        """`counts`: near samples whose intensities are labels, all near samples, free samples."""
+        """Build from `counts` of labelled near samples, all near samples and free samples."""
         num_labelled, num_near, num_free = counts
         taken = max(num_near, num_free)
-        # Fewer samples of one kind are spread evenly over the rays, so that they cover the whole scene too.
+        # The less frequent kind is spread evenly over the rays, so that it covers the whole scene too.
         near_rays, free_rays = (np.arange(n) * taken // max(n, 1) for n in (num_near, num_free))
         chosen = np.zeros(num_near, np.bool_)
         chosen[_spread(num_labelled, num_near)] = True
@@ -243,7 +243,7 @@ class _Layout:
 
 
 def _spread(count: int, of: int) -> NDArray[np.int64]:
-    """`count` numbers of range(`of`), evenly spread, ascending. With jitter, since rays are taken in runs."""
+    """Return `count` of range(`of`), ascending and evenly spaced, with jitter, since rays are drawn in runs."""
     numbers = np.arange(count)
     jittered = numbers + numbers * _GOLDEN % 1
     spread: NDArray[np.int64] = np.minimum(jittered * of // max(count, 1), of - 1).astype(np.int64)
@@ -251,24 +251,24 @@ def _spread(count: int, of: int) -> NDArray[np.int64]:
 
 
 def draw_seed(generator: torch.Generator) -> int:
-    """A random seed of the core's random numbers."""
+    """Draw a seed for the core's random numbers."""
     return int(torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator))
 
 
 @dataclass(frozen=True)
 class Dropout:
-    """Which numbers of a matrix are kept. PyTorch's own dropout draws from the global generator."""
+    """Dropout mask of a matrix. PyTorch's own dropout draws from the global generator."""
 
-    seed: int  # of the random bytes, one for each number of the matrix
-    keep: int  # numbers whose byte is below this are kept, from 1 to 256
+    seed: int  # seed of the random bytes, one for each element of the matrix
+    keep: int  # elements with a byte below this are kept, from 1 to 256
 
     @classmethod
     def draw(cls, dropout: float, generator: torch.Generator) -> Dropout:
-        """`dropout`: probability that a number is dropped."""
+        """Draw a seed. `dropout`: probability that an element is dropped."""
         return cls(draw_seed(generator), round(256 * (1 - dropout)))
 
     def factors(self, rows: int, columns: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(rows, columns): 0 for dropped numbers, 256 / keep for the others, so that the mean is 1."""
+        """Return factors (rows, columns): 0 for dropped elements, 256 / keep for the others, so that the mean is 1."""
         bytes_ = random_bytes(self.seed, rows, columns)
         # not < keep: 256 does not fit into a byte
         return torch.from_numpy(bytes_ <= self.keep - 1).to(dtype) * (256 / self.keep)

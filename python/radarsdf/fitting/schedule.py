@@ -10,29 +10,29 @@ from dataclasses import dataclass
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.sampling import FREE_SAMPLES, NEAR_SAMPLES
 
-# The sdf stage makes so many passes over the samples, within these limits. If they contradict each other, the least
-# number of iterations wins over the most passes and the most samples. Measured with SOAP: 0.6 of Adam's iterations are as
-# good to 0.1 points of F-score; half of the passes lose 0.2.
+# Passes of the sdf stage over the samples, within the limits below. If these conflict, the minimum number of iterations
+# takes precedence over the maximum of passes and of samples. Measured with SOAP: 0.6 of Adam's iterations are as good to
+# 0.1 points of F-score; half of the passes lose 0.2.
 _SDF_PASSES = 0.6
 _LEAST_SDF_ITERATIONS = 150  # with fewer, the surface of a small scene is unfinished
 _ENOUGH_SDF_ITERATIONS = 180  # with fewer, the networks have not converged
 _MOST_SDF_PASSES = 1.2  # with more over few returns, the field memorises their noise
 _MOST_SAMPLES_PER_VERTEX = 20.0
-# Where that takes more iterations than these, half of it. Measured on `hugin` and `oculii` of 600 scans and on eight
-# `hugin` side by side: 0.0 to 0.1 points of F-score less in half the training.
+# If the limit on samples allows more iterations than this, half of it. Measured on `hugin` and `oculii` with 600 scans and
+# on eight `hugin` side by side: 0.0 to 0.1 points of F-score less in half the training.
 _MANY_SDF_ITERATIONS = 300
-# Beyond this, batches grow: one of the usual size touches little of so large a map.
+# Beyond this, batches grow: one of the usual size covers little of so large a map.
 _MOST_SDF_ITERATIONS = 5000
 
-# The training of the intensity network makes this many passes over the samples near the surface, within these limits.
-# Joint iterations count. Measured with SOAP: 0.4 of Adam's iterations have the same error to 0.4 %.
+# Passes of the intensity network's training over the samples near the surface, joint iterations included, within the
+# limits below. Measured with SOAP: 0.4 of Adam's iterations have the same error to 0.4 %.
 _INTENSITY_PASSES = 0.65
 _LEAST_INTENSITY_ITERATIONS = 500  # with fewer, it has not converged on a small scene
 _MOST_INTENSITY_ITERATIONS = 1750
-# After the joint iterations, since the field moves under the network until then.
+# Minimum after the joint iterations, during which the field still changes.
 _LEAST_INTENSITY_STAGE = 300
 
-_HALF_DROPOUT_PASSES = 2.5  # a fit that uses each sample so often has half of the configured dropout
+_HALF_DROPOUT_PASSES = 2.5  # uses of each sample at which dropout has half of the configured rate
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Schedule:
     batch_size: int = 0  # samples in an iteration of the sdf stage
     neighbours: int = 1  # neighbouring rays that a batch takes together
     sdf_iterations: int = 0
-    passes: float = 0.0  # how often the sdf stage uses each sample
-    intensity_iterations: int = 0  # that train the intensity network
+    passes: float = 0.0  # passes of the sdf stage over the samples
+    intensity_iterations: int = 0  # iterations that train the intensity network
     intensity_batch_size: int = 0
     dropout_scale: float = 0.0  # factor on the dropout
 
@@ -51,7 +51,7 @@ class Schedule:
     def of(
         cls, config: FitConfig, *, surface_returns: int, returns: int, vertices: int, with_intensity: bool
     ) -> Schedule:
-        """The schedule for `surface_returns` returns without ghosts, `returns` with them."""
+        """Compute the schedule for `surface_returns` returns without ghosts, and `returns` with them."""
         if not config.train:
             return cls()
         training = config.training
@@ -59,7 +59,7 @@ class Schedule:
         batch_size, iterations = training.batch_size, training.sdf_iterations
         if iterations is None:
             batch_size, iterations = _sdf_schedule(config, samples, vertices)
-        # A larger batch takes more rays at as many places: rays at the same place share cache lines.
+        # A larger batch draws longer runs of rays at as many places: neighbouring rays share cache lines.
         neighbours = max(1, batch_size // training.batch_size)
         surface = (batch_size, neighbours, iterations, iterations * batch_size / samples)
         if not with_intensity:
@@ -72,8 +72,8 @@ class Schedule:
             intensity_iterations = _intensity_iterations(config, samples, iterations)
         if training.intensity_in_free_space:  # the samples are those of the sdf stage
             intensity_batch_size = batch_size
-        # A sample that is used often is easily memorised. Measured: the same dropout for all scenes (0.7 and
-        # 0.2) is as good on sparse ones, but costs 2 % on a dense one, which uses its samples twice.
+        # A frequently used sample is easily memorised. Measured: constant dropout for all scenes (0.7 and 0.2)
+        # is as good on sparse ones, but costs 2 % on a dense one, which uses its samples twice.
         times_used = intensity_iterations * intensity_batch_size / samples
         dropout_scale = times_used / (times_used + _HALF_DROPOUT_PASSES)
         return cls(*surface, intensity_iterations, intensity_batch_size, dropout_scale)
@@ -84,8 +84,8 @@ class Schedule:
 
 
 def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, int]:
-    # Few returns: what is learnt from more samples than those of a pass is the same again. Measured on 20 to 300 returns
-    # of four simulated scenes: errors are as small, and 20 take a quarter of the time.
+    # With few returns, a batch of more than one pass is redundant. Measured on 20 to 300 returns of four simulated
+    # scenes: errors are as small, and 20 take a quarter of the time.
     batch_size = min(config.training.batch_size, samples)
     one_pass = samples / batch_size
     wanted = max(_SDF_PASSES * one_pass, min(_ENOUGH_SDF_ITERATIONS, _MOST_SDF_PASSES * one_pass))
@@ -98,7 +98,7 @@ def _sdf_schedule(config: FitConfig, samples: int, vertices: int) -> tuple[int, 
 
 
 def _intensity_iterations(config: FitConfig, samples: int, joint: int) -> int:
-    """Iterations that train the intensity network, the `joint` ones of the sdf stage included."""
+    """Return the iterations that train the intensity network, the `joint` ones of the sdf stage included."""
     wanted = math.ceil(_INTENSITY_PASSES * samples / config.training.intensity_batch_size)
     wanted = min(max(wanted, _LEAST_INTENSITY_ITERATIONS), _MOST_INTENSITY_ITERATIONS)
     return max(1, joint + round(config.effort * max(wanted - joint, _LEAST_INTENSITY_STAGE)))

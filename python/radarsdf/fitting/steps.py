@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From rays to a map: the steps of a fit, in order."""
+"""Steps of a fit, from rays to a map."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from radarsdf.threads import ThreadPool
 
 @dataclass(frozen=True)
 class FitInput:
-    """What a fit starts from. Whatever is None follows from these rays."""
+    """Input of a fit. Fields that are None are computed from the rays."""
 
-    rays: Rays  # all, scan by scan
-    scale: IntensityScale | None  # of their intensities
-    poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans; only used without a `sensor`
-    moving: int = 0  # returns that were left out because they move
+    rays: Rays  # all rays, scan by scan
+    scale: IntensityScale | None  # scale of their intensities
+    poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans, used to estimate the `sensor`
+    moving: int = 0  # number of moving returns left out
     why_none_moving: str | None = None  # see :class:`radarsdf.returns.moving.MovingReturns`
     inside: NDArray[np.bool_] | None = None
-    """(N,) returns that the map is made of, whole leaf cells of them. The other rays only show what they crossed. None: all."""
+    """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
     clutter_ratio: float | None = None  # share of the returns that lie on no thin surface
-    returns_per_cell: float | None = None  # mean number in the cells of surfels
+    returns_per_cell: float | None = None  # mean number of returns in the cells of surfels
     sensor: Sensor | None = None
     box_cells: NDArray[np.int64] | None = None
-    """(2, 3) leaf cells from the origin; what rays crossed outside [lower, upper) is not kept. None: all is."""
-    sums: ScanSums | None = None  # over the scans of the rays, if they were kept up scan by scan
-    visibility: VisibilityCounts | None = None  # visibility counts, likewise
+    """(2, 3) box [lower, upper) of free-space crossings to store, leaf cells from the origin. None: no limit."""
+    sums: ScanSums | None = None  # sums over the scans of the rays, if updated incrementally
+    visibility: VisibilityCounts | None = None  # visibility counts, if updated incrementally
 
 
 def fit_rays(
@@ -62,9 +62,9 @@ def fit_rays(
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
 ) -> RadarMap:
-    """Fits a map to what `read` returns. See :func:`radarsdf.fit`, also for errors."""
+    """Fit a map to the input that `read` returns. See :func:`radarsdf.fit`, also for errors."""
     try:
-        # A map that is made in inference mode could not give gradients later.
+        # A map created in inference mode could not compute gradients later.
         with torch.inference_mode(mode=False), ThreadPool(config.num_threads) as pool:
             contents, stop = _fit(read, config, progress, checkpoint, pool)
     except KeyboardInterrupt as interruption:
@@ -85,7 +85,7 @@ def _fit(
     checkpoint: str | PathLike[str] | None,
     pool: ThreadPool,
 ) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
-    """The contents of the map, and why the training ended early, if it did."""
+    """Return the contents of the map, and the reason for an early end of the training, if any."""
     num_threads, clock = pool.num_threads, [time.perf_counter()]
     seconds: dict[str, float] = {}
 
@@ -123,11 +123,11 @@ def _fit(
     closes = learnt.intensities is not None and config.closes_intensity
     of_intensity = (learnt, surface.surfels) if closes else None
     surface_rays = surface.rays
-    del given, surface, returns, leaf_keys  # most of the memory, of which the training makes use again
+    del given, surface, returns, leaf_keys  # frees most of the memory for the training
     stop: KeyboardInterrupt | Diverged | None = None
     if isinstance(field, NeuralField):
         training = Training(field, surface_rays, learnt, scale, schedule, config, pool)
-        del surface_rays, learnt  # of which the training has a copy
+        del surface_rays, learnt  # the training has a copy
         if saved is not None:
             saved.resume(training)
         try:
@@ -135,8 +135,8 @@ def _fit(
         except (KeyboardInterrupt, Diverged) as early:
             stop = early
         report.update(training.report())
-        del training  # rays and moments, of which the closed form has no need
-    # What a network that diverged leaves of the intensities can be anything.
+        del training  # frees rays and moments, which the closed form does not need
+        # The residuals of a diverged network are arbitrary.
     if of_intensity is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
         field.reflectance = closed_form(contents, *of_intensity, num_threads)
     field.requires_grad_(False)
@@ -156,7 +156,7 @@ def _contents(
     config: FitConfig,
     num_threads: int,
 ) -> MapContents:
-    """The map, with the field as it is before the training."""
+    """Return the contents of the map, with the untrained field."""
     rays, scale, surfels, leaf_m = given.rays, given.scale, surface.surfels, config.leaf_size_m
     sensor, clutter_ratio, returns_per_cell = given.sensor, given.clutter_ratio, given.returns_per_cell
     if sensor is None:
@@ -194,7 +194,7 @@ def _report(
     schedule: Schedule,
     config: FitConfig,
 ) -> dict[str, Any]:
-    """What the map's report says before the training."""
+    """Return the report of the map before the training."""
     cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
     sizes = {"returns": len(learnt), "cells": cells, "rows": rows}
     skipped: list[tuple[str, float | None]] = []

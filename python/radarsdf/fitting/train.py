@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Stage 2: trains the parameters of a field. First the surface, then reflectance on the frozen surface."""
+"""Stage 2: training of a field. First the surface, then reflectance on the frozen surface."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.rays import Rays
 from radarsdf.threads import ThreadPool
 
-_GENERATORS = 2  # random generators of a fit: for samples, for dropout
-_CHECK_EVERY = 100  # iterations. To check and copy all parameters in each would take a tenth of its time
-_MOST_SPANS = 200  # of the history of each loss: enough for a plot, little in the file of a map
-_KEPT = 0.99  # of the sums that show a divergence, in each iteration: they are of about the last hundred
+_GENERATORS = 2  # number of random generators: for samples, for dropout
+_CHECK_EVERY = 100  # iterations. Checking and copying all parameters in each would take a tenth of the time
+_MOST_SPANS = 200  # maximum length of the history of a loss: enough for a plot, small in the file of a map
+_KEPT = 0.99  # decay per iteration of the sums that detect divergence: about the last hundred count
 _WORST = {
     "sdf": "more than if all distances had the wrong sign",
     "intensity": "more than the whole range of intensities",
@@ -48,8 +48,8 @@ class Interrupted(KeyboardInterrupt):
     Attributes
     ----------
     radar_map : RadarMap or None
-        The map so far, which can be used like any other. None if the training had not begun. In its
-        ``report``, ``iterations_done`` is less than ``iterations``.
+        The map so far, usable like any other, with ``iterations_done`` below ``iterations`` in its ``report``.
+        None if the training had not begun.
     """
 
     def __init__(self, radar_map: RadarMap | None = None) -> None:
@@ -58,28 +58,28 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Diverged(FloatingPointError):
-    """A loss or a parameter is not finite, or a loss is worse than any answer of the right size.
+    """A loss or a parameter is not finite, or a loss exceeds that of the worst plausible prediction.
 
-    The message names it, the stage and the iteration.
+    The message names the loss or parameter, the stage and the iteration.
 
     Attributes
     ----------
     radar_map : RadarMap or None
-        The last state that was checked and good, at most 100 iterations before.
+        The last state that passed the check, at most 100 iterations before.
     """
 
     radar_map: RadarMap | None = None
 
 
 class LossHistory:
-    """Mean losses in each of some equal spans of the iterations, and whether they show a divergence."""
+    """Mean losses in equal spans of the iterations, and detection of divergence."""
 
     def __init__(self, iterations: Mapping[str, int], config: FitConfig) -> None:
         self._iterations = dict(iterations)
         self._sigma_m = config.sigma_m
-        # A row for each span: iterations done, sum of their losses, seconds of training at their end.
+        # A row for each span: iterations done, sum of their losses, training time at their end, s.
         self._spans = {name: np.zeros((min(n, _MOST_SPANS), 3)) for name, n in iterations.items()}
-        # A row for each loss: iterations, their losses, and those of the worst answers, fading.
+        # A row for each loss: exponentially decaying sums of iterations, losses, and losses of the worst plausible prediction.
         self._recent = np.zeros((len(_WORST), 3))
         self._started_s = time.perf_counter()
 
@@ -88,10 +88,10 @@ class LossHistory:
         self._started_s = time.perf_counter() - before_s
 
     def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: NDArray[Any]) -> None:
-        """Adds the losses of an iteration, after which so many are `done`, of samples with these labels (B,), m."""
+        """Add the losses of an iteration on samples with labels `sdf_m` (B,), m. `done`: iterations done, it included."""
         now_s = time.perf_counter() - self._started_s
-        # Distances with the wrong sign have a cross-entropy of less than 1 + distance / sigma, and intensities from 0 to
-        # 1 an absolute error of at most 1.
+        # The cross-entropy of distances with the wrong sign is below 1 + distance / sigma, and the absolute error of
+        # intensities from 0 to 1 is at most 1.
         worst = {"sdf": 1 + float(np.abs(sdf_m).mean()) / self._sigma_m, "intensity": 1.0}
         self._recent *= _KEPT
         for row, name in enumerate(_WORST):
@@ -103,14 +103,14 @@ class LossHistory:
                 span[2] = now_s
 
     def fault(self) -> str | None:
-        """A loss that is worse than any answer of the right size over about a hundred iterations."""
+        """Describe a loss that exceeds that of the worst plausible prediction over about a hundred iterations, if any."""
         for (count, loss, worst), (name, words) in zip(self._recent, _WORST.items(), strict=True):
             if loss > worst:
                 return f"the {name} loss is {loss / count:.3g}, {words},"
         return None
 
     def to_report(self) -> dict[str, dict[str, list[Any]]]:
-        """For each loss and span: iterations done at its end, mean loss, seconds of training."""
+        """Return for each loss and span the iterations done at its end, the mean loss and the training time, s."""
         found = {}
         for name, spans in self._spans.items():
             begun = spans[spans[:, 0] > 0]
@@ -132,22 +132,22 @@ class LossHistory:
 
 @dataclass(frozen=True)
 class _Stage:
-    """A stage of the training."""
+    """Stage of the training."""
 
     name: str
     losses: Losses
     iterations: int
     done_before: int  # iterations of the sdf stage that count for this stage too
-    optimisers: list[Optimiser]  # of the parameters that are trained, in the order of their gradients
-    rows: RowAdam | None  # optimiser of the features if only the touched ones move
+    optimisers: list[Optimiser]  # optimisers of the trained parameters, in the order of their gradients
+    rows: RowAdam | None  # optimiser of the features if only touched rows move
     draw: Callable[[], Batch]
 
 
 class Training:
-    """Trains `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
+    """Train `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
 
-    In the sdf stage the intensity network, if there is one, trains too: its iterations are joint ones. Ghosts are not part of
-    the surface, but the sensor will see them again, so their intensities are learnt. Without a `scale` there are none.
+    In the sdf stage the intensity network, if any, trains too: these are joint iterations. Ghosts are not part of the surface,
+    but the sensor will see them again, so their intensities are learnt. `scale` is None without intensities.
     """
 
     def __init__(
@@ -171,9 +171,9 @@ class Training:
         self._generator, of_dropout = (torch.Generator("cpu").manual_seed(seed) for seed in seeds)
         self._backend = kind(field, config, schedule.dropout_scale, of_dropout, pool)
         self._scale = None if network is None else scale
-        # A sampler has its own copy of the rays: there is one at a time.
+        # A sampler copies the rays, so only one exists at a time.
         self._sampler = self._sampler_of(surface)
-        # Returns from which the intensity stage draws. None: those of the sampler.
+        # Returns of the intensity stage. None: those of the current sampler.
         self._later = None if returns is surface or self._scale is None else returns
         self._rows: RowAdam | None = None
         self._optimisers: dict[str, Optimiser] = {}
@@ -201,7 +201,7 @@ class Training:
             self._sampler, self._later = self._sampler_of(self._later), None
 
     def state(self) -> dict[str, Tensor]:
-        """All that the rest of the training depends on, between two iterations. Tensors are not copied."""
+        """Return all that the rest of the training depends on, between two iterations, without copying tensors."""
         losses = [self.losses.get(name, 0.0) for name in self.iterations_done]
         state = {
             "done": torch.tensor(list(self.iterations_done.values()), dtype=torch.int64, device="cpu"),
@@ -215,7 +215,7 @@ class Training:
         return state
 
     def _parts(self) -> Iterable[tuple[str, Any]]:
-        """What has a state of its own, by name."""
+        """Yield the stateful parts by name."""
         yield from (("history", self.history), ("backend", self._backend), ("sampler", self._sampler))
         if self._rows is not None:
             yield "rows", self._rows
@@ -223,7 +223,7 @@ class Training:
             yield f"optimiser.{name}", optimiser
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Restores what :meth:`state` of the same fit returned. Raises a ValueError if it is impossible."""
+        """Restore a :meth:`state` of the same fit. Raise a ValueError if it is invalid."""
         done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
         if not all(0 <= done[name] <= self.iterations[name] for name in done):
             msg = f"{done} iterations of {self.iterations}"
@@ -245,9 +245,9 @@ class Training:
         return {name: getattr(self, name) for name in names} | {"loss_history": self.history.to_report()}
 
     def run(self, progress: bool | None, checkpoint: Checkpoint | None = None) -> None:
-        """Runs all iterations that are left.
+        """Run all remaining iterations.
 
-        Raises :class:`Diverged`, and the field then has the last parameters that were checked and good; or after Ctrl-C a
+        Raises :class:`Diverged`, with the field reset to the last parameters that passed the check; or after Ctrl-C a
         KeyboardInterrupt, between two iterations.
         """
         stages = self._stages()
@@ -268,7 +268,7 @@ class Training:
                 raise KeyboardInterrupt
 
     def _stages(self) -> list[_Stage]:
-        """The sdf stage, then the intensity stage if it has iterations."""
+        """Return the sdf stage, and the intensity stage if it has iterations."""
         joint = "intensity" in self._optimisers
         iterations, optimisers = self.iterations["sdf"], list(self._optimisers.values())
         losses: Losses = "joint" if joint else "sdf"
@@ -280,11 +280,11 @@ class Training:
         return stages
 
     def _batch(self) -> Batch:
-        """A batch of the sdf stage."""
+        """Draw a batch of the sdf stage."""
         return self._sampler.batch(self._backend.num_parts(self._schedule.batch_size))
 
     def _labelled_batch(self) -> Batch:
-        """A batch of the intensity stage, after the last one of the sdf stage."""
+        """Draw a batch of the intensity stage, after the last one of the sdf stage."""
         self._draw_from_all_returns()
         if self._config.training.intensity_in_free_space:
             return self._batch()
@@ -312,14 +312,14 @@ class Training:
 
         ahead: Batch | None = None
         for i in range(self._done(stage), iterations):
-            # Each stage starts at the full learning rate, also for an optimiser that an earlier stage used.
+            # Each stage starts at the full learning rate, even if an earlier stage used the optimiser.
             cosine = 0.5 * (1 + math.cos(math.pi * i / iterations))
             share = cosine if self._config.training.optimiser == "soap" else 1.0
             stop = interrupted()
             write = checkpoint is not None and (stop or checkpoint.due())
             judge = i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
             pause = stop or write or judge
-            # No samples are drawn ahead before the state is written: it would contain the draw after the next.
+            # Samples are not prefetched before the state is written: it would include their draw.
             batch = ahead or stage.draw()
             found, ahead = self._backend.of(stage.losses, batch, _nothing if pause else stage.draw)
             loss = sum(found.losses.values())
@@ -337,12 +337,12 @@ class Training:
             for name in counts:
                 self.iterations_done[name] = min(stage.done_before + i + 1, self.iterations[name])
             self.history.add(found.losses, self.iterations_done, batch.sdf_m)
-            # Gradients of all features are as large as these: not two at once.
+            # Gradients of all features are as large as the features: free them before the next ones.
             del batch, found, move_networks
             bar.set_postfix_str(f"{stage.name} loss {loss:.3g}", refresh=False)
             bar.update()
             if pause:
-                # A sum is finite only if all numbers are. A sum that overflows is no better.
+                # A sum is finite only if all terms are. Overflow is a fault, too.
                 if not all(math.isfinite(float(p.detach().sum())) for p in changing):
                     give_up("a parameter is not finite")
                 if judge and (fault := self.history.fault()):
@@ -358,7 +358,7 @@ class Training:
 def _move_networks(
     found: Gradients, optimisers: list[Optimiser], share: float, pool: ThreadPool | None = None
 ) -> None:
-    """Changes the networks by the gradients."""
+    """Update the networks by the gradients."""
     total = iter(found.by_parameters)
     for optimiser in optimisers:
         optimiser.learning_rate = share * optimiser.full_rate
@@ -366,4 +366,4 @@ def _move_networks(
 
 
 def _nothing() -> None:
-    """Runs meanwhile where no samples are drawn ahead."""
+    """Stand in for the prefetch of a batch."""

@@ -35,7 +35,7 @@ class Surfels:
     centres: NDArray[np.float64]  # (P, 3) weighted mean of the returns, local, m
     normals: NDArray[np.float64]  # (P, 3) unit vectors towards the sensors
     variances: NDArray[np.float64]  # (P, 3) variances of the returns along the principal axes, ascending, m²
-    widest: NDArray[np.float32] | None = None  # (P, 3) principal axes of the largest variance, unit vectors, in a batch
+    widest: NDArray[np.float32] | None = None  # (P, 3) axes of the largest variance, unit vectors, in a batch
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:

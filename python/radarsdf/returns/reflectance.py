@@ -36,7 +36,7 @@ _ROUNDS = 2  # four are no better
 _MOST_RETURNS, _MOST_ASKED = 200_000, 50_000
 _GROUPS = np.array([[2.5, 0.25, 0.12]])  # a kind of cells, as above
 _CORRELATION = 0.1  # intra-group correlation: the effective number of n returns is n / (1 + 0.1 (n - 1))
-_LEAST_MEAN = 0.005  # smallest stored mean, share of the intensity range. A third are smaller and predict nothing
+_LEAST_MEAN = 0.005  # smallest stored mean, share of the intensity range. A third are smaller and useless
 
 # With a network, the prediction averages the network's and `_NETWORK_TIMES` the network's plus its closed-form residual.
 # Half of the residual, since the rest is noise of the returns that the network was trained on; and half of the network's

@@ -147,7 +147,7 @@ class MeanRays:
 
     keys: NDArray[np.uint64]  # (M,) Morton keys of the cells, ascending
     points: NDArray[np.float32]  # (M, 3) mean of the returns in each cell, local, m
-    directions: NDArray[np.float32]  # (M, 3) mean of their directions, unit vectors; downwards if that is zero
+    directions: NDArray[np.float32]  # (M, 3) unit vectors of their mean direction; downwards if it is zero
     counts: NDArray[np.float32]  # (M,) number of returns in each cell
     scans: NDArray[np.uint32]  # (M,) number of different scans with returns in each cell
     ranges_m: NDArray[np.float32]  # (M,) mean range of the returns in each cell, m
