@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Grids for planners: what is occupied, free and unknown, distances, heights for wheels, and their files."""
+"""Grids for planners: occupied, free and unknown voxels, distances, costmaps, and their files."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files of grids: OctoMap's binary octree, and ROS's map_server (YAML and PGM)."""
+"""File formats of grids: OctoMap's binary octree, and ROS's map_server (YAML and PGM)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from radarsdf.io.files import check_outputs, write_whole
 
-_PIXELS = np.array([254, 0, 205], np.uint8)  # as map_saver writes free, occupied and unknown
-_LEVELS = 16  # of OctoMap's octree
-_HALF = 1 << (_LEVELS - 1)  # voxels from the middle of the tree to its border
-_MOST_OFF = 0.01  # voxels: rounding of the origin
+_PIXELS = np.array([254, 0, 205], np.uint8)  # grey values of map_saver for free, occupied and unknown
+_LEVELS = 16  # depth of OctoMap's octree
+_HALF = 1 << (_LEVELS - 1)  # half width of the tree, voxels
+_MOST_OFF = 0.01  # tolerance for rounding of the origin, voxels
 _FREE, _OCCUPIED, _INNER = 1, 2, 3
 
 
 def check_suffix(path: Path, *suffixes: str) -> None:
-    """Raise a ValueError for a path that ends otherwise."""
+    """Raise a ValueError if `path` has another suffix."""
     if path.suffix not in suffixes:
         msg = f"{path} must end in {', '.join(suffixes)}"
         raise ValueError(msg)
@@ -30,7 +30,7 @@ def write_map_server(path: Path, state: NDArray[np.int8], origin: NDArray[np.flo
     check_suffix(path, ".yaml")
     image = path.with_suffix(".pgm")
     check_outputs([path, image])
-    rows = np.ascontiguousarray(_PIXELS[state].T[::-1])  # the first row of an image is the last of y
+    rows = np.ascontiguousarray(_PIXELS[state].T[::-1])  # image rows are in descending order of y
     header = f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode()
     write_whole(image, header + rows.tobytes())
     quoted = image.name.replace("'", "''")
@@ -65,11 +65,11 @@ def write_octomap(path: Path, state: NDArray[np.int8], origin: NDArray[np.float6
 
 
 def _octree(keys: NDArray[np.int64], codes: NDArray[np.int64]) -> tuple[int, bytes]:
-    """Number of nodes, and two bytes for each inner node in depth-first order, of voxels (N, 3) with codes (N,).
+    """Encode voxels (N, 3) with codes (N,): number of nodes, and two bytes for each inner node in depth-first order.
 
-    The two bytes are the codes of its eight children, in the order of x, y, z with x first; 0: unknown.
+    The two bytes are the codes of its eight children, x varying fastest; 0: unknown.
     """
-    numbers = np.zeros(len(keys), np.int64)  # of Morton
+    numbers = np.zeros(len(keys), np.int64)  # Morton codes
     for bit in range(_LEVELS):
         for axis in range(3):
             numbers |= (keys[:, axis] >> bit & 1) << (3 * bit + axis)
@@ -78,13 +78,13 @@ def _octree(keys: NDArray[np.int64], codes: NDArray[np.int64]) -> tuple[int, byt
         parents, where = np.unique(numbers >> 3, return_inverse=True)
         word = np.zeros(len(parents), np.int64)
         np.bitwise_or.at(word, where, codes << (2 * (numbers & 7)))
-        # Eight children that are all free, or all occupied, become a leaf.
+        # Prune eight children that are all free, or all occupied, to a leaf.
         is_leaf = (word == 0x5555) | (word == 0xAAAA)
         size += int(np.count_nonzero(~is_leaf[where]))
         firsts.append(parents[~is_leaf] << (3 * level))
         levels.append(np.full(len(firsts[-1]), -level))
         words.append(word[~is_leaf])
         numbers, codes = parents, np.where(is_leaf, word & 3, _INNER)
-    # An inner node comes before what is in it: by the number of its first voxel, and the larger one first.
+    # Pre-order: sort by the number of the first voxel, larger nodes first.
     order = np.lexsort([np.concatenate(levels), np.concatenate(firsts)])
     return size, np.concatenate(words)[order].astype("<u2").tobytes()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A box of the world in voxels: occupied, free and unknown; and what planners derive from it."""
+"""Voxel grid of a box of the world, occupied, free and unknown, and the quantities that planners derive from it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from radarsdf.settings import settings
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 1
 LETHAL = 100
-"""Cost of a column that no wheel can enter, as in ROS."""
+"""Cost of a column that the vehicle cannot enter, as in ROS."""
 
 _Metres = Annotated[float, Field(gt=0, le=100)]
 
@@ -30,47 +30,47 @@ class DistanceField:
     """Euclidean distances from the centre of each voxel of a grid."""
 
     occupied_m: NDArray[np.float32]
-    """(X, Y, Z) to the centre of the nearest occupied voxel, m; in occupied ones minus that to the nearest other one. The
-    unknown does not count: infinite if nothing is occupied."""
+    """(X, Y, Z) distance to the centre of the nearest occupied voxel, m; in occupied voxels the negative distance to the
+    nearest other one. Unknown voxels do not count: infinite if nothing is occupied."""
     not_free_m: NDArray[np.float32]
-    """(X, Y, Z) to the centre of the nearest voxel that is not free or beyond the grid, m; 0 in voxels that are not free."""
+    """(X, Y, Z) distance to the centre of the nearest voxel that is not free or outside the grid, m; 0 if not free."""
     error_m: float
-    """Half a diagonal of a voxel, and the error of the surface's position, m. It is no bound: false returns and missing
+    """Half a diagonal of a voxel plus the position error of the surface, m. Not an upper bound: false returns and missing
     surface add to it."""
 
 
 @settings
 class Wheels:
-    """Limits of a vehicle, of which costs are shares."""
+    """Limits of a vehicle. Costs are relative to them."""
 
     max_slope_rad: Annotated[float, Field(gt=0, lt=1.5)] = 0.35
-    """The steepest ground that it climbs, rad."""
+    """Steepest ground that the vehicle climbs, rad."""
     max_step_m: _Metres = 0.15
-    """The highest step that its wheels climb, m."""
+    """Highest step that its wheels climb, m."""
     clearance_m: _Metres = 2.0
-    """Its height, m: nothing may hang lower over the ground."""
+    """Its height, m: overhanging objects must be higher above the ground."""
 
 
 @dataclass(frozen=True)
 class Costmap:
-    """Ground and costs in the columns of a grid. NaN, and a cost of -1, where the ground is unknown."""
+    """Ground and costs by column of a grid. NaN, and a cost of -1, where the ground is unknown."""
 
     height_m: NDArray[np.float32]
-    """(X, Y) height of the ground, world, m: the lowest surface with room for the vehicle above it."""
+    """(X, Y) height of the ground, world, m: the lowest surface that faces upwards."""
     slope_rad: NDArray[np.float32]
-    """(X, Y) of a plane through the heights of a column and its eight neighbours."""
+    """(X, Y) slope of the plane fitted to the heights of a column and its eight neighbours, rad."""
     step_m: NDArray[np.float32]
-    """(X, Y) largest difference of height from that plane among them, m."""
+    """(X, Y) largest residual of these heights, m."""
     clearance_m: NDArray[np.float32]
-    """(X, Y) from the ground to the first occupied voxel above it, m. Infinite where there is none."""
+    """(X, Y) distance from the ground to the first occupied voxel above it, m. Infinite where there is none."""
     cost: NDArray[np.int8]
-    """(X, Y) 0 to 99, the larger of the shares of the slope and of the step that the vehicle can do; 100 where one of
-    them or the clearance is too much for it, -1: unknown."""
+    """(X, Y) 0 to 99, the larger ratio of slope and step to the limits of the vehicle; 100 where a limit is exceeded or the
+    clearance too low, -1: unknown."""
 
 
 @dataclass(frozen=True)
 class FlatGrid:
-    """Occupied, free and unknown columns of a grid."""
+    """Two-dimensional grid of occupied, free and unknown columns."""
 
     origin: NDArray[np.float64]
     """(2,) lower corner of column (0, 0), world, m."""
@@ -80,12 +80,12 @@ class FlatGrid:
     """(X, Y) -1: unknown, 0: free, 1: occupied."""
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the grid as ROS's map_server reads it.
+        """Write the grid in the format of ROS's map_server.
 
         Parameters
         ----------
         path : path-like
-            ``NAME.yaml``. The image is written next to it, as ``NAME.pgm``.
+            ``NAME.yaml``. The image is written next to it as ``NAME.pgm``.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class FlatGrid:
 
 @dataclass(frozen=True)
 class Grid:
-    """Voxels of a box of the world, made by :func:`radarsdf.grid`.
+    """Voxel grid of a box of the world, created by :func:`radarsdf.grid`.
 
     Voxel (i, j, k) spans ``origin + [i, j, k] * voxel_size`` to ``origin + [i + 1, j + 1, k + 1] * voxel_size``.
     """
@@ -111,12 +111,12 @@ class Grid:
     state: NDArray[np.int8]
     """(X, Y, Z) -1: unknown, 0: free, 1: occupied."""
     probability: NDArray[np.float32]
-    """(X, Y, Z) probability that there is a surface in the voxel. NaN without rays and returns there."""
+    """(X, Y, Z) probability of a surface in the voxel. NaN without rays and returns there."""
     distance_m: NDArray[np.float32]
-    """(X, Y, Z) the map's signed distance at the centre of the voxel, m, positive in free space. NaN where it was not
+    """(X, Y, Z) signed distance of the map at the centre of the voxel, m, positive in free space. NaN where it was not
     observed."""
     position_error_m: float
-    """The position of the surface in 95 % of the occupied voxels is known to so much, with 95 % confidence, m."""
+    """95 % quantile, over occupied voxels, of the half width of the 95 % confidence interval of the surface's position, m."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -126,12 +126,12 @@ class Grid:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """(X, Y, Z) whether rays passed the voxel and nothing is in it."""
+        """(X, Y, Z) whether rays crossed the voxel and nothing is in it."""
         return np.equal(self.state, FREE)
 
     @property
     def occupied(self) -> NDArray[np.bool_]:
-        """(X, Y, Z) whether there probably is a surface in the voxel."""
+        """(X, Y, Z) whether the voxel probably contains a surface."""
         return np.equal(self.state, OCCUPIED)
 
     @property
@@ -156,7 +156,7 @@ class Grid:
         return self.origin + (voxels + 0.5) * self.voxel_size
 
     def at(self, x: ArrayLike) -> NDArray[np.int8]:
-        """Look up the state of the voxels that positions are in.
+        """Look up the state of the voxels that contain positions.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ class Grid:
         Returns
         -------
         (N,) ndarray of int8
-            As :attr:`state`; unknown outside of the grid, and at positions that are not finite.
+            Values of :attr:`state`; unknown outside the grid, and at non-finite positions.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class Grid:
         return found
 
     def distances(self) -> DistanceField:
-        """Compute Euclidean distances to what is occupied, and to what is not free; exact between centres of voxels.
+        """Compute Euclidean distances to occupied voxels, and to voxels that are not free; exact between centres.
 
         Returns
         -------
@@ -194,7 +194,7 @@ class Grid:
         from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
         def to_nearest(others: NDArray[np.bool_], beyond: bool) -> NDArray[np.float32]:
-            """Distances of voxels to the nearest one that is not in a mask. `beyond`: what is beyond the grid is not."""
+            """Return distances to the nearest voxel outside the mask `others`. `beyond`: the outside of the grid counts."""
             mask = np.pad(others, 1, constant_values=not beyond)
             found: NDArray[np.float64] = distance_transform_edt(mask, self.voxel_size)
             return found[1:-1, 1:-1, 1:-1].astype(np.float32)
@@ -207,7 +207,7 @@ class Grid:
         return DistanceField(occupied_m, to_nearest(self.free, True), error_m)
 
     def costmap(self, wheels: Wheels | None = None) -> Costmap:
-        """Compute heights of the ground, and their costs for a vehicle.
+        """Compute heights of the ground, and costs for a vehicle.
 
         Parameters
         ----------
@@ -221,7 +221,7 @@ class Grid:
         """
         wheels = Wheels() if wheels is None else wheels
         height, clearance = self._ground()
-        # A column of walls alone has no ground, but nothing can stand there.
+        # A column with walls alone has no ground, but cannot be entered.
         blocked = np.isnan(height) & self.occupied.any(axis=2)
         with np.errstate(invalid="ignore"):
             blocked |= clearance < wheels.clearance_m
@@ -234,18 +234,18 @@ class Grid:
         return Costmap(height, slope, step, clearance, cost)
 
     def flat(self, lower_m: float = 0.3, upper_m: float = 2.0) -> FlatGrid:
-        """Flatten what is between two heights above the ground to the grid in two dimensions that ROS's map_server reads.
+        """Project the voxels between two heights above the ground to a two-dimensional grid for ROS's map_server.
 
         Parameters
         ----------
         lower_m, upper_m : float
-            Above the ground of each column, or of the nearest one whose ground is known, m. Below `lower_m` wheels pass,
-            above `upper_m` the robot does.
+            Heights above the ground of the column, or of the nearest one with known ground, m. Lower obstacles are passed by
+            the wheels, higher ones by the robot.
 
         Returns
         -------
         FlatGrid
-            A column is occupied if a voxel between the heights is, free if all are.
+            A column is occupied if any voxel between the heights is, free if all are.
 
         Raises
         ------
@@ -265,22 +265,22 @@ class Grid:
         nearest = distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
         base = height[tuple(nearest)]
         above, half = self._z() - base[..., None], self.voxel_size / 2
-        # Whole voxels: one that only reaches into the heights from below may be of the ground.
+        # Whole voxels: one that extends below `lower_m` may belong to the ground.
         between = (above - half >= lower_m) & (above - half < upper_m)
         free = np.where(between, self.free, True).all(axis=2) & between.any(axis=2)
-        # A column whose heights reach out of the box is free only as far as the box is known.
+        # A column with `upper_m` above the top of the box is not free: the box does not cover it.
         free &= base + upper_m <= top_m + half
         state = np.full(height.shape, UNKNOWN, np.int8)
         state[free], state[(self.occupied & between).any(axis=2)] = FREE, OCCUPIED
         return FlatGrid(self.origin[:2].copy(), self.voxel_size, state)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the grid to a file. An old one is replaced only once the new one is complete.
+        """Write the grid to a file. An existing one is replaced only once the new one is complete.
 
         Parameters
         ----------
         path : path-like
-            ``.npz``: all arrays of the grid, by name. ``.bt``: an octree as OctoMap reads it, of what is occupied and free.
+            ``.npz``: all arrays of the grid, by name. ``.bt``: OctoMap's binary octree of occupied and free voxels.
 
         Raises
         ------
@@ -298,17 +298,17 @@ class Grid:
             write_octomap(target, self.state, self.origin, self.voxel_size)
 
     def _z(self) -> NDArray[np.float64]:
-        """(Z,) heights of the voxels' centres, world, m."""
+        """Return the heights (Z,) of the voxels' centres, world, m."""
         return np.asarray(self.origin[2] + (np.arange(self.shape[2]) + 0.5) * self.voxel_size)
 
     def _ground(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Heights of the ground (X, Y), world, m, and the room above it, m. NaN in columns without.
+        """Return the heights (X, Y) of the ground, world, m, and the clearance above it, m. NaN in columns without ground.
 
-        The ground of a column is the lowest surface on which the signed distance rises upwards. Its height is where the
-        distance is zero, interpolated between the voxels above and below.
+        The ground of a column is the lowest surface on which the signed distance increases upwards. Its height is the zero
+        crossing of the distance, interpolated between the voxels above and below.
         """
         z = self._z()
-        # Above the uppermost voxels nothing is known.
+        # Nothing is known above the top voxels.
         lower, occupied = self.distance_m, np.pad(self.occupied, ((0, 0), (0, 0), (0, 1)))
         upper = np.concatenate([lower[..., 1:], np.full_like(lower[..., :1], np.nan)], axis=2)
         with np.errstate(invalid="ignore"):
@@ -318,7 +318,7 @@ class Grid:
         first = up.argmax(axis=2)
         share = np.take_along_axis(share, first[..., None], 2)[..., 0]
         height = np.where(found, z[first] + share * self.voxel_size, np.nan).astype(np.float32)
-        # Not the voxels of the ground itself, which are one or two.
+        # Exclude the voxels of the ground itself, one or two.
         above = np.arange(len(z)) > np.asarray(first + 2)[..., None]
         hanging: NDArray[np.bool_] = self.occupied & above & found[..., None]
         room = np.where(hanging.any(axis=2), z[hanging.argmax(axis=2)] - self.voxel_size / 2 - height, np.inf)
@@ -326,7 +326,7 @@ class Grid:
 
 
 def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | DistanceField) -> None:
-    """Write costs or distances of a grid to an ``.npz``, by name, with the grid's `origin` and `voxel_size`."""
+    """Write costs or distances of a grid to an ``.npz``, by name, with its `origin` and `voxel_size`."""
     target = path_of(path, "path")
     check_suffix(target, ".npz")
     of_grid: dict[str, ArrayLike] = {"origin": grid.origin, "voxel_size": grid.voxel_size}
@@ -334,14 +334,14 @@ def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | Distance
 
 
 def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Slope and largest residual of a plane through each column and its eight neighbours. NaN with fewer than three."""
+    """Fit a plane to each column and its eight neighbours: slope and largest residual. NaN with fewer than three heights."""
     padded = np.pad(height.astype(np.float64), 1, constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*height.shape, 9)
     known = np.isfinite(around)
     design = np.array([[1.0, i * size, j * size] for i, j in np.ndindex(3, 3)])
     normal = np.einsum("xyk,ka,kb->xyab", known.astype(np.float64), design, design)
     right = np.einsum("xyk,ka->xya", np.where(known, around, 0), design)
-    fits = (np.linalg.det(normal) > 1e-6 * size**4) & known[..., 4]  # the column itself
+    fits = (np.linalg.det(normal) > 1e-6 * size**4) & known[..., 4]  # index 4: the column itself
     plane = np.full((*height.shape, 3), np.nan)
     plane[fits] = np.linalg.solve(normal[fits], right[fits, :, None])[..., 0]
     step = np.fmax.reduce(np.abs(around - np.einsum("ka,xya->xyk", design, plane)), axis=-1)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The grid of a map: occupied where a surface probably is, free only where rays passed."""
+"""Conversion of a map to a grid: occupied where a surface is probable, free only where rays crossed."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from radarsdf.map.map import Map
 
-_MAX_VOXELS = 2**28  # 15 bytes each
-# Half of what a cube covers across a plane through its centre, in edges: the mean over all directions of the plane.
+_MAX_VOXELS = 2**28  # of 15 bytes
+# Half width of a cube along the normal of a plane through its centre, in edges: mean over all directions.
 _HALF_WIDTH = 0.75
 _SIGMAS_95 = 1.96
-# Probabilities of a surface. Free voxels were passed by scans seven times as often as what is behind surfaces.
+# Probability thresholds of a surface. The odds for free voxels are 1 to 7.
 _OCCUPIED_FROM, _FREE_TO = 0.5, 0.125
 
 
 def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     """Classify the voxels of a box as occupied, free or unknown, for planners.
 
-    A voxel is occupied where a surface probably is: by its signed distance, with :meth:`Map.uncertainty` and
-    :meth:`Map.confidence`. It is free only where rays passed on the way to their returns, where no return is in it, where
-    all its neighbours are known, since an unseen surface may be next to the unknown, and where no surface of a neighbour may
-    reach into it. All else is unknown: blind cones, what is nearer than the minimum range, smooth ground at grazing angles.
-    Glass and thin wires may be called free if rays to what is behind them passed often.
+    A voxel is occupied where a surface is probable, by its signed distance, :meth:`Map.uncertainty` and
+    :meth:`Map.confidence`. It is free only if rays crossed it on the way to their returns, it contains no return, all its
+    neighbours are known, since an unseen surface may border on unknown space, and no surface of a neighbour may extend into
+    it. All else is unknown: blind cones, space within the minimum range, smooth ground at grazing angles. Glass and thin
+    wires may be classified as free if many rays passed to objects behind them.
 
     Parameters
     ----------
     radar_map : Map
-        Fitted with ``returns.free_space``, which :class:`FitConfig` has and ``quick()`` has not.
+        Fitted with ``returns.free_space``, which is on by default and off in ``quick()``.
     box : (2, 3) array_like
-        Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world: grids
-        of adjacent boxes fit together.
+        Lower and upper corner, world, m. The grid covers the box, extended to multiples of `voxel_size` in the world, so
+        that grids of adjacent boxes align.
     voxel_size : float
-        Edge of a voxel, m. Below that of a leaf cell, voxels are not better known. Above it, a voxel is occupied if a
-        part of it is, and free only if it is throughout.
+        Edge of a voxel, m. Below that of a leaf cell, the information does not increase. Above it, a voxel is occupied if
+        any part of it is, and free only if all of it is.
 
     Returns
     -------
     Grid
-        Of places on true surfaces, at most 0.07 % are called free, in simulated places of all kinds.
+        In simulated scenes of all kinds, at most 0.07 % of positions on true surfaces are classified as free.
 
     Raises
     ------
@@ -67,9 +67,9 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     check_free_space(radar_map, "this map")
     corners = check_box(box)
     size = positive(voxel_size, "voxel_size")
-    # A voxel is at most as large as a leaf cell, or is made of parts that are.
+    # Voxels larger than a leaf cell are merged from parts that are not.
     parts = max(1, math.ceil(size / radar_map.config.leaf_size_m - 1e-6)) if size <= MAX_POSITION_M else 1
-    # Whole multiples of the voxel, as octrees have them; 1e-6 voxels are rounding.
+    # Integer multiples of the voxel, as in octrees; 1e-6 voxels allow for rounding.
     first = np.floor(corners[0] / size + 1e-6)
     counts = np.maximum(1, np.ceil(corners[1] / size - 1e-6) - first)
     voxels = np.prod(counts) * parts**3
@@ -82,14 +82,14 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
 
 
 def check_free_space(radar_map: Map, name: str) -> None:
-    """Raise a ValueError if a map, called `name` in it, has no free-space crossings."""
+    """Raise a ValueError if a map, called `name` in the message, has no free-space crossings."""
     if not radar_map.config.returns.free_space:
         msg = f"{name} has no free-space crossings: fit it with returns.free_space=True, the default but for quick()"
         raise ValueError(msg)
 
 
 def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: tuple[int, ...]) -> Grid:
-    """The grid from a corner (3,), world, m, in voxels that are at most as large as leaf cells."""
+    """Compute the grid from a lower corner (3,), world, m, in voxels at most as large as leaf cells."""
     from scipy.ndimage import binary_erosion  # noqa: PLC0415 - slow to import
 
     leaf_m = radar_map.config.leaf_size_m
@@ -101,7 +101,7 @@ def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: t
         *(np.floor((x - cells.corner[axis]) / leaf_m).astype(np.int64) for axis, x in enumerate(centres))
     )
     passed, observed = cells.passed[places], cells.observed[places]
-    # An unseen surface lies where what rays passed ends. So next to the unknown, nothing is free.
+    # An unseen surface bounds the crossed space, so voxels next to unknown space are not free.
     enclosed = binary_erosion(known, np.ones((3, 3, 3)))[places] & ~cells.returns[places]
     odds = radar_map.free_space_odds
     probability = np.where(passed > 0, (odds / (1 + odds)).astype(np.float32)[passed], np.float32(np.nan))
@@ -117,11 +117,11 @@ def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: t
         sigma_m = radar_map.uncertainty(x)
         spread_m = np.nan_to_num(sigma_m, nan=leaf_m).astype(np.float64)
         confidence = np.where(np.isnan(planes_m), 0, radar_map.confidence(x)).astype(np.float64)
-        # Where the map has it; its error is in `position_error_m`, or rough surfaces would be nowhere.
+        # At its position in the map, without the error (see `position_error_m`), or rough surfaces would vanish.
         of_surface = np.where(_crossed(distance_m, _HALF_WIDTH * size)[rows], confidence, 0)
         is_there = of_surface >= _OCCUPIED_FROM
         occupied[rows] = is_there
-        # Behind a surface, rays passed by mistake: nothing is free there.
+        # Rays that crossed space behind a surface are false: nothing is free there.
         is_before = ndtr((_HALF_WIDTH * size - distance_m[rows]) / spread_m)
         free[rows] &= np.nan_to_num(confidence * is_before) <= _FREE_TO
         step = max(1, round(leaf_m / size))
@@ -143,7 +143,7 @@ def _touched(
     size: float,
     step: int,
 ) -> NDArray[np.float32]:
-    """Largest probability, in each voxel of a grid, that the surface of one of the `voxels` (N, 3), `step` away, is in it.
+    """Return the largest probability, by voxel, that the surface of one of the `voxels` (N, 3), `step` away, extends into it.
 
     `planes`: distances (N,), normals (N, 3), standard errors (N,) and probabilities of a surface (N,).
     """
@@ -163,9 +163,9 @@ def _touched(
 
 
 def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool_]:
-    """Voxels next to one on the other side of a surface, if the surface is in reach or nearer to them than to that one.
+    """Return a mask of voxels next to a sign change of the distance, if the surface is in reach or nearer than to the neighbour.
 
-    What is only near zero may be the end of what the field knows.
+    A distance near zero without a sign change may be the end of the observed field.
     """
     padded = np.pad(distance_m, 1, constant_values=np.nan)
     found = np.zeros(distance_m.shape, bool)
@@ -178,7 +178,7 @@ def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool
 
 
 def _coarser(fine: Grid, parts: int) -> Grid:
-    """Voxels of so many of the grid's an edge: occupied if one is, free if all are."""
+    """Merge `parts` voxels along each edge: occupied if any is, free if all are."""
     shape = [n // parts for n in fine.shape]
     split = [n for length in shape for n in (length, parts)]
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Colours of intensities."""
+"""Colour map of intensities."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import real_array
 
-# From indigo through magenta and orange to yellow. The lightness grows from 0.32 to 0.93 in OKLab, in equal steps.
+# From indigo through magenta and orange to yellow. Lightness increases from 0.32 to 0.93 in OKLab, in equal steps.
 _ANCHORS = np.array([
     [43, 20, 133], [91, 33, 143], [137, 45, 141], [181, 60, 128], [218, 82, 107],
     [245, 113, 79], [253, 156, 70], [254, 197, 84], [249, 237, 82],
@@ -18,9 +18,9 @@ NEUTRAL = (190, 196, 204)  # light grey, for surfaces without a value
 
 
 def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
-    """Colours (N, 4) uint8, RGBA, of values (N,): from dark indigo at `low` to bright yellow at `high`, NaN grey.
+    """Map values (N,) to RGBA colours (N, 4) uint8, from dark indigo at `low` to bright yellow at `high`; NaN is grey.
 
-    Values outside the limits have the colour of the nearer one; if these are equal, all values have the middle colour.
+    Values outside the limits are clipped; if the limits are equal, all values get the middle colour.
     """
     if not (np.isfinite([low, high]).all() and low <= high):
         msg = f"limits must be finite and ascending, not {low} and {high}"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The parts of a map, which its file, its queries and its mesh have in common."""
+"""The contents of a map, shared by its file, its queries and its mesh."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from radarsdf.returns.view_statistics import ViewStatistics
 
 @dataclass(frozen=True)
 class WholeMap:
-    """What evidence at a place depends on besides the returns there: properties of the whole map."""
+    """Properties of the whole map on which evidence at a place depends, besides the returns there."""
 
     origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
     clutter_ratio: float  # share of the returns that lie on no thin surface, in [0, 1]
-    returns_per_cell: float  # mean number of returns in the cells of surfels that hold any
+    returns_per_cell: float  # mean number of returns in the cells of surfels with returns
 
 
 @dataclass(frozen=True)
 class MapContents(WholeMap):
-    """The parts of a map."""
+    """The contents of a map."""
 
     field: Field  # signed distance and intensity, in the local frame
-    intensity_scale: IntensityScale | None  # range of the training intensities. None: it has no intensities
+    intensity_scale: IntensityScale | None  # range of the training intensities. None without intensities
     evidence: Evidence  # evidence of a surface in each leaf cell
-    sensor: Sensor  # the radar, as the scans of the fit show it
-    report: dict[str, Any]  # counts, losses, noise of the sensor and seconds of the fit
+    sensor: Sensor  # the radar, estimated from the scans of the fit
+    report: dict[str, Any]  # counts, losses, sensor noise and times of the fit, s
     free_space: FreeSpace = dataclasses.field(default_factory=FreeSpace.none)  # free-space crossings, or none
-    # View statistics of intensity, or none.
+    # View statistics of intensity, possibly empty.
     view_statistics: ViewStatistics = dataclasses.field(default_factory=ViewStatistics.none)

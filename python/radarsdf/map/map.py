@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The questions that every map answers, and what each kind of map implements for them."""
+"""The interface of maps: public queries, and the abstract methods behind them."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ if TYPE_CHECKING:
 
 
 class Map(ABC):
-    """A surface and its reflectance: the interface of :class:`RadarMap` and :class:`TiledMap`.
+    """Surface and reflectance of a scene: the interface of :class:`RadarMap` and :class:`TiledMap`.
 
     Queries take world coordinates, m, as array_like or CPU tensors of shape (N, 3), and return the same kind: float64 for
-    float64 input and lists, float32 otherwise. Coordinates are converted to the local frame in float64, so large
-    ones such as UTM lose no precision. A wrong shape raises a ValueError; values that are
-    not real numbers, or a tensor on another device, raise a TypeError. Several threads may query a map at once, and a map can be pickled.
+    float64 input and lists, float32 otherwise. Coordinates are converted to the local frame in float64, so large ones such as
+    UTM lose no precision. A wrong shape raises a ValueError; values that are not real numbers, or a tensor on another device,
+    raise a TypeError. Queries are thread-safe, and a map can be pickled.
 
-    A map knows the leaf cells near returns, see :meth:`observed`. Elsewhere, free space included, and at positions that are
-    not finite, the signed distance, its gradient and the intensity are NaN. Without returns near a position, the
-    uncertainty is NaN and the confidence 0.
+    A map covers the leaf cells near returns, see :meth:`observed`. Elsewhere, free space included, and at non-finite
+    positions, the signed distance, its gradient and the intensity are NaN. Without returns near a position, the uncertainty
+    is NaN and the confidence 0.
     """
 
     def sdf(self, x: Any, *, extrapolate: bool = False) -> Any:
-        """Signed distance to the surface.
+        """Compute the signed distance to the surface.
 
         Parameters
         ----------
         x : (N, 3) array_like or Tensor
             World, m.
         extrapolate : bool
-            Whether to evaluate the field where nothing was observed, too. Its values mean nothing there.
+            Whether to evaluate the field also where nothing was observed. Its values are meaningless there.
 
         Returns
         -------
         (N,) ndarray or Tensor
             Signed distance, m: positive in free space, zero on the surface, negative behind it. NaN where `x` was not
-            :meth:`observed`, or is not finite. It is learnt along the sensor's rays, so it exceeds the Euclidean distance where
-            they meet the surface at a grazing angle.
+            :meth:`observed`, or is not finite. It is learnt along the sensor's rays, so it exceeds the Euclidean distance at
+            grazing incidence.
         """
         world, answer = _as_positions(x)
         return answer(self._sdf(world, extrapolate))
 
     def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
-        """Gradient of the signed distance.
+        """Compute the gradient of the signed distance.
 
         Parameters
         ----------
@@ -75,14 +75,14 @@ class Map(ABC):
         Returns
         -------
         (N, 3) ndarray or Tensor
-            Derivatives along x, y and z of the world, pointing to free space. The norm is about 1 where rays met the surface at a
-            right angle, and larger where they grazed it. NaN where :meth:`sdf` is.
+            Derivatives along x, y and z of the world, pointing to free space. The norm is about 1 where rays met the surface at
+            normal incidence, and larger at grazing incidence. NaN where :meth:`sdf` is.
         """
         world, answer = _as_positions(x)
         return answer(self._gradient(world, extrapolate))
 
     def observed(self, x: Any) -> Any:
-        """Whether positions lie in a leaf cell, near returns or in a small gap between them, or on its border.
+        """Test whether positions lie in or on the border of a leaf cell, near returns or in a small gap between them.
 
         Parameters
         ----------
@@ -92,13 +92,13 @@ class Map(ABC):
         Returns
         -------
         (N,) ndarray of bool or Tensor
-            Where it is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
+            False where :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
         """
         world, answer = _as_positions(x)
         return answer(self._observed(world))
 
     def uncertainty(self, x: Any) -> Any:
-        """Standard error of the surface's position, from the noise of the returns near each position.
+        """Estimate the standard error of the surface's position, from the noise of the returns near each position.
 
         Parameters
         ----------
@@ -108,17 +108,17 @@ class Map(ABC):
         Returns
         -------
         (N,) ndarray or Tensor
-            (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells near `x`, interpolated between cells, and a floor added in
-            quadrature, m. σ is the noise of a return along and across the beam, see ``report["noise"]``: it grows with the
-            range. The floor, which no number of returns reduces, is 0.05 leaf cells, and up to 1.1 more the higher the clutter
-            ratio (:attr:`clutter_ratio`). NaN where there are no returns near `x`, or `x` is not finite. Errors of the poses
-            count if ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of the :class:`FitConfig` state them.
+            (Σ 1 / σ²)^-½ over the returns in the 27 leaf cells near `x`, interpolated between cells, plus a floor in quadrature,
+            m. σ is the noise of a return along and across the beam, see ``report["noise"]``, and grows with the range. The
+            floor, independent of the number of returns, is 0.05 leaf cells, plus up to 1.1 depending on :attr:`clutter_ratio`.
+            NaN where there are no returns near `x`, or `x` is not finite. Pose errors are included if ``returns.pose_sigma_m``
+            and ``pose_sigma_rad`` of the :class:`FitConfig` specify them.
         """
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[1])
 
     def confidence(self, x: Any) -> Any:
-        """Probability that there is a surface, from the returns near each position and the scans that reached it.
+        """Estimate the probability of a surface, from the returns near each position and the scans that reached it.
 
         Parameters
         ----------
@@ -128,22 +128,22 @@ class Map(ABC):
         Returns
         -------
         (N,) ndarray or Tensor
-            Probability, in [0, 1], that a true surface is within the edge of a leaf cell. 0 where there are no returns near `x`,
+            Probability, in [0, 1], that a true surface is within a leaf cell's edge. 0 where there are no returns near `x`,
             or `x` is not finite.
 
         Notes
         -----
-        A logistic function of the precision of the returns, of how many are missing given the scans that reached the place, of
-        the map's clutter ratio, and of its returns per cell. It was fitted to simulated places and five real drives; on other
-        kinds, the worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
+        A logistic regression on the precision of the returns, the number of missing returns given the scans that reached the
+        place, the map's clutter ratio, and its returns per cell. It was trained on simulated scenes and five real drives; on
+        other kinds of scenes, the worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
         """
         world, answer = _as_positions(x)
         return answer(self.surface_at(world)[2])
 
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
-        """Intensity of the return that a sensor would get from each position.
+        """Predict the intensity of the return that a sensor would measure at each position.
 
-        At ranges outside of those of the fit, it is that of the nearest range of the fit.
+        Ranges are clipped to those of the fit.
 
         Parameters
         ----------
@@ -189,33 +189,33 @@ class Map(ABC):
         voxel_size : float
             Edge of a voxel, m.
         box : (2, 3) array_like, optional
-            Lower and upper corner, world, m. Only voxels with their centre inside are meshed.
+            Lower and upper corner, world, m. Only voxels with their centre inside are meshed. Default: the whole map.
         viewpoint : (3,) array_like, optional
             Sensor position, world, m, for which intensities are predicted at the vertices.
         min_confidence : float, optional
-            In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out. Default: the value at which the
-            F-score of the observed surface is expected to be highest. 0 keeps all (3QFP).
+            In [0, 1]. Triangles with a vertex of lower :meth:`confidence` are left out. Default: the value that maximises
+            the expected F-score of the observed surface. 0 keeps all (3QFP).
         max_uncertainty : float, optional
-            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: no limit;
-            what is uncertain is improbable, too.
+            Triangles with a vertex of higher or unknown :meth:`uncertainty`, m, are left out. Default: no limit;
+            uncertain surface has a low confidence, too.
         min_component_triangles : int, optional
-            Components of fewer triangles are then left out. Default: 30 in voxels of up to 0.1 m, and fewer in larger
-            ones, 15 at 0.2 m (3QFP: 300, which on sparse scans costs ten points of completion).
+            Connected components of fewer remaining triangles are left out. Default: 30 in voxels of up to 0.1 m, fewer in
+            larger ones, 15 at 0.2 m (3QFP: 300, which on sparse scans costs ten points of completion).
         progress : bool, optional
             Whether to show a progress bar. Default: only on a terminal.
 
         Returns
         -------
         trimesh.Trimesh
-            World frame, m. Triangles and vertex normals face free space. The mesh is empty if there is no surface.
+            World frame, m. Triangles and vertex normals face free space. Empty if there is no surface.
 
             - ``vertex_attributes``: `confidence` and `uncertainty_m`, (V,) float32. With a viewpoint also `intensity`,
-              sensor units, and the vertices have its colours, from dark (low) to bright (high).
-            - ``metadata``: `leaf_cells` of the map, and `leaf_cells_searched`, in which the surface can be;
-              `min_confidence` that was applied; `expected_precision`, the share of the mesh that is expected to be true;
-              `coverage_of_observed`, the share of the surface that returns lie on that it is expected to cover;
-              `whole_precision` and `whole_coverage_of_observed`, the same if all were kept. Surface that no ray reached is in
-              none of them: of all that is there, the mesh may cover far less.
+              sensor units, and vertex colours for it, from dark (low) to bright (high).
+            - ``metadata``: `leaf_cells` of the map, and `leaf_cells_searched`, those that may contain surface;
+              the applied `min_confidence`; `expected_precision`, the share of the mesh that is expected to be true;
+              `coverage_of_observed`, the expected share of the surface with returns that the mesh covers;
+              `whole_precision` and `whole_coverage_of_observed`, the same if all were kept. Surface that no ray reached is not
+              counted: the mesh may cover far less of the whole scene.
 
         Raises
         ------
@@ -256,10 +256,10 @@ class Map(ABC):
         noise: bool = False,
         seed: int | np.random.Generator = 0,
     ) -> View:
-        """Predict the scan that a radar would get from a pose, and what each of its beams first meets.
+        """Predict the scan of a radar at a pose, and the first surface along each of its beams.
 
-        Beams are traced to the surface that :meth:`mesh` keeps by default. Returns come from patches of the field's surface, most
-        from those that often had returns in the scans that reached them: the likeliest scan, not a random one.
+        Beams are traced to the surface that :meth:`mesh` keeps by default. Returns are placed on patches of the field's surface in
+        proportion to the number expected from the detection rate of each patch: the likeliest scan, not a random one.
 
         Parameters
         ----------
@@ -268,27 +268,27 @@ class Map(ABC):
         sensor : Sensor, optional
             The radar. Default: :attr:`sensor`, estimated from the scans of the fit.
         returns : float, optional
-            Number of returns before those below the sensor's threshold are left out; at most one for each patch of surface in
-            view. Default: the sensor's number. More returns show more of what it can see.
+            Number of returns before those below the sensor's threshold are left out; at most one for each patch in view.
+            Default: the sensor's number. More returns show more of the visible surface.
         noise : bool
-            Whether the returns have the sensor's noise in range, azimuth and elevation.
+            Whether to add the sensor's noise in range, azimuth and elevation.
         seed : int or numpy.random.Generator
-            Of the noise. No global generator is touched.
+            Seed of the noise. No global generator is used.
 
         Returns
         -------
         View
-            The first call for a map prepares its surface, which takes about a second for each million leaf cells. Of a
-            map in tiles, the part within the sensor's range is held until a view needs another one.
+            The first call for a map extracts its surface, which takes about a second per million leaf cells. For a map in
+            tiles, the part within the sensor's range is cached until a view needs another one.
 
         Raises
         ------
         ValueError
             If the pose is not a rigid transform, or a number is out of range.
         TypeError
-            If `sensor` is no :class:`Sensor`.
+            If `sensor` is not a :class:`Sensor`.
         MemoryError
-            If the view would take more memory than there is. At most 10^6 beams are traced.
+            If the view would need more memory than available. At most 10^6 beams are traced.
         """
         from radarsdf.map.view import view_from  # noqa: PLC0415 - trimesh is slow to import
 
@@ -299,12 +299,12 @@ class Map(ABC):
 
     @abstractmethod
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the map to a safetensors file. After :func:`radarsdf.load`, all results have the same bits.
+        """Write the map to a safetensors file. After :func:`radarsdf.load`, all results are bit-identical.
 
         Parameters
         ----------
         path : path-like
-            An old file is replaced only once the new one is complete.
+            An existing file is replaced only once the new one is complete.
 
         Raises
         ------
@@ -319,7 +319,7 @@ class Map(ABC):
 
     @property
     def report(self) -> dict[str, Any]:
-        """Counts, losses, noise of the sensor and seconds of the fit. `skipped`: parts of the method that it did not run."""
+        """Counts, losses, sensor noise and times, s, of the fit. `skipped`: parts of the method that it did not run."""
         return self._contents_of_any.report
 
     @property
@@ -334,12 +334,12 @@ class Map(ABC):
 
     @property
     def has_intensity(self) -> bool:
-        """Whether intensities were given to the fit."""
+        """Whether the map was fitted with intensities."""
         return self.intensity_scale is not None
 
     @property
     def clutter_ratio(self) -> float:
-        """Clutter ratio: share of the returns that lie on no thin surface, in [0, 1]."""
+        """Share of the returns that lie on no thin surface, in [0, 1]."""
         return self._contents_of_any.clutter_ratio
 
     @property
@@ -350,36 +350,36 @@ class Map(ABC):
     @property
     @abstractmethod
     def extent(self) -> NDArray[np.float64]:
-        """Lower and upper corner of the box that encloses all leaf cells, (2, 3) float64, world, m."""
+        """Lower and upper corner of the bounding box of all leaf cells, (2, 3) float64, world, m."""
 
     @property
     @abstractmethod
     def num_cells(self) -> int:
-        """Number of leaf cells, in which the map was observed: int."""
+        """Number of leaf cells, int."""
 
     @property
     @abstractmethod
     def file_bytes(self) -> int:
-        """Size of the file that :meth:`save` writes, but for the up to 4 kB of its header: int, bytes."""
+        """Size of the file that :meth:`save` writes, without its header of up to 4 kB: int, bytes."""
 
-    # What grids, comparisons and views read of a map, and what each kind of map implements, at positions (N, 3), world, m.
+    # Interface for grids, comparisons and views, and the abstract methods, at positions (N, 3), world, m.
 
     @abstractmethod
     def cells_near(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
-        """Free space and returns in the leaf cells that overlap a box of two corners (3,), world, m."""
+        """Return free space and returns in the leaf cells that overlap the box of two corners (3,), world, m."""
 
     @abstractmethod
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
-        """The evidence of a surface at positions (N, 3), world, m."""
+        """Return the evidence of a surface at positions (N, 3), world, m."""
 
     @abstractmethod
     def view_statistics(self) -> ViewStatisticsAt:
-        """View statistics of intensity. Empty without intensities, or without ``returns.free_space``."""
+        """Return view statistics of intensity, empty without intensities or ``returns.free_space``."""
 
     @property
     @abstractmethod
     def _contents_of_any(self) -> MapContents:
-        """The parts of the map, or of one of its tiles, for what all have in common."""
+        """The contents of the map, or of any of its tiles, for properties that all share."""
 
     @cached_property
     def free_space_odds(self) -> NDArray[np.float64]:
@@ -400,38 +400,38 @@ class Map(ABC):
 
     @abstractmethod
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
-        """:meth:`Map.mesh` without intensities. `wanted`: its arguments but for the viewpoint."""
+        """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     @abstractmethod
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
-        """What views from a position (3,) need of the map within a range. It is held for the next view."""
+        """Return the data for views from a position (3,) within a range, cached for the next view."""
 
     def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
-        """:meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
+        """Return :meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
         return self._sdf(world, False), self._gradient(world, False)
 
     def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The surface near positions (N, 3), world, m, as planes: signed distances (N,), m, and unit normals (N, 3)."""
+        """Linearise the surface at positions (N, 3), world, m: signed distances (N,), m, to planes, and unit normals (N, 3)."""
         sdf, gradient = (values.double().numpy() for values in self.plane_at(torch.from_numpy(x)))
         length = np.linalg.norm(gradient, axis=1)
-        # Along grazing rays the field is longer than the distance, and its gradient is as much longer than 1.
+        # At grazing incidence the field exceeds the distance, and its gradient exceeds 1, by the same factor.
         return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
 
     def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
-        """:meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
+        """Return :meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
         evidence, contents = self.evidence_at(world), self._contents_of_any
         return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
 
 
 def _as_positions(x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
-    """`x` as a tensor (N, 3), and a function that gives results the kind and precision of `x`; `rows`: (3,) is repeated so often."""
+    """Convert `x` to a tensor (N, 3), and return a function that converts results back; (3,) is broadcast to `rows`."""
     is_tensor = isinstance(x, Tensor)
     if is_tensor:
         if x.device.type != "cpu" or x.layout != torch.strided or x.is_complex():
             msg = f"positions must be real numbers in a dense tensor on the CPU, not {x.dtype} {x.layout} on {x.device}"
             raise TypeError(msg)
         world = x.detach()
-    else:  # read-only arrays are copied, because PyTorch warns of them
+    else:  # copy read-only arrays, because PyTorch warns of them
         world = torch.from_numpy(np.require(real_array(x, "positions"), requirements=["C", "W"]))
     if rows is not None and world.shape == (3,):
         world = world.expand(rows, 3)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Triangle meshes of the level sets of sampled fields, by marching cubes; of tensors with gradients.
+"""Marching cubes: triangle meshes of level sets of sampled fields, differentiable for tensors.
 
-A cell here is a cube of eight neighbouring samples, corner ``4 * dx + 2 * dy + dz`` of which is at ``(dx, dy, dz)`` from the
-lower one. A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length: it
-depends on no other sample. Triangles have no gradient: they change only where a sample changes its sign.
+A cell is a cube of eight neighbouring samples; corner ``4 * dx + 2 * dy + dz`` has the offset ``(dx, dy, dz)`` from the
+lower one. A vertex lies on an edge between two samples a and b of different signs, at (level - a) / (b - a) of its length, so
+it depends on no other sample. Triangles have no gradient: they change only where a sample changes sign.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ def marching_cubes(
 ) -> tuple[Any, Any]:
     """Triangulate the surface on which a volume crosses a level.
 
-    A sample is positive if it is greater than `level`. The normals of the triangles point to the positive side. The mesh is
-    closed and manifold except where the cells in use end: at the border of the volume or of the mask, and at NaN samples. No
-    triangle has zero area: vertices stay 0.1 % of an edge's length away from samples.
+    A sample is positive if it is greater than `level`. Triangle normals point to the positive side. The mesh is closed and
+    manifold except at the border of the volume or of the mask, and at NaN samples. No triangle has zero area: vertices keep a
+    distance of 0.1 % of an edge's length from samples.
 
-    For a tensor, the vertices can be differentiated by the samples, once; the gradient is zero where a vertex is kept away from
+    For a tensor, the vertices are once differentiable by the samples; the gradient is zero where a vertex is clamped away from
     a sample, and where a sample is infinite. For a gradient by the level, subtract the level from the samples.
 
     Parameters
     ----------
     volume : array_like or Tensor, shape (nx, ny, nz)
-        Samples. An infinite one counts by its sign. Other types than float32 and float64 are converted to the smaller of
-        these that holds all values of the type; 64-bit integers are rounded to float64.
+        Samples. Only the sign of an infinite one matters. Types other than float32 and float64 are converted to the smaller
+        of these that represents all values of the type; 64-bit integers are rounded to float64.
     level : float
         Value of the field on the surface.
     spacing : array_like, shape (3,)
-        Distance between samples along each axis, finite and positive, in world units.
+        Distance between samples along each axis, positive and finite, in world units.
     origin : array_like, shape (3,)
         Position of sample (0, 0, 0), in world units.
     mask : array_like of bool, shape (nx, ny, nz), optional
-        True where a sample may be used. A cell is triangulated if all its eight samples may be used and none
-        is NaN. Default: all may be used.
+        True for valid samples. A cell is triangulated if all its eight samples are valid and none is NaN.
+        Default: all are valid.
     num_threads : int
-        0: as many as OpenMP uses.
+        Number of threads. 0: that of OpenMP.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def marching_cubes(
     TypeError
         If `volume` is not real or `mask` is not boolean.
     ValueError
-        If a shape does not fit, `spacing`, `origin` or `level` is out of range, or there are too many
+        If shapes do not match, `spacing`, `origin` or `level` is out of range, or there are too many
         vertices for int32.
 
     Examples
@@ -122,7 +122,7 @@ def extract_cells(
     origin: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
     num_threads: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """:func:`marching_cubes` of values (K,) at lattice coordinates (K, 3), in cells (M, 8) as of :func:`sparse_lattice`."""
+    """Triangulate values (K,) at lattice coordinates (K, 3), in cells (M, 8) of :func:`sparse_lattice`."""
     corners, cells = (np.ascontiguousarray(a, np.int32) for a in (corners, cells))
     placement = list(spacing), list(origin), level
     return _core.marching_cubes_sparse(corners, values, cells, *placement, num_threads)
@@ -131,12 +131,12 @@ def extract_cells(
 def sparse_lattice(
     cells: NDArray[Any], *, num_threads: int = 0
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Different cells (M', 3) of those with lower corners (M, 3), sorted; their corners (K, 3), sorted; rows of these (M', 8)."""
+    """Return the sorted unique cells (M', 3) of lower corners (M, 3), their sorted corners (K, 3), and rows of these (M', 8)."""
     return _core.sparse_lattice(np.ascontiguousarray(cells, np.int32), num_threads)
 
 
 def mesh_components(faces: NDArray[Any], num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Component (F,) of each of the faces (F, 3), which share vertices, numbered by their first faces; and their sizes (C,)."""
+    """Label connected components of faces (F, 3): labels (F,), in order of their first faces, and sizes (C,)."""
     return _core.mesh_components(np.ascontiguousarray(faces, np.int32), num_vertices)
 
 
@@ -158,7 +158,7 @@ class _MarchingCubes(torch.autograd.Function):
         ctx.save_for_backward(samples, edges)
         ctx.placement = spacing, level, num_threads
         ctx.mark_non_differentiable(faces)
-        ctx.set_materialize_grads(False)  # or the faces' gradient would be zeros of their size
+        ctx.set_materialize_grads(False)  # or zeros would be allocated for the faces' gradient
         return vertices, faces
 
     @staticmethod
@@ -168,7 +168,7 @@ class _MarchingCubes(torch.autograd.Function):
             return (None,) * 6
         samples, edges = (saved.detach().numpy() for saved in ctx.saved_tensors)
         spacing, level, num_threads = ctx.placement
-        # The core fills it. NumPy asks for huge pages, as PyTorch does not.
+        # The core fills it. NumPy requests huge pages, PyTorch does not.
         grad = np.empty(samples.shape, samples.dtype)
         upstream = vertices_grad.contiguous().numpy()
         _core.marching_cubes_dense_backward(samples, edges, upstream, spacing, level, grad, num_threads)
@@ -176,7 +176,7 @@ class _MarchingCubes(torch.autograd.Function):
 
 
 def _as_tensor(volume: Tensor) -> Tensor:
-    """`volume` in C order as float32 or float64, whichever would be taken of an array of this type."""
+    """Convert `volume` to C order, as float32 or float64 by the rule for arrays."""
     kind = volume.dtype
     if kind.is_complex:
         msg = f"volume must be real numbers, not {kind}"
@@ -186,7 +186,7 @@ def _as_tensor(volume: Tensor) -> Tensor:
 
 
 def _as_samples(volume: ArrayLike) -> NDArray[Any]:
-    """`volume` in C order as float32, if it holds every value of the type, or float64."""
+    """Convert `volume` to C order, as float32 if that represents every value of the type, else float64."""
     refuse_masked(volume, "volume")
     array = np.asarray(volume)
     if array.dtype.kind in "biuf" and np.can_cast(array.dtype, np.float32, "safe"):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The mesh of a map: distances at the corners of voxels, triangles, and which of them are kept."""
+"""Mesh extraction: distances at the corners of voxels, triangles, and filtering by evidence."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_mesh
 from radarsdf.returns.intensities import IntensityScale
 
-_MAX_VOXELS = 2**30  # with repeated ones. Lattice coordinates, and rows of corners, are int32
-# Edges of a leaf cell. A cell is left out if its corners are all farther than this from the surface, on the same side.
-# Measured on four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the cells are left.
+_MAX_VOXELS = 2**30  # duplicates included. Lattice coordinates and rows of corners are int32
+# Leaf cells. A cell is skipped if all its corners are farther than this from the surface, on the same side. Measured on
+# four scenes: with 0 some triangles are lost, with 0.1 none. With 0.25 half of the cells are left.
 _CLEARLY = 0.25
-# Share of the distance to the voxel's centre by which a corner on the map's border is moved to be evaluated.
+# Shift of a corner on the map's border for evaluation, as a share of its distance to the voxel's centre.
 _INWARD = 1e-3
 
 
@@ -40,11 +40,11 @@ class Surface:
 
     vertices: NDArray[np.float64]  # (V, 3) local frame, m
     faces: NDArray[np.int32]  # (F, 3) rows of the vertices, counter-clockwise seen from free space
-    evidence: queries.EvidenceAt  # of each vertex
+    evidence: queries.EvidenceAt  # at the vertices
     confidence: NDArray[np.float32]  # (V,) see :meth:`Map.confidence`
     uncertainty_m: NDArray[np.float32]  # (V,) see :meth:`Map.uncertainty`
-    tally: Tally  # its area by confidence
-    cells_searched: int  # number of leaf cells in which the surface can be
+    tally: Tally  # area by confidence
+    cells_searched: int  # number of leaf cells that may contain surface
 
     @classmethod
     def of(
@@ -54,11 +54,11 @@ class Surface:
         box: NDArray[np.float64] | None = None,
         progress: bool | None = False,
     ) -> Surface:
-        """The surface in voxels of this edge, m, in the whole map or in a `box` (2, 3), local frame, m."""
+        """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
         corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
         options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": torch.get_num_threads()}
         vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
-        # By way of the world's coordinates, as those who query the mesh's own vertices do.
+        # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
         evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
         return cls.from_triangles(contents, vertices, faces, evidence, searched)
 
@@ -71,7 +71,7 @@ class Surface:
         evidence: queries.EvidenceAt,
         cells_searched: int,
     ) -> Surface:
-        """From triangles and the evidence at their vertices."""
+        """Build from triangles and the evidence at their vertices."""
         found = queries.probabilities(scene, evidence)
         confidence, uncertainty = found.confidence.float(), queries.uncertainty(scene, evidence).numpy()
         areas_m2 = vertex_areas(vertices, faces)
@@ -80,7 +80,7 @@ class Surface:
         return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
-        """(F,) faces within the limits, without small components."""
+        """Return a mask (F,) of the faces within the limits, without small components."""
         min_confidence = self.tally.threshold(limits.min_confidence).min_confidence
         kept = within(limits, min_confidence, self.faces, self.confidence, self.uncertainty_m)
         rows = np.flatnonzero(kept)
@@ -90,7 +90,7 @@ class Surface:
         return kept
 
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
-        """What the limits leave, in the world. `leaf_cells`: of the whole map."""
+        """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         return self.part(
             origin, self.kept(limits), **counts, **self.tally.threshold(limits.min_confidence).metadata
@@ -99,7 +99,7 @@ class Surface:
     def part(
         self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
     ) -> trimesh.Trimesh:
-        """The faces that are `kept` (F,), in the world."""
+        """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
         used, faces = renumbered(len(self.vertices), self.faces[kept])
         vertices, confidence = self.vertices[used] + origin, self.confidence[used]
         return described_mesh(vertices, faces, confidence, self.uncertainty_m[used], **metadata)
@@ -108,7 +108,7 @@ class Surface:
 def extract_mesh(
     contents: MapContents, voxel_size: float, *, box: ArrayLike | None, progress: bool | None, **wanted: Any
 ) -> trimesh.Trimesh:
-    """The mesh of one map; `wanted`: the limits of :meth:`Map.mesh`."""
+    """Extract the mesh of one map. `wanted`: the limits of :meth:`Map.mesh`."""
     voxel_size = positive(voxel_size, "voxel_size")
     if voxel_size > MAX_POSITION_M:
         msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
@@ -126,7 +126,7 @@ def described_mesh(
     uncertainty_m: NDArray[np.float32],
     **metadata: float,
 ) -> trimesh.Trimesh:
-    """The mesh of vertices (V, 3), world, m, with their attributes and its metadata."""
+    """Build a mesh of vertices (V, 3), world, m, with vertex attributes and metadata."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.vertex_attributes["confidence"] = confidence
     mesh.vertex_attributes["uncertainty_m"] = uncertainty_m
@@ -137,7 +137,7 @@ def described_mesh(
 def with_intensities(
     mesh: trimesh.Trimesh, intensities: NDArray[Any], scale: IntensityScale
 ) -> trimesh.Trimesh:
-    """The mesh with intensities (V,), sensor units, and their colours at its vertices."""
+    """Add intensities (V,), sensor units, and their colours to the vertices of a mesh."""
     values = intensities.astype(np.float32)
     mesh.vertex_attributes["intensity"] = values
     colors = intensity_colors(values, scale.low, scale.high)
@@ -156,20 +156,20 @@ def within(
     confidence: NDArray[np.float32],
     uncertainty_m: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
-    """(F,) which of the faces (F, 3) each have three vertices within the limits: the one place where they are compared."""
+    """Return a mask (F,) of the faces (F, 3) with all vertices within the limits: the one place that compares them."""
     certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= limits.max_uncertainty
     return with_all(certain & (confidence >= min_confidence), faces)
 
 
 def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(F,) which of the faces (F, 3) have three vertices that are `good` (V,)."""
+    """Return a mask (F,) of the faces (F, 3) with all vertices in the mask `good` (V,)."""
     first, second, third = faces.T
     found: NDArray[np.bool_] = good[first] & good[second] & good[third]
     return found
 
 
 def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
-    """Which vertices faces use, (V,) bool, and the faces (F, 3) as rows of these."""
+    """Return a mask (V,) of the vertices that faces use, and the faces (F, 3) renumbered accordingly."""
     used = np.zeros(num_vertices, bool)
     used[faces] = True
     renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
@@ -177,7 +177,7 @@ def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.
 
 
 def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int32]:
-    """(V,) the first of the vertices at `rows` (B,) in the same place as each of these; the others themselves."""
+    """Map vertices (V,) to themselves, and those at `rows` (B,) to the first one at the same position."""
     found = np.arange(len(vertices), dtype=np.int32)
     _, first, which = np.unique(vertices[rows], axis=0, return_index=True, return_inverse=True)
     found[rows] = rows[first][which.ravel()]
@@ -190,10 +190,10 @@ def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDA
 def sample_lattice(
     contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], int]:
-    """The voxels of leaf cells in which the surface can be. `box` (2, 3), local frame, m, limits their centres.
+    """Sample the voxels of leaf cells that may contain surface. `box` (2, 3), local frame, m, limits their centres.
 
-    Returns lattice coordinates of corners (K, 3), rows of these for each voxel (M, 8), signed distances at the corners (K,), m,
-    and the number of leaf cells that were searched.
+    Returns lattice coordinates of corners (K, 3), their rows for each voxel (M, 8), signed distances at the corners (K,), m,
+    and the number of leaf cells searched.
     """
     config, num_threads = contents.config, torch.get_num_threads()
     leaf_size_m = config.leaf_size_m
@@ -214,7 +214,7 @@ def sample_lattice(
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     if voxel_size < leaf_size_m and not even:
-        # Only those with their centre in an occupied cell: others would continue the surface beyond the map.
+        # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
         centre = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
         voxels = voxels[_occupied(contents, centre)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
@@ -230,7 +230,7 @@ def crossed(
     leaf_size_m: float,
     distances_at: Callable[[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]], NDArray[Any]],
 ) -> NDArray[np.int32]:
-    """Those of the leaf cells (M, 3) whose corners, by `distances_at`, are not all clearly on one side of the surface."""
+    """Return the leaf cells among (M, 3) with corners, by `distances_at`, not all clearly on one side of the surface."""
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
     found: NDArray[np.int32] = unique[
         _near_surface(distances_at(unique, corners, cell_corners)[cell_corners], leaf_size_m)
@@ -239,23 +239,23 @@ def crossed(
 
 
 def _near_surface(values_m: NDArray[Any], leaf_size_m: float) -> NDArray[np.bool_]:
-    """(M,) whether the distances (M, 8) at the corners of leaf cells are not all clearly on one side."""
+    """Return a mask (M,) of the leaf cells with corner distances (M, 8) not all clearly on one side."""
     margin_m, corners = (
         _CLEARLY * leaf_size_m,
         np.ascontiguousarray(values_m.T),
-    )  # along rows of eight it is slow
+    )  # reductions along rows of eight are slow
     found: NDArray[np.bool_] = (corners.min(axis=0) <= margin_m) & (corners.max(axis=0) >= -margin_m)
     return found
 
 
 def per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
-    """Voxels along the edge of a leaf cell, and whether they divide it, so that each is in one cell."""
+    """Return the number of voxels along the edge of a leaf cell, and whether they divide it evenly."""
     parts = max(1, math.ceil(min(leaf_size_m / voxel_size, _MAX_VOXELS) - 1e-9))
     return parts, math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
 
 
 def subdivided(cells: NDArray[Any], parts: int) -> NDArray[Any]:
-    """(M · parts³, 3) voxels of cells (M, 3), of which `parts` make an edge."""
+    """Subdivide cells (M, 3) into voxels (M · parts³, 3), `parts` along an edge."""
     inside = np.indices((parts,) * 3, cells.dtype).reshape(3, -1).T
     voxels: NDArray[Any] = cells[:, None] * cells.dtype.type(parts) + inside
     return voxels.reshape(-1, 3)
@@ -269,7 +269,7 @@ def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.
 def _voxels_of(
     cells: NDArray[np.int32], voxel_size: float, parts: int, even: bool, config: FitConfig
 ) -> NDArray[np.int32]:
-    """Lattice coordinates (M, 3) of the voxels that overlap leaf cells; `parts`, `even`: see :func:`per_cell`. Some are repeated."""
+    """Return the voxels (M, 3) that overlap leaf cells, with duplicates. `parts`, `even`: see :func:`per_cell`."""
     leaf_size_m = config.leaf_size_m
     if max(len(cells) * (parts + 1) ** 3, int(np.abs(cells).max(initial=0)) * parts) > _MAX_VOXELS:
         msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
@@ -277,7 +277,7 @@ def _voxels_of(
     check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
     if even:
         return subdivided(cells, parts)
-    # Points from one end of a cell to the other, at most a voxel apart, find every voxel that overlaps it.
+    # Points across a cell, at most a voxel apart, hit every voxel that overlaps it.
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
     inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
     voxels = np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32)
@@ -292,14 +292,14 @@ def _corner_distances(
     voxel_corners: NDArray[np.int32],
     progress: bool | None = False,
 ) -> NDArray[np.float32]:
-    """Signed distances (K,) at lattice corners (K, 3), m.
+    """Evaluate signed distances (K,), m, at lattice corners (K, 3).
 
-    A corner on the border of the map may be in a cell beyond it, which has no features. It is moved towards the centre of one of
-    its voxels until it is in an occupied cell, and the distance moved is added to its value.
+    A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
+    until it is in an occupied cell, and the distance moved is added to its absolute value.
     """
     points = corners.astype(np.float32) * np.float32(voxel_size)
     outside = ~_occupied(contents, points)
-    # The last voxel of each corner is the one that it is moved into: of repeated indices, NumPy keeps the last.
+    # Move each corner into its last voxel: NumPy keeps the last assignment of repeated indices.
     owners = np.zeros(len(corners), np.int32)
     owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
     moved = np.flatnonzero(outside)

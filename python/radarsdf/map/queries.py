@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a map knows at positions (N, 3) float32, local frame, m. All calls of the field are here."""
+"""Queries of a map at positions (N, 3) float32, local frame, m: the one place that evaluates the field."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from radarsdf.threads import ThreadPool, resolve_num_threads, start_vector_libra
 VOXEL_M = 0.1
 """Default edge of a mesh's voxels, m."""
 INWARD = 1e-3
-"""How far points on the border of a map are moved into it, edges of a cell."""
-_CHUNK = 1 << 13  # points evaluated at a time, so that hidden layers stay in the second-level cache
-_MIN_RANGE_M = 1e-6  # smallest divisor of a direction, for points at the sensor itself
+"""Shift of points on the border of a map into it, edges of a cell."""
+_CHUNK = 1 << 13  # points per evaluation, so that hidden layers fit the second-level cache
+_MIN_RANGE_M = 1e-6  # lower bound of the norm of a direction, for points at the sensor
 
-# From this clutter ratio on, the errors are those of a rough scene.
+# Clutter ratio from which on a scene counts as fully rough.
 # Measured: 0 to 0.07 on simulated scenes without much clutter, 0.27 to 0.44 on five real drives.
 _ROUGH_CLUTTER_RATIO = 0.27
-# The part of the uncertainty that repetition does not shrink, leaf cells: in smooth scenes, and what rough ones add.
-# Returns that agree there may share an error. Chosen with `python -m bench.paper calibration`: errors are within 95 %
+# Floor of the uncertainty, leaf cells, which more returns do not reduce: in smooth scenes, and its increase in rough ones,
+# where consistent returns may share an error. Tuned with `python -m bench.paper calibration`: errors are within 95 %
 # intervals with 0.00 to 0.03 m on smooth simulated scenes, and with 0.20 to 0.29 m on the drives.
 _FLOOR_CELLS = 0.05
 _ROUGH_FLOOR_CELLS = 1.1
-# Fitted by `python -m bench.paper.one_probability`: intercept and coefficients of `terms` in the logits of the confidence
-# and of the coverage.
+# Coefficients of `terms` in the logits of the confidence and of the coverage, fitted by
+# `python -m bench.paper.one_probability`.
 _CONFIDENCE = (3.29, -1.25, -0.87, -3.77, -3.50)
 _COVERING = (-0.21, -0.79, -1.47, -2.68, -2.46)
-_CROWDED_RETURNS = 4.0  # returns in a cell that have half of the effect that any number has
+_CROWDED_RETURNS = 4.0  # returns per cell at which crowding has half of its maximal effect
 _BEND_CELLS = 2.0  # bending allowed by the smoothness term, leaf cells: a slope turns from -1 to 1
-_LEAST_LOGIT = -80.0  # what was observed is not impossible: float32 has this probability
-# Least share of the scans that reach a surface that have a return in one of its cells.
+_LEAST_LOGIT = -80.0  # so that the probability of an observed surface does not underflow in float32
+# Minimum share of the scans reaching a surface that have a return in a given cell of it.
 _DETECTION_RATE = 1 / 36
-_SMOOTH = 0.5  # standard deviations: a few more hits than needed are a little more evidence
-_ODDS_CELLS = 50_000  # evenly spread leaf cells that calibrate the weight of free-space crossings
+_SMOOTH = 0.5  # width of the smooth maximum, standard deviations: excess hits are weak evidence
+_ODDS_CELLS = 50_000  # sample of leaf cells that calibrates the weight of free-space crossings
 
 
-@torch.inference_mode(mode=False)  # gradients, of which normals are made, need ordinary tensors
+@torch.inference_mode(mode=False)  # gradients, for normals, need ordinary tensors
 def to_local(contents: WholeMap, world: Tensor) -> Tensor:
-    """World positions (N, 3), m, in the local frame, float32. The origin is subtracted in float64."""
+    """Convert world positions (N, 3), m, to the local frame, float32. The origin is subtracted in float64."""
     return (world.double() - torch.from_numpy(contents.origin)).float()
 
 
@@ -71,7 +71,7 @@ def gradient(contents: MapContents, points: Tensor) -> Tensor:
 
 @torch.inference_mode(mode=False)
 def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
-    """(N,) intensity, sensor units, of the returns of sensors (N, 3), local frame, m, from the points."""
+    """Predict intensities (N,), sensor units, of returns from points to sensors (N, 3), local frame, m."""
     scale, field = contents.intensity_scale, contents.field
     assert scale is not None
 
@@ -79,7 +79,7 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         positions, rays = chunk[:, :3], chunk[:, :3] - chunk[:, 3:]
         ranges_m = rays.norm(dim=1)
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
-        # Beyond the ranges of the returns a regression would extrapolate.
+        # Clip to the ranges of the fit: the regression would extrapolate.
         ranges_m = ranges_m.clamp(*contents.sensor.range_m)
         return scale.to_sensor(field.intensity(positions, directions, ranges_m))
 
@@ -98,11 +98,11 @@ def evaluate(
     description: str = "",
     progress: bool | None = False,
 ) -> Tensor:
-    """function(points) without gradients, in chunks, on as many threads as PyTorch uses."""
+    """Evaluate function(points) without gradients, in chunks, on the number of threads of PyTorch."""
     without_gradients = torch.no_grad()(function)
     chunks = torch.split(points, _CHUNK)
     if len(chunks) <= 1:
-        start_vector_library()  # the first queries may come from several threads at once
+        start_vector_library()  # the first queries may be concurrent
         return without_gradients(points)
     with ThreadPool() as pool:
         results = pool.map(without_gradients, chunks)
@@ -110,14 +110,14 @@ def evaluate(
         return torch.cat(list(bar))
 
 
-# Where the map was observed
+# Observed region
 
 
 @torch.inference_mode(mode=False)
 def into_cells(contents: MapContents, points: Tensor, size_m: float | None = None) -> tuple[Tensor, Tensor]:
-    """Points, of which those on the border of the occupied leaf cells are moved a little into one, and which are inside.
+    """Shift points on the border of occupied leaf cells slightly into one; return the points, and a mask of those inside.
 
-    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may have no features.
+    A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may be empty.
     """
     leaf_m = contents.config.leaf_size_m
     step_m = INWARD * (leaf_m if size_m is None else size_m)
@@ -140,7 +140,7 @@ def into_cells(contents: MapContents, points: Tensor, size_m: float | None = Non
 def where_observed(
     contents: MapContents, function: Callable[..., Tensor], points: Tensor, *others: Tensor, extrapolate: bool
 ) -> Tensor:
-    """function(contents, points, *others) where points (N, 3) were observed, or are finite, and others are finite; else NaN."""
+    """Evaluate function(contents, points, *others) at observed (`extrapolate`: finite) points and finite others; else NaN."""
     points, known = into_cells(contents, points)
     if extrapolate:
         known = points.isfinite().all(dim=1)
@@ -151,7 +151,7 @@ def where_observed(
 
 @torch.inference_mode(mode=False)
 def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Tensor:
-    """function(*inputs) of the rows that are `known` (N,); NaN in the others."""
+    """Evaluate function(*inputs) for the rows in the mask `known` (N,); NaN for the others."""
     if bool(known.all()):
         return function(*inputs)
     found = function(*(rows[known] for rows in inputs))
@@ -164,11 +164,11 @@ def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Te
 
 
 class EvidenceAt(NamedTuple):
-    """Evidence of a surface at N points, interpolated between the centres of leaf cells. 0 without cells."""
+    """Evidence of a surface at N points, interpolated between the centres of leaf cells; 0 outside the cells."""
 
     information: Tensor  # (N,) sum of 1 / variance over the returns near each point, m⁻²
-    hits: Tensor  # (N,) scans with returns there
-    visibility: Tensor  # (N,) scans whose rays reach there
+    hits: Tensor  # (N,) number of scans with returns near each point
+    visibility: Tensor  # (N,) number of scans with rays reaching it
 
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
@@ -179,24 +179,24 @@ def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
 def interpolated(
     found: Evidence, leaf_keys: NDArray[np.uint64], leaf_size_m: float, points: Tensor
 ) -> EvidenceAt:
-    """The evidence of leaf cells with these keys (C,), ascending, at each point (N, 3), local frame, m."""
+    """Interpolate the evidence of leaf cells with ascending keys (C,) at points (N, 3), local frame, m."""
     of_cells = np.stack([found.information, found.hits, found.visibility], 1, dtype=np.float32)
-    # Points that are too far away for a key are moved to the limit, where there are no cells.
+    # Points beyond the range of keys are clamped to its limit, where there are no cells.
     limit_m = MAX_CELLS_FROM_ORIGIN * leaf_size_m
     near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
-    # Trilinearly, because a vertex of a mesh may be on the face of two cells.
+    # Trilinear, because a vertex of a mesh may lie on the face between two cells.
     at_points = CellBlocks(leaf_keys).interpolate(leaf_size_m, of_cells, near.numpy(), resolve_num_threads(0))
     return EvidenceAt(*torch.from_numpy(at_points).unbind(1))
 
 
 def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
-    """(N,) standard error of the surface's position, m. NaN where there are no returns."""
+    """Return the standard error (N,) of the surface's position, m; NaN where there are no returns."""
     variance_m2 = 1 / evidence.information + _floor_m(contents) ** 2
     return variance_m2.sqrt().masked_fill(evidence.information <= 0, torch.nan)
 
 
 def roughness(contents: WholeMap) -> float:
-    """From 0, where all returns lie on thin surfaces, to 1, of a scene as rough as real drives."""
+    """Return the roughness, from 0, where all returns lie on thin surfaces, to 1, that of real drives."""
     return min(contents.clutter_ratio / _ROUGH_CLUTTER_RATIO, 1.0)
 
 
@@ -206,20 +206,20 @@ def _floor_m(contents: WholeMap) -> float:
 
 
 def confidence(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
-    """(N,) probability that a surface is within a leaf cell's edge. 0 where there are no returns."""
+    """Return the probability (N,) that a surface is within a leaf cell's edge; 0 where there are no returns."""
     return probabilities(contents, evidence).confidence.float()
 
 
 class Probabilities(NamedTuple):
-    """Probabilities of a surface at N points, float64. 0, or next to it, where there are no returns."""
+    """Probabilities of a surface at N points, float64; (nearly) 0 where there are no returns."""
 
     confidence: Tensor  # (N,) see :func:`confidence`
-    covering: Tensor  # (N,) true surface newly covered over its area; only ratios count
-    reach: Tensor  # (N,) share of a normal distribution of the position's error within a leaf cell's edge
+    covering: Tensor  # (N,) true surface newly covered per area, up to a constant factor
+    reach: Tensor  # (N,) probability of a position error within a leaf cell's edge, normally distributed
 
 
 def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
-    """Logistic regression on :func:`terms`. The confidence is at most the probability that the position is within a leaf cell."""
+    """Evaluate the logistic regression on :func:`terms`. `reach` is an upper bound of the confidence."""
     start_vector_library()
     columns = terms(contents, evidence)
     logits = torch.tensor([_CONFIDENCE, _COVERING], dtype=torch.float64, device="cpu")
@@ -229,9 +229,9 @@ def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
 
 
 def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
-    """(N, 5) float64 regressors: 1, the logarithm of the error in leaf cells, how many returns of a surface are missing
-    there, in standard deviations, how rough the map is, and how crowded its returns are. Infinite without returns."""
-    # The last two are bounded: a map that is rougher or more crowded than any that was learnt from must not lose all surface.
+    """Return regressors (N, 5), float64: 1, log of the error in leaf cells, missing returns of a surface in standard
+    deviations, and roughness and crowding of the map. Infinite without returns."""
+    # The last two are bounded: a rougher or more crowded map than in the training data must not lose all surface.
     error_cells = evidence.information.double().rsqrt() / contents.config.leaf_size_m
     expected = CELLS_OF_SURFACE * _DETECTION_RATE * evidence.visibility.double()
     deviations = (expected - evidence.hits.double()) / (expected + 1).sqrt()
@@ -245,10 +245,10 @@ def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 
 def _smoothed(error_cells: Tensor) -> Tensor:
-    """(N,) standard errors of a surface that bends little, leaf cells; `error_cells`: of the returns near each place alone.
+    """Return standard errors (N,) of a smooth surface, leaf cells, from `error_cells` of the returns near each place alone.
 
-    A thin plate whose second differences have the standard deviation b cells, and returns of the density ρ, variances⁻¹ a
-    cell: 1 / (8 √(ρ / b²)) is the variance. Where the returns alone are better, its neighbours add nothing.
+    For a thin plate with second differences of standard deviation b cells, and returns of information density ρ per cell, the
+    variance is 1 / (8 √(ρ / b²)). Where the returns alone are more precise, the neighbourhood adds nothing.
     """
     density = 1 / (CELLS_OF_SURFACE * error_cells.square())
     return error_cells.minimum((_BEND_CELLS / (8 * density.sqrt())).sqrt())
@@ -259,18 +259,18 @@ def _smoothed(error_cells: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class CellsInBox:
-    """Rays and returns in the leaf cells of a box, arrays of leaf cells."""
+    """Free space and returns in the leaf cells of a box, as dense arrays."""
 
     corner: NDArray[np.float64]  # (3,) lower corner of the first cell, world, m
-    passed: NDArray[np.uint8]  # number of scans with a ray through the cell, up to 7
-    returns: NDArray[np.bool_]  # whether there are returns in it
-    observed: NDArray[np.bool_]  # whether it is a leaf cell of the map
+    passed: NDArray[np.uint8]  # number of scans with a ray through the cell, at most 7
+    returns: NDArray[np.bool_]  # whether the cell has returns
+    observed: NDArray[np.bool_]  # whether the cell is a leaf cell of the map
 
 
 def dense_cells(
     contents: MapContents, lower: NDArray[np.int64], shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
-    """`passed`, `returns` and `observed` of the leaf cells from `lower` (3,) on, counted from the origin of a map."""
+    """Return `passed`, `returns` and `observed` of the leaf cells from `lower` (3,) on, relative to the map's origin."""
     passed, returns = contents.free_space.dense(lower, shape)
     cells = lattice_of(contents.field.table.leaf_keys()) - lower
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
@@ -280,15 +280,15 @@ def dense_cells(
 
 
 def free_space_odds(contents: MapContents) -> NDArray[np.float64]:
-    """(8,) how much more often 0 to 7 or more scans cross a leaf cell behind a surface than one in front of it."""
-    # Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells by their noise, and
-    # on the way to false returns.
+    """Return the odds (8,) that a leaf cell crossed by 0 to 7 or more scans is behind rather than before a surface."""
+    # Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells because of noise,
+    # and on the way to false returns.
     keys = contents.field.table.leaf_keys()
     keys = keys[:: max(1, len(keys) // _ODDS_CELLS)]
     leaf_m = contents.config.leaf_size_m
     centres = torch.from_numpy(((lattice_of(keys) + 0.5) * leaf_m).astype(np.float32))
     distances_m = signed_distance(contents, centres).numpy()
-    # Along grazing rays the field is longer than the distance, and where returns are noisy shorter; so is its gradient.
+    # At grazing incidence the field exceeds the distance, and with noisy returns falls below it; so does its gradient.
     edge = leaf_m * np.linalg.norm(gradient(contents, centres).numpy(), axis=1)
     weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
     passed = contents.free_space.at(keys)
@@ -296,6 +296,6 @@ def free_space_odds(contents: MapContents) -> NDArray[np.float64]:
     sides = (distances_m < -edge, distances_m > edge)
     behind, before = (np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1 for side in sides)
     odds = (behind / behind.sum()) / (before / before.sum())
-    # More crossings never make a cell less free: chance is smoothed away from the end on.
+    # Enforce monotonicity: more crossings never make a cell less free.
     falling: NDArray[np.float64] = np.minimum.accumulate(odds)
     return falling

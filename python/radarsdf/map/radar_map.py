@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The map that a fit returns, in one file."""
+"""The map that a fit returns, stored in one file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class RadarMap(Map):
-    """A fitted map in one file, made by :func:`radarsdf.fit` or :func:`radarsdf.load`. See :class:`Map` for its queries."""
+    """Fitted map in one file, created by :func:`radarsdf.fit` or :func:`radarsdf.load`. See :class:`Map` for its queries."""
 
     def __init__(self, contents: MapContents) -> None:
         self._contents = contents
@@ -41,7 +41,7 @@ class RadarMap(Map):
 
     def __reduce__(self) -> tuple[Callable[..., RadarMap], tuple[Any, ...]]:
         tensors, description = storage.parts_of(self._contents)
-        return _from_pickle, (save(tensors), description)  # as bytes: a pickle without classes of PyTorch
+        return _from_pickle, (save(tensors), description)  # bytes: the pickle needs no classes of PyTorch
 
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
         return self._where_observed(queries.signed_distance, world, extrapolate=extrapolate)
@@ -84,7 +84,7 @@ class RadarMap(Map):
         low, high = (0, 1) if scale is None else (scale.low, scale.high)
         return self._contents.view_statistics.in_world(self.origin, low, high)
 
-    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - it is of all
+    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
         return self._viewed
 
     @cached_property
@@ -116,7 +116,7 @@ class RadarMap(Map):
 
     @property
     def nbytes(self) -> int:
-        """Size of the parameters of the field, bytes. 3QFP calls this the size of the map."""
+        """Size of the parameters of the field, bytes: the size of the map in 3QFP."""
         return sum(p.numel() * p.element_size() for p in self.field.parameters())
 
     @property
@@ -131,7 +131,7 @@ class RadarMap(Map):
 
 
 def load_file(path: str | PathLike[str]) -> RadarMap:
-    """:func:`radarsdf.load` of a file. Nothing in it is executed."""
+    """Load a map from a file. No code in it is executed."""
     return RadarMap(storage.load_contents(path))
 
 

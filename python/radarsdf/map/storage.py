@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A map as one safetensors file, and as a pickle."""
+"""Serialisation of a map to a safetensors file, and to a pickle."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ FORMAT_VERSION = 13
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "hits": torch.uint32, "visibility": torch.uint32}
-# Types and numbers of dimensions of the arrays of other parts. Bits and keys are stored as int64, which all readers of
-# safetensors have; keys have at most 63 bits, as those of leaf cells.
+# Types and dimensions of the arrays of other parts. Bits and keys are stored as int64, which all readers of safetensors
+# support; keys have at most 63 bits, like those of leaf cells.
 _PARTS = {
     "free_space": {"keys": (torch.int64, 1), "planes": (torch.int64, 3)},
     "view_statistics": {
@@ -60,7 +60,7 @@ _PARTS = {
 
 
 def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
-    """Write a map to one file, whole or not at all. A ValueError if a number is not finite: it could not be loaded."""
+    """Write a map to one file, atomically. Raise a ValueError if a number is not finite: it could not be loaded."""
     tensors, description = parts_of(contents)
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():
@@ -77,7 +77,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
 
 @torch.inference_mode(mode=False)  # or the map could not give gradients
 def load_contents(path: str | PathLike[str]) -> MapContents:
-    """Read the file of a map. A ValueError if it is damaged, of another program or of another version."""
+    """Read the file of a map. Raise a ValueError if it is damaged, of another program or of another version."""
     check_regular_file(path)
     foreign = None
     try:
@@ -89,7 +89,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
             elif version != str(FORMAT_VERSION):
                 foreign = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}: fit it again"
             else:
-                # Copied, because the tensors are views of the file, which may be changed or removed.
+                # Copy: the tensors are views of the file, which may be changed or removed.
                 tensors = {name: file.array(name).clone() for name in file.names}
                 return contents_of(tensors, json.loads(metadata["description"]))
     except OSError:
@@ -103,7 +103,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
 
 
 def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
-    """(C,) Morton keys of the leaf cells of a map, ascending. Nothing else of its file is read or checked."""
+    """Read the ascending Morton keys (C,) of the leaf cells of a map, and nothing else of its file."""
     try:
         with open_tensors(path, "np") as file:
             keys: NDArray[Any] = file.array("leaf_keys")
@@ -115,14 +115,14 @@ def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
 
 
 def file_bytes(contents: MapContents) -> int:
-    """Size of the file of :func:`save_contents`, without the names of its arrays, bytes."""
+    """Return the size of the file of :func:`save_contents`, without the names of its arrays, bytes."""
     tensors, description = parts_of(contents)
-    quoted = json.dumps(json.dumps(description))  # as it stands in the header, which is JSON itself
+    quoted = json.dumps(json.dumps(description))  # as quoted in the header, which is JSON itself
     return sum(tensor.nbytes for tensor in tensors.values()) + len(quoted)
 
 
 def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """All tensors of a map, and a description that JSON can store."""
+    """Return all tensors of a map, and a description that JSON can store."""
     field, scale, reflectance = contents.field, contents.intensity_scale, contents.field.reflectance
     tensors: dict[str, Tensor] = {f"field.{name}": value for name, value in field.state_dict().items()}
     tensors["origin"] = torch.from_numpy(contents.origin)
@@ -152,7 +152,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapContents:
-    """The inverse of :func:`parts_of`. Raises an error of some kind if parts do not fit together."""
+    """Invert :func:`parts_of`. Raise an exception of any type if parts are inconsistent."""
     config = FitConfig.from_dict(description["config"])
     origin = _taken(tensors, "origin", torch.float64, (3,))
     keys = _taken(tensors, "leaf_keys", torch.int64, (None,))
@@ -172,7 +172,7 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
         arrays = _arrays_of("reflectance", tensors)
         reflectance = Reflectance(config.leaf_size_m, **arrays, network_share=share)
         reflectance.check()
-    # One of the two must answer for intensities, and without them neither can.
+    # A map with intensities needs a network or a closed form to predict them; one without has neither.
     trained = scale is not None and config.trains_intensity
     answered = trained or reflectance is not None
     _check(answered == (scale is not None), "what answers for intensities is missing, or there are none")
@@ -196,8 +196,8 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
 def _field_of(
     tensors: dict[str, Tensor], keys: NDArray[np.uint64], config: FitConfig, with_intensity: bool
 ) -> Field:
-    """The field with these leaf cells, of all tensors that are left."""
-    # Without memory, for shapes alone: a damaged description could ask for networks of any size.
+    """Build the field with these leaf cells from the remaining tensors."""
+    # On the meta device, for shapes alone: a damaged description could request networks of any size.
     with torch.device("meta"):
         if config.train:
             field: Field = NeuralField(keys, config, with_intensity=with_intensity)
@@ -223,7 +223,7 @@ def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
 def _taken(
     tensors: dict[str, Tensor], name: str, dtype: torch.dtype, shape: tuple[int | None, ...]
 ) -> NDArray[Any]:
-    """Takes a tensor of finite numbers of this type and shape. None: any length."""
+    """Pop a tensor of finite numbers of this type and shape; None stands for any length."""
     tensor = tensors.pop(name)
     fits = tensor.dtype == dtype and tensor.ndim == len(shape) and bool(tensor.isfinite().all())
     fits &= all(wanted in (None, length) for wanted, length in zip(shape, tensor.shape, strict=False))
@@ -247,7 +247,7 @@ def _damaged(path: str | PathLike[str]) -> ValueError:
 
 
 class _Report(TypedDict, total=False):
-    """What others read of :attr:`Map.report`, which :func:`radarsdf.fitting.steps.fit_rays` writes."""
+    """Schema of the parts of :attr:`Map.report` that other modules read, written by :func:`radarsdf.fitting.steps.fit_rays`."""
 
     __pydantic_config__ = ConfigDict(strict=True, extra="allow")  # type: ignore[misc]
 
@@ -264,7 +264,7 @@ _REPORT: TypeAdapter[Any] = TypeAdapter(_Report)
 
 
 def checked_report(report: Any) -> dict[str, Any]:
-    """The report of a fit, from JSON. A ValueError if parts that others read are of other types."""
+    """Validate the report of a fit, from JSON. Raise a ValueError if parts of the schema have other types."""
     try:
         _REPORT.validate_python(by_name(report, "the report"))
     except ValidationError as error:

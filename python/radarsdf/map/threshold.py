@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Which triangles a mesh keeps: its limits, and the confidence at which the expected F-score is highest."""
+"""Limits of the triangles that a mesh keeps, and the confidence threshold of the highest expected F-score."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from radarsdf.map.queries import VOXEL_M
 
 Floats = NDArray[np.float64]
 
-_BINS = 1000  # of the confidences from 0 to 1
+_BINS = 1000  # bins of the confidence from 0 to 1
 _SCALARS = 3
-TALLY_NUMBERS = 3 * _BINS + _SCALARS  # of a :class:`Tally`
-_COMPONENT_TRIANGLES = 30  # of the smallest component that is kept, in voxels of VOXEL_M
+TALLY_NUMBERS = 3 * _BINS + _SCALARS  # length of :meth:`Tally.sums`
+_COMPONENT_TRIANGLES = 30  # minimum size of a component in voxels of VOXEL_M
 
 
 class Limits(NamedTuple):
-    """Which triangles a mesh keeps; see :meth:`Map.mesh`."""
+    """Limits of the triangles that a mesh keeps; see :meth:`Map.mesh`."""
 
-    min_confidence: float | None  # None: that of the highest expected F-score
+    min_confidence: float | None  # None: the one of the highest expected F-score
     max_uncertainty: float  # m
     min_component_triangles: int
 
@@ -39,7 +39,7 @@ class Limits(NamedTuple):
         max_uncertainty: float | None = None,
         min_component_triangles: int | None = None,
     ) -> Limits:
-        """The arguments of :meth:`Map.mesh`, checked, with defaults filled in."""
+        """Check the arguments of :meth:`Map.mesh` and fill in defaults."""
         if min_confidence is not None:
             min_confidence = number(min_confidence, "min_confidence")
         if not 0 <= (min_confidence or 0) <= 1:
@@ -50,7 +50,7 @@ class Limits(NamedTuple):
             msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
             raise ValueError(msg)
         if min_component_triangles is None:
-            # In larger voxels fewer, of more area.
+            # Fewer in larger voxels, whose triangles have more area.
             min_component_triangles = round(_COMPONENT_TRIANGLES * min(1.0, VOXEL_M / voxel_m))
         components = whole_number(min_component_triangles, "min_component_triangles", 0)
         return cls(min_confidence, max_uncertainty, components)
@@ -58,14 +58,14 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True)
 class Threshold:
-    """The least confidence of a mesh, and what is expected of it. The names are those in the ``metadata`` of a mesh."""
+    """Confidence threshold of a mesh, and its expected quality. The names are those in the ``metadata`` of a mesh."""
 
-    min_confidence: float  # in [0, 1]; surface of less is left out
-    expected_precision: float  # share of the area kept that is expected to be true; 0 if nothing is kept
-    # Share of the observed surface, that which returns lie on, that it is expected to cover; 0 if none is expected. Surface
-    # that no ray reached does not count: the share of all that is there may be far smaller.
+    min_confidence: float  # in [0, 1]; surface below it is left out
+    expected_precision: float  # expected true share of the kept area; 0 if nothing is kept
+    # Expected share of the observed surface, the one with returns, that the mesh covers; 0 if there is none. Surface that no
+    # ray reached does not count: the share of the whole scene may be far smaller.
     coverage_of_observed: float
-    whole_precision: float  # the same two if all surface were kept, whatever its confidence
+    whole_precision: float  # the same two if all surface were kept, regardless of its confidence
     whole_coverage_of_observed: float
 
     @classmethod
@@ -86,18 +86,18 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Tally:
-    """Area of a map's surface by confidence. Sums over parts of a map, such as tiles, are those of the whole."""
+    """Area of a map's surface by confidence. Additive over parts of a map, such as tiles."""
 
-    area_m2: Floats  # (B,) of the surface in each of B equal bins of the confidence from 0 to 1
-    true_m2: Floats  # (B,) expected true area of it
-    covering: Floats  # (B,) true surface that is newly covered as the confidence falls. Only ratios count
-    existing_m2: float  # expected true surface, whether or not its position is known well enough
-    once_m2: float  # expected true surface that has a return of one scan in one cell
-    twice_m2: float  # … of two
+    area_m2: Floats  # (B,) area of the surface in each of B equal bins of the confidence from 0 to 1
+    true_m2: Floats  # (B,) expected true area
+    covering: Floats  # (B,) true surface newly covered as the threshold falls, up to a constant factor
+    existing_m2: float  # expected true surface, regardless of the accuracy of its position
+    once_m2: float  # expected true surface with a single hit (one scan in one cell)
+    twice_m2: float  # expected true surface with two hits
 
     @classmethod
     def of(cls, area_m2: Floats, confidence: Floats, covering: Floats, reach: Floats, hits: Floats) -> Tally:
-        """Of a surface by its vertices: areas by ``vertex_areas`` of the core, and numbers of :mod:`queries`, (V,) each."""
+        """Build from the vertices of a surface: areas by the core's ``vertex_areas``, and results of :mod:`queries`, (V,) each."""
         true_m2 = confidence * area_m2
         bins = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
@@ -118,7 +118,7 @@ class Tally:
         return cls(area_m2, true_m2, covering, existing_m2, once_m2, twice_m2)
 
     def threshold(self, min_confidence: float | None = None) -> Threshold:
-        """The threshold of the highest expected F-score, or the expectations at a given one."""
+        """Return the threshold of the highest expected F-score, or the expected quality at a given confidence."""
         kept_m2, true_m2, covering = (
             np.cumsum(values[::-1])[::-1] for values in (self.area_m2, self.true_m2, self.covering)
         )
@@ -126,7 +126,7 @@ class Tally:
         coverage = covering / covering[0] if covering[0] > 0 else covering
         if min_confidence is None:
             total = precision + self.reachable * coverage
-            # Over twice the reachable share, which is the same for all: if nothing can be reached, all is kept.
+            # Up to a factor of twice the reachable share, which is constant: if nothing is reachable, all is kept.
             f_score = np.divide(precision * coverage, total, out=np.zeros_like(total), where=total > 0)
             row = int(np.flatnonzero(f_score == f_score.max())[-1]) if f_score.any() else 0
             min_confidence = row / _BINS
@@ -138,9 +138,9 @@ class Tally:
 
     @property
     def reachable(self) -> float:
-        """Share of the observed surface that can be covered: it has returns, and lies near enough to where it was found."""
-        # Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: Chao's estimate of
-        # species that no sample has. Surface that no ray reaches leaves no trace in these counts.
+        """Share of the observed surface that can be covered: it has returns, and its position is accurate enough."""
+        # Of the surface that these scans could have hit, at least once² / (2 · twice) has no return: Chao's estimator of
+        # unseen species. Surface that no ray reaches leaves no trace in these counts.
         true_m2 = float(self.true_m2.sum())
         if true_m2 == 0 or (self.once_m2 > 0 and self.twice_m2 == 0):
             return 0.0
@@ -149,7 +149,7 @@ class Tally:
 
 
 def across_triangles(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
-    """(F, 3) normals of triangles (F, 3), twice as long as their areas, and (F,) these lengths, m²."""
+    """Return the cross products (F, 3) of the edges of triangles (F, 3), and their lengths (F,), twice the areas, m²."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return across, np.sqrt(np.einsum("ni,ni->n", across, across))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Predicted scans: the returns that a radar would get from a pose, and what its beams meet."""
+"""Predicted scans: the returns of a radar at a pose, and the first surface along its beams."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from radarsdf.scans import Scan, Scans
 from radarsdf.threads import resolve_num_threads
 
 _Floats = NDArray[np.float64]
-_Intensity = Callable[[_Floats, _Floats], NDArray[np.float32]]  # (N,) of points (N, 3) and a sensor (3,), m
+_Intensity = Callable[[_Floats, _Floats], NDArray[np.float32]]  # (N,) from points (N, 3) and a sensor (3,), m
 
-# The density of returns on the surface is rate^a · cosine^b / range^c, times d where the patch is hidden: (a, b, c, d) in
-# smooth scenes, where beams are spread by angle, and in rough ones, where a radar sees much behind surfaces. Chosen with
+# The density of returns on the surface is rate^a · cosine^b / range^c, times d if the patch is occluded: (a, b, c, d) in
+# smooth scenes, where returns are spread by angle, and in rough ones, where a radar sees much behind surfaces. Tuned with
 # `python -m bench.paper novel-views`.
 _SMOOTH = np.array([1.0, 1.0, 2.0, 0.01])
 _ROUGH = np.array([2.2, 0.3, 1.0, 0.65])
-_HIDDEN_M = 0.5  # so far behind the first surface a patch is hidden
+_HIDDEN_M = 0.5  # distance behind the first surface from which on a patch is occluded
 _MIN_COSINE = 0.05
 _MIN_BEAM_RAD = 2e-3
 _MAX_BEAMS = 1_000_000
-_ORDER_M = 0.05  # edge of the cells along whose order returns are spread evenly
-# Prior of the detection rate, in scans: with few scans that reached a patch, it is uncertain.
+_ORDER_M = 0.05  # edge of the cells in whose Morton order returns are spread evenly
+# Prior of the detection rate, in scans, for patches reached by few scans.
 _VISIBILITY_BEFORE = 2.0
 _HITS_BEFORE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The scan predicted for one pose: N returns, and what each of the E · A beams first meets."""
+    """Predicted scan at one pose: N returns, and the first surface along each of E · A beams."""
 
     T_world_sensor: _Floats
     """(4, 4) m."""
@@ -78,12 +78,12 @@ class View:
 
     @property
     def scans(self) -> Scans:
-        """The returns as :class:`radarsdf.io.Scans` of one scan, for the writers of :mod:`radarsdf.io`."""
+        """The returns as a single scan in :class:`radarsdf.io.Scans`, for the writers of :mod:`radarsdf.io`."""
         return scans_of_views([self])
 
 
 def scans_of_views(views: Iterable[View]) -> Scans:
-    """The returns of views, one scan each."""
+    """Convert views to scans, one each."""
     kept = [(view.points, view.T_world_sensor, view.intensities) for view in views]
     values = [intensities for _, _, intensities in kept if intensities is not None]
     return Scans(
@@ -95,21 +95,21 @@ def scans_of_views(views: Iterable[View]) -> Scans:
 
 @dataclass(frozen=True, eq=False)
 class ViewedMap:
-    """The surface of a map as rays meet it, and patches that may have returns; in a local frame. It is made once for a map."""
+    """Traceable surface of a map, and patches that may have returns, in a local frame. Built once for a map."""
 
-    tracer: SurfaceTracer  # of the triangles that the mesh keeps by default
-    centres: _Floats  # (P, 3) patches: middles of all triangles where the field crosses zero, m
+    tracer: SurfaceTracer  # tracer of the triangles that the mesh keeps by default
+    centres: _Floats  # (P, 3) centroids of all triangles of the zero level set, the patches, m
     normals: _Floats  # (P, 3) unit vectors towards free space
-    areas_m2: _Floats  # (P,) of the patches
-    rates: _Floats  # (P,) detection rate: share of the scans that reached a patch that have a return there
-    origin: _Floats  # (3,) of the local frame, world, m
-    roughness: float  # See :func:`radarsdf.map.queries.roughness`
+    areas_m2: _Floats  # (P,) areas of the patches
+    rates: _Floats  # (P,) detection rate: share of the scans reaching a patch that have a return there
+    origin: _Floats  # (3,) origin of the local frame, world, m
+    roughness: float  # see :func:`radarsdf.map.queries.roughness`
     intensity: _Intensity | None
-    max_memory_bytes: int | None  # what views may take. None: what the system has left
+    max_memory_bytes: int | None  # memory limit of views. None: what the system has left
 
     @classmethod
     def of(cls, contents: MapContents) -> ViewedMap:
-        """A whole map, in voxels of a leaf cell's size, which is finer than the noise of a radar."""
+        """Build for a whole map, in voxels of a leaf cell's size, which is finer than the noise of a radar."""
         config = contents.config
         check_views(config.max_memory_bytes, cells=len(contents.evidence.visibility))
 
@@ -136,7 +136,7 @@ class ViewedMap:
         evidence_at: Callable[[_Floats], queries.EvidenceAt],
         intensity: _Intensity | None,
     ) -> ViewedMap:
-        """All triangles are patches; rays meet those that the mesh keeps by default. `evidence_at`: of points (N, 3), m."""
+        """Build with all triangles as patches, and those of the default mesh for tracing. `evidence_at`: of points (N, 3), m."""
         across, twice_m2 = across_triangles(surface.vertices, surface.faces)
         centres = surface.vertices[surface.faces].mean(axis=1)
         evidence = evidence_at(centres)
@@ -149,7 +149,7 @@ class ViewedMap:
         return cls(tracer, *patches, origin, *of_scene)
 
     def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:
-        """(N,) where rays from `origin` (3,) in unit `directions` (N, 3) first meet the mesh, m; inf: nowhere."""
+        """Return distances (N,), m, to the first hits of rays from `origin` (3,) in unit `directions` (N, 3); inf: none."""
         rows = np.ascontiguousarray(directions, np.float32)
         found, _ = self.tracer.first_hits(origin.tolist(), rows, max_range_m, False, resolve_num_threads(0))
         return found
@@ -158,7 +158,7 @@ class ViewedMap:
 def view_from(
     surface: ViewedMap, pose: _Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
 ) -> View:
-    """:meth:`Map.render` at a `pose` (4, 4), T_world_sensor, m."""
+    """Render a view at a `pose` (4, 4), T_world_sensor, m; see :meth:`Map.render`."""
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
     if not 0 <= wanted <= 1e8:
         msg = f"returns must be in [0, 10^8], not {returns}"
@@ -181,7 +181,7 @@ def view_from(
 
 
 def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
-    """Ranges, azimuths and elevations (N,) of points (N, 3), sensor frame, m."""
+    """Convert points (N, 3), sensor frame, m, to ranges, azimuths and elevations (N,)."""
     x, y, z = points.T
     ranges_m = np.sqrt(x * x + y * y + z * z)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -191,7 +191,7 @@ def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
 def _patches(
     surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, count: int
 ) -> NDArray[np.int64]:
-    """Rows of the patches that have a return: `count`, spread evenly by the number that is expected of each."""
+    """Return the rows of `count` patches with returns, distributed in proportion to their expected numbers."""
     centres = surface.centres
     seen = np.ones(len(centres), bool)
     limits = (sensor.range_m, sensor.azimuth_rad, sensor.elevation_rad)
@@ -215,11 +215,11 @@ def _patches(
 
 
 def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
-    """At most `count` rows, spread evenly by the number `expected` (N,) of each, of which one row has at most one."""
+    """Return at most `count` distinct rows, distributed in proportion to their `expected` (N,) numbers."""
     count = min(count, int(np.count_nonzero(expected)))
     if count == 0:
         return np.zeros(0, np.int64)
-    # The k largest have one each: of these k, the fewest after which no other one has more than its share of the rest.
+    # The k largest get one each, with the smallest k for which no other row's share of the rest exceeds one.
     falling = np.sort(expected)[::-1]
     rest = np.cumsum(falling[::-1])[::-1]
     full = int(np.argmax(falling * (count - np.arange(len(falling))) <= rest))
@@ -238,7 +238,7 @@ def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _F
 
 
 def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
-    """Azimuths (A,) and elevations (E,) of beams that overlap by half."""
+    """Return azimuths (A,) and elevations (E,) of beams that overlap by half."""
     steps = [max(width / 2, _MIN_BEAM_RAD) for width in sensor.beam_rad]
     limits = (sensor.azimuth_rad, sensor.elevation_rad)
     counts = [int((high - low) / step) + 1 for (low, high), step in zip(limits, steps, strict=True)]
@@ -253,7 +253,7 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 def _first_surface(
     surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, azimuth: _Floats, elevation: _Floats
 ) -> NDArray[np.float32]:
-    """Range (E, A) of what each beam first meets, NaN where that is nothing."""
+    """Return the range (E, A) of the first surface along each beam; NaN where there is none."""
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)
     ranges_m = surface.ranges(position, directions, float(sensor.range_m[1]))
