@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans, times and Doppler, checked for shapes, values and units."""
+"""Validation of scans, times and Doppler: shapes, values and units."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.scans import Scans, filled
 
-_MOST_M = 500.0  # median range, m. Imaging radars reach 300 m
-_INTERVALS_S = 0.002, 20.0  # median between scans: from 500 Hz to what the overlap of moving scans allows
-_MOST_REACHES = 10.0  # median ranges between two scans, that have nothing in common then
+_MOST_M = 500.0  # maximum median range, m. Imaging radars reach 300 m
+_INTERVALS_S = 0.002, 20.0  # limits of the median scan interval: 500 Hz, and no overlap of moving scans
+_MOST_REACHES = 10.0  # maximum distance between two scans, median ranges: they do not overlap
 
 
 @dataclass(frozen=True)
 class CheckedScans:
-    """F scans of one drive."""
+    """Validated scans of one drive, F of them."""
 
-    scans: list[Floats]  # (N_i, 3), sensor frame, m; without the returns that move
-    times_s: Floats | None  # (F,) from the first scan on
+    scans: list[Floats]  # (N_i, 3) static returns, sensor frame, m
+    times_s: Floats | None  # (F,) relative to the first scan
     begin_s: float  # time of the first scan
-    velocities: SensorVelocities | None  # by the Doppler. None: there is none, or it yields no velocity
-    moving: int  # number of returns that were left out, because they move
-    notes: list[str]  # sentences on what was not used
+    velocities: SensorVelocities | None  # from Doppler. None without Doppler, or if it yields no velocity
+    moving: int  # number of moving returns left out
+    notes: list[str]  # sentences on unused input
 
     @classmethod
     def of(
@@ -40,7 +40,7 @@ class CheckedScans:
         doppler_mps: Sequence[ArrayLike] | None,
         times: ArrayLike | None,
     ) -> CheckedScans:
-        """Of scans (N_i, 3), Doppler (N_i,) and times (F,). Raises TypeError or ValueError where they are none."""
+        """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
         if doppler_mps is not None and times is None and not isinstance(points, Scans):
             msg = "Doppler needs times: when each scan was taken, s"
             raise ValueError(msg)
@@ -71,7 +71,7 @@ class CheckedScans:
         return cls(standing, times_s, begin_s, velocities, moving, notes)
 
     def check_intervals(self) -> None:
-        """Raises a ValueError if the times between scans cannot be in seconds."""
+        """Raise a ValueError if the times between scans cannot be in seconds."""
         if self.times_s is None or len(self.scans) < 2:
             return
         interval_s = float(np.median(np.diff(self.times_s)))
@@ -87,13 +87,13 @@ class CheckedScans:
 
 
 def median_range_m(scans: Sequence[Floats]) -> float:
-    """Of all returns (N_i, 3). 0 if there are none."""
+    """Return the median range of all returns (N_i, 3). 0 without returns."""
     ranges_m = np.concatenate([np.linalg.norm(scan, axis=1) for scan in scans])
     return float(np.median(ranges_m)) if len(ranges_m) else 0.0
 
 
 def _checked_times(times: ArrayLike, num_scans: int) -> Floats:
-    """(F,) s."""
+    """Return times (F,), s. Raise a ValueError if they are invalid."""
     times_s: Floats = real_array(times, "times_s")
     if times_s.shape != (num_scans,):
         msg = f"times_s must be one for each of {num_scans} scans, not {times_s.shape}"

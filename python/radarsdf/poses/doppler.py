@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Velocities of the sensor by Doppler, and the motion from scan to scan that they imply."""
+"""Velocities of the sensor from Doppler, and the motion between scans that they imply."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from radarsdf.poses.motion import Motion, spans_of, way
 from radarsdf.poses.rigid import Floats, rotation_vector, step_vectors, steps
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
-_SAMPLED, _PAIRS = 400, 40  # returns of a scan, and pairs of neighbouring scans, that show the sign
-_ERRORS = 3.0  # standard errors of a difference that is no chance
-# Measured (Astyx drives): the error of a velocity exceeds that of independent returns. So is one of
-# elevations that all have the same error.
+_SAMPLED, _PAIRS = 400, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
+_ERRORS = 3.0  # standard errors of a significant difference
+# Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
+# elevations with a common error.
 LEAST_MPS = 0.02
-_COMPARED = 8  # steps, over which errors of single poses are small
-# Of what moves upright, where Doppler measures its vertical velocity worse: a share of the speed. Slopes of roads: 0.05.
+_COMPARED = 8  # steps to sum over, so that errors of single poses are small
+# Prior deviation of the vertical velocity, share of the speed, where Doppler is less precise. Slopes of roads: 0.05.
 _CLIMB = 0.1
-_LEAST_STEP_M = 1e-4  # deviation of a step, to divide by
-# Share of the speed that all velocities of a drive may have too much, in any direction: the axes and the scale of a radar are known
-# to this. Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
+_LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
+# Systematic error of all velocities of a drive in any direction, share of the speed: by the axes and the scale of the radar.
+# Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
 _IN_COMMON = 0.003
-NOT_USED = "The Doppler is not used"  # how notes on it begin
+NOT_USED = "The Doppler is not used"  # prefix of notes on it
 
 
 class NoVelocityError(ValueError):
@@ -39,20 +39,20 @@ class NoVelocityError(ValueError):
 
 @dataclass(frozen=True)
 class SensorVelocities:
-    """Of the sensor in its own frame, at each of F scans."""
+    """Velocities of the sensor in its own frame, at each of F scans."""
 
     mean_mps: Floats  # (F, 3)
     covariance: Floats  # (F, 3, 3), m²/s²
-    change: Floats  # (3,) by how much the square of each component's change grows with time, m²/s³
-    static: list[NDArray[np.bool_]]  # (N_i,) of each scan: returns that agree with its velocity
-    found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Elsewhere it is interpolated
-    climb_assumed: int = 0  # scans whose Doppler hardly measures the vertical velocity
+    change: Floats  # (3,) spectral density of the acceleration by component (random walk), m²/s³
+    static: list[NDArray[np.bool_]]  # F masks (N_i,) of the returns that agree with the velocity
+    found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Else it is interpolated
+    climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
 
     @classmethod
     def of(
         cls, scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], times_s: Floats
     ) -> SensorVelocities:
-        """Of scans (N_i, 3), sensor frame, m. Raises a NoVelocityError if fewer than half of them, or than two, have a velocity."""
+        """Estimate from scans (N_i, 3), sensor frame, m. Raise a NoVelocityError if less than half, or two, yield a velocity."""
         each = sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
         if 2 * found.sum() < max(len(found), 2):
@@ -71,7 +71,7 @@ class SensorVelocities:
         at = times_s[found]
         durations = np.diff(at)
         usual = (durations > 0) & (durations <= 2 * np.median(durations))
-        # With the noise of the velocities in it: rather too much.
+        # Includes the noise of the velocities: an overestimate.
         squares = np.diff(mean[found], axis=0)[usual] ** 2
         change = squares.sum(axis=0) / max(durations[usual].sum(), 1e-9) + LEAST_MPS**2
         for i in np.flatnonzero(~found):
@@ -81,33 +81,33 @@ class SensorVelocities:
         return cls(mean, covariance, change, static, found, weak)
 
     def select(self, rows: slice) -> SensorVelocities:
-        """Of these scans."""
+        """Select scans."""
         return SensorVelocities(
             self.mean_mps[rows], self.covariance[rows], self.change, self.static[rows], self.found[rows]
         )
 
     @property
     def usual_mps(self) -> float:
-        """Median of the speeds."""
+        """Median speed, m/s."""
         return float(np.median(np.linalg.norm(self.mean_mps, axis=1)))
 
     def scaled(self, factor: float, sigma: float = 0.0) -> SensorVelocities:
-        """Times a factor, whose deviation is such a share of it. -1: for a radar whose Doppler is positive if the sensor comes nearer."""
+        """Scale by a factor with relative deviation `sigma`. -1 for a radar with positive Doppler for approaching objects."""
         mean = factor * self.mean_mps
         covariance = factor**2 * self.covariance + sigma**2 * mean[:, :, None] * mean[:, None, :]
         return dataclasses.replace(self, mean_mps=mean, covariance=covariance, change=factor**2 * self.change)
 
     def step_covariance(self, i: int, duration_s: float) -> Floats:
-        """(3, 3) of the translation from scan `i` to the next one, m²: of both velocities, and a Brownian bridge between them."""
+        """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
         ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
         between: Floats = ends + np.diag(self.change) * duration_s**3 / 12
         return between
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
-    """Means (F, 3) and covariances (F, 3, 3) of velocities of a sensor that climbs little, and the number of changed ones.
+    """Apply a prior on small vertical velocities: means (F, 3), covariances (F, 3, 3), and the number of changed ones.
 
-    Where a vertical velocity is known less well than a share of the speed, as by a radar whose returns all lie in a plane.
+    It applies where Doppler is less precise than the prior, as for a radar with all returns in a plane.
     """
     variances = covariance[:, 2, 2]
     climbed = np.nansum(mean_mps[:, 2] ** 2 / variances) / np.nansum(1 / variances)
@@ -120,18 +120,18 @@ def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
 
 @dataclass(frozen=True)
 class DopplerMotion(Motion):
-    """Translations from scan to scan, by velocities. They depend on how the sensor turned meanwhile."""
+    """Translations between scans from velocities. They depend on the rotation of the sensor in between."""
 
     velocities: SensorVelocities
     durations_s: Floats  # (F - 1,)
-    # (F - 1, 3) rotation vectors of the steps, roughly: over a gap, a sensor may have turned by more than half a turn.
+    # (F - 1, 3) approximate rotation vectors of the steps: over a gap, a sensor may turn by more than half a turn.
     turns: Floats
 
     @classmethod
     def by(
         cls, velocities: SensorVelocities, times_s: Floats, poses: Floats, turns: Floats | None = None
     ) -> DopplerMotion:
-        """Of scans with these times (F,) and about these poses (F, 4, 4). `turns` None: those of the poses."""
+        """Build from times (F,) and approximate poses (F, 4, 4) of scans. `turns` None: those of the poses."""
         durations_s = np.diff(times_s)
         turns = step_vectors(poses)[:, 3:] if turns is None else turns
         ways = np.stack([velocities.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
@@ -144,11 +144,11 @@ class DopplerMotion(Motion):
         return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002
-        """As it is: the velocities' own covariances are known. If they were learnt, real drives ended four times as far off."""
+        """Return self: covariances of velocities are known. Learning them made the final error of real drives four times larger."""
         return self
 
     def at(self, poses: Floats) -> DopplerMotion:
-        """As measured by a sensor that turned as these poses do."""
+        """Update the translations for the rotations of `poses`."""
         between, means = steps(poses), self.velocities.mean_mps
         for i, step in enumerate(between):
             turn = rotation_vector(step[:3, :3], self.turns[i])
@@ -157,7 +157,7 @@ class DopplerMotion(Motion):
 
 
 def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
-    """Share of the squared displacements of poses (F, 4, 4) that velocities contradict, 0 if it is within their errors."""
+    """Return the share of the squared displacements of poses (F, 4, 4) not explained by velocities; 0 within their errors."""
     ways = np.einsum("fij,fj->fi", poses[:-1, :3, :3], motion.steps[:, :3, 3])
     count = min(_COMPARED, len(ways))
     measured, variance = (
@@ -172,14 +172,14 @@ def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
 
 
 def doppler_sign(scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats) -> int:
-    """-1 if neighbouring scans, without what moves, agree better with all velocities reversed, else 1."""
+    """Return -1 if neighbouring scans of static returns agree better with all velocities reversed, else 1."""
     moved_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * np.diff(times_s)
     usable = (
         velocities.found[1:] & velocities.found[:-1] & (np.diff(times_s) <= 2 * np.median(np.diff(times_s)))
     )
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
     pairs = np.flatnonzero(usable)
-    pairs = np.sort(pairs[np.argsort(moved_m[pairs])[-_PAIRS:]])  # the longest ones determine most
+    pairs = np.sort(pairs[np.argsort(moved_m[pairs])[-_PAIRS:]])  # the longest steps are most informative
     gains = []
     for i in pairs.tolist():
         first, second = scans[i : i + 2]

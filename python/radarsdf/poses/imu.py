@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Rotations that a gyroscope measured, and the alignment of an IMU with a radar: axes, up, and time offset.
+"""Rotations from a gyroscope, and the alignment of an IMU with a radar: axes, vertical, and time offset.
 
-The velocity by Doppler changes as the accelerometer measures, once both are rotated into one frame by the gyroscope. With R the
-rotation from the IMU's axes to the radar's, Q(t) that of the IMU since the beginning, and v the velocity of the radar in its
-own frame:
+Changes of the Doppler velocity match the accelerometer once the gyroscope rotates both into one frame. With R the rotation
+from the IMU's axes to the radar's, Q(t) that of the IMU since the beginning, and v the velocity of the radar in its own
+frame:
 
     Q (Rᵀ v - ω x lever) = V + ∫ Q (f - bias) dt + g t
 
-within each window of some seconds, whose V is free. It is linear in the entries of Rᵀ, g and V, which initialises the search over
-the time offset. Robust nonlinear least squares (Gauss and Newton's method) ends it.
+within windows of some seconds, each with a free V. The equation is linear in the entries of Rᵀ, g and V: a linear solution for
+each time offset on a grid initialises robust nonlinear least squares (Gauss-Newton).
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import Floats, covariance_in, nearest_rotation, rotation
 
-# Bias and noise of cheap gyroscopes, until the drive itself shows them.
+# Prior bias and noise, of cheap gyroscopes, until they are estimated from the drive.
 _FIRST_BIAS_RAD_S = 0.02
 _FIRST_NOISE_RAD = 0.003
-_LEAST_STEPS = 4  # fewer turns contradict nothing
+_LEAST_STEPS = 4  # minimum number of turns for a contradiction
 _MOST_BIAS_RAD_S = 0.35  # zero-rate offset of the cheapest gyroscopes: 20 degrees a second
-# Mean squared deviation of a turn from the rates, per step, and as a multiple of that from a constant rate, from which on rates
-# contradict the returns. Simulated drives of 9 kinds: 0.02 to 0.63 times; in wrong units, signs or axes 1.3 times and more.
+# Gate on the mean squared residual of turns from the rates, absolute and relative to that from a constant rate. Simulated
+# drives of 9 kinds: 0.02 to 0.63 times; in wrong units, signs or axes 1.3 times and more.
 _CONTRADICTED, _CONTRADICTED_SHARE = 12.0, 1.2
 
-# Of a window, at least: longer ones gave the real walk the same rotation, to 0.5 degrees.
+# Minimum length of a window: longer ones gave the same rotation for the real walk, to 0.5 degrees.
 _WINDOW_S, _WINDOW_SCANS = 4.0, 10
-_MAX_TIME_OFFSET_S, _LATE_STEP_S = 0.5, 0.02  # time offsets that are tried
-_UNRELATED_S = 2.0  # from here on, the motions that are compared have nothing to do with each other
-_UNRELATED = 60  # such offsets that are tried: none must fit as well
-_LEFT = 4.0  # variances of what the IMU leaves of velocities, at most: 0.1 to 0.5 where it is right
-_KNOWN_RAD = 0.1  # standard deviation of a rotation that is of use
-# Knots of the gyroscope's bias, linear between them, at least so far apart.
+_MAX_TIME_OFFSET_S, _LATE_STEP_S = 0.5, 0.02  # grid of time offsets
+_UNRELATED_S = 2.0  # time shift from which on motions are uncorrelated
+_UNRELATED = 60  # number of such shifts as null hypotheses: none must fit as well
+_LEFT = 4.0  # maximum normalised variance of residual velocities: 0.1 to 0.5 for a correct alignment
+_KNOWN_RAD = 0.1  # maximum standard deviation of a useful rotation
+# Maximum number of knots of the gyroscope's piecewise linear bias, and their minimum distance.
 _KNOTS, _KNOT_S = 12, 10.0
-_BIAS_CHANGE_RAD_S = 1e-3  # from one of them to the next: of cheap gyroscopes, over minutes
-_FORCE_BIAS, _LEVER_M = 0.2, 0.3  # deviations of the accelerometer's bias, m/s², and of the lever
-_MEDIAN = 2.366  # of a chi-squared variable of three
-_ROBUST = 3.0  # deviations from which on a velocity counts less
-_ITERATIONS, _SETTLED, _DIFFERENCE = 20, 0.03, 1e-6  # steps, deviations at the end, increments for slopes
+_BIAS_CHANGE_RAD_S = 1e-3  # deviation of its change between knots: cheap gyroscopes, over minutes
+_FORCE_BIAS, _LEVER_M = 0.2, 0.3  # prior deviations of the accelerometer's bias, m/s², and of the lever arm
+_MEDIAN = 2.366  # median of the chi-squared distribution with three degrees of freedom
+_ROBUST = 3.0  # scale of Cauchy's loss, standard deviations
+_ITERATIONS, _SETTLED, _DIFFERENCE = 20, 0.03, 1e-6  # maximum, tolerance in deviations, finite difference
 
-# Half of the time, nothing that a radar is mounted on turns faster, or is accelerated more: a turn a second, three times gravity.
+# Maximum median rate and centripetal acceleration of anything that carries a radar: one turn a second, three times gravity.
 _MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
 
 
@@ -60,13 +60,13 @@ class UnusableGyroscopeError(ValueError):
 
 
 def cumulated(turns: Floats) -> Floats:
-    """(N + 1, 3, 3) cumulative products of rotation vectors (N, 3), the identity first."""
+    """Return the cumulative products (N + 1, 3, 3) of rotation vectors (N, 3), the identity first."""
     count = len(turns) + 1
     width = int(np.ceil(np.sqrt(count)))
     padded = np.zeros((width * width, 3))
     padded[1:count] = turns
     found: Floats = Rotation.from_rotvec(padded).as_matrix().reshape(width, width, 3, 3)
-    # Rows in parallel, then one row after another: few steps of many products each.
+    # Scan within rows in parallel, then across rows: few steps of many products each.
     for k in range(1, width):
         found[:, k] = found[:, k - 1] @ found[:, k]
     for row in range(1, width):
@@ -80,14 +80,14 @@ class Gyroscope:
 
     turns: Floats  # (F - 1, 3) rotation vectors in the frame of the first of two scans, rad
     durations_s: Floats  # (F - 1,)
-    bias: MotionRate  # of the measured rate, rad/s
+    bias: MotionRate  # bias of the measured rate, rad/s
     noise_rad2: float = _FIRST_NOISE_RAD**2  # variance of a rotation over the median duration
 
     @classmethod
     def of(
         cls, angular_velocity: Floats, at_s: Floats, times_s: Floats, bias_rad_s: float = _FIRST_BIAS_RAD_S
     ) -> Gyroscope:
-        """Of rates (G, 3), rad/s, measured at ascending times (G,), and scans at `times_s` (F,)."""
+        """Integrate rates (G, 3), rad/s, at ascending times (G,) between scans at `times_s` (F,)."""
         # Between two neighbouring times, of scans or rates, the rate is their mean (the trapezoidal rule).
         inner = at_s[(at_s > times_s[0]) & (at_s < times_s[-1])]
         edges = np.union1d(inner, times_s)
@@ -99,19 +99,19 @@ class Gyroscope:
 
     @property
     def _noise(self) -> Floats:
-        """(F - 1,) variance of each component of a rotation, rad²."""
+        """Variance (F - 1,) of each component of a rotation, rad²."""
         return self.noise_rad2 * self.durations_s / max(float(np.median(self.durations_s)), 1e-9)
 
     def step(self, i: int) -> MotionRate:
-        """The rotation vector from scan `i` to the next, rad."""
+        """Return the rotation vector from scan `i` to the next, rad."""
         duration_s = self.durations_s[i]
         covariance = self.bias.covariance * duration_s**2 + self._noise[i] * np.eye(3)
         return MotionRate(self.turns[i] - self.bias.mean * duration_s, covariance)
 
     def learnt(self, turns: Floats, covariance: Floats) -> Gyroscope:
-        """With the bias and the noise that rotations (F - 1, 3) show, with their covariance (F - 1, 3, 3). NaN: unknown.
+        """Estimate bias and noise from rotations (F - 1, 3) with covariance (F - 1, 3, 3); NaN where unknown.
 
-        Raises an UnusableGyroscopeError if they contradict the rates.
+        Raises an UnusableGyroscopeError if the rotations contradict the rates.
         """
         known = np.isfinite(turns).all(axis=1) & (self.durations_s > 0)
         if known.sum() < 2:
@@ -131,9 +131,9 @@ class Gyroscope:
 def _fitted_bias(
     off: Floats, durations_s: Floats, weights: Floats, before: Floats | float = 0.0
 ) -> tuple[Floats, Floats, float]:
-    """Constant rate (3,) that rotations `off` (K, 3) show, its information (3, 3), and the mean squared residual.
+    """Fit a constant rate (3,) to residual rotations `off` (K, 3); return it, its information (3, 3) and the mean squared residual.
 
-    Weighted least squares; `before` is the information that the rate is 0.
+    Weighted least squares; `before` is the information of a prior at 0.
     """
     information = before + np.einsum("fij,f->ij", weights, durations_s**2)
     bias: Floats = np.linalg.solve(information, np.einsum("fij,fj,f->i", weights, off, durations_s))
@@ -142,12 +142,12 @@ def _fitted_bias(
 
 
 def _check(off: Floats, turns: Floats, durations_s: Floats, weights: Floats, covariance: Floats) -> None:
-    """Raises an UnusableGyroscopeError if rotations that are `off` (K, 3) from those of returns contradict them."""
+    """Raise an UnusableGyroscopeError if the residual rotations `off` (K, 3) are too large or biased."""
     bias, _, square = _fitted_bias(off, durations_s, weights)
     constant = _fitted_bias(-turns, durations_s, weights)[2]
     rate = float(np.linalg.norm(bias))
     contradicted = len(off) > _LEAST_STEPS and square > max(_CONTRADICTED, _CONTRADICTED_SHARE * constant)
-    # Turns that the returns hardly show all have the error of what was expected.
+    # Turns that the returns hardly observe share the error of their prediction.
     unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
     if contradicted or rate >= _MOST_BIAS_RAD_S + 3 * unknown:
         msg = (
@@ -159,16 +159,16 @@ def _check(off: Floats, turns: Floats, durations_s: Floats, weights: Floats, cov
 
 @dataclass(frozen=True)
 class _ImuMotion:
-    """The motion of an IMU, integrated."""
+    """Integrated motion of an IMU."""
 
     times_s: Floats
     rates: Floats  # (G, 3) rad/s without bias
-    turns: Floats  # (G, 3, 3) to the frame of the first time
-    speeds: Floats  # (G, 3) integral of the forces without bias, in the frame of the first time, m/s
+    turns: Floats  # (G, 3, 3) rotations to the initial frame
+    speeds: Floats  # (G, 3) integral of the specific forces without bias in the initial frame, m/s
 
     @classmethod
     def of(cls, imu: Imu, rate_bias: Floats, force_bias: Floats) -> _ImuMotion:
-        """Without biases (K, 3) of rates at evenly spaced knots, and (3,) of forces."""
+        """Integrate `imu` corrected for biases (K, 3) of rates at evenly spaced knots, and (3,) of forces."""
         assert imu.specific_force is not None
         at = np.linspace(imu.times_s[0], imu.times_s[-1], len(rate_bias))
         rates = imu.angular_velocity - np.stack([np.interp(imu.times_s, at, bias) for bias in rate_bias.T], 1)
@@ -180,7 +180,7 @@ class _ImuMotion:
         return cls(imu.times_s, rates, turns, speeds)
 
     def at(self, times_s: Floats) -> tuple[Floats, Floats, Floats]:
-        """Rates (F, 3), rotations (F, 3, 3) and speeds (F, 3) at other times."""
+        """Interpolate rates (F, 3), rotations (F, 3, 3) and speeds (F, 3) at `times_s` (F,)."""
         times_s = np.clip(times_s, self.times_s[0], self.times_s[-1])
         before = np.clip(np.searchsorted(self.times_s, times_s) - 1, 0, len(self.times_s) - 2)
         left = (times_s - self.times_s[before])[:, None]
@@ -194,26 +194,26 @@ class _ImuMotion:
 
 @dataclass(frozen=True)
 class ImuAlignment:
-    """The geometry and time offset between an IMU and a radar."""
+    """Extrinsics and time offset between an IMU and a radar."""
 
     R_sensor_imu: Floats  # (3, 3)
-    sigma_rad: float  # its deviation about the least certain axis. 0: it was given
-    time_offset_s: float  # by which the times of scans are too late, in the clock of the IMU
+    sigma_rad: float  # its standard deviation about the least certain axis. 0: given
+    time_offset_s: float  # delay of the times of scans in the clock of the IMU
     lever_m: Floats  # (3,) position of the radar in the axes of the IMU
     angular_velocity: Floats  # (G, 3) rad/s, in the axes of the radar, without bias
-    bias_rad_s: float  # deviation of the remaining bias, about the least certain axis
+    bias_rad_s: float  # standard deviation of the remaining bias about the least certain axis
     times_s: Floats  # (G,) in the clock of the scans
     up: Floats  # (F, 3) unit vectors in the frame of the radar at each scan
 
     @property
     def words(self) -> str:
-        """What was found, in one sentence."""
+        """Summary in one sentence."""
         how = f"found to {np.degrees(self.sigma_rad):.1f} degrees" if self.sigma_rad > 0 else "given"
         return f"The IMU's axes were {how}, scans are {self.time_offset_s:.3f} s late in its clock, and its accelerometer gives the vertical."
 
     @classmethod
     def of(cls, imu: Imu, velocities: SensorVelocities, times_s: Floats) -> ImuAlignment | None:
-        """Of velocities at ascending `times_s` (F,). None: they do not determine it."""
+        """Estimate from velocities at ascending `times_s` (F,). None if it is not observable."""
         if imu.specific_force is None or len(times_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
             return None
         if times_s[-1] - times_s[0] < 4 * _UNRELATED_S:
@@ -227,7 +227,7 @@ class ImuAlignment:
 
 
 def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows (K,) of scans in windows of about `_WINDOW_S` without gaps, and the number (K,) of each one's window."""
+    """Return rows (K,) of scans in windows of about `_WINDOW_S` without gaps, and their window (K,)."""
     usual = float(np.median(np.diff(times_s)))
     length_s = max(_WINDOW_S, _WINDOW_SCANS * usual)
     number, begin = np.zeros(len(times_s), np.intp), 0
@@ -240,7 +240,7 @@ def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _centred(values: Floats, window: NDArray[np.intp]) -> Floats:
-    """Values (K, ...) less their mean in each window."""
+    """Subtract the mean of each window from values (K, ...)."""
     first = np.searchsorted(window, np.arange(window[-1] + 1))
     counts = np.bincount(window).reshape(-1, *[1] * (values.ndim - 1))
     centred: Floats = values - (np.add.reduceat(values, first, axis=0) / counts)[window]
@@ -250,11 +250,11 @@ def _centred(values: Floats, window: NDArray[np.intp]) -> Floats:
 def _first_guess(
     imu: Imu, v: Floats, _: Floats, times_s: Floats, window: NDArray[np.intp]
 ) -> tuple[Floats, Floats, float] | None:
-    """Rotation (3, 3), gravity (3,) and time offset, by linear least squares. None: chance explains the motions as well."""
+    """Solve for rotation (3, 3), gravity (3,) and time offset by linear least squares. None if not significant."""
     motion = _ImuMotion.of(imu, np.zeros((1, 3)), np.zeros(3))
 
     def fit(at_s: Floats) -> tuple[float, Floats]:
-        """Residual sum of squares; the entries of Rᵀ row by row, then gravity."""
+        """Return the residual sum of squares, and the entries of Rᵀ row by row, then gravity."""
         _, turns, speeds = motion.at(at_s)
         rows = np.zeros((len(at_s), 3, 12))
         rows[:, :, :9] = np.einsum("fij,fk->fijk", turns, v).reshape(-1, 3, 9)
@@ -267,7 +267,7 @@ def _first_guess(
     late = np.arange(-_MAX_TIME_OFFSET_S, _MAX_TIME_OFFSET_S + 1e-9, _LATE_STEP_S)
     fits = [fit(times_s - s) for s in late]
     best = int(np.argmin([cost for cost, _ in fits]))
-    # A drive that stands still for the most part has the same rotations and velocities at many times.
+    # A mostly stationary drive has the same rotations and velocities at many times.
     span_s = times_s[-1] - times_s[0]
     away = np.linspace(_UNRELATED_S, span_s - _UNRELATED_S, _UNRELATED)
     if fits[best][0] >= min(fit(times_s[0] + (times_s - times_s[0] + s) % span_s)[0] for s in away):
@@ -288,7 +288,7 @@ def _fitted(
     gravity: Floats,
     time_offset_s: float,
 ) -> ImuAlignment | None:
-    """By robust nonlinear least squares. None: it does not explain the velocities, or leaves the rotation open."""
+    """Refine by robust nonlinear least squares. None if the velocities are not explained, or the rotation is not observable."""
     known = imu.R_sensor_imu is not None
     first = np.searchsorted(window, np.arange(window[-1] + 1))
     information = np.linalg.inv(covariance)
@@ -299,7 +299,7 @@ def _fitted(
         return R_first if known else R_first @ rotation(x[:3])
 
     def off(x: Floats) -> Floats:
-        """(K, 3) residual velocities in standard deviations, without what each window has in common."""
+        """Return whitened residual velocities (K, 3), with the mean of each window removed."""
         R, at_s = rotated(x), times_s - x[12]
         rates, turns, speeds = _ImuMotion.of(imu, x[13:].reshape(-1, 3), x[6:9]).at(at_s)
         moved = np.einsum("ji,fj->fi", R, v) - np.cross(rates, x[9:12])
@@ -331,7 +331,7 @@ def _fitted(
     if not np.isfinite(x).all():
         return None
     scale = float(np.median((off(x) ** 2).sum(axis=1))) / _MEDIAN
-    # A smaller scale is no better knowledge: errors that scans have in common do not show in it.
+    # A scale below 1 does not reduce the covariance: common errors of scans do not show in residuals.
     deviations *= max(scale, 1.0)
     sigma_rad = 0.0 if known else float(np.sqrt(np.linalg.eigvalsh(deviations[:3, :3])[-1]))
     time_offset_s = float(x[12])
@@ -355,7 +355,7 @@ def _fitted(
 
 @dataclass(frozen=True)
 class Inertial:
-    """What is used of an IMU."""
+    """The usable measurements of an IMU."""
 
     gyroscope: Gyroscope | None
     alignment: ImuAlignment | None = None
@@ -365,10 +365,10 @@ class Inertial:
     def of(
         cls, imu: Imu | None, velocities: SensorVelocities | None, times_s: Floats, begin_s: float
     ) -> Inertial:
-        """Of scans at `times_s` (F,) after `begin_s`, in the clock of the IMU."""
+        """Build for scans at `times_s` (F,) relative to `begin_s`, in the clock of the IMU."""
         if imu is None:
             return cls(None)
-        # Units are judged before anything is computed with them.
+        # Check units first.
         rate = float(np.median(np.linalg.norm(imu.angular_velocity, axis=1)))
         across = rate * (0.0 if velocities is None else velocities.usual_mps)
         if rate > _MOST_RAD_S or across > _MOST_MPS2:
@@ -391,12 +391,12 @@ class Inertial:
         return cls(Gyroscope.of(rates, imu.times_s, times_s))
 
     def without(self, why: object) -> Inertial:
-        """Not used, and why."""
+        """Drop the gyroscope, with a note on the reason."""
         return Inertial(None, notes=(*self.notes, f"The gyroscope is not used: {why}."))
 
     @property
     def report(self) -> dict[str, Any] | None:
-        """For the report of the poses. None: nothing was aligned."""
+        """Entry of the report of the poses. None without alignment."""
         if (found := self.alignment) is None:
             return None
         R, lever_m = found.R_sensor_imu.tolist(), found.lever_m.tolist()
@@ -409,14 +409,14 @@ class Inertial:
 
 
 def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
-    """Poses (F, 4, 4) and covariances (F, 6, 6) in a world whose z axis points up, by `up` (F, 3) in the frame of the radar.
+    """Rotate poses (F, 4, 4) and covariances (F, 6, 6) to a world with z up, by `up` (F, 3) in the frame of the radar.
 
-    The first position stays at the origin; the world is turned no further than it takes.
+    The first position stays at the origin; the rotation is minimal.
     """
     now = np.einsum("fij,fj->i", poses[:, :3, :3], up)
     turn, _ = Rotation.align_vectors([[0, 0, 1.0]], [now])
     if now[2] < 0 and np.hypot(now[0], now[1]) < 1e-9 * -now[2]:
-        turn = Rotation.from_rotvec([np.pi, 0, 0])  # upside down: any axis would do
+        turn = Rotation.from_rotvec([np.pi, 0, 0])  # upside down: the axis is arbitrary
     R, found = turn.as_matrix(), poses.copy()
     found[:, :3] = np.einsum("ij,fjk->fik", R, poses[:, :3])
     return found, covariance_in(covariance, R)

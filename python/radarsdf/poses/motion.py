@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Motion from scan to scan: what is expected of it, and what sources measured."""
+"""Motion between scans: priors, predictions, and measurements."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from scipy.stats import qmc
 
 from radarsdf.poses.rigid import Floats, between, rotation, skew, step_vectors, steps, transform
 
-_PRIOR_STEPS = 3.0  # steps that the first guess of habits is worth
+_PRIOR_STEPS = 3.0  # weight of the initial motion prior, steps
 
-_SPAN = 4.0  # standard deviations from end to end, that a search covers
-_FEWEST, _MOST = 64, 8192  # poses of a search
+_SPAN = 4.0  # width of a search, standard deviations
+_FEWEST, _MOST = 64, 8192  # limits of the number of poses of a search
 
-_LEAST_SPAN = 0.1  # of a step, in median steps: two scans at the same time may still differ
-_LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # deviations to divide by: no radar resolves less
+_LEAST_SPAN = 0.1  # minimum duration of a step, median steps: two scans at the same time may still differ
+_LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # minimum deviations, below the resolution of any radar
 
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """What is expected of a rate with three components, of turning, rad/s, or moving, m/s."""
+    """Prior of a rate with three components: rotation, rad/s, or translation, m/s."""
 
-    usual: Floats  # (3,) its mean square
-    change: Floats  # (3,) by how much the square of its change grows with time, per second
-    # Whether it comes back to zero (Ornstein and Uhlenbeck's process). Turns end, a drive goes on: with velocities that come
-    # back, a sparse simulated drive without Doppler was 4.8 m off instead of 0.25; with turns that stay, a real one 7.9 m
-    # instead of 1.
+    usual: Floats  # (3,) mean square
+    change: Floats  # (3,) mean square of its change per second
+    # Whether the rate is mean-reverting (Ornstein-Uhlenbeck process) or a random walk. Turns end, a drive goes on: with
+    # mean-reverting velocities, the error of a sparse simulated drive without Doppler was 4.8 m instead of 0.25; with
+    # random-walk turns, that of a real one 7.9 m instead of 1.
     settles: bool
 
     def after(self, rate: MotionRate | None, elapsed_s: float) -> MotionRate:
-        """The rate `elapsed_s` later. None: it was not known."""
+        """Predict the rate `elapsed_s` later. `rate` None: unknown."""
         if rate is None:
             return MotionRate(np.zeros(3), np.diag(self.usual))
         if not self.settles:
@@ -46,7 +46,7 @@ class MotionPrior:
         return MotionRate(share * rate.mean, covariance)
 
     def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
-        """From the rates of a drive's steps, which lasted so long. None: it was lost there."""
+        """Update from the rates of a drive's steps and their durations. Rate None: tracking was lost."""
         known = [rate.mean for rate in rates if rate is not None]
         if not known:
             return self
@@ -64,15 +64,15 @@ class MotionPrior:
 
 @dataclass(frozen=True)
 class MotionRate:
-    """A rate and how well it is known."""
+    """Rate with its covariance."""
 
     mean: Floats  # (3,)
     covariance: Floats  # (3, 3)
 
 
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
-    """(..., 3) of a sensor that turns evenly by the rotation vectors `turn` (..., 3) while its velocity changes evenly, in its
-    first frame, m."""
+    """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
+    and linearly changing velocity."""
     middle = np.einsum("...ij,j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
     end = np.einsum("...ij,j->...i", rotation(turn), end_mps)
     found: Floats = duration_s / 6 * (begin_mps + 4 * middle + end)
@@ -81,23 +81,23 @@ def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> 
 
 @dataclass(frozen=True)
 class PredictedStep:
-    """The motion from one scan to the next, in the frame of the first, before its returns are used."""
+    """Predicted motion from one scan to the next, in the frame of the first, before its returns are used."""
 
     turn: MotionRate  # rotation vector, rad
     begin_mps: Floats  # (3,) velocity at the first scan, in its frame
-    end_mps: Floats  # (3,) at the second scan, in the frame of that
-    translation_covariance: Floats  # (3, 3) of the translation if the turn is known, m²
+    end_mps: Floats  # (3,) velocity at the second scan, in its frame
+    translation_covariance: Floats  # (3, 3) of the translation given the turn, m²
     duration_s: float
 
     def pose(self, turn: Floats | None = None) -> Floats:
-        """(..., 4, 4) of a sensor that turned by the rotation vectors `turn` (..., 3). None: as is expected."""
+        """Return the pose (..., 4, 4) after rotation vectors `turn` (..., 3). None: the predicted one."""
         turn = self.turn.mean if turn is None else turn
         return transform(turn, way(turn, self.begin_mps, self.end_mps, self.duration_s))
 
     def covariance(self, turn: Floats | None = None) -> Floats:
-        """(6, 6) of translation and rotation vector, in the first frame. A sensor that turned more has gone elsewhere, too."""
+        """Return the covariance (6, 6) of translation and rotation vector, in the first frame, correlated by the turn."""
         turn = self.turn.mean if turn is None else turn
-        # Half of the way's second half turns with the sensor.
+        # Derivative of the translation by the turn: about that of its second half.
         swept = -skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
         both = np.concatenate([swept, np.eye(3)])
         found: Floats = both @ self.turn.covariance @ both.T
@@ -105,19 +105,19 @@ class PredictedStep:
         return found
 
     def spread_m(self, radius_m: float) -> float:
-        """Standard deviation of the place of a return so far away, m: largest over the directions."""
+        """Return the largest standard deviation of the position of a return at range `radius_m`, m."""
         moved = np.linalg.eigvalsh(self.covariance()[:3, :3])[-1]
         turned = np.linalg.eigvalsh(self.turn.covariance)[-1]
         return float(np.sqrt(max(moved + radius_m**2 * turned, 0.0)))
 
     def candidates(self, capture_m: float, radius_m: float) -> tuple[Floats, Floats]:
-        """Turns (K, 3) and poses (K, 4, 4) that cover what is likely, about `capture_m` apart for returns so far away."""
+        """Sample turns (K, 3) and poses (K, 4, 4) of the prediction, about `capture_m` apart for returns at range `radius_m`."""
         turns, turn_axes = np.linalg.eigh(self.turn.covariance)
         ways, way_axes = np.linalg.eigh(self.translation_covariance)
         deviations = np.sqrt(np.maximum(np.concatenate([turns, ways]), 0.0))
         needed = np.maximum(1.0, _SPAN * deviations / np.repeat([capture_m / radius_m, capture_m], 3)).prod()
         count = int(np.clip(2 ** np.ceil(np.log2(needed)), _FEWEST, _MOST))
-        # A quasi-random sequence leaves fewer holes than random numbers (Sobol 1967).
+        # A quasi-random sequence covers space more evenly than random numbers (Sobol 1967).
         draws = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(count) * deviations
         drawn = self.turn.mean + draws[:, :3] @ turn_axes.T
         shifts: NDArray[np.float64] = draws[:, 3:] @ way_axes.T
@@ -128,36 +128,34 @@ class PredictedStep:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motions between neighbouring scans as measured by one source: given poses, Doppler, or a gyroscope."""
+    """Motions between neighbouring scans measured by one source: given poses, Doppler, or a gyroscope."""
 
     steps: Floats  # (F - 1, 4, 4)
-    bias: Floats  # (6,) of each step: translation, m, rotation vector, rad, in the frame of the sensor
+    bias: Floats  # (6,) bias of a step: translation, m, rotation vector, rad, in the sensor frame
     variances: (
-        Floats  # (2,) of each component of a step's translation, m², and rotation, rad², where its share is 1
+        Floats  # (2,) variances of a component of a step's translation, m², and rotation, rad², at share 1
     )
-    shares: (
-        Floats  # (F - 1, 6) factors of these variances. Infinite: the source does not measure this component
-    )
-    spans: Floats  # (F - 1,) duration of each step over the median. Biases grow with it
-    # (6,) deviation of the part of the bias that no measurement of this source can find.
+    shares: Floats  # (F - 1, 6) factors of these variances. Infinite for components that are not measured
+    spans: Floats  # (F - 1,) duration of each step relative to the median, to which biases are proportional
+    # (6,) standard deviation of the systematic part of the bias, not observable from this source.
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
     # (2,) lower bounds of `variances` where the covariance is computed.
     least_variances: Floats = field(default_factory=lambda: np.zeros(2), kw_only=True)
 
     @classmethod
     def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> Motion:
-        """Of given poses (F, 4, 4), at `times_s` (F,) or equally far apart. Errors of steps add up: variances grow with time."""
+        """Build from poses (F, 4, 4) at `times_s` (F,), or evenly spaced. Step errors accumulate: variances grow with time."""
         spans = spans_of(times_s, len(poses))
         shares = np.repeat(spans[:, None], 6, axis=1)
         variances = np.square([max(sigma_m, _LEAST_M), max(sigma_rad, _LEAST_RAD)])
         return cls(steps(poses), np.zeros(6), variances, shares, spans)
 
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
-        """As measured by a sensor with these poses (F, 4, 4). Most measurements are the same for all."""
+        """Relinearise at poses (F, 4, 4). Most measurements do not depend on them."""
         return self
 
     def errors(self, poses: Floats) -> Floats:
-        """(F - 1, 6) of the given steps, if `poses` (F, 4, 4) are right: translations, m, and rotation vectors, rad."""
+        """Return residuals (F - 1, 6) of `poses` (F, 4, 4) against the measured steps: translations, m, rotation vectors, rad."""
         found = steps(poses)
         turns = between(self.steps, found)[:, :3, :3]
         off_m = found[:, :3, 3] - self.steps[:, :3, 3]
@@ -165,7 +163,7 @@ class Motion:
 
     @staticmethod
     def _jacobians(poses: Floats) -> tuple[Floats, Floats]:
-        """(F - 1, 6, 6) each: of a step's errors by the increments of its first and its second pose."""
+        """Return Jacobians (F - 1, 6, 6) of the residuals by increments of the first and the second pose of a step."""
         first, second = np.zeros((2, len(poses) - 1, 6, 6))
         back = poses[:-1, :3, :3].transpose(0, 2, 1)
         first[:, :3, :3], second[:, :3, :3] = -back, back
@@ -175,7 +173,7 @@ class Motion:
         return first, second
 
     def prior(self, poses: Floats) -> tuple[Floats, Floats, Floats]:
-        """Of increments of `poses` (F, 4, 4): blocks on the diagonal (F, 6, 6) and below it (F - 1, 6, 6), and the gradient (F, 6)."""
+        """Return the normal equations of increments of `poses`: diagonal blocks (F, 6, 6), sub-diagonal ones, gradient (F, 6)."""
         information = 1 / (np.repeat(self.variances, 3) * self.shares)
         first, second = self._jacobians(poses)
         errors = (self.errors(poses) - self.bias * self.spans[:, None]) * information
@@ -186,7 +184,7 @@ class Motion:
         return diagonal, np.einsum("fki,fk,fkj->fij", second, information, first), gradient
 
     def by_bias(self, poses: Floats) -> tuple[Floats, Floats]:
-        """Derivatives of the gradient (K, F, 6) by uncertain components of the bias, in their deviations, and information (K,)."""
+        """Return derivatives (K, F, 6) of the gradient by uncertain, normalised bias components, and their information (K,)."""
         rows = np.flatnonzero(self.bias_sigma)
         weights = self.spans[:, None] / (np.repeat(self.variances, 3) * self.shares) * self.bias_sigma
         found = np.zeros((len(rows), len(poses), 6))
@@ -195,11 +193,11 @@ class Motion:
         return found, (weights * self.spans[:, None] * self.bias_sigma).sum(axis=0)[rows]
 
     def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> Motion:
-        """With the bias and the deviations that `poses` show.
+        """Re-estimate bias and variances from `poses`.
 
-        Their covariance has blocks `diagonal` (F, 6, 6) and `below` (F - 1, 6, 6), of increments of the poses `before`: elsewhere,
-        the free motion of the whole would seem errors of steps. A step of expectation maximisation (Dempster et al. 1977): the
-        square of an error is that of its estimate and its variance.
+        Their covariance has blocks `diagonal` (F, 6, 6) and `below` (F - 1, 6, 6), of increments of the poses `before`: at other
+        poses, the gauge freedom would count as step errors. One step of expectation maximisation (Dempster et al. 1977): the
+        expected square of an error is the square of its estimate plus its variance.
         """
         first, second = self._jacobians(before)
         blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
@@ -207,8 +205,8 @@ class Motion:
         errors, spans, weights = self.errors(poses), self.spans[:, None], 1 / self.shares
         counts = np.isfinite(self.shares).sum(axis=0)
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
-        # Where the returns alone leave more than the bias, along a corridor say, it would follow the poses, and these the bias,
-        # for ever: a straight corridor was drawn together by 3 cm a step. So the share of the variance that is left shrinks it.
+        # Where the returns hardly constrain the poses, along a corridor say, bias and poses would drift together without end:
+        # a straight corridor shrank by 3 cm a step. So the bias is shrunk by the share of the variance that remains.
         variances, left_mean = (
             np.repeat(self.variances, 3),
             (weights * left).sum(axis=0) / np.maximum(counts, 1),
@@ -222,9 +220,9 @@ class Motion:
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
-    """Deviations by which steps of poses (F, 4, 4) differ from the one before, as if it were noise: m, rad.
+    """Return standard deviations of the changes between successive steps of poses (F, 4, 4), treated as noise: m, rad.
 
-    Errors of poses that are repeated, or from another clock, are as large as the steps: with less, returns would seem outliers.
+    Repeated poses, or poses of another clock, have errors as large as the steps: with less, returns would seem outliers.
     """
     if len(poses) < 3:
         return 0.0, 0.0
@@ -236,7 +234,7 @@ def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
 
 
 def spans_of(times_s: Floats | None, num_scans: int) -> Floats:
-    """(F - 1,) durations of steps over the median. Without times, all are alike."""
+    """Return durations (F - 1,) of steps relative to the median. Without times, all are 1."""
     spans = np.ones(num_scans - 1)
     if times_s is None:
         return spans

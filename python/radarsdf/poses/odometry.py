@@ -35,34 +35,34 @@ from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
-# Share of the variance of a step's rotation that the returns must remove. Over the scans whose planes are kept, this adds up to
+# Minimum share of the prior variance of a step's rotation that the returns must remove: over the window of scans, it adds up to
 # all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_OBSERVED_TURN = 1 / WINDOW
 
 
 class UnobservedMotionError(ValueError):
-    """Neither the returns nor anything else measures how the sensor moved."""
+    """Neither the returns nor another source observe the motion of the sensor."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """Poses that were estimated from the radar alone."""
+    """Poses estimated from the radar alone."""
 
     poses: Floats
     """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
     covariance: Floats
-    """(F, 6, 6) as of :class:`RefinedPoses`, relative to the scan in the middle of each segment."""
+    """(F, 6, 6) as in :class:`RefinedPoses`, relative to the middle scan of each segment."""
     segments: NDArray[np.int64]
-    """(F,) number of the segment of the drive that each scan belongs to. Where tracking was lost, mostly over a gap in time, a new
-    segment begins: its position relative to the one before is dead reckoning, and no map should join them."""
+    """(F,) segment of the drive of each scan. A new segment begins where tracking was lost, mostly over a gap in time: its
+    position relative to the previous one is dead reckoning, and no map should join them."""
     report: dict[str, Any]
-    """`verdict` in words; `length_m` of the trajectory; `segments`, their number; `doppler` and `gyroscope`, whether they were used;
-    `doppler_sign`, -1 if Doppler is positive for what comes nearer; `gyroscope_bias`, rad/s; `imu`, None or its `R_sensor_imu` with
-    `sigma_rad`, `time_offset_s`, by which the times of scans are too late in its clock, and `lever_m`, from it to the radar in its axes;
-    `moving`, returns that were excluded; `notes` on what was not used or was assumed; `scans`, `seconds`."""
+    """`verdict` in words; `length_m` of the trajectory; `segments`, their number; `doppler` and `gyroscope`, whether used;
+    `doppler_sign`, -1 if Doppler is positive for approaching objects; `gyroscope_bias`, rad/s; `imu`, None or its `R_sensor_imu`
+    with `sigma_rad`, `time_offset_s`, the delay of the times of scans in its clock, and `lever_m`, from it to the radar in its
+    axes; `moving`, number of moving returns; `notes` on unused input and assumptions; `scans`, `seconds`."""
 
     def longest_segment(self) -> slice:
-        """The scans of the segment with the most scans: those to make a map of."""
+        """Return the scans of the segment with the most scans, from which to fit a map."""
         counts = np.bincount(self.segments)
         first = int(np.searchsorted(self.segments, np.argmax(counts)))
         return slice(first, first + int(counts.max()))
@@ -79,45 +79,45 @@ def odometry(
 ) -> Odometry:
     """Estimate the poses of scans from the radar alone.
 
-    Fits each scan to the planes of the scans before it, starting from Doppler, a gyroscope or the motion so far; over a gap, by a
-    search. Then adjusts all scans at once, as :func:`refine_poses` does. The motion prior, the noise of the sensor and the bias of
-    its gyroscope are estimated from the drive.
+    Registers each scan with the planes of the previous scans, starting from Doppler, a gyroscope or the motion so far, or from a
+    search over a gap. Then adjusts all scans jointly, as :func:`refine_poses` does. The motion prior, the noise of the sensor and
+    the bias of its gyroscope are estimated from the drive.
 
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, times and Doppler are used
-        where none are given here.
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. :class:`radarsdf.io.Scans` supply times and
+        Doppler unless these are passed separately.
     doppler_mps : sequence of F arrays, optional
-        (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured.
+        (N_i,) each, radial speed, m/s, of either sign, aliased or not; NaN where it was not measured.
     times_s : (F,) array_like
-        Of the scans, s.
+    Times of the scans, s.
     imu : Imu, optional
-        A gyroscope, and an accelerometer where there is one; of Scans, theirs. Without `R_sensor_imu`, its rotation on the radar
-        is estimated, and with an accelerometer and Doppler the offset of its clock and the direction of up.
+        A gyroscope, optionally with an accelerometer. Default: that of `Scans`. Without `R_sensor_imu`, its mounting rotation is
+        estimated, and with an accelerometer and Doppler its time offset and the vertical, too.
     config : FitConfig, optional
-        Its ranges, noise, leaf cells and threads are used.
+        Settings, of which ranges, noise, leaf cells and threads are used.
     progress : bool, optional
-        Whether to show a progress bar. Default: only in a terminal.
+        Whether to show a progress bar. Default: only on a terminal.
 
     Returns
     -------
     Odometry
-        The same bits with any number of threads.
+        Bit-identical with any number of threads.
 
     Raises
     ------
     TypeError
         If an argument has the wrong type.
     ValueError
-        If scans, Doppler, times or rates are invalid, if there are no times, or if nothing measures a part of the motion:
-        without Doppler, the position along a wall; without a gyroscope, the turns of a radar with few returns that is slower
-        than 20 m/s. If Doppler was given and not used, the error gives the reason.
+        If scans, Doppler, times or rates are invalid, times are missing, or a part of the motion is not observable: without
+        Doppler, the position along a wall; without a gyroscope, the turns of a radar with few returns that is slower than
+        20 m/s. If Doppler was passed but not used, the message gives the reason.
 
     Notes
     -----
-    The scale is that of the radar's ranges and, with Doppler, of its speeds. Without an accelerometer, the first scan is assumed
-    to be level.
+    The scale follows the radar's ranges and, with Doppler, its speeds. Without an accelerometer, the first scan is assumed to
+    be level.
 
     Examples
     --------
@@ -184,7 +184,7 @@ def odometry(
 
 
 def trajectory_length_m(poses: Floats, segments: NDArray[np.int64]) -> float:
-    """Length of the steps within segments of a trajectory of poses (F, 4, 4)."""
+    """Return the length of a trajectory of poses (F, 4, 4) within its segments."""
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return float(lengths_m[np.diff(segments) == 0].sum())
 
@@ -192,7 +192,7 @@ def trajectory_length_m(poses: Floats, segments: NDArray[np.int64]) -> float:
 def _together(
     drive: Drive, tracked: list[Tracked], segments: NDArray[np.int64], config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats]:
-    """Poses and covariances of all scans of each segment at once."""
+    """Jointly estimate poses and covariances of all scans of each segment."""
     poses = np.stack([found.pose for found in tracked])
     covariance = np.zeros((len(poses), 6, 6))
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
@@ -202,14 +202,14 @@ def _together(
         if rows.stop - rows.start < 2 or len(returns) == 0:
             continue
         motions = drive.motions(tracked, rows)
-        # They are near the truth already: no short windows are needed.
+        # Tracked poses are close to the truth: no short windows are needed.
         found = PosesEstimate.of(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance
 
 
 def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> None:
-    """Raises a UnobservedMotionError where nothing measures a part of the motion; adds notes on assumptions."""
+    """Raise an UnobservedMotionError if a part of the motion is not observable; append notes on assumptions."""
     if len(tracked) < 2:
         return
     way, turn = np.median([found.observed for found in tracked[1:]], axis=0).tolist()

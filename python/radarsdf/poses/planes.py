@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Planes that scans have in common at given poses."""
+"""Planes shared by scans at given poses."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import merged_keys
 
-# The edge of a region is 2 to the power of this, in cells. Wide regions have many planes, and estimate errors well: with
-# 8 cells, the position along simulated walls had 5 times too small a deviation, with 16 to 64 not.
+# Log2 of the edge of a region, cells. Large regions have many planes, and estimate errors well: with 8 cells, the standard
+# deviation along simulated walls was 5 times too small, with 16 to 64 correct.
 _DOUBLINGS = 4
 
-# Scans in the band that is factored. 16 to 128 take the same time, since fewer need more iterations.
+# Width of the factored band, scans. 16 to 128 take the same time, since fewer need more iterations.
 _TOGETHER = 32
-_LEAST_RANGE_M = 1e-6  # to divide by
-# Cells are at least a quarter as wide as returns of one scan are apart: with 40 returns over 150 m, planes of smaller cells have too
-# few of them. Radars of 500 to 2,000 returns a scan have 0.2 to 0.5 m between them, so that their cells are those of a map.
+_LEAST_RANGE_M = 1e-6  # against division by zero
+# Cells are at least a quarter of the spacing of returns in a scan: with 40 returns over 150 m, smaller cells have too few. Radars
+# of 500 to 2,000 returns a scan have a spacing of 0.2 to 0.5 m, so that their cells are those of a map.
 _CELLS_APART = 4
 _SAMPLED_SCANS = 16
 
 
 def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
-    """(P, 3) unit normals of the surfels, without the spread that their errors make.
+    """Return unit normals (P, 3) of the surfels, corrected for the spread caused by their errors.
 
-    Along a wall, each normal points a little along it by chance, as if returns measured the position along it. In each region, the
-    spread of the normals is reduced by what their errors contribute (errors in variables, Fuller 1987). Whatever the normals are,
-    scans that move together lose nothing.
+    Along a wall, normals are slightly tilted along it by chance, as if returns observed the position along it. In each region, the
+    spread of the normals is reduced by the contribution of their errors (errors in variables, Fuller 1987). With any normals, a
+    joint motion of the scans has no cost.
     """
     assert surfels.widest is not None
     planes = np.flatnonzero(surfels.is_flat())
@@ -48,7 +48,7 @@ def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
     across = np.cross(widest, normals)
     thickness, *widths = surfels.variances[planes].T
     weights = surfels.counts[cells] / thickness
-    # Of a regression: the variances of the two slopes.
+    # Variances of the two slopes of a plane fit.
     of_across, of_widest = (weights * thickness / (surfels.support[cells] * width) for width in widths)
     spread = np.einsum("n,ni,nj->nij", weights, normals, normals)
     errors = np.einsum("n,ni,nj->nij", of_across, across, across)
@@ -63,14 +63,14 @@ def unbiased_normals(surfels: Surfels, num_threads: int) -> Floats:
     spread, errors = of_regions.reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
     found = np.einsum("nij,nj->ni", reduction(spread, errors)[region], normals)
     lengths = np.sqrt(np.einsum("ni,ni->n", found, found))[:, None]
-    # A normal that seems all error stays as it is: in this region, there are hardly any others.
+    # A normal explained by errors alone is not changed: the region has hardly any others.
     all_normals = surfels.normals.copy()
     all_normals[planes] = np.where(lengths > 0.5, found / np.maximum(lengths, 0.5), normals)
     return all_normals
 
 
 def reduction(spread: Floats, errors: Floats) -> Floats:
-    """(..., K, K) linear maps M for which M spread Mᵀ is `spread` (..., K, K) less its part `errors`, or 0."""
+    """Return linear maps M (..., K, K) with M spread Mᵀ = `spread` minus `errors`, or 0 where that is negative."""
     values, axes = np.linalg.eigh(spread)
     root = np.sqrt(np.maximum(values, 1e-12 * np.maximum(values[..., -1:], 1e-12)))[..., None, :]
     white = axes / root
@@ -83,7 +83,7 @@ def reduction(spread: Floats, errors: Floats) -> Floats:
 
 
 def plane_cell_m(scans: Sequence[Floats], leaf_size_m: float) -> float:
-    """Edge of the cell of a plane, m: as of a map's surfel, or larger where scans (N_i, 3) are sparse."""
+    """Return the edge of the cell of a plane, m: that of a map's surfel, or larger for sparse scans (N_i, 3)."""
     sampled = [scan for scan in scans if len(scan) > 1]
     sampled = sampled[:: max(1, len(sampled) // _SAMPLED_SCANS)]
     apart_m = [float(np.median(cKDTree(scan).query(scan, 2)[0][:, 1])) for scan in sampled]
@@ -92,7 +92,7 @@ def plane_cell_m(scans: Sequence[Floats], leaf_size_m: float) -> float:
 
 @dataclass(frozen=True)
 class SensorReturns:
-    """Returns in the frames of their sensors, scan by scan."""
+    """Returns in the sensor frame, scan by scan."""
 
     directions: NDArray[np.float32]  # (N, 3) unit vectors
     ranges_m: NDArray[np.float32]  # (N,)
@@ -102,7 +102,7 @@ class SensorReturns:
     def of(
         cls, scans: Sequence[NDArray[np.float64]], min_range_m: float, max_range_m: float | None
     ) -> SensorReturns:
-        """Of scans (N_i, 3), sensor frame, m; without returns beyond these ranges."""
+        """Build from scans (N_i, 3), sensor frame, m, without returns outside these ranges."""
         points = np.concatenate(scans)
         ranges_m = np.sqrt(np.einsum("ni,ni->n", points, points))
         number = np.repeat(np.arange(len(scans), dtype=np.int32), [len(scan) for scan in scans])
@@ -115,15 +115,15 @@ class SensorReturns:
         return len(self.scans)
 
     def select(self, part: NDArray[np.bool_]) -> SensorReturns:
-        """Those of a mask (N,)."""
+        """Select returns by a mask (N,)."""
         return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part])
 
     def every(self, step: int) -> SensorReturns:
-        """The first one, and each that comes `step` later."""
+        """Return every `step`-th return."""
         return self.select(np.arange(len(self)) % step == 0)
 
     def posed(self, poses: Floats) -> Rays:
-        """As rays of sensors with these poses (F, 4, 4). Their local frame begins at the mean position."""
+        """Convert to rays at sensor poses (F, 4, 4), in a local frame at the mean position."""
         origin = poses[:, :3, 3].mean(axis=0)
         first = np.searchsorted(self.scans, np.arange(len(poses) + 1))
         directions = np.empty_like(self.directions)
@@ -138,10 +138,10 @@ class SensorReturns:
 
 @dataclass(frozen=True)
 class PlaneGrid:
-    """How returns are grouped into planes."""
+    """Grouping of returns into planes."""
 
     window: int  # number of consecutive scans that share planes
-    shifted: bool  # whether windows begin in the middle of one
+    shifted: bool  # whether windows are shifted by half
     cell_m: float  # edge of the cell of a plane
 
 
@@ -153,9 +153,9 @@ def common_planes(
     config: ReturnsConfig,
     num_threads: int = 0,
 ) -> tuple[CommonPlanes, SensorNoise]:
-    """The normal equations of poses (F, 4, 4) from returns on common planes, and the noise of the sensor.
+    """Build the normal equations of poses (F, 4, 4) from returns on common planes, and the noise of the sensor.
 
-    `noise` None: estimated from these planes. `num_threads` 0: as many as OpenMP uses.
+    `noise` None: estimated from these planes. `num_threads` 0: that of OpenMP.
     """
     rays = returns.posed(poses)
     planes = np.full(len(rays), -1, np.int32)
@@ -195,10 +195,10 @@ def common_planes(
 
 
 def _planes_of(points: NDArray[np.float32], surfels: Surfels, num_threads: int) -> NDArray[np.int32]:
-    """(N,) the flat surfel of each point (N, 3), local, m: that of the cell in which its foot on the surface lies. -1: none.
+    """Return the flat surfel (N,) of each point (N, 3), local, m: that of the cell of its projection onto the surface; -1: none.
 
-    Noise moves returns across surfaces, into cells beyond them. By the cells that they lie in themselves, it would be cut where
-    cells end, unlike for near and far returns, and turn poses.
+    Noise moves returns across surfaces into other cells. By the cells of the returns themselves, it would be truncated at cell
+    borders, differently for near and far returns, and rotate poses.
     """
     planes = surfels.flat_planes_at(points, num_threads)
     on = np.flatnonzero(planes >= 0)

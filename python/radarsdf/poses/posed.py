@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Refined or estimated poses, as maps and reports use them."""
+"""Refined or estimated poses for maps and reports."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from radarsdf.poses.odometry import Odometry
 from radarsdf.poses.refine import RefinedPoses
 from radarsdf.poses.rigid import Floats
 
-_MOST = 500  # scans whose poses are kept: a plot shows no more
+_MOST = 500  # maximum number of poses in a report: enough for a plot
 
 
 def pose_sigmas(covariance: Floats) -> tuple[float, float]:
-    """Compute the standard deviations of a pose's position, m, and rotation, rad, by axis, of the median scan.
+    """Compute median standard deviations per axis of the position, m, and rotation, rad, of poses.
 
     These are the values for ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of a :class:`FitConfig`.
 
     Parameters
     ----------
     covariance : (F, 6, 6) ndarray
-        Of :class:`RefinedPoses` or :class:`Odometry`.
+        Covariance of :class:`RefinedPoses` or :class:`Odometry`.
     """
     position_m, turn_rad = np.median(_sigmas(covariance), axis=0).tolist()
     return position_m, turn_rad
 
 
 def _sigmas(covariance: Floats) -> Floats:
-    """(F, 2) of positions, m, and rotations, rad, root mean square of the three axes."""
+    """Return standard deviations (F, 2) of positions, m, and rotations, rad, root mean square of the three axes."""
     variances = np.einsum("fii->fi", covariance).reshape(-1, 2, 3).mean(axis=2)
     sigmas: Floats = np.sqrt(np.maximum(variances, 0.0))
     return sigmas
@@ -41,7 +41,7 @@ def _sigmas(covariance: Floats) -> Floats:
 def trajectory_report(
     found: RefinedPoses | Odometry, given: Floats | None, rows: slice = slice(None)
 ) -> dict[str, Any]:
-    """The trajectory of the scans `rows` for the report of a fit, as values of JSON. `given` (F, 4, 4): the poses before."""
+    """Return the trajectory of the scans `rows` for the report of a fit, as JSON values. `given` (F, 4, 4): original poses."""
     poses = found.poses[rows]
     some = np.unique(np.linspace(0, len(poses) - 1, min(_MOST, len(poses))).astype(np.int64))
     sigmas = _sigmas(found.covariance[rows])[some]
@@ -60,37 +60,37 @@ def trajectory_report(
 
 @dataclass(frozen=True)
 class PosedScans:
-    """The poses of the scans that a map is made of."""
+    """Poses of the scans to fit a map to."""
 
     poses: Floats  # (K, 4, 4) T_world_sensor, m
-    rows: slice  # the K scans among those of the drive: all, or the longest segment, if poses were found in several
-    given: Floats | None = None  # (K, 4, 4) the poses before. None: there were none
+    rows: slice  # the K scans among those of the drive: all, or the longest segment of odometry
+    given: Floats | None = None  # (K, 4, 4) original poses, if any
     segments: int = 1
-    way: dict[str, Any] | None = None  # the trajectory for the report of a map. None: the poses are as given
+    way: dict[str, Any] | None = None  # trajectory for the report of a map. None for original poses
     sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
-    notes: tuple[str, ...] = ()  # sentences on what was not used
+    notes: tuple[str, ...] = ()  # sentences on unused input
 
     @classmethod
     def as_given(cls, poses: Floats) -> PosedScans:
-        """Poses (F, 4, 4) that are neither refined nor found."""
+        """Build from original poses (F, 4, 4)."""
         return cls(poses, slice(0, len(poses)), poses)
 
     @classmethod
     def refined(cls, refined: RefinedPoses, given: Floats) -> PosedScans:
-        """Given poses (F, 4, 4) that were refined. Deviations are known only of poses that were not kept."""
+        """Build from refined poses and the original ones (F, 4, 4). `sigmas` are unknown if these were kept."""
         sigmas = pose_sigmas(refined.covariance) if refined.improved else None
         rows, notes = slice(0, len(given)), tuple(refined.report.get("notes", ()))
         return cls(refined.poses, rows, given, 1, trajectory_report(refined, given), sigmas, notes)
 
     @classmethod
     def found(cls, found: Odometry) -> PosedScans:
-        """The longest segment of a drive without poses."""
+        """Build from the longest segment of odometry."""
         rows, report = found.longest_segment(), found.report
         sigmas, way = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
         return cls(found.poses[rows], rows, None, report["segments"], way, sigmas, tuple(report["notes"]))
 
     def config(self, config: FitConfig) -> FitConfig:
-        """`config` with the errors of the poses, unless it states some itself."""
+        """Return `config` with the errors of the poses, unless it specifies its own."""
         if self.sigmas is None or config.returns.pose_sigma_m or config.returns.pose_sigma_rad:
             return config
         sigma_m, sigma_rad = self.sigmas

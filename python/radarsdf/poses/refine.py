@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Joint estimate of the poses of all scans, from common planes and measured motion."""
+"""Joint estimation of the poses of all scans, from common planes and measured motion."""
 
 from __future__ import annotations
 
@@ -28,42 +28,42 @@ from radarsdf.returns.rays import LeftOut
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
 
-# The least errors of a step that the estimate begins with. It ends where the returns lead: measured, 0.1 m and 0.5 degrees
-# end with the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
+# Minimum initial standard deviations of a step, m and rad. They do not determine the result: measured, 0.1 m and 0.5 degrees
+# converge to the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
 _FIRST_SIGMAS = 0.1, 0.01
-_CONTRADICTED = 0.5  # share of the squared motion, from which on Doppler and poses cannot be of one drive
-# Within short windows of scans, the drift is small compared with a cell. Each window may be twice as long as the one before.
+_CONTRADICTED = 0.5  # unexplained share of the squared motion at which Doppler and poses are inconsistent
+# Within short windows of scans, the drift is small compared with a cell. The window doubles from stage to stage.
 _FIRST_WINDOW = 8
-_OF_WINDOWS = (4, 2)  # edges of cells, in those of a map's surfels
-_OF_ALL = (4, 4, 2, 2)  # the same, once all scans are together
-_MOST_ROUNDS = 12  # with cells as small as a map's surfels
-# Standard deviations that poses still move by. Planes change in each round, so that 0.1 is often never reached; 0.3
-# ends with the same errors in half the time.
+_OF_WINDOWS = (4, 2)  # cell edges for windows, relative to a map's surfels
+_OF_ALL = (4, 4, 2, 2)  # cell edges for all scans
+_MOST_ROUNDS = 12  # maximum number of rounds with the cells of a map's surfels
+# Convergence threshold on the step, standard deviations. Planes change in each round, so that 0.1 is often never reached;
+# 0.3 results in the same errors in half the time.
 _SETTLED = 0.3
 _TOLERANCE, _MOST_ITERATIONS = 1e-2, 100  # of the conjugate gradients
-_EXACT = 1e-3  # tolerance where differences of solutions count
-# Information about each pose, 1/m² and 1/rad²: what returns and steps leave free stays where it is.
+_EXACT = 1e-3  # tolerance for differences of solutions
+# Information of a weak prior on each pose, 1/m² and 1/rad²: unobserved components are not changed.
 _WEAK = 1e-4
-_FIXED = 1e10  # information about the pose that the covariance is relative to
+_FIXED = 1e10  # information that fixes the reference pose of the covariance
 
 
 @dataclass(frozen=True)
 class RefinedPoses:
-    """Poses that returns of different scans agree on, and whether they are better than the given ones."""
+    """Refined poses of scans, and whether they are better than the given ones."""
 
     poses: Floats
     """(F, 4, 4) T_world_sensor: the refined poses if they are an improvement, else the given ones. Mean position and mean
     rotation are those of the given poses."""
     covariance: Floats
-    """(F, 6, 6) of `poses`, relative to the scan in the middle: translation, m, and rotation vector about the sensor, rad, in
-    world axes. Conservative where a loop closes over more than 32 scans."""
+    """(F, 6, 6) of `poses`, relative to the middle scan: translation, m, and rotation vector about the sensor, rad, in world
+    axes. Conservative for loops of more than 32 scans."""
     improved: bool
     """Whether held-out returns agree better with those of other scans, at a significance level of 0.001."""
     report: dict[str, Any]
     """`verdict` in words; `gain`, the mean increase of the log density of other scans' returns at held-out ones, and its
-    `gain_error`; `sigma_m` and `sigma_rad` of a given step and its `bias`; `moved_m` and `moved_rad`, root mean square change of
-    the poses; `noise` of the sensor; `moving`, returns excluded by their Doppler; `notes` on what was not used; `scans`,
-    `returns`, `rounds`, `seconds`."""
+    `gain_error`; `sigma_m`, `sigma_rad` and `bias` of a given step; `moved_m` and `moved_rad`, root mean square change of the
+    poses; `noise` of the sensor; `moving`, number of returns excluded by Doppler; `notes` on unused input; `scans`, `returns`,
+    `rounds`, `seconds`."""
 
 
 def refine_poses(
@@ -77,43 +77,43 @@ def refine_poses(
 ) -> RefinedPoses:
     """Refine the poses of scans so that their returns lie on common surfaces.
 
-    Adjusts all scans at once: residuals are the distances of returns from planes that scans have in common, which are unknown,
-    too, and the given motions from scan to scan. The noise of the sensor, the errors of the given steps and their bias are
-    estimated. Scans that see the same place again close a loop, whatever the time between them.
+    Adjusts all scans jointly: residuals are the distances of returns to common planes, which are re-estimated in each round, and
+    the deviations from the given motion between scans. The noise of the sensor, the errors of the given steps and their bias
+    are estimated. Scans that revisit a place close a loop, regardless of the time between them.
 
     Parameters
     ----------
     points : iterable of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, poses, times and Doppler are
-        used where none are given here.
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. :class:`radarsdf.io.Scans` supply poses, times
+        and Doppler unless these are passed separately.
     poses : array_like, optional
         (F, 4, 4) T_world_sensor, m, one for each scan.
     doppler_mps : sequence of F arrays, optional
-        (N_i,) each, speed along the ray, m/s, of either sign, folded or not; NaN where it was not measured. Returns that
-        move are excluded. Needs `times_s`.
+        (N_i,) each, radial speed, m/s, of either sign, aliased or not; NaN where it was not measured. Moving returns are
+        excluded. Needs `times_s`.
     times_s : (F,) array_like, optional
-        Of the scans, s. After a gap, a step has larger errors. By default all steps are alike.
+        Times of the scans, s. Steps over gaps have larger errors. By default all steps are alike.
     config : FitConfig, optional
-        Its ranges, noise, leaf cells and threads are used.
+        Settings, of which ranges, noise, leaf cells and threads are used.
     progress : bool, optional
-        Whether to show a progress bar. Default: only in a terminal.
+        Whether to show a progress bar. Default: only on a terminal.
 
     Returns
     -------
     RefinedPoses
-        With the given poses where held-out returns do not agree better. The same bits with any number of threads.
+        Contains the given poses if held-out returns do not agree better. Bit-identical with any number of threads.
 
     Raises
     ------
     TypeError
         If an argument has the wrong type.
     ValueError
-        If poses are missing, shapes do not fit together, ranges cannot be in m, or times descend.
+        If poses are missing, shapes do not match, ranges cannot be in m, or times descend.
 
     Notes
     -----
-    "Improved" means that a map is sharper, not that the trajectory is nearer to the truth: what returns do not measure, such
-    as the position along a corridor, follows the given steps.
+    "Improved" means that a map is sharper, not that the trajectory is more accurate: unobserved components, such as the
+    position along a corridor, follow the given steps.
 
     Examples
     --------
@@ -176,7 +176,7 @@ def refine_poses(
     }
     if verdict.improved:
         return RefinedPoses(found.poses, found.covariance, True, report)
-    # Neither trajectory is excluded, so the errors of the given one may be as large as their difference.
+    # Neither trajectory is rejected, so the errors of the given one may be as large as their difference.
     middle = len(given) // 2
     placed = np.einsum("ij,fjk->fik", given[middle] @ np.linalg.inv(found.poses[middle]), found.poses)
     off = increments(given, placed)
@@ -185,7 +185,7 @@ def refine_poses(
 
 @dataclass(frozen=True)
 class PosesEstimate:
-    """Poses (F, 4, 4), their covariance (F, 6, 6), and what was estimated with them."""
+    """Estimated poses (F, 4, 4), their covariance (F, 6, 6), motions and noise."""
 
     poses: Floats
     covariance: Floats
@@ -205,13 +205,13 @@ class PosesEstimate:
         first_window: int = _FIRST_WINDOW,
         progress: bool | None = False,
     ) -> PosesEstimate:
-        """From `given` (F, 4, 4) and measured motions, by Gauss and Newton's method, with new planes in each round."""
+        """Estimate from `given` (F, 4, 4) and measured motions by the Gauss-Newton method, with new planes in each round."""
         poses, count, noise, motions = given, len(given), None, list(motions)
         plan = _plan(count, first_window)
         rounds = 0
         for window, cells in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
             grid = PlaneGrid(window, rounds % 2 == 1, cells * cell_m)
-            # The noise is estimated every other round: with the poses, it changes slowly.
+            # The noise is estimated every other round: it changes slowly.
             known = None if rounds % 2 == 0 else noise
             planes, noise = common_planes(returns, poses, grid, known, config, num_threads)
             steps, inverse, inverse_below, decrement = planes.solve(
@@ -223,15 +223,15 @@ class PosesEstimate:
             if window == count and cells == 1 and decrement < _SETTLED**2 * steps.size:
                 break
         assert noise is not None
-        # Steps that were tracked by the same returns have the errors of these. As independent measurements, they would
-        # halve the deviations.
+        # Steps tracked from the same returns share their errors. As independent measurements, they would halve the
+        # deviations.
         evidence = [replace(m, variances=np.maximum(m.variances, m.least_variances)) for m in motions]
         diagonal, below, gradient = _prior(evidence, poses)
         diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
 
         def solved(more: Floats | float) -> Floats:
-            """Increments (F, 6) once something is added to the gradient."""
+            """Solve for increments (F, 6) with `more` added to the gradient."""
             right = gradient + more
             return planes.solve(diagonal, below, right, _EXACT, _MOST_ITERATIONS, False, num_threads)[0]
 
@@ -239,7 +239,7 @@ class PosesEstimate:
 
 
 def _plan(num_scans: int, window: int) -> list[tuple[int, int]]:
-    """Windows of scans and edges of cells, coarse to fine, and from short windows to all scans."""
+    """List windows of scans and cell edges, coarse to fine, from short windows to all scans."""
     plan = []
     while window < num_scans:
         plan += [(window, cells) for cells in _OF_WINDOWS]
@@ -248,7 +248,7 @@ def _plan(num_scans: int, window: int) -> list[tuple[int, int]]:
 
 
 def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Floats]:
-    """The sum of the motions' normal equations, as :meth:`Motion.prior`."""
+    """Sum the motions' normal equations; see :meth:`Motion.prior`."""
     parts = [motion.prior(poses) for motion in motions]
     diagonal, below, gradient = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
     return diagonal + _WEAK * np.eye(6), below, gradient
@@ -257,9 +257,9 @@ def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Fl
 def _by_biases(
     motions: Sequence[Motion], poses: Floats, solved: Callable[[Floats | float], Floats]
 ) -> Floats:
-    """(F, 6, 6) covariance of the poses by errors that all steps have in common, as far as returns leave them open.
+    """Return the covariance (F, 6, 6) of the poses due to systematic errors of all steps, given the returns.
 
-    The biases are unknowns, too, which the poses are eliminated from (the Schur complement).
+    The biases are unknowns, too: the poses are eliminated (Schur complement).
     """
     by, own = (np.concatenate(parts) for parts in zip(*(m.by_bias(poses) for m in motions), strict=True))
     if len(by) == 0:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Rigid motions: increments of poses, relative motions, and the motion that brings one trajectory onto another."""
+"""Rigid motions: increments of poses, relative motions, and alignment of trajectories."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 def moved(poses: Floats, increments: Floats) -> Floats:
-    """The poses (F, 4, 4) with increments (F, 6): each adds a translation, m, and turns about the sensor, rad, both in world axes."""
+    """Apply increments (F, 6) to poses (F, 4, 4): a translation, m, and a rotation about the sensor, rad, in world axes."""
     found = poses.copy()
     turn = Rotation.from_rotvec(increments[:, 3:]).as_matrix()
     found[:, :3, :3] = np.einsum("fij,fjk->fik", turn, poses[:, :3, :3])
@@ -21,25 +21,25 @@ def moved(poses: Floats, increments: Floats) -> Floats:
 
 
 def increments(first: Floats, second: Floats) -> Floats:
-    """(F, 6) from poses to others (F, 4, 4), as :func:`moved` takes them."""
+    """Return the increments (F, 6) from `first` to `second` poses (F, 4, 4), the inverse of :func:`moved`."""
     turns = np.einsum("fij,fkj->fik", second[:, :3, :3], first[:, :3, :3])
     translations = second[:, :3, 3] - first[:, :3, 3]
     return np.concatenate([translations, Rotation.from_matrix(turns).as_rotvec()], axis=1)
 
 
 def steps(poses: Floats) -> Floats:
-    """(F - 1, 4, 4) motion from each pose to the next, in the frame of the first of the two."""
+    """Return the motions (F - 1, 4, 4) from each pose to the next, in the frame of the first of the two."""
     return between(poses[:-1], poses[1:])
 
 
 def step_vectors(poses: Floats) -> Floats:
-    """(F - 1, 6) translations, m, and rotation vectors, rad, of these motions."""
+    """Return the translations, m, and rotation vectors, rad, (F - 1, 6) of :func:`steps`."""
     motions = steps(poses)
     return np.concatenate([motions[:, :3, 3], Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()], axis=1)
 
 
 def between(first: Floats, second: Floats) -> Floats:
-    """(K, 4, 4) motion from each pose to the other one, in the frame of the first of the two."""
+    """Return the motions (K, 4, 4) from `first` to `second` poses, in the frames of the first."""
     found = np.tile(np.eye(4), (len(first), 1, 1))
     back = first[:, :3, :3]
     found[:, :3, :3] = np.einsum("fji,fjk->fik", back, second[:, :3, :3])
@@ -48,7 +48,7 @@ def between(first: Floats, second: Floats) -> Floats:
 
 
 def alignment(poses: Floats, reference: Floats) -> Floats:
-    """(4, 4) motion that brings the mean position and the mean rotation of poses (F, 4, 4) to those of `reference`."""
+    """Return the motion (4, 4) that aligns the mean position and mean rotation of poses (F, 4, 4) with `reference`."""
     turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
     whole = np.eye(4)
     whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
@@ -56,7 +56,7 @@ def alignment(poses: Floats, reference: Floats) -> Floats:
 
 
 def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
-    """(4, 4) motion with the rotation of `turn` that brings the mean position of poses (F, 4, 4) to that of `reference`."""
+    """Return the motion (4, 4) with the rotation of `turn` that aligns the mean position of poses (F, 4, 4) with `reference`."""
     whole = turn.copy()
     middle = poses[:, :3, 3].mean(axis=0)
     whole[:3, 3] = reference[:, :3, 3].mean(axis=0) - np.einsum("ij,j->i", whole[:3, :3], middle)
@@ -64,19 +64,19 @@ def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
 
 
 def aligned(poses: Floats, reference: Floats) -> Floats:
-    """The poses (F, 4, 4), as a whole moved and turned so that their mean position and mean rotation are those of `reference`."""
+    """Rigidly align poses (F, 4, 4) with the mean position and mean rotation of `reference`."""
     found: Floats = np.einsum("ij,fjk->fik", alignment(poses, reference), poses)
     return found
 
 
 def turned_by(poses: Floats, others: Floats) -> Floats:
-    """(F,) angles between the rotations of poses and others (F, 4, 4), rad."""
+    """Return the angles (F,) between the rotations of two sets of poses (F, 4, 4), rad."""
     found: Floats = Rotation.from_matrix(between(poses, others)[:, :3, :3]).magnitude()
     return found
 
 
 def moved_by(before: Floats, after: Floats) -> dict[str, float]:
-    """By how much poses (F, 4, 4) differ, root mean square, for a report: `moved_m` and `moved_rad`."""
+    """Return the root mean square change of poses (F, 4, 4) for a report: `moved_m` and `moved_rad`."""
     return {
         "moved_m": float(np.sqrt(((after - before)[:, :3, 3] ** 2).sum(axis=1).mean())),
         "moved_rad": float(np.sqrt((turned_by(before, after) ** 2).mean())),
@@ -84,14 +84,14 @@ def moved_by(before: Floats, after: Floats) -> dict[str, float]:
 
 
 def nearest_rotation(matrix: Floats) -> Floats:
-    """(3, 3) rotation, not a reflection, that is nearest to a matrix: of sums b aᵀ, the one that best turns each a to its b (Kabsch)."""
+    """Return the nearest rotation (3, 3) to a matrix, not a reflection; for Σ b aᵀ, the one that best maps a to b (Kabsch)."""
     u, _, vt = np.linalg.svd(matrix)
     found: Floats = np.einsum("ij,j,jk->ik", u, [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))], vt)
     return found
 
 
 def covariance_in(covariance: Floats, R: Floats) -> Floats:
-    """Covariances (F, 6, 6) of translations and rotation vectors in the axes of a frame that is turned by R (3, 3)."""
+    """Rotate covariances (F, 6, 6) of translations and rotation vectors by R (3, 3)."""
     whole = np.zeros((6, 6))
     whole[:3, :3] = whole[3:, 3:] = R
     found: Floats = np.einsum("ij,fjk,lk->fil", whole, covariance, whole)
@@ -99,20 +99,20 @@ def covariance_in(covariance: Floats, R: Floats) -> Floats:
 
 
 def skew(vectors: Floats) -> Floats:
-    """(N, 3, 3) matrices that are the cross products with `vectors` (N, 3)."""
+    """Return the cross-product matrices (N, 3, 3) of `vectors` (N, 3)."""
     x, y, z = vectors.T
     o = np.zeros(len(vectors))
     return np.stack([o, -z, y, z, o, -x, -y, x, o], 1).reshape(-1, 3, 3)
 
 
 def rotation(vector: Floats) -> Floats:
-    """(..., 3, 3) rotations by rotation vectors (..., 3), rad. There are no dimensions before the last, or one."""
+    """Convert rotation vectors (3,) or (N, 3), rad, to matrices (..., 3, 3)."""
     found: Floats = Rotation.from_rotvec(vector).as_matrix()
     return found
 
 
 def transform(turn: Floats, translation: Floats) -> Floats:
-    """(..., 4, 4) of rotation vectors (..., 3), rad, and translations (..., 3), m."""
+    """Build transforms (..., 4, 4) from rotation vectors (..., 3), rad, and translations (..., 3), m."""
     found = np.zeros((*turn.shape[:-1], 4, 4))
     found[..., :3, :3] = rotation(turn)
     found[..., :3, 3] = translation
@@ -121,7 +121,7 @@ def transform(turn: Floats, translation: Floats) -> Floats:
 
 
 def rotation_vector(matrix: Floats, near: Floats | None = None) -> Floats:
-    """(3,) of a rotation (3, 3), rad. Of those that differ by whole turns, the one nearest to `near`, or to 0."""
+    """Convert a rotation (3, 3) to the rotation vector (3,), rad, nearest to `near`, or to 0, up to whole turns."""
     found: Floats = Rotation.from_matrix(matrix).as_rotvec()
     angle = float(np.linalg.norm(found))
     if near is None or angle == 0:

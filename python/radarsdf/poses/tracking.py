@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Tracking of a drive without poses: each scan is registered with the planes of those before it."""
+"""Tracking of a drive without poses: each scan is registered with the planes of the previous ones."""
 
 from __future__ import annotations
 
@@ -27,97 +27,97 @@ from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 
 WINDOW = 25
-"""Scans whose planes are kept. With 60, nothing was better on simulated drives, and wrong poses were remembered longer."""
-_CELLS = (4.0, 2.0)  # edges of cells, in those of a map's surfels
-_ITERATIONS, _SETTLED = 8, 0.03  # of Gauss and Newton's method, in each cell size; in standard deviations
-_MOST_RETURNS, _SEARCHED = 2000, 250  # returns of a scan that are registered, and that a search compares
-# Deviation of an expected translation up to which a search may reach the scans before, in median ranges; and up to which a new
-# segment begins where dead reckoning leads.
+"""Number of scans in the local map. With 60, simulated drives were no better, and wrong poses persisted longer."""
+_CELLS = (4.0, 2.0)  # cell edges, relative to a map's surfels
+_ITERATIONS, _SETTLED = 8, 0.03  # Gauss-Newton at each cell size: maximum, tolerance in deviations
+_MOST_RETURNS, _SEARCHED = 2000, 250  # maximum returns of a scan to register, to score in a search
+# Maximum standard deviation of a predicted translation: for a search, in median ranges; and for a new segment to begin at the
+# dead-reckoned pose.
 _MOST_RADII, _MOST_RECKONED_M = 10.0, 1e4
-_FOLLOWED = 12  # best poses of a search
-_ELSEWHERE = 500  # poses that show what agrees by chance
-_ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
-_NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
-# Of the last scans, that it is estimated from: so many determine a deviation to a percent. With all 25 scans of 2,000 returns, it took
+_FOLLOWED = 12  # best candidates of a search, refined
+_ELSEWHERE = 500  # unrelated poses, for the agreement by chance
+_ERRORS = 3.0  # standard errors by which more returns agree at an accepted pose
+_NOISE_AT = (1, 4, 16, 64)  # numbers of scans at which the noise of the sensor is re-estimated
+# Returns of the last scans for this estimate: they determine a deviation to a percent. With all 25 scans of 2,000 returns, it took
 # three times as long as a scan.
 _NOISE_RETURNS = 10_000
-_SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells: further than returns of one thing reach
-_SURE = 0.05  # cells: deviation of an expected translation that needs no returns
+_SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells, beyond the extent of single objects
+_SURE = 0.05  # standard deviation of a predicted translation that needs no returns, cells
 _LEAST_VARIANCE = 1e-12
-# Initial priors. The drive's own rates replace them after the first pass. With 1 rad/s, the first steps of sparse real
-# scans were lost, up to 9 degrees.
+# Initial priors, replaced by the drive's own rates after the first pass. With 1 rad/s, the first steps of sparse real
+# scans were wrong by up to 9 degrees.
 _TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
 _MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 _PASSES = 3
-# Share of a step's variance that the returns must remove where nothing else measures the translation. Below a half, the motion before
-# is more informative than they are. Simulated walls: 0.08 and 0.10; all other kinds of scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
+# Minimum share of a step's prior variance that the returns must remove if nothing else measures the translation. Below half,
+# the prior is more informative. Simulated walls: 0.08 and 0.10; all other scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
 LEAST_OBSERVED = 0.5
-# Deviation of the acceleration across the trajectory: what moves fast turns slowly. Vehicles on roads: about 1; drones and hands: 2.
+# Standard deviation of the lateral acceleration: at high speed, turns are slow. Vehicles on roads: about 1; drones and hands: 2.
 LATERAL_MPS2 = 2.0
-# Deviation of the rate of turning up to which it may stay unknown from step to step: the joint estimate and the covariance hold
-# for small rotations. That of a sensor faster than 20 m/s.
+# Maximum standard deviation of a turn rate that may remain unobserved between scans, that of a sensor faster than 20 m/s: the joint
+# estimate and the covariance are valid for small rotations.
 _SLOW_TURN_RAD_S = 0.1
-# Steps that show the scale of Doppler, and the fewest; the first scan that is compared with enough before it.
+# Steps to estimate the scale of Doppler, their minimum, and the first scan with enough previous ones to compare.
 _COMPARED, _FEW_COMPARED, _FIRST_COMPARED = 12, 6, 4
-# Deviation of that scale: from half of it, or twice, the returns of most scenes find the true one.
+# Prior deviation of that scale: from half or twice the true one, the returns of most scenes converge to it.
 _FREE_SCALE = 0.15
-# Further off, returns find other scales: 0.18 in a hall, where scans that are drawn together agree.
+# Beyond this ratio, returns yield spurious scales: 0.18 in a hall, where contracted scans agree.
 _MOST_SCALE = 2.5
-# Errors of the scale that returns find: 0.01 to 0.04 where they see all of the motion, up to 0.22 in tunnels and yards.
+# Errors of the estimated scale: 0.01 to 0.04 where the motion is fully observed, up to 0.22 in tunnels and yards.
 _SAME_SCALE = 0.25
-_BY_CHANCE = 0.02  # probability that another scale seems to fit better
-_TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
+_BY_CHANCE = 0.02  # significance level of another scale
+_TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # initial deviations of a tracked step
 
 
 @dataclass
 class Tracked:
-    """One scan, where it was found."""
+    """Tracked scan."""
 
     pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
     covariance: (
-        Floats  # (6, 6) of the step that led here: translation, m, and rotation vector, rad, in world axes
+        Floats  # (6, 6) of the step to this scan: translation, m, and rotation vector, rad, in world axes
     )
-    agreeing: float  # share of the returns on planes of the scans before, in [0, 1]. NaN: it begins a segment
-    segment: int  # number of the segment of the drive that it is part of
-    turn: Floats  # (3,) rotation vector of the step in the frame of the scan before, rad; may exceed half a turn
-    # Share of the expected step's variance that the returns removed, of the translation and of the rotation, each in the
-    # least certain direction. 0: nothing.
+    agreeing: float  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
+    segment: int  # number of its segment of the drive
+    turn: Floats  # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn
+    # Share of the predicted variance that the returns removed, of translation and rotation, each in the least certain
+    # direction.
     observed: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass
 class Tracker:
-    """The last scans' planes, and where the last scan was."""
+    """Local map of planes of the last scans, and the last pose."""
 
-    cell_size_m: float  # edge of the cell of a map's surfel
+    cell_size_m: float  # edge of the cell of a map's surfel, m
     config: ReturnsConfig
     num_threads: int = 0
     last: Tracked = field(init=False)
     _planes: list[LocalPlanes] = field(default_factory=list)
-    # Scans (N, 3), sensor frame, their poses, and the points as they were added to the planes: taken out again, they leave nothing.
+    # Scans (N, 3), sensor frame, their poses, and the points as added to the planes, for an exact removal.
     _recent: deque[tuple[Floats, Floats, Floats]] = field(default_factory=deque)
     _variances: list[float] = field(default_factory=list)
     _scans: int = 0
 
     def follow(self, scan: Floats, expected: PredictedStep | None) -> Tracked:
-        """The next scan (N, 3), sensor frame, m, is where its returns agree, near `expected`. None: it is the first."""
+        """Register the next scan (N, 3), sensor frame, m, near `expected`, and add it to the map. None: the first scan."""
         found = self.seek(scan, expected)
         self.keep(scan, found)
         return found
 
     def seek(self, scan: Floats, expected: PredictedStep | None) -> Tracked:
-        """Where :meth:`follow` would put a scan. Nothing changes."""
+        """Register a scan like :meth:`follow`, without changing the map."""
         if expected is None or not self._planes:
             return begun(np.eye(4))
-        # Where a drive was lost, what was mapped before and after cannot be joined.
+        # If tracking is lost, the maps before and after cannot be joined.
         if (found := self._sought(scan, expected)) is not None:
             return found
-        # Nor where dead reckoning leads after a day.
+        # Dead reckoning over a day is useless.
         reckoned = expected.spread_m(0.0) <= _MOST_RECKONED_M
         return begun(self.last.pose @ expected.pose() if reckoned else self.last.pose, self.last.segment + 1)
 
     def keep(self, scan: Floats, found: Tracked) -> None:
-        """Adds a scan to the planes that the next ones are registered with."""
+        """Add a scan to the planes with which the next ones are registered."""
         if not self._planes or found.segment != self.last.segment:
             self._planes = [LocalPlanes(cells * self.cell_size_m) for cells in _CELLS]
             self._recent.clear()
@@ -153,7 +153,7 @@ class Tracker:
         if expected.spread_m(radius_m) <= capture_m:
             return self._fitted(scan, expected, expected.turn.mean)
         if expected.spread_m(0.0) > _MOST_RADII * radius_m:
-            return None  # where the scans so far are seen, if at all, is not among a search's few poses
+            return None  # too few candidates to find an overlap with the previous scans, if any
         return self._searched(scan, expected, capture_m, radius_m)
 
     def _in_world(self, covariance: Floats) -> Floats:
@@ -164,7 +164,7 @@ class Tracker:
     def _fitted(
         self, scan: Floats, expected: PredictedStep, turn: Floats, start: Floats | None = None
     ) -> Tracked:
-        """By Gauss and Newton's method from `start`, with what is expected of a sensor that turned by `turn`."""
+        """Register by Gauss-Newton from `start`, with the prior of a sensor that turned by `turn`."""
         middle = self.last.pose @ expected.pose(turn)
         prior = self._in_world(expected.covariance(turn)) + _LEAST_VARIANCE * np.eye(6)
         pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
@@ -179,19 +179,19 @@ class Tracker:
     def _normal_equations(
         self, planes: LocalPlanes, scan: Floats, pose: Floats
     ) -> tuple[Floats, Floats, float]:
-        """Hessian and gradient of an increment of `pose`, and the weight of the returns that agree.
+        """Return Hessian and gradient of an increment of `pose`, and the weight of the inliers.
 
-        Without the share that errors of the normals contribute: along a wall, normals that point a little along it would seem to
-        measure the position along it.
+        The contribution of errors of the normals is removed: along a wall, slightly tilted normals would seem to observe the
+        position along it.
         """
         hessian, gradient, doubt, weight = planes.agreement(scan, np.ascontiguousarray(pose), self._variances)
         M = reduction(hessian, doubt)
         return M @ hessian @ M.T, M @ (M @ gradient), weight
 
     def _without_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
-        """The covariance without the information along the least certain axis that returns have wherever the scan is put.
+        """Remove the spurious information along the least certain axis that returns have for any shift of the scan.
 
-        Along a tunnel, returns match walls everywhere, and some of the matches hold the scan by chance.
+        In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance.
         """
         cell_m = _CELLS[-1] * self.cell_size_m
         axis = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
@@ -214,7 +214,7 @@ class Tracker:
     def _settled(
         self, scan: Floats, pose: Floats, middle: Floats, prior: Floats
     ) -> tuple[Floats, Floats, float]:
-        """The pose to which returns and a prior around `middle` lead, its covariance, and the share of returns that agree."""
+        """Iterate to convergence with a prior around `middle`; return the pose, its covariance, and the share of inliers."""
         information, weight, covariance = np.linalg.inv(prior), 0.0, prior
         for planes in self._planes:
             for _ in range(_ITERATIONS):
@@ -231,7 +231,7 @@ class Tracker:
     def _searched(
         self, scan: Floats, expected: PredictedStep, capture_m: float, radius_m: float
     ) -> Tracked | None:
-        """The best of many poses, if the returns agree there clearly better than at any other place and than by chance."""
+        """Search many poses for the best, if the returns agree there significantly better than elsewhere and than by chance."""
         coarse, sample = self._planes[0], thinned(scan, _SEARCHED)
 
         def scores(poses: Floats) -> Floats:
@@ -242,7 +242,7 @@ class Tracker:
         poses = np.einsum("ij,kjl->kil", self.last.pose, steps)
         means = scores(poses).mean(axis=1)
         best = _best(means)
-        # In a scene that repeats itself, the best poses may all be near one place, and the true one be another.
+        # In a self-similar scene, the best candidates may all lie near a wrong place.
         elsewhere = np.flatnonzero(_apart_m(poses, poses[best[0]], radius_m) > 2 * capture_m)
         best += elsewhere[_best(means[elsewhere])].tolist()
         found = [self._fitted(scan, expected, turns[i], poses[i]) for i in best]
@@ -256,7 +256,7 @@ class Tracker:
         return found[first] if clear.all() else None
 
     def _elsewhere(self, reach_m: float) -> Floats:
-        """(_ELSEWHERE, 4, 4) upright poses near those of the last scans, in any other direction."""
+        """Draw upright poses (_ELSEWHERE, 4, 4) near those of the last scans, with other headings."""
         rng = np.random.default_rng(0)
         known = np.stack([pose for _, pose, _ in self._recent])
         up = self.last.pose[:3, 2]
@@ -269,30 +269,30 @@ class Tracker:
 
 
 def begun(pose: Floats, segment: int = 0) -> Tracked:
-    """A scan that a segment of the drive begins with, at this pose (4, 4)."""
+    """Return the first scan of a segment, at this pose (4, 4)."""
     return Tracked(pose, np.zeros((6, 6)), np.nan, segment, np.zeros(3))
 
 
 def _removed_share(prior: Floats, covariance: Floats) -> float:
-    """Share of the variance before that is gone, in the direction where it is least."""
+    """Return the share of the prior variance removed, in the direction where it is smallest."""
     return max(1 - float(eigh(covariance, prior, eigvals_only=True)[-1]), 0.0)
 
 
 def _best(scores: Floats) -> list[int]:
-    """Rows of the highest scores."""
+    """Return the rows of the highest scores."""
     rows: list[int] = np.argsort(-scores, kind="stable")[:_FOLLOWED].tolist()
     return rows
 
 
 def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
-    """(K,) by how far poses (K, 4, 4) move a return at this range from where another pose puts it, m, at most."""
+    """Return upper bounds (K,) of the displacement, m, of a return at range `radius_m` between poses (K, 4, 4) and `pose`."""
     off = increments(np.broadcast_to(pose, poses.shape), poses)
     apart: Floats = np.linalg.norm(off[:, :3], axis=1) + radius_m * np.linalg.norm(off[:, 3:], axis=1)
     return apart
 
 
 def thinned(scan: Floats, most: int) -> Floats:
-    """At most about so many returns, evenly spread over the scan."""
+    """Subsample a scan evenly to about `most` returns."""
     return np.ascontiguousarray(scan[:: max(1, -(-len(scan) // most))])
 
 
@@ -304,11 +304,11 @@ class Drive:
     times_s: Floats
     velocities: SensorVelocities | None
     gyroscope: Gyroscope | None
-    turns: MotionPrior = _TURNS  # of the sensor, in its own frame
+    turns: MotionPrior = _TURNS  # in the sensor frame
     moves: MotionPrior = _MOVES
 
     def expected(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
-        """The step to scan `i`, after one with these rates. None: they are unknown."""
+        """Predict the step to scan `i` from the rates of the previous one; None if unknown."""
         duration_s = float(self.times_s[i] - self.times_s[i - 1])
         before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
         elapsed_s = (duration_s + before_s) / 2
@@ -326,7 +326,7 @@ class Drive:
 
     @property
     def usual_turn_rad_s(self) -> float:
-        """Prior deviation of the rates at which a sensor with these velocities turns."""
+        """Prior standard deviation of the turn rate, given the velocities, rad/s."""
         usual = float(np.sqrt(_TURNS.usual[0]))
         if self.velocities is None:
             return usual
@@ -335,16 +335,16 @@ class Drive:
 
     @property
     def turns_slowly(self) -> bool:
-        """Whether it is so fast that it cannot turn far from scan to scan."""
+        """Whether the sensor is so fast that it hardly turns between scans."""
         return self.usual_turn_rad_s < _SLOW_TURN_RAD_S
 
     def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
-        """The measured motions from scan to scan among these."""
+        """Return the measured motions between the scans of `rows`."""
         times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
-        # The tracked steps initialise the estimate; it finds how good they are. Other measurements replace them.
+        # Tracked steps initialise the estimate, which finds their errors. Other measurements replace them.
         motion = Motion.of(poses, _TRACKED_M, _TRACKED_RAD, times_s)
         duration_s = float(np.median(np.diff(times_s)))
-        # They are no evidence in addition to the returns that they were tracked by, but for how this sensor usually moves.
+        # They are no evidence beyond the returns from which they were tracked, except for the motion prior.
         least = duration_s**2 * np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
         turn_sigma_rad_s = np.full(3, self.usual_turn_rad_s)
         if self.gyroscope is not None:
@@ -355,8 +355,8 @@ class Drive:
         motion = dataclasses.replace(motion, least_variances=least)
         if self.velocities is None:
             return [motion]
-        # Tracked translations in addition to Doppler, or in its place, double the errors of positions on simulated drives. What
-        # few returns hardly change of an expected turn is an error that all steps have in common.
+        # Tracked translations in addition to Doppler, or instead of it, double the position errors on simulated drives. The
+        # error of predicted turns that few returns hardly correct is common to all steps.
         motion.shares[:, :3] = np.inf
         common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
         turns = np.stack([found.turn for found in tracked[rows][1:]])
@@ -367,7 +367,7 @@ class Drive:
 
 
 def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRate, MotionRate]:
-    """Of turning and moving, in the frame of the sensor."""
+    """Compute the rates of rotation and translation, in the sensor frame."""
     back = before[:3, :3].T
     half = rotation(0.5 * now.turn).T @ back
     way = half @ (now.pose[:3, 3] - before[:3, 3])
@@ -378,11 +378,11 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRat
     return MotionRate(now.turn / duration_s, of_turn), MotionRate(way / duration_s, of_way)
 
 
-Rates = tuple[MotionRate, MotionRate] | tuple[None, None]  # of turning, rad/s, and moving, m/s, if known
+Rates = tuple[MotionRate, MotionRate] | tuple[None, None]  # rotation, rad/s, and translation, m/s, if known
 
 
 def _tracked(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]]:
-    """One pass over the scans, and the rates of each step."""
+    """Track all scans in one pass; return them, and the rates of each step."""
     tracked = [tracker.follow(drive.scans[0], None)]
     rates: list[Rates] = []
     last: Rates = None, None
@@ -399,7 +399,7 @@ def _tracked(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]
 def followed(
     drive: Drive, config: FitConfig, num_threads: int, progress: bool | None = False
 ) -> tuple[Drive, list[Tracked]]:
-    """The drive with its own motion prior, and its scans where the last pass found them."""
+    """Track a drive in several passes; return it with its learnt motion prior, and the scans of the last pass."""
     gyroscope, drive = drive.gyroscope, dataclasses.replace(drive, gyroscope=None)
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
@@ -407,7 +407,7 @@ def followed(
         tracked, rates = _tracked(drive, Tracker(cell_m, config.returns, num_threads))
         turn_prior = drive.turns
         if i == 0 and drive.turns_slowly and tracked[-1].segment > 0:
-            # Its returns agree nowhere. The next passes search less far.
+            # Tracking was lost. Narrow the search of the next passes.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turn_prior = MotionPrior(usual, usual, True)
         drive = dataclasses.replace(
@@ -416,7 +416,7 @@ def followed(
             moves=drive.moves.learnt([move for _, move in rates], durations_s),
         )
         if i == 0 and gyroscope is not None:
-            # Rotations that were found with its help could not show its bias.
+            # Rotations tracked with the gyroscope would not reveal its bias.
             vectors, covariance = np.full((len(rates), 3), np.nan), np.tile(np.eye(3), (len(rates), 1, 1))
             for k, ((turn, _), duration_s) in enumerate(zip(rates, durations_s, strict=True)):
                 if turn is not None:
@@ -426,10 +426,10 @@ def followed(
 
 
 def doppler_factor(drive: Drive, config: FitConfig, num_threads: int) -> float:
-    """Speed by the returns over speed by Doppler, where they clearly differ, else 1.
+    """Estimate the ratio of the speed from returns to that from Doppler, if it differs significantly from 1, else 1.
 
-    Fast scans are tracked with Doppler of a free scale. The scale that the returns find must also, if both are fixed, make more of
-    them agree than that of the Doppler: alone, they favour what draws scans together.
+    The fastest scans are tracked with a free scale of the Doppler. The estimated scale, when fixed, must also yield more inliers
+    than that of the Doppler: returns alone favour contraction.
     """
     durations_s = np.diff(drive.times_s)
     count = min(_COMPARED, len(durations_s))
@@ -453,7 +453,7 @@ def doppler_factor(drive: Drive, config: FitConfig, num_threads: int) -> float:
         squared_m2 = float(moved_m @ moved_m)
         if now.segment == before.segment and squared_m2 > 0:
             variance = float(moved_m @ now.covariance[:3, :3] @ moved_m) / squared_m2**2
-            # That of the mean of two velocities was known before.
+            # Subtract the prior, that of the mean of two velocities.
             information += max(1 / variance - 2 / _FREE_SCALE**2, 0.0)
             off += (float(moved_m @ (now.pose[:3, 3] - before.pose[:3, 3])) / squared_m2 - 1) / variance
     factor = 1 + off / max(information, 1.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Whether held-out returns agree better with other poses."""
+"""Test of refined poses on held-out returns."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise
 
-_NEIGHBOURS = 16  # of a return, of which those of other scans make the density there
-_MOST_RETURNS = 20_000  # that are compared
-_BY_CHANCE = 1e-3  # probability that true poses seem improved
-# However certain, a smaller gain is none. Measured: up to 0.0006 with true poses, 0.0015 and more where a drift of 0.01 m and 0.05
-# degrees a step is found.
+_NEIGHBOURS = 16  # nearest neighbours of a return; those of other scans contribute to the density
+_MOST_RETURNS = 20_000  # maximum number of held-out returns
+_BY_CHANCE = 1e-3  # significance level: probability that true poses seem improved
+# Minimum relevant gain, however significant. Measured: up to 0.0006 with true poses, 0.0015 and more where a drift of 0.01 m and
+# 0.05 degrees a step is corrected.
 _LEAST_GAIN = 0.001
-_HELD_OUT = 0.2  # of the returns
-_PLACE = 0.25  # edge of a place, in median ranges: what is seen as one thing from near and far is smaller
-# Edge of a cell, in median ranges, whose returns of other scans only show that scans overlap there.
+_HELD_OUT = 0.2  # share of the returns
+_PLACE = 0.25  # edge of a place, median ranges: larger than single objects, near or far
+# Edge of a cell, median ranges, in which the returns of other scans indicate only that scans overlap.
 _NEARBY = 0.5
-_MOST_COUNTED = 100_000  # returns of these cells
+_MOST_COUNTED = 100_000  # maximum number of returns counted in these cells
 
 
 def held_out(count: int, seed: int) -> NDArray[np.bool_]:
-    """(count,) mask of the returns that judge the estimate."""
+    """Return a mask (count,) of the held-out returns."""
     return np.random.default_rng(seed).random(count) < _HELD_OUT
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How much better returns agree with those of other scans."""
+    """Gain in agreement between returns of different scans."""
 
-    gain: float  # mean increase, over the scans, of the log density of other scans' returns where returns lie
+    gain: float  # mean over scans of the increase of the log density of other scans' returns at held-out ones
     error: float  # its standard error
-    parts: int  # number of independent scans, or of places, if these are fewer
-    # The same gain of the density in cells that are far larger than errors of poses. Where scans are drawn together, on
-    # top of each other in the end, all densities rise, whether or not surfaces agree.
+    parts: int  # number of independent scans, or of places if these are fewer
+    # The same gain for the density in cells far larger than pose errors. Where scans contract, in the end on top of each
+    # other, all densities rise, whether or not surfaces agree.
     crowding: float = 0.0
 
     @property
     def needed(self) -> float:
-        """The gain that matters and that neither chance (Student's t) nor crowding explains."""
+        """Minimum gain: relevant, significant (Student's t), and not explained by crowding."""
         if self.parts < 2:
             return np.inf
         by_chance = float(student.ppf(1 - _BY_CHANCE, self.parts - 1)) * self.error
@@ -61,7 +61,7 @@ class Verdict:
 
     @property
     def words(self) -> str:
-        """One sentence."""
+        """Summary in one sentence."""
         first, agree = "The given poses are kept", "do not agree"
         if self.improved:
             first, agree = "The refined poses make a sharper map", "agree"
@@ -74,10 +74,10 @@ class Verdict:
     def of(
         cls, held: SensorReturns, used: SensorReturns, before: Floats, after: Floats, noise: SensorNoise
     ) -> Verdict:
-        """Of the returns `held` out, compared with those that were `used`, by a sensor with this noise.
+        """Compare `held`-out returns with the `used` ones at poses `before` and `after`.
 
-        Returns are not independent. Those of a scan have the errors of its pose in common. Those of a place may lie on one
-        thing that moved, or that looks different from everywhere. The standard error is the larger one of the two.
+        Returns are not independent. Those of a scan share the error of its pose. Those of a place may lie on one object that
+        moved, or that looks different from each side. The standard error is the larger of the two clustered ones.
         """
         if len(held) == 0:
             return cls(0.0, np.inf, 0)
@@ -90,7 +90,7 @@ class Verdict:
         parts = min(by_scans.parts, int(places.max()) + 1)
         if parts < 2:
             return cls(0.0, np.inf, parts)
-        # Those of a place may all be wrong together.
+        # Cluster-robust standard error over places.
         sums = np.bincount(places, gains - gains.mean())
         error = float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)) / len(gains))
         crowding = cls.by_groups(_crowding(held, used, before, after), held.scans).gain
@@ -98,7 +98,7 @@ class Verdict:
 
     @classmethod
     def by_groups(cls, gains: Floats, groups: NDArray[np.integer[Any]]) -> Verdict:
-        """Of gains (N,), whose errors are common within each of the groups with numbers (N,)."""
+        """Compute mean and standard error of gains (N,) with common errors within `groups` (N,)."""
         counts = np.bincount(groups)
         means = np.bincount(groups, gains)[counts > 0] / counts[counts > 0]
         if len(means) < 2:
@@ -109,11 +109,11 @@ class Verdict:
 def _gains(
     held: SensorReturns, used: SensorReturns, before: Floats, after: Floats, noise: SensorNoise
 ) -> Floats:
-    """(N,) by how much the logarithm of the density at the held returns rises.
+    """Return the increase (N,) of the log density at the held-out returns.
 
-    A nearest return alone mostly shows how returns happen to lie. The density is a sum over several, with a kernel as wide as the
-    noise of both returns and the distance between returns. A return without others nearby is clutter, or of something new: so the
-    median of the densities is added to each, and such returns count little.
+    A nearest neighbour alone mostly reflects the sampling. The density is a sum over several, with a kernel as wide as the noise
+    of both returns and the spacing of returns. An isolated return is clutter or a new object: the median density is added to
+    each, so that such returns count little.
     """
     variances = noise.mean_variances_m2(held.ranges_m), noise.mean_variances_m2(used.ranges_m)
     densities, apart_m2 = [], 0.0
@@ -130,14 +130,14 @@ def _gains(
             kernel = np.exp(-0.5 * distances**2 / variance) / variance**1.5
         densities.append(np.where(others, kernel, 0.0).sum(axis=1))
     floor = float(np.median(densities[0]))
-    if floor == 0:  # scans that have nothing in common where they are
+    if floor == 0:  # the scans do not overlap
         return np.zeros(len(held))
     gains: Floats = np.log((densities[1] + floor) / (densities[0] + floor))
     return gains
 
 
 def _crowding(held: SensorReturns, used: SensorReturns, before: Floats, after: Floats) -> Floats:
-    """(N,) by how much the logarithm of the number of other scans' returns in the cell of each held return rises."""
+    """Return the increase (N,) of the log number of other scans' returns in the cell of each held-out return."""
     edge_m = _NEARBY * float(np.median(held.ranges_m))
     used = used.every(-(-len(used) // _MOST_COUNTED))
     counts = []
@@ -145,7 +145,7 @@ def _crowding(held: SensorReturns, used: SensorReturns, before: Floats, after: F
         points = np.concatenate([held.posed(poses).points, used.posed(poses).points])
         cells = np.unique(np.floor(points / edge_m), axis=0, return_inverse=True)[1].ravel()
         of_held, of_used = np.split(cells, [len(held)])
-        # A sparse table of cells by scans.
+        # Sparse matrix of counts by cell and scan.
         shape = int(cells.max()) + 1, len(poses)
         table = coo_matrix((np.ones(len(used)), (of_used, used.scans)), shape).tocsr()
         in_cell = np.asarray(table.sum(axis=1)).ravel()[of_held]
