@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The map that a robot grows while it drives."""
+"""Incremental map of a driving robot."""
 
 from __future__ import annotations
 
@@ -46,54 +46,54 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Integrated:
-    """What became of a scan."""
+    """Result of the integration of a scan."""
 
     scan_id: ScanId
-    """By which it can be moved and taken out."""
+    """Identifier to move or remove the scan."""
     pose: NDArray[np.float64]
-    """(4, 4) T_world_sensor, m: where it was placed."""
+    """(4, 4) T_world_sensor, m."""
     blocks: NDArray[np.uint64]
-    """(B,) keys of the blocks of 8 × 8 × 8 leaf cells whose returns changed, ascending."""
+    """(B,) ascending keys of the changed blocks of 8 × 8 × 8 leaf cells."""
     moving: int
-    """Number of moving returns, which were left out."""
+    """Number of moving returns, which are left out."""
     moved: tuple[ScanId, ...] = ()
-    """Earlier scans that were placed again, as it is clear only now how the sensor moves; see :meth:`LiveMap.pose`."""
+    """Earlier scans with re-estimated poses, since the motion was not observable before; see :meth:`LiveMap.pose`."""
 
 
 class LiveMap:
-    """A map that grows scan by scan. Scans can be moved, and taken out again, without a trace.
+    """Incremental map. Scans can be added, moved and removed exactly.
 
     Parameters
     ----------
     config : FitConfig, optional
         Settings. :meth:`mesh` and :meth:`map` use those of :meth:`FitConfig.quick` with the same cells, returns, and bridges
-        over gaps; :meth:`finish` fits with all of them.
+        over gaps; :meth:`finish` uses all of them.
     origin : (3,) array_like, optional
-        Origin of the local frame, world, m. By default the first sensor position, moved to the next corner of a block of
+        Origin of the local frame, world, m. Default: the first sensor position, rounded to the nearest block corner of
         ``config.lattice``.
     max_bytes : int, optional
-        Memory, bytes, beyond which the oldest scans are let go: they stay in the map, but can no longer be moved or taken
-        out. None: all are kept.
+        Memory limit, bytes, above which the oldest scans are sealed: they stay in the map, but can no longer be moved or
+        removed. Default: no limit.
     folder : path-like, optional
-        An empty or new folder, or one that a map has used before. Scans are written there instead of being let go, and
-        regions instead of being forgotten by :meth:`clear_outside`. It is locked as long as the map lives.
+        An empty, new or previously used folder, to which scans are written instead of being sealed, and regions instead of
+        being discarded by :meth:`clear_outside`. It is locked during the lifetime of the map.
 
     Raises
     ------
     ValueError
-        If a setting is out of range, several scans are to be accumulated, or `folder` holds other files.
+        If a setting is out of range, `returns.accumulate_scans` is not 1, or `folder` contains other files.
     OSError
         If `folder` cannot be written, or another map uses it.
 
     Notes
     -----
-    A scan adds integers that depend on the scan, its pose and the settings alone. So a map that a scan was taken out of has
-    the bits of one that never saw it, in any order. The noise of the sensor, if it is not given, intensities, what
-    :meth:`finish` trains, and files depend on the order of scans.
+    A scan adds integers that depend on the scan, its pose and the settings alone. So after a removal, the map is bit-identical
+    to one that never saw the scan, in any order. Estimated noise of the sensor, intensities, the result of :meth:`finish`, and
+    files depend on the order of scans.
 
-    All methods may be called from any thread; readers see the map before a change or after it. After any error, the map is
-    as before. Poses are T_world_sensor, m. Methods that change the map return the keys (B,) of the blocks of 8 × 8 × 8 leaf
-    cells whose returns changed, or are gone, uint64, ascending.
+    All methods are thread-safe, and changes are atomic: after any error, the map is as before. Poses are T_world_sensor, m.
+    Methods that change the map return the ascending keys (B,), uint64, of the blocks of 8 × 8 × 8 leaf cells with changed or
+    removed returns.
 
     Examples
     --------
@@ -104,7 +104,7 @@ class LiveMap:
     ...     done = live.integrate(points, pose)
     >>> len(live), live.mesh().is_empty
     (8, False)
-    >>> blocks = live.remove(done.scan_id)  # as if it had never been there
+    >>> blocks = live.remove(done.scan_id)  # as if it had never been added
     >>> len(live), len(blocks) > 0
     (7, True)
     """
@@ -128,8 +128,8 @@ class LiveMap:
             weakref.finalize(self, os.close, locked_folder(place))
         self._state = GrowingState(config, corner, most, place)
         self._follower = Follower(config)
-        self._lock = threading.RLock()  # of the state
-        self._reading = threading.Lock()  # of its surface, taken first
+        self._lock = threading.RLock()  # guards the state
+        self._reading = threading.Lock()  # guards its surface; acquired first
 
     def __len__(self) -> int:
         with self._lock:
@@ -147,34 +147,34 @@ class LiveMap:
 
     @property
     def origin(self) -> NDArray[np.float64] | None:
-        """(3,) origin of the local frame, world, m. None: there was no scan yet."""
+        """(3,) origin of the local frame, world, m. None before the first scan."""
         return self._state.origin
 
     @property
     def scan_ids(self) -> list[ScanId]:
-        """Of the scans that can be moved or taken out, in the order in which they came."""
+        """Identifiers of the scans that can be moved or removed, in order of insertion."""
         with self._lock:
             return self._state.log.ids
 
     @property
     def sealed_scans(self) -> int:
-        """Number of scans that can no longer be moved or taken out."""
+        """Number of scans that can no longer be moved or removed."""
         with self._lock:
             return len(self._state.log.sealed)
 
     @property
     def num_bytes(self) -> int:
-        """Memory that the map takes, bytes."""
-        with self._lock:  # tables that grow just now have no size
+        """Memory of the map, bytes."""
+        with self._lock:  # tables must not grow meanwhile
             return self._state.num_bytes
 
     def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
-        """Pose of a scan, (4, 4) float64.
+        """Return the pose of a scan, (4, 4) float64.
 
         Raises
         ------
         KeyError
-            If there is no such scan, or it was let go.
+            If there is no such scan, or it was sealed.
         """
         with self._lock:
             entry = self._state.log.entry(scan_id)
@@ -192,38 +192,38 @@ class LiveMap:
         time_s: float | None = None,
         scan_id: ScanId | None = None,
     ) -> Integrated:
-        """Add a scan, of N returns.
+        """Add a scan of N returns.
 
-        Without its pose, it is placed where its returns agree with the last scans, near where its Doppler, or the motion so
-        far, lead. The world is then the frame of the first scan. Where poses drift, :func:`radarsdf.refine_poses` refines them
-        for :meth:`move_all`.
+        Without a pose, it is registered with the last scans, near the pose predicted by its Doppler or the motion so far. The
+        world is then the frame of the first scan. :func:`radarsdf.refine_poses` corrects drift of the poses for
+        :meth:`move_all`.
 
         Parameters
         ----------
         points : (N, 3) array_like
             Returns, sensor frame, m.
         pose : (4, 4) array_like, optional
-            Without it, the scan needs a time after that of the scan before.
+            T_world_sensor, m. Without it, the scan needs a time after that of the previous scan.
         intensities : (N,) array_like, optional
-            Sensor units. All scans have them, or none has.
+            Sensor units, for all scans or none.
         doppler_mps : (N,) array_like, optional
-            Speed along the ray, m/s, folded or not; NaN where it was not measured. Moving returns are left out.
+            Radial speed, m/s, aliased or not; NaN where it was not measured. Moving returns are left out.
         time_s : float, optional
-            When the scan was taken, s. Only scans without a pose need it, and those before them, to go on from.
+            Time of the scan, s. Required for scans without a pose, and for the scans before them.
         scan_id : hashable, optional
-            By which the scan is known. By default a number that counts on.
+            Identifier of the scan. Default: a consecutive number.
 
         Returns
         -------
         Integrated
-            Where it was placed, and what changed.
+            Pose of the scan, and changed blocks.
 
         Raises
         ------
         ValueError
-            If something is invalid, the map has a scan of this id, or a scan without a pose is late.
+            If an argument is invalid, the map has a scan of this id, or a scan without a pose is out of order.
         Lost
-            A ValueError, if a scan without a pose agrees with the last ones nowhere near.
+            If a scan without a pose cannot be registered with the last ones; a ValueError.
         """
         scan = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
@@ -262,24 +262,24 @@ class LiveMap:
         return Integrated(scan_id, scan.pose.copy(), blocks, moving, again)
 
     def remove(self, scan_id: ScanId) -> Keys:
-        """Take a scan out. The map then has the bits of one that never saw it.
+        """Remove a scan. The map is then bit-identical to one that never saw it.
 
         Raises
         ------
         KeyError
             If there is no scan of this id.
         ValueError
-            If it was let go to bound the memory.
+            If it was sealed to limit memory.
         """
         with self._lock:
             return self._state.exchange({}, [scan_id])
 
     def move(self, scan_id: ScanId, pose: ArrayLike) -> Keys:
-        """Move a scan to another pose, (4, 4). Raises as :meth:`remove`."""
+        """Move a scan to another pose (4, 4). Raises the exceptions of :meth:`remove`."""
         return self.move_all({scan_id: pose})
 
     def move_all(self, poses: Mapping[ScanId, ArrayLike]) -> Keys:
-        """Move scans to other poses at once, as after a closed loop: all, or none if one cannot be moved.
+        """Move scans to other poses atomically, as after a loop closure.
 
         Parameters
         ----------
@@ -289,7 +289,7 @@ class LiveMap:
         Raises
         ------
         KeyError, ValueError
-            As of :meth:`remove`, or if a pose is invalid.
+            As for :meth:`remove`, or if a pose is invalid.
         """
         instance(poses, Mapping, "poses")  # type: ignore[type-abstract]
         with self._lock:
@@ -304,17 +304,17 @@ class LiveMap:
             return self._state.exchange(moved, moved)
 
     def clear_outside(self, centre: ArrayLike, radius_m: float) -> Keys:
-        """Forget the map beyond a ball. Scans that reach beyond it can then be neither moved nor taken out.
+        """Discard the map outside a ball. Scans that extend beyond it can no longer be moved or removed.
 
-        With a folder, nothing is forgotten: regions of 64³ leaf cells that lie beyond the ball go there, and come back, with
-        the same bits, when a scan that reaches them is added, moved or taken out. Until then :meth:`mesh` is without them.
+        With a folder, nothing is discarded: regions of 64³ leaf cells outside the ball are written there, and restored
+        bit-identically when a scan that reaches them is added, moved or removed. Until then they are not in :meth:`mesh`.
 
         Parameters
         ----------
         centre : (3,) array_like
             World, m.
         radius_m : float
-            Blocks with their middle farther away, or regions of which all is farther away, go.
+            Blocks are discarded if their centre is farther away, regions are written if they are entirely farther away.
 
         Raises
         ------
@@ -326,31 +326,31 @@ class LiveMap:
             return self._state.clear_outside(middle, radius)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the state to an ``.npz`` file, from which :meth:`load` goes on. An old one is replaced at once.
+        """Write the state to an ``.npz`` file for :meth:`load`. An existing file is replaced atomically.
 
         Raises
         ------
         ValueError, OSError
-            If an id of a scan is neither a whole number nor a string, or the file cannot be written.
+            If a scan id is neither an integer nor a string, or the file cannot be written.
         """
         with self._lock, self._state.whole():
             self._state.save(path)
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> LiveMap:
-        """Read a map as it was saved, with its settings and bits. Scans without poses go on from the last scans with times.
+        """Read a saved map, with its settings, bit-identically. Tracking resumes from the last scans with times.
 
         Parameters
         ----------
         path : path-like
-            A file that :meth:`save` wrote.
+            A file written by :meth:`save`.
         folder : path-like, optional
-            As of the constructor.
+            See the constructor.
 
         Raises
         ------
         ValueError
-            If the file holds no live map, is damaged, or comes from another version, or `folder` holds other files.
+            If the file is not a live map, is damaged, or of another version, or `folder` contains other files.
         OSError
             If it cannot be read, or another map uses `folder`.
         """
@@ -363,7 +363,7 @@ class LiveMap:
         return live
 
     def mesh(self, **limits: Any) -> trimesh.Trimesh:
-        """Extract the surface as triangles, in voxels of the size of leaf cells. Distances are derived again where they changed.
+        """Extract the surface as triangles, in voxels of the size of leaf cells. Only changed distances are recomputed.
 
         Parameters
         ----------
@@ -373,7 +373,7 @@ class LiveMap:
         Returns
         -------
         trimesh.Trimesh
-            World frame, m, as of :meth:`Map.mesh`. It is empty if there is no surface.
+            World frame, m, see :meth:`Map.mesh`. Empty if there is no surface.
 
         Raises
         ------
@@ -387,25 +387,25 @@ class LiveMap:
             try:
                 growing.update(*changes)
                 scene, surface = growing.surface(visibility)
-            except BaseException:  # Ctrl-C, say: half of it would be wrong from now on
+            except BaseException:  # such as Ctrl-C: a partial update would be inconsistent
                 self._state.forget_surface()
                 raise
         return surface.mesh(scene.origin, wanted, surface.cells_searched)
 
     def map(self) -> RadarMap:
-        """Fit a map to all scans that could be taken out, by :meth:`FitConfig.quick`, with intensities in closed form.
+        """Fit a map to all scans that are not sealed, by :meth:`FitConfig.quick`, with closed-form intensities.
 
         Raises
         ------
         ValueError, OSError
-            If there is no scan that could be taken out, or files in the folder cannot be read.
+            If there is no such scan, or files in the folder cannot be read.
         """
         with self._lock, self._state.whole():
             read = self._state.fit_input()
         return fit_rays(read, self._state.quick, progress=False)
 
     def finish(self, *, progress: bool | None = None) -> RadarMap:
-        """Fit a map to all scans with all settings, as :func:`radarsdf.fit` does with this `origin`.
+        """Fit a map to all scans with all settings, like :func:`radarsdf.fit` with this `origin`.
 
         Parameters
         ----------
@@ -415,7 +415,7 @@ class LiveMap:
         Raises
         ------
         ValueError
-            If scans were let go, or there are none.
+            If scans were sealed, or there are none.
         """
         with self._lock:
             if sealed := self.sealed_scans:
@@ -442,7 +442,7 @@ def _checked_scan(
     time_s: float | None,
     config: ReturnsConfig,
 ) -> LoggedScan:
-    """A scan, whose pose is not known yet. Raises a ValueError if it is none."""
+    """Check a scan, without a pose yet. Raise a ValueError if it is invalid."""
     scans, values, _ = check_scans([points], None if intensities is None else [intensities])
     scan = scans[0].copy()
     speeds, static = None, None

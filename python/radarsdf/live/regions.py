@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Columns of cells, kept in regions of 64³ leaf cells: what is near a change is found without reading the rest."""
+"""Columns of cells, partitioned into regions of 64³ leaf cells for local access near changes."""
 
 from __future__ import annotations
 
@@ -18,62 +18,62 @@ Keys = NDArray[np.uint64]
 Rows = dict[str, NDArray[Any]]
 
 REGION_CELLS = 64  # leaf cells along the edge of a region
-REGION_BITS = np.uint64(18)  # by which the key of a leaf cell is longer than that of its region
+REGION_BITS = np.uint64(18)  # bits of a leaf cell's Morton key below those of its region
 NO_KEYS = np.zeros(0, np.uint64)
-_FARTHEST = 1_000_000  # cell along each axis that has a key
+_FARTHEST = 1_000_000  # farthest cell along each axis that has a key
 
 
 def steps_near(reach: int) -> NDArray[np.int64]:
-    """((2 reach + 1)³, 3) steps of at most `reach` along each axis."""
+    """Return all offsets ((2 reach + 1)³, 3) of at most `reach` along each axis."""
     return np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
 
 
 def shifted(keys: Keys, steps: NDArray[np.int64]) -> Keys:
-    """Keys of the cells that are `steps` (S, 3) away from those with these keys (N,), ascending, each once."""
+    """Return the unique ascending keys of cells at offsets `steps` (S, 3) from `keys` (N,)."""
     return np.unique(_keys_at((lattice_of(keys)[:, None] + steps).reshape(-1, 3)))
 
 
 def cubes_near(leaf_keys: Keys, edge: int, reach: int) -> Keys:
-    """Keys of the first leaf cells of all cubes of `edge` cells, a power of two, that are within `reach` cells of others."""
+    """Return keys of the first leaf cells of cubes of `edge` (power of two) cells within `reach` cells of those of `leaf_keys`."""
     bits = np.uint64(3 * (edge.bit_length() - 1))
     corners = np.unique(leaf_keys >> bits) << bits
     return shifted(corners, edge * steps_near(math.ceil(reach / edge)))
 
 
 def regions_of(leaf_keys: Keys) -> Keys:
-    """Keys of the regions of these leaf cells, ascending, each once."""
+    """Return the unique ascending keys of the regions of leaf cells."""
     return np.unique(leaf_keys >> REGION_BITS)
 
 
 def regions_near(regions: Keys, reach: int) -> Keys:
-    """Keys of these regions, and of those at most `reach` away along each axis, ascending."""
+    """Return the ascending keys of these regions, and of those at most `reach` away along each axis."""
     near = shifted(regions << REGION_BITS, REGION_CELLS * steps_near(reach))
     return np.unique(near >> REGION_BITS)
 
 
 def region_places(regions: Keys) -> NDArray[np.int64]:
-    """(R, 3) positions of regions: that of i spans [i, i + 1) times their edge."""
+    """Return the lattice positions (R, 3) of regions: i spans [i, i + 1) times their edge."""
     return lattice_of(regions << REGION_BITS) // REGION_CELLS
 
 
 def _keys_at(cells: NDArray[np.int64]) -> Keys:
-    """(N,) keys of cells (N, 3)."""
-    # The middle of a cell of 1 m is exact in float64.
+    """Return the keys (N,) of cells (N, 3)."""
+    # The centre of a cell of 1 m is exact in float64.
     return cell_keys(np.clip(cells, -_FARTHEST, _FARTHEST - 1) + 0.5, 1.0, 1)
 
 
 class RegionTable:
-    """Rows by the Morton keys of their cells, ascending, in regions. `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2."""
+    """Table by ascending Morton keys of cells, partitioned into regions. `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2."""
 
     def __init__(self, leaves_per_cell: int = 1, **columns: NDArray[Any]) -> None:
-        """`columns`: one row of each, as a new cell has it."""
+        """Create an empty table. `columns`: default row of each column."""
         self._merged = leaves_per_cell.bit_length() - 1
         self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}
         self._parts: dict[int, Rows] = {}
         self.num_bytes = 0
 
     def gather(self, regions: Keys | None = None) -> Rows:
-        """The rows of `regions` (R,), ascending, in the order of their keys. None: all."""
+        """Return the rows of ascending `regions` (R,), in the order of their keys. None: all."""
         wanted = sorted(self._parts) if regions is None else regions.tolist()
         parts = [self._parts[region] for region in wanted if region in self._parts]
         return {
@@ -82,7 +82,7 @@ class RegionTable:
         }
 
     def carried(self, regions: Keys, keys: Keys) -> Rows:
-        """Rows of cells with these `keys`, all in `regions`: as they are where there are some, else new ones."""
+        """Return rows for `keys`, all in `regions`: the existing ones, else defaults."""
         before = self.gather(regions)
         rows = {name: np.repeat(new, len(keys), axis=0) for name, new in self._new.items()}
         _, after, old = np.intersect1d(keys, before["keys"], assume_unique=True, return_indices=True)
@@ -91,7 +91,7 @@ class RegionTable:
         return rows | {"keys": keys}
 
     def put(self, regions: Keys, rows: Rows) -> None:
-        """All rows of `regions` (R,), ascending, become those of `rows` that are in them."""
+        """Replace all rows of ascending `regions` (R,) by those of `rows` in them."""
         of_rows = self.regions_of(rows["keys"])
         ends = np.searchsorted(of_rows, regions, side="right").tolist()
         starts = np.searchsorted(of_rows, regions).tolist()
@@ -102,7 +102,7 @@ class RegionTable:
                 self.num_bytes += sum(column.nbytes for column in part.values())
 
     def regions_of(self, keys: Keys) -> Keys:
-        """(N,) keys of the regions of cells with these `keys` (N,), ascending, of this table."""
+        """Return the regions (N,) of this table's cells with ascending `keys` (N,)."""
         if self._merged == 0:
             return keys >> REGION_BITS
         bits = REGION_BITS - np.uint64(3 * self._merged)

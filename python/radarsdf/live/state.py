@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a map that grows consists of, and how it changes."""
+"""State of a live map, and its changes."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
-_UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # nothing depends on it: it is estimated once there are scans
-_NOISE_RETURNS = 100_000  # for the noise: as many as those on flat surfels that are wanted, and more
+_UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # placeholder until it is estimated from scans
+_NOISE_RETURNS = 100_000  # sample for the noise, enough to include the required returns on flat surfels
 
 
 class GrowingState:
-    """Sums over scans, the scans themselves, and the surface that follows. One thread at a time."""
+    """Sums over scans, the scans, and the surface derived from them. Not thread-safe."""
 
     def __init__(
         self,
@@ -60,13 +60,13 @@ class GrowingState:
         self.noise = _UNKNOWN
         self.with_intensities: bool | None = None
         self.next_id = 0
-        self._noise_of = 0  # number of scans that the noise was estimated from
-        self._changed: set[int] = set()  # keys of the blocks that the surface has to take in
+        self._noise_of = 0  # number of scans at the last estimate of the noise
+        self._changed: set[int] = set()  # keys of the blocks to update in the surface
         self._surface: GrowingSurface | None = None
 
     @property
     def num_bytes(self) -> int:
-        """Memory that all takes."""
+        """Memory in total, bytes."""
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
@@ -76,7 +76,7 @@ class GrowingState:
         gone: Iterable[ScanId],
         origin: NDArray[np.float64] | None = None,
     ) -> Keys:
-        """Takes scans out and puts others in, also of the same ids, all or none. Returns the keys of the changed blocks."""
+        """Remove and insert scans, possibly of the same ids, atomically. Return the keys of the changed blocks."""
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         before, self.origin = self.origin, self.origin if origin is None else origin
         try:
@@ -84,7 +84,7 @@ class GrowingState:
             try:
                 if come:
                     self._bound()
-            except BaseException:  # the disk is full, say
+            except BaseException:  # such as a full disk
                 self._apply(left, come)
                 raise
         except BaseException:
@@ -93,7 +93,7 @@ class GrowingState:
         return blocks
 
     def _apply(self, come: dict[ScanId, LoggedScan], gone: dict[ScanId, LoggedScan]) -> Keys:
-        """Changes the sums and the log, or leaves all as it was. Returns the keys of the changed blocks."""
+        """Change the sums and the log atomically. Return the keys of the changed blocks."""
         change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
         for scans, sign in ((gone, -1), (come, 1)):
             for scan in scans.values():
@@ -109,9 +109,9 @@ class GrowingState:
         return blocks
 
     def _bound(self) -> None:
-        """Lets scans go, to the folder if there is one, where memory is short."""
+        """Seal scans, or write them to the folder, to stay within the memory limit."""
         if self.max_bytes is not None and self.num_bytes > self.max_bytes:
-            if self._noise_of == 0:  # the scans it is estimated from may go
+            if self._noise_of == 0:  # the scans for its estimate may be sealed
                 self._settle_noise()
             self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
@@ -134,7 +134,7 @@ class GrowingState:
 
     @contextmanager
     def whole(self) -> Iterator[None]:
-        """Within, nothing is put away. Afterwards, the same regions are again."""
+        """Restore all regions from disk within the context, and write the same ones again afterwards."""
         away = self._store.regions
         self._bring_back(away)
         try:
@@ -151,8 +151,8 @@ class GrowingState:
         return blocks
 
     def changes(self) -> tuple[GrowingSurface, tuple[Any, ...], VisibilityCounts]:
-        """The surface as it was derived last, the arguments of its update, and the visibility counts."""
-        self._settle_noise()  # which may fail, as scans may have to be read
+        """Return the last surface, the arguments of its update, and the visibility counts."""
+        self._settle_noise()  # first: may raise, since scans may be read from disk
         if self._surface is None:
             surface = GrowingSurface(self.quick, np.zeros(3) if self.origin is None else self.origin)
             self._surface = None if self.origin is None else surface
@@ -165,11 +165,11 @@ class GrowingState:
         return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
 
     def forget_surface(self) -> None:
-        """The surface is derived again from all sums."""
+        """Discard the surface, to recompute it from all sums."""
         self._surface = None
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes all to a file. Raises a ValueError for ids of scans that are neither numbers nor strings."""
+        """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
         keys, ids, sealed = self.sums.block_keys(), self.log.ids, self.log.sealed
         if not all(type(scan_id) in (int, str) for scan_id in (*ids, *sealed)):
             msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
@@ -193,7 +193,7 @@ class GrowingState:
         )
 
     def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[NDArray[Any]]) -> None:
-        """Makes a new state that which was saved."""
+        """Restore a saved state into a new one."""
         self.sums.insert(*sums)
         self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
         self.next_id, self.with_intensities = described.next_id, described.with_intensities
@@ -203,7 +203,7 @@ class GrowingState:
         self._bound()
 
     def scans(self) -> list[LoggedScan]:
-        """Those that can be taken out. Raises a ValueError if there are none."""
+        """Return the scans that are not sealed. Raise a ValueError if there are none."""
         scans = list(self.log.scans())
         if not scans:
             msg = "there are no scans to learn from: integrate some first"
@@ -211,7 +211,7 @@ class GrowingState:
         return scans
 
     def fit_input(self) -> Callable[[], FitInput]:
-        """What a fit of all scans starts from, with the sums that were kept up."""
+        """Return a function for the input of a fit of all scans, with the incremental sums."""
         scans, sums, visibility, origin = self.scans(), self._all_sums(), self._visibility(), self.origin
 
         def read() -> FitInput:
@@ -233,7 +233,7 @@ class GrowingState:
         return VisibilityCounts(*self.sums.visibility_of(self.sums.block_keys()))
 
     def _settle_noise(self) -> None:
-        """Estimates the sensor's noise, if there are twice or half as many scans as the last time."""
+        """Estimate the sensor's noise if the number of scans has doubled or halved since the last time."""
         scans = len(self.log)
         if self._noise_of / 2 < scans < 2 * self._noise_of:
             return
@@ -247,7 +247,7 @@ class GrowingState:
 
 
 def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:
-    """The rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
+    """Return the rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
     static = [scan.static for scan in scans]
     return prepare(
         [scan.points for scan in static],
@@ -260,7 +260,7 @@ def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.
 
 
 def _blocks_of_regions(blocks: Keys) -> Keys:
-    """Keys of all blocks of the regions of these blocks, ascending."""
+    """Return the ascending keys of all blocks in the regions of these blocks."""
     bits = REGION_BITS - BLOCK_BITS
     regions = np.unique(blocks >> bits)
     found: Keys = ((regions << bits)[:, None] | np.arange(1 << int(bits), dtype=np.uint64)).reshape(-1)

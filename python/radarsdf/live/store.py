@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a live map keeps in files: scans and regions that memory has no room for, and its whole state."""
+"""Files of a live map: scans and regions moved out of memory, and its saved state."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ _KINDS = {
     "is_static": "b",
 }  # arrays of a scan, and their types
 
-_LOCK = "live.lock"  # also the mark of a folder that a map has used
-_BYTES_OF_SCAN = 1000  # of the objects that hold a scan, about
+_LOCK = "live.lock"  # also marks a folder as used by a map
+_BYTES_OF_SCAN = 1000  # approximate overhead of a scan
 _CELL_COLUMNS: dict[str, tuple[Any, ...]] = {
     "keys": (np.uint64, None),
     "sums": (np.int64, None, 14),
     "scans_of_cells": (np.uint32, None),
     "visibility_keys": (np.uint64, None),
     "visibility": (np.uint32, None),
-}  # in the order in which the core takes them
+}  # in the order of the core's arguments
 
 
 def locked_folder(folder: Path) -> int:
-    """Makes the folder of one map, and locks it until the descriptor is closed."""
+    """Create the folder of one map, and lock it until the returned descriptor is closed."""
     folder.mkdir(exist_ok=True)
     ours = (_LOCK, "*scan-*.npz*", "*region-*.npz*") if (folder / _LOCK).is_file() else ()
     if not all(any(path.match(name) for name in ours) for path in folder.iterdir()):
@@ -53,30 +53,30 @@ def locked_folder(folder: Path) -> int:
 
 
 def compact(points: NDArray[np.float64]) -> NDArray[Any]:
-    """The same numbers in half of the memory, if float32 holds all their bits."""
+    """Convert to float32 if that is lossless, to halve the memory."""
     small = points.astype(np.float32)
     return small if (small == points).all() else points
 
 
 @dataclass(frozen=True)
 class LoggedScan:
-    """One scan as it was given."""
+    """Scan as passed to the map."""
 
     pose: NDArray[np.float64]  # (4, 4) T_world_sensor, m
-    points: NDArray[Any]  # (N, 3) sensor frame, m: float32 if that holds all bits, else float64
+    points: NDArray[Any]  # (N, 3) sensor frame, m: float32 if that is lossless, else float64
     intensities: NDArray[np.float32] | None = None  # (N,) sensor units
-    doppler_mps: NDArray[Any] | None = None  # (N,) along the ray
-    is_static: NDArray[np.bool_] | None = None  # (N,) the static returns, which the map has. None: all
+    doppler_mps: NDArray[Any] | None = None  # (N,) radial speed
+    is_static: NDArray[np.bool_] | None = None  # (N,) mask of the static returns, those in the map. None: all
     time_s: float | None = None
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Those that it has, by their names."""
+        """Existing arrays by name."""
         return {name: array for name in _KINDS if (array := getattr(self, name)) is not None}
 
     @property
     def static(self) -> LoggedScan:
-        """With its static returns alone."""
+        """The scan with static returns only."""
         if self.is_static is None:
             return self
         kept: dict[str, Any] = {name: array[self.is_static] for name, array in self.arrays.items()}
@@ -84,11 +84,11 @@ class LoggedScan:
 
     @property
     def num_bytes(self) -> int:
-        """Memory that it takes."""
+        """Memory, bytes."""
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
 
     def at(self, pose: NDArray[np.float64]) -> LoggedScan:
-        """The same from another pose (4, 4)."""
+        """Return the scan at another pose (4, 4)."""
         return replace(self, pose=pose)
 
 
@@ -106,7 +106,7 @@ class _OnDisk:
 def _scan_of(
     arrays: Mapping[str, NDArray[Any]], pose: NDArray[np.float64], time_s: float | None
 ) -> LoggedScan:
-    """A scan as it was written. Raises a KeyError or a ValueError if it is damaged."""
+    """Build a scan from the arrays of its file. Raise a KeyError or a ValueError if it is damaged."""
     points = positions(arrays["points"], "points")
     for name, array in arrays.items():
         if name != "points":
@@ -118,10 +118,10 @@ def _scan_of(
 
 
 class ScanLog:
-    """Scans by their ids, in the order in which they came.
+    """Scans by id, in order of insertion.
 
-    Where memory is short, the oldest are written to `folder`. Without one they are sealed: they stay in the map, but nothing
-    can take them out of it.
+    To limit memory, the oldest are written to `folder`. Without a folder they are sealed: they stay in the map, but can no
+    longer be removed.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -129,7 +129,7 @@ class ScanLog:
         self._scans: dict[ScanId, LoggedScan | _OnDisk] = {}
         self.sealed: set[ScanId] = set()
         self._written = 0
-        self.num_bytes = 0  # memory of what is held
+        self.num_bytes = 0  # memory of the scans
 
     def __len__(self) -> int:
         return len(self._scans) + len(self.sealed)
@@ -139,15 +139,15 @@ class ScanLog:
 
     @property
     def ids(self) -> list[ScanId]:
-        """Of the scans that can be taken out again."""
+        """Identifiers of the scans that can be removed."""
         return list(self._scans)
 
     def entry(self, scan_id: ScanId) -> LoggedScan | _OnDisk | None:
-        """What has the pose and the time of a scan. None: it cannot be taken out."""
+        """Return the entry with the pose and the time of a scan. None if it cannot be removed."""
         return self._scans.get(scan_id)
 
     def get(self, scan_id: ScanId) -> LoggedScan:
-        """A scan. Raises a KeyError if there is none of this id, a ValueError if it was let go."""
+        """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
         if scan_id in self.sealed:
             msg = f"scan {scan_id!r} cannot be moved or taken out: it was let go; give the map a folder to keep scans in"
             raise ValueError(msg)
@@ -158,17 +158,17 @@ class ScanLog:
         return found.read() if isinstance(found, _OnDisk) else found
 
     def scans(self, every: int = 1) -> Iterator[LoggedScan]:
-        """Every n-th of those that can be taken out, in their order."""
+        """Iterate over every n-th scan that can be removed, in order."""
         return (self.get(scan_id) for scan_id in self.ids[::every])
 
     def put(self, scan_id: ScanId, scan: LoggedScan | _OnDisk) -> None:
-        """Adds a scan, or changes one in its place."""
+        """Add a scan, or replace it in place."""
         self._free(scan_id)
         self._scans[scan_id] = scan
         self.num_bytes += scan.num_bytes
 
     def drop(self, scan_id: ScanId) -> None:
-        """Takes a scan out."""
+        """Remove a scan."""
         self._free(scan_id)
         del self._scans[scan_id]
 
@@ -176,11 +176,11 @@ class ScanLog:
         there = self._scans.get(scan_id)
         self.num_bytes -= 0 if there is None else there.num_bytes
         if isinstance(there, _OnDisk):
-            with suppress(OSError):  # a file that stays harms nothing
+            with suppress(OSError):  # a leftover file is harmless
                 there.path.unlink()
 
     def shrink(self, max_bytes: int) -> None:
-        """Lets the oldest scans in memory go until all take at most so much."""
+        """Write or seal the oldest scans in memory until they fit into `max_bytes`."""
         in_memory = [(scan_id, scan) for scan_id, scan in self._scans.items() if isinstance(scan, LoggedScan)]
         for scan_id, scan in in_memory:
             if self.num_bytes <= max_bytes:
@@ -194,7 +194,7 @@ class ScanLog:
             self.put(scan_id, _OnDisk(scan.pose, path, scan.time_s))
 
     def seal_beyond(self, centre: NDArray[np.float64], radius_m: float) -> None:
-        """Seals the scans with returns beyond a ball around `centre` (3,), world, m. None is on the disk."""
+        """Seal the scans with returns outside a ball around `centre` (3,), world, m. No scan is on disk."""
         for scan_id in self.ids:
             scan = self.get(scan_id)
             reach_m = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1).max())
@@ -207,7 +207,7 @@ class ScanLog:
 
 
 class RegionStore:
-    """Sums of regions that were put away, in a file each in `folder`, which come back with the same bits."""
+    """Region store: sums of regions on disk, one file each in `folder`, restored bit-identically."""
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
@@ -215,7 +215,7 @@ class RegionStore:
 
     @property
     def regions(self) -> Keys:
-        """(R,) keys of the regions that are put away, ascending."""
+        """Ascending keys (R,) of the regions on disk."""
         return np.array(sorted(self._away), np.uint64)
 
     def _path(self, region: int) -> Path:
@@ -223,7 +223,7 @@ class RegionStore:
         return self.folder / f"region-{region:016x}.npz"
 
     def put_away(self, sums: GrowingSums, regions: Keys) -> Keys:
-        """Moves all blocks of `regions` out of `sums`, once all are written. Returns the keys of the blocks, ascending."""
+        """Move all blocks of `regions` from `sums` to disk, after all are written. Return the ascending keys of the blocks."""
         blocks = sums.block_keys()
         region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
         written = np.intersect1d(regions, region_of_block)
@@ -237,7 +237,7 @@ class RegionStore:
         return gone
 
     def bring_back(self, sums: GrowingSums, regions: Keys) -> Keys:
-        """Moves those of `regions` that are put away into `sums`, all or none. Returns the keys of their blocks, ascending."""
+        """Move the `regions` on disk into `sums`, atomically. Return the ascending keys of their blocks."""
         regions = np.intersect1d(regions, self.regions)
         if len(regions) == 0:
             return NO_KEYS
@@ -247,14 +247,14 @@ class RegionStore:
         sums.insert(*columns)
         self._away.difference_update(regions.tolist())
         for path in paths:
-            with suppress(OSError):  # a file that stays harms nothing
+            with suppress(OSError):  # a leftover file is harmless
                 path.unlink()
         keys, _, _, visibility_keys, _ = columns
         return np.union1d(visibility_keys, keys >> BLOCK_BITS)
 
 
 def _sums_of(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], ...]:
-    """The columns of cells and blocks in a file. The core trusts that keys ascend and that no cell is empty."""
+    """Return the columns of cells and blocks in a file. The core relies on ascending keys and non-empty cells."""
     try:
         check_arrays(arrays, _CELL_COLUMNS)
         if (arrays["keys"][1:] < arrays["keys"][:-1]).any() or (arrays["sums"][:, 0] < 1).any():
@@ -271,7 +271,7 @@ _Count = Annotated[int, Field(ge=0, le=2**62)]
 
 
 class Described(BaseModel):
-    """What the state of a map has besides arrays."""
+    """State of a map without its arrays."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -285,7 +285,7 @@ class Described(BaseModel):
     max_bytes: Annotated[int, Field(ge=1, le=2**63 - 1)] | None
     sealed: list[int | str]
     ids: list[int | str]
-    poses: list[list[list[float]]]  # T_world_sensor, m, of the scans of these ids
+    poses: list[list[list[float]]]  # T_world_sensor, m, of the scans in `ids`
     times_s: list[float | None]
 
 
@@ -295,7 +295,7 @@ def save_state(
     scans: Sequence[LoggedScan],
     sums: Sequence[NDArray[Any]],
 ) -> None:
-    """Writes a state whole or not at all. `sums`: columns of cells and of blocks, as the core gives and takes them."""
+    """Write a state atomically. `sums`: columns of cells and blocks in the core's format."""
     arrays: dict[str, NDArray[Any]] = dict(zip(_CELL_COLUMNS, sums, strict=True))
     for i, scan in enumerate(scans):
         arrays |= {f"{name} {i}": array for name, array in scan.arrays.items()}
@@ -306,7 +306,7 @@ def save_state(
 def load_state(
     path: str | PathLike[str],
 ) -> tuple[Described, list[LoggedScan], tuple[NDArray[Any], ...]]:
-    """The state that :func:`save_state` wrote. Raises a ValueError if the file is none, or damaged."""
+    """Read a state written by :func:`save_state`. Raise a ValueError if the file is invalid or damaged."""
     try:
         described = Described.model_validate_json(arrays_of(path, ["described"])["described"].tobytes())
         ids = [*described.ids, *described.sealed]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The surface of a map that grows: what a quick fit makes of sums, derived again only where they changed."""
+"""Surface of a live map: a quick fit of the sums, updated incrementally."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ from radarsdf.returns.planes import (
 from radarsdf.returns.sums import MeanRays, ScanSums, lattice_of, merged_keys
 from radarsdf.threads import resolve_num_threads
 
-_BLOCK_CELLS, _LARGE_CELLS = 8, 16  # edges of cubes, in which distances from changes are counted
+_BLOCK_CELLS, _LARGE_CELLS = 8, 16  # edges of cubes that quantise distances from changes, leaf cells
 
 
 class GrowingSurface:
-    """Planes, ghosts, distances and triangles of sums over scans. :meth:`update` derives again what changes reach.
+    """Planes, ghosts, distances and triangles of sums over scans. :meth:`update` recomputes what depends on changes.
 
-    All is a function of the sums, the visibility counts and the noise: however they came about, it has the same bits. Planes
-    and distances take most of the time, and are kept by region. Ghosts and triangles are found again for the whole map.
+    The result is a function of the sums, the visibility counts and the noise, bit-identical for any history. Planes and
+    distances take most of the time, and are cached by region. Ghosts and triangles are recomputed for the whole map.
     """
 
     def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
-        self._config = config  # of a quick fit
-        self._origin = origin  # (3,) of the local frame, world, m
+        self._config = config  # quick settings
+        self._origin = origin  # (3,) origin of the local frame, world, m
         self._noise: SensorNoise | None = None
         vector, number = np.full((1, 3), np.nan, np.float32), np.zeros(1, np.float32)
         # Leaf cells with returns: mean rays and normals.
@@ -79,10 +79,10 @@ class GrowingSurface:
             support=np.zeros(1),
             planes=np.full((1, 9), np.nan),
         )
-        self._surfels = self._surfels_of(self._cells.gather())  # of all cells
-        self._ghosts = NO_KEYS  # of the cells of surfels that hold ghosts, ascending
+        self._surfels = self._surfels_of(self._cells.gather())  # surfels of all cells
+        self._ghosts = NO_KEYS  # ascending keys of the surfel cells with ghosts
         self._crossed = RegionTable()  # leaf cells that rays cross near their returns
-        # These, and those that bridge gaps between them: distances at the corners, m, whether they change sign, evidence.
+        # These, and the bridges over gaps between them: distances at the corners, m, whether they change sign, evidence.
         self.distances = RegionTable(
             values=np.zeros((1, 8), np.float32),
             crossed=np.zeros(1, bool),
@@ -92,16 +92,16 @@ class GrowingSurface:
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all that is kept, bytes."""
+        """Memory of all tables, bytes."""
         return sum(table.num_bytes for table in (self._leaves, self._cells, self._crossed, self.distances))
 
     def update(self, blocks: Keys, sums: ScanSums, noise: SensorNoise, num_threads: int) -> Keys:
-        """Derives again what changes reach. Returns the keys of the regions with other distances, ascending.
+        """Recompute what depends on changes. Return the ascending keys of the regions with recomputed distances.
 
-        `blocks` (B,): keys of the blocks whose sums changed, ascending; `sums`: all of the regions of these.
+        `blocks` (B,): ascending keys of the blocks with changed sums; `sums`: all sums in their regions.
         """
         changed = self._put_sums(blocks, sums)
-        if noise != self._noise:  # ghosts and evidence depend on it everywhere
+        if noise != self._noise:  # all ghosts and evidence depend on it
             self._noise = noise
             changed = np.union1d(changed, self._leaves.gather()["keys"])
         if len(changed) == 0:
@@ -114,7 +114,7 @@ class GrowingSurface:
         return self._derive_distances(changed, noise, num_threads)
 
     def surface(self, visibility: VisibilityCounts) -> tuple[WholeMap, Surface]:
-        """All triangles, with the evidence of their vertices. `visibility`: of all blocks."""
+        """Extract all triangles, with the evidence at their vertices. `visibility`: of all blocks."""
         num_threads = resolve_num_threads(self._config.num_threads)
         surfels, leaf_m = self._surfels, self._config.leaf_size_m
         scene = WholeMap(self._origin, self._config, surfels.clutter_ratio(), surfels.returns_per_cell())
@@ -128,7 +128,7 @@ class GrowingSurface:
             corners, values, of_cells, spacing=[leaf_m] * 3, num_threads=num_threads
         )
         evidence = Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
-        # By way of the world's coordinates, as those who query the mesh's own vertices do.
+        # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
         at = queries.interpolated(evidence, rows["keys"], leaf_m, local(scene, vertices + self._origin))
         return scene, Surface.from_triangles(scene, vertices, faces, at, len(rows["keys"]))
 
@@ -148,7 +148,7 @@ class GrowingSurface:
         )
 
     def _put_sums(self, blocks: Keys, sums: ScanSums) -> Keys:
-        """Takes sums in. Returns the keys of the leaf cells in changed blocks that have returns, or had some."""
+        """Update the tables from sums. Return the keys of the leaf cells in changed blocks with returns, now or before."""
         regions = regions_of(blocks << BLOCK_BITS)
         either = np.union1d(self._leaves.gather(regions)["keys"], sums.keys)
         self._leaves.put(regions, self._leaves.carried(regions, sums.keys) | vars(MeanRays.of_sums(sums)))
@@ -158,7 +158,7 @@ class GrowingSurface:
         return found
 
     def _fit_planes(self, changed: Keys, num_threads: int) -> Keys:
-        """Fits the planes of the cells near changed ones. Returns the regions of these, ascending."""
+        """Fit planes in the neighbourhood of changed cells. Return the ascending keys of their regions."""
         near = shifted(np.unique(merged_keys(changed)), steps_near(1))
         regions = np.unique(self._cells.regions_of(near))
         cells = self._cells.gather(regions_near(regions, 1))
@@ -177,7 +177,7 @@ class GrowingSurface:
         return regions
 
     def _find_ghosts(self, noise: SensorNoise, num_threads: int) -> Keys:
-        """Finds ghosts again. Returns the keys of the leaf cells that became ghosts, or are none any more."""
+        """Detect ghosts again. Return the keys of the leaf cells that became ghosts or ceased to be."""
         leaves = self._leaves.gather()
         found = find_ghosts(self._surfels, _means_of(leaves), noise, num_threads)
         before, self._ghosts = self._ghosts, self._surfels.keys[found]
@@ -187,7 +187,7 @@ class GrowingSurface:
         return differs
 
     def _find_normals(self, regions: Keys, num_threads: int) -> Keys:
-        """Finds the normals of the leaf cells in these regions. Returns the keys of those that differ from before."""
+        """Compute the normals of the leaf cells in these regions. Return the keys of the changed ones."""
         leaves = self._leaves.gather(regions)
         surfels = self._surfels_of(self._cells.gather(regions))
         normals = normals_at(_means_of(leaves), surfels, num_threads)
@@ -197,15 +197,15 @@ class GrowingSurface:
         return found
 
     def _derive_distances(self, changed: Keys, noise: SensorNoise, num_threads: int) -> Keys:
-        """Derives distances and evidence again where they depend on changed leaf cells. Returns the regions, ascending.
+        """Recompute distances and evidence that depend on changed leaf cells. Return their regions, ascending.
 
-        A ray counts in the cells of its band; the corners of the last one have others round them. Cells that come or go show
-        which rays count at the corners of those round them, and smoothing carries what is known there.
+        A ray contributes to the cells of its band, and via shared corners to the neighbours of the last one. Added or removed
+        cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
         """
         config = self._config
         reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(max(TRUNCATION_CELLS, BAND_CELLS)) + 1)
         centre = regions_of(reached)
-        # Bridges depend on medians of blocks of 32 cells, and on their two ends.
+        # Bridges depend on medians over blocks of 32 cells, and on their two ends.
         own, around = regions_near(centre, 2), regions_near(centre, 3)
         leaves = self._leaves.gather(around)
         is_true = ~np.isin(merged_keys(leaves["keys"]), self._ghosts)
@@ -217,7 +217,7 @@ class GrowingSurface:
         crossed = self._crossed.gather(around)["keys"]
         counts = means.counts.astype(np.float64)
         found = bridged(crossed, means.keys, counts, config.encoding.bridge_cells, num_threads)
-        # At the rim of what was gathered, bridges lack an end.
+        # At the border of the gathered regions, bridges lack an end.
         leaf_keys = np.concatenate(
             [found[np.isin(found >> REGION_BITS, own)], before[~np.isin(before >> REGION_BITS, own)]]
         )
@@ -226,7 +226,7 @@ class GrowingSurface:
         reached = np.union1d(reached, cubes_near(came_or_went, _BLOCK_CELLS, 1))
         there = regions_of(np.union1d(leaf_keys, before))
         redone = np.intersect1d(regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED)), there)
-        # All that has a part in what their corners get: smoothing reaches no farther.
+        # All cells that influence their corners: smoothing reaches no farther.
         near = regions_near(redone, 1)
         leaf_keys = leaf_keys[np.isin(leaf_keys >> REGION_BITS, near)]
         here = np.isin(means.keys >> REGION_BITS, near)
@@ -249,6 +249,6 @@ class GrowingSurface:
 
 
 def _means_of(rows: Rows) -> MeanRays:
-    """The mean rays of leaf cells with these columns."""
+    """Build the mean rays of leaf cells from their columns."""
     names = ("keys", "points", "directions", "counts", "scans", "ranges_m")
     return MeanRays(**{name: rows[name] for name in names})

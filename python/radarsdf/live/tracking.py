@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Places scans without poses on the planes of the last ones, near where their Doppler or the motion so far lead."""
+"""Online tracking: registers scans without poses with the last ones, predicted by Doppler or the motion so far."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ from radarsdf.poses.tracking import LEAST_OBSERVED, WINDOW, Drive, Tracked, Trac
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
-_STEPS = 100  # of the motion so far, from which the usual motion is learnt
-_START = 8  # scans of a start, all of which are placed again once 2, 4 and 8 are there
-_KNOWN_STEPS = 2  # before a start that make it none: how the sensor moves is known
-_CLEAR = 5.0  # standard errors by which more returns agree if the Doppler has the other sign
-_CHANCE = 0.25  # share of a sparse radar's returns that agree at a wrong pose, about: 0.13 to 0.27
-_MOVES = 5.0  # standard deviations of a velocity that is not zero
-_OBSERVED_STEPS = 10  # over which returns alone must observe the motion of the sensor
-_GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # covariance of a step between given poses, about
+_STEPS = 100  # steps from which the motion prior is learnt
+_START = 8  # scans of the initialisation, re-estimated jointly after 2, 4 and 8 scans
+_KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
+_CLEAR = 5.0  # standard errors by which more returns agree with one sign of the Doppler
+_CHANCE = 0.25  # approximate share of a sparse radar's returns that agree at a wrong pose: 0.13 to 0.27
+_MOVES = 5.0  # standard deviations of a significant velocity
+_OBSERVED_STEPS = 10  # steps over which returns alone must observe the motion of the sensor
+_GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # approximate covariance of a step between given poses
 
 
 class Lost(ValueError):
-    """The returns of a scan agree nowhere near where it was expected: where it was taken is not known."""
+    """Tracking was lost: a scan cannot be registered near its predicted pose."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A scan, and where it was found."""
+    """Scan with its estimated pose."""
 
     scan_id: ScanId
-    logged: LoggedScan  # with its time. Where the map has it now, `found` says
-    velocity: SensorVelocity | None  # by its Doppler. None: it gives none
+    logged: LoggedScan  # with its time. Its current pose in the map is in `found`
+    velocity: SensorVelocity | None  # from its Doppler, if that yields one
     found: Tracked
-    given: bool = True  # whether the pose was given, and is not found again
-    sign: int = 0  # of the Doppler, as known then: -1 if positive as the sensor comes nearer, 0 if not known
+    given: bool = True  # whether the pose was given, and is not re-estimated
+    sign: int = 0  # sign of the Doppler as known then: -1 if positive for approaching objects, 0 if unknown
 
     @property
     def time_s(self) -> float:
-        """When it was taken."""
+        """Time of the scan, s."""
         assert self.logged.time_s is not None
         return self.logged.time_s
 
@@ -61,7 +61,7 @@ class Step:
 
     @cached_property
     def moves(self) -> bool:
-        """Whether its Doppler does not show that the sensor stands."""
+        """Whether the sensor may move: False if its Doppler shows that it is stationary."""
         if self.velocity is None:
             return True
         v = self.velocity.velocity_mps
@@ -70,7 +70,7 @@ class Step:
 
 @dataclass
 class Follower:
-    """Tracks the sensor. The map owns the poses: they are read before each scan. A scan that is refused leaves no trace."""
+    """Tracker of the sensor. The map owns the poses, which are read before each scan. A rejected scan has no effect."""
 
     config: FitConfig
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
@@ -81,7 +81,7 @@ class Follower:
         self._begin([])
 
     def seek(self, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
-        """Where a scan is, whose own pose does not count: the last of the steps. Those before it are scans to be placed again."""
+        """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
         self._synchronise(log)
         new = Step(scan_id, logged, self._velocity(logged), begun(np.eye(4)), given=False)
         if not self._steps:
@@ -109,7 +109,7 @@ class Follower:
         return found
 
     def keep(self, found: list[Step]) -> None:
-        """Goes on from the scans that :meth:`seek` found: they are in the map."""
+        """Continue from the scans returned by :meth:`seek`, which are now in the map."""
         if len(found) == 1:
             self._add(found[0])
         else:
@@ -117,12 +117,12 @@ class Follower:
             self._begin([*(step for step in self._steps if step.scan_id not in again), *found])
 
     def place(self, scan_id: ScanId, logged: LoggedScan) -> None:
-        """Notes a scan that came with its pose. It is processed once one comes without."""
+        """Queue a scan with a given pose. It is processed before the next one without."""
         if logged.time_s is not None:
             self._given.append((scan_id, logged))
 
     def _synchronise(self, log: ScanLog) -> None:
-        """Reads the poses of the map: scans may have been moved or taken out."""
+        """Read the poses of the map: scans may have been moved or removed."""
         steps = {step.scan_id: now for step in self._steps if (now := _now(step, log)) is not None}
         if len(steps) < len(self._steps) or not all(map(operator.is_, steps.values(), self._steps)):
             self._begin(list(steps.values()))
@@ -134,7 +134,7 @@ class Follower:
         self._given.clear()
 
     def _begin(self, steps: Sequence[Step]) -> None:
-        """As if only these scans had come."""
+        """Reset to the state after only these scans."""
         size_m = LEAVES_PER_SURFEL * self.config.leaf_size_m
         self._tracker = Tracker(size_m, self.config.returns, self.config.num_threads)
         self._steps.clear()
@@ -153,7 +153,7 @@ class Follower:
             self._tracker.keep(step.scan, step.found)
 
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
-        """By the Doppler of a scan. None: it gives none."""
+        """Estimate the velocity from the Doppler of a scan, if that yields one."""
         if logged.doppler_mps is None:
             return None
         others = [step.logged.doppler_mps for step in list(self._steps)[-WINDOW:]]
@@ -162,7 +162,7 @@ class Follower:
         return found if found.found else None
 
     def _next(self, new: Step, sign: int) -> Step:
-        """A scan, from the one before it."""
+        """Register a scan from the previous one."""
         steps = [*list(self._steps)[-2:], new]
         durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
         usual = Drive([], np.zeros(0), None, None)
@@ -180,7 +180,7 @@ class Follower:
         return dataclasses.replace(new, found=found, sign=sign)
 
     def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
-        """By their Doppler. None: one of the last two gives none."""
+        """Return the velocities of scans. None if one of the last two has none."""
         if any(step.velocity is None for step in steps[-2:]):
             return None
         each = [
@@ -196,7 +196,7 @@ class Follower:
         return _signed(SensorVelocities(mean, covariance, change + LEAST_MPS**2, static, found), sign)
 
     def _start(self, log: ScanLog, new: Step, sign: int) -> list[Step] | None:
-        """The first scans placed again by odometry, once more are there. None: the next scan follows from those before."""
+        """Re-estimate the first scans by odometry, if due. None if the next scan can be registered with the previous ones."""
         steps = [*self._steps, new]
         fixed = [i for i, step in enumerate(steps) if step.given or log.entry(step.scan_id) is None][:-1]
         first = max(fixed, default=0)
@@ -208,7 +208,7 @@ class Follower:
         if not new.moves or not due:
             return None
         sign, tracked = self._followed(steps[first:], sign)
-        if first >= _KNOWN_STEPS and first == len(steps) - 2:  # it only needed the sign
+        if first >= _KNOWN_STEPS and first == len(steps) - 2:  # only the sign was missing
             return [self._next(new, sign)]
         frame = steps[first].found.pose
         both = np.kron(np.eye(2), frame[:3, :3])
@@ -222,7 +222,7 @@ class Follower:
         ]
 
     def _followed(self, steps: list[Step], sign: int) -> tuple[int, list[Tracked]]:
-        """The sign of the Doppler, 0 if it is not clear, and scans where odometry finds them, in the frame of the first."""
+        """Return the sign of the Doppler, 0 if not significant, and the scans tracked by odometry, in the frame of the first."""
         drive = Drive([step.scan for step in steps], np.array([step.time_s for step in steps]), None, None)
         points = [step.logged.points for step in steps]
         speeds = [step.logged.doppler_mps for step in steps if step.logged.doppler_mps is not None]
@@ -255,13 +255,13 @@ class Follower:
 
 
 def _covariance(velocity: SensorVelocity) -> Floats:
-    """(3, 3) m²/s²."""
+    """Return the covariance (3, 3), m²/s², of a velocity including systematic errors."""
     covariance: Floats = velocity.covariance + LEAST_MPS**2 * np.eye(3)
     return covariance
 
 
 def _now(step: Step, log: ScanLog) -> Step | None:
-    """A scan as it is in the map. None: it was taken out. One that was let go cannot have changed."""
+    """Return a scan as it is in the map. None if it was removed. A sealed one cannot have changed."""
     entry = log.entry(step.scan_id)
     if entry is None:
         return step if step.scan_id in log else None
@@ -274,7 +274,7 @@ def _now(step: Step, log: ScanLog) -> Step | None:
 
 
 def _signed(velocities: SensorVelocities, sign: int) -> SensorVelocities:
-    """For Doppler of this sign. 0: it may be either, so that the mean is no motion, and the speed its deviation."""
+    """Apply the sign of the Doppler. For an unknown one, 0, the mean is zero, and the speed is its deviation."""
     mean, covariance = velocities.mean_mps, velocities.covariance
     if sign == 0:
         covariance = covariance + mean[:, :, None] * mean[:, None, :]
