@@ -76,7 +76,7 @@ class Checkpoint:
         try:
             with open_tensors(self._path) as file:
                 if (names := set(file.names)) != set(expected):
-                    msg = f"{sorted(names ^ set(expected))!s:.100} are too few or too many"
+                    msg = f"{sorted(names ^ set(expected))!s:.100} are missing or unexpected"
                     raise ValueError(msg)
                 state = {name: file.array(name).clone() for name in expected}
             for name, value in state.items():

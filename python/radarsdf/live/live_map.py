@@ -119,7 +119,7 @@ class LiveMap:
     ) -> None:
         config = FitConfig() if config is None else instance(config, FitConfig, "config")
         if config.returns.accumulate_scans != 1:
-            msg = "returns.accumulate_scans must be 1: a live map gets scans one after another"
+            msg = "returns.accumulate_scans must be 1: a live map integrates single scans"
             raise ValueError(msg)
         corner = None if origin is None else positions([np.asarray(origin)], "origin")[0]
         most = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
@@ -269,7 +269,7 @@ class LiveMap:
         KeyError
             If there is no scan of this id.
         ValueError
-            If it was sealed to limit memory.
+            If it was sealed by `max_bytes` or :meth:`clear_outside`.
         """
         with self._lock:
             return self._state.exchange({}, [scan_id])
@@ -419,7 +419,7 @@ class LiveMap:
         """
         with self._lock:
             if sealed := self.sealed_scans:
-                msg = f"{sealed} scans were let go, so that they cannot be fitted: give the map a folder to keep scans in"
+                msg = f"{sealed} scans were sealed by max_bytes or clear_outside, and cannot be fitted: give the map a folder to keep scans in"
                 raise ValueError(msg)
             scans, origin = self._state.scans(), self._state.origin
         intensities = [scan.intensities for scan in scans if scan.intensities is not None]

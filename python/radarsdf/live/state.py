@@ -206,7 +206,7 @@ class GrowingState:
         """Return the scans that are not sealed. Raise a ValueError if there are none."""
         scans = list(self.log.scans())
         if not scans:
-            msg = "there are no scans to learn from: integrate some first"
+            msg = "there are no scans to fit: integrate some first"
             raise ValueError(msg)
         return scans
 

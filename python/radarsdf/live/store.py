@@ -149,7 +149,7 @@ class ScanLog:
     def get(self, scan_id: ScanId) -> LoggedScan:
         """Return a scan. Raise a KeyError if there is none of this id, a ValueError if it was sealed."""
         if scan_id in self.sealed:
-            msg = f"scan {scan_id!r} cannot be moved or taken out: it was let go; give the map a folder to keep scans in"
+            msg = f"scan {scan_id!r} cannot be moved or removed: it was sealed by max_bytes or clear_outside; give the map a folder to keep scans in"
             raise ValueError(msg)
         if scan_id not in self._scans:
             msg = f"the map has no scan {scan_id!r}"
@@ -311,7 +311,7 @@ def load_state(
         described = Described.model_validate_json(arrays_of(path, ["described"])["described"].tobytes())
         ids = [*described.ids, *described.sealed]
         if len(set(ids)) < len(ids) or (ids and described.origin is None):
-            msg = "ids are there twice, or the origin is missing"
+            msg = "ids are duplicated, or the origin is missing"
             raise ValueError(msg)
         names = [[f"{name} {i}" for name in _KINDS] for i in range(len(described.ids))]
         arrays = arrays_of(path, (*_CELL_COLUMNS, *itertools.chain(*names)))

@@ -86,7 +86,7 @@ class Follower:
         new = Step(scan_id, logged, self._velocity(logged), begun(np.eye(4)), given=False)
         if not self._steps:
             if len(log):
-                msg = "the map has scans, but none with a time to go on from: give the pose of the scan, and its time"
+                msg = "the map has scans, but none with a time to continue from: give the pose of the scan, and its time"
                 raise Lost(msg)
             return [new]
         if not new.time_s > self._steps[-1].time_s:
@@ -98,7 +98,7 @@ class Follower:
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
         why = ""
         if any(step.found.segment for step in found):
-            why = f"the scan at {new.time_s:.6f} s agrees nowhere near, or in several places"
+            why = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
         elif not by_doppler and len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED:
             why = "the returns alone do not observe the motion of the sensor"
         if why:

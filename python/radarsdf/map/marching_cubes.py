@@ -210,10 +210,10 @@ def _as_placement(
     step, start = real_array(spacing, "spacing"), real_array(origin, "origin")
     for name, values, fits in (("spacing", step, step > 0), ("origin", start, start < np.inf)):
         if values.shape != (3,) or not (fits & np.isfinite(values)).all():
-            msg = f"{name} must be three finite numbers, and positive ones as spacing, not {values}"
+            msg = f"{name} must be three finite numbers, positive for spacing, not {values}"
             raise ValueError(msg)
     with np.errstate(over="ignore"):
         if not np.isfinite(np.abs(start) + step * extent).all():
-            msg = f"spacing {spacing!r} puts the end of the lattice beyond float64"
+            msg = f"the lattice with spacing {spacing!r} ends beyond float64"
             raise ValueError(msg)
     return step.tolist(), start.tolist()
