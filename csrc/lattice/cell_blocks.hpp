@@ -1,10 +1,10 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Cells in blocks of 4 x 4 x 4, and these in regions of 4 x 4 x 4 blocks: a bit for each. A block's cells are
-// consecutive in Morton order, so the row of a cell is that of the block's first cell and the number of bits below its
-// own; so are a region's blocks. Only regions are looked up in a hash table, which thus stays small and tells at once
-// where there is nothing: rays skip what is empty, sums over neighbours rarely leave a region.
+// Two-level bit masks of cells: blocks of 4 x 4 x 4 cells in regions of 4 x 4 x 4 blocks. The cells of a block are
+// consecutive in Morton order, so the row of a cell is that of the block's first cell plus the number of set bits below
+// its own; likewise the blocks of a region. Only regions are looked up in a hash table, which thus stays small and
+// rejects empty space early: rays skip empty regions, neighbour sums rarely leave a region.
 #pragma once
 
 #include <cstdint>
@@ -15,22 +15,22 @@
 
 namespace radarsdf {
 
-constexpr int kBlockBits = 2;                // an axis
-constexpr int kRegionBits = 2 * kBlockBits;  // an axis
+constexpr int kBlockBits = 2;                // per axis
+constexpr int kRegionBits = 2 * kBlockBits;  // per axis
 
-// What is there of a cube of 4 x 4 x 4.
+// Occupied parts of a cube of 4 x 4 x 4.
 struct Occupancy {
-  std::uint64_t mask;  // bit i: part i (of Morton order) is there
-  std::int32_t first;  // row of the first part that is there; the others follow
+  std::uint64_t mask;  // bit i: part i in Morton order is occupied
+  std::int32_t first;  // row of the first occupied part; the others follow
 
-  std::int32_t row(std::uint64_t key) const {  // of one of the 64 parts; -1 where it is not there
+  std::int32_t row(std::uint64_t key) const {  // row of one of the 64 parts, or -1
     const std::uint64_t bit = std::uint64_t{1} << (key & 63);
     return (mask & bit) != 0 ? first + count_bits(mask & (bit - 1)) : -1;
   }
 };
 
-// The parts of a block that lie at even places along an axis (0 and 2), at place 1, and at place 3. A part's place is
-// two bits of its Morton number: bit `axis` is the low one and bit `axis + 3` the high one.
+// Masks of the parts of a block at even positions along an axis (0 and 2), at position 1, and at position 3. The
+// position of a part has bit `axis` of its Morton number as low bit and bit `axis + 3` as high bit.
 constexpr std::uint64_t parts_where(int axis, bool low_bit, bool any_high_bit, bool high_bit) {
   std::uint64_t mask = 0;
   for (int i = 0; i < 64; ++i) {
@@ -46,7 +46,7 @@ constexpr std::uint64_t kOne[3] = {parts_where(0, true, false, false), parts_whe
 constexpr std::uint64_t kThree[3] = {parts_where(0, true, false, true), parts_where(1, true, false, true),
                                      parts_where(2, true, false, true)};
 
-// All parts one further along the axis: those that stay in the block, and those that are in the next one.
+// Moves all parts by one along the axis: those that stay in the block, and those carried into the next one.
 inline std::uint64_t shifted(std::uint64_t mask, int axis) {
   return (mask & kEven[axis]) << (1 << axis) | (mask & kOne[axis]) << (7 << axis);
 }
@@ -54,7 +54,7 @@ inline std::uint64_t carried(std::uint64_t mask, int axis) { return (mask & kThr
 
 class CellBlocks {
  public:
-  // keys: Morton keys, ascending, each once; a key's position is its row. Throws std::invalid_argument.
+  // keys: unique ascending Morton keys; the position of a key is its row. Throws std::invalid_argument.
   CellBlocks(const std::uint64_t* keys, std::int64_t count);
 
   std::int64_t size() const { return size_; }
@@ -62,13 +62,13 @@ class CellBlocks {
   static std::uint64_t block_key(std::uint64_t key) { return key >> (3 * kBlockBits); }
   static std::uint64_t region_key(std::uint64_t key) { return key >> (3 * kRegionBits); }
 
-  // The blocks of a region, the cells of one of its blocks; nullptr where there are none.
+  // The blocks of a region, and the cells of one of its blocks; nullptr if empty.
   const Occupancy* region(std::uint64_t region_key) const { return at(regions_, numbers_.find(region_key)); }
   const Occupancy* block(const Occupancy& region, std::uint64_t block_key) const {
     return at(blocks_, region.row(block_key));
   }
 
-  // The row of each key, -1 where it has none.
+  // The row of each key, or -1.
   void rows(const std::uint64_t* keys, std::int64_t count, std::int32_t* rows, int num_threads) const;
 
  private:
@@ -77,16 +77,16 @@ class CellBlocks {
   }
 
   std::int64_t size_;
-  FlatMap numbers_;  // of regions
+  FlatMap numbers_;  // indices of regions by key
   std::vector<Occupancy> regions_, blocks_;
 };
 
-// Rows of keys of which most lie in the block, or at least in the region, of the one before.
+// Cached look-up of keys that mostly lie in the block, or at least in the region, of the previous one.
 class NearbyRows {
  public:
   explicit NearbyRows(const CellBlocks& cells) : cells_(&cells) {}
 
-  // The row of a key, -1 where it has none.
+  // The row of a key, or -1.
   std::int32_t row(std::uint64_t key) {
     if (CellBlocks::block_key(key) != block_key_) {
       block_key_ = CellBlocks::block_key(key);

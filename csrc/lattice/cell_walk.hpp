@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The cells that a piece of a line goes through, in order (Amanatides and Woo 1987). Where the line meets a face of the
-// lattice depends on that face alone, so a longer piece of the same line goes through all the cells of a shorter one.
+// Traversal of the cells along a line segment (Amanatides and Woo 1987). The intersection with a face of the lattice
+// depends on that face alone, so a longer segment of the same line crosses all cells of a shorter one.
 #pragma once
 
 #include <algorithm>
@@ -16,14 +16,14 @@
 
 namespace radarsdf {
 
-// Cells that point + t * direction is in for a t in [from_m, to_m]: for (CellWalk cell(...); cell.inside();
-// cell.next()). check_rays comes first.
+// Cells that contain point + t * direction for t in [from_m, to_m]: for (CellWalk cell(...); cell.inside();
+// cell.next()). Call check_rays first.
 //
-// A step changes all three axes, two of them by nothing. To choose one by a branch or an index takes twice as long: the
-// next step waits for it.
+// A step updates all three axes, two of them by zero. Selecting one by a branch or an index takes twice as long: the
+// next step depends on it.
 class CellWalk {
  public:
-  // bias: of the keys, as kAxisBias is that of leaf cells.
+  // bias: offset of the coordinates in keys; kAxisBias for leaf cells.
   CellWalk(const float* point, const float* direction, double from_m, double to_m, double cell_size_m,
            std::int32_t bias = kAxisBias)
       : to_m_(to_m) {
@@ -32,13 +32,13 @@ class CellWalk {
       const std::int32_t step = cells_per_m >= 0 ? 1 : -1, ahead = step > 0 ? 1 : 0;
       const double m_per_cell = cells_per_m != 0 ? 1 / cells_per_m : std::numeric_limits<double>::infinity();
       std::int32_t cell = floor_to_int(position + from_m * cells_per_m);
-      // Rounding may have put the beginning one cell too far back.
+      // Rounding may start one cell too early.
       while ((cell + ahead - position) * m_per_cell < from_m) cell += step;
       Axis& way = axes_[axis];
       way = {position, m_per_cell, static_cast<double>(cell + ahead), static_cast<double>(step), 0, cell, step, 0, 0};
       way.next_m = (way.face - position) * m_per_cell;
       way.key = spread_bits(static_cast<std::uint32_t>(cell + bias)) << axis;
-      // With the bits of other axes set, a carry passes through them; without, a borrow does.
+      // A carry propagates through set bits of the other axes, a borrow through cleared ones.
       const std::uint64_t unit = std::uint64_t{1} << axis;
       way.key_step = step > 0 ? ~key_bits(axis) + unit : std::uint64_t{0} - unit;
     }
@@ -48,7 +48,7 @@ class CellWalk {
   std::int32_t coordinate(int axis) const { return axes_[axis].cell; }
   std::uint64_t key() const { return axes_[0].key | axes_[1].key | axes_[2].key; }
 
-  // Where the line leaves the cell.
+  // Distance at which the line leaves the cell.
   double leaves_m() const {
     const double xy_m = std::min(axes_[0].next_m, axes_[1].next_m);
     return std::min(xy_m, axes_[2].next_m);
@@ -66,11 +66,11 @@ class CellWalk {
 
  private:
   struct Axis {
-    double position, m_per_cell;  // of the point, in cells; negative where the coordinate falls
-    double face, face_step;       // that comes next, in cells
-    double next_m;                // where the line meets it
+    double position, m_per_cell;  // of the point, cells; negative for descending coordinates
+    double face, face_step;       // next face, cells
+    double next_m;                // its distance along the line
     std::int32_t cell, cell_step;
-    std::uint64_t key, key_step;  // bits of this axis; what is added to them and beyond them
+    std::uint64_t key, key_step;  // bits of this axis; increment, with carry propagation
   };
 
   static constexpr std::uint64_t key_bits(int axis) { return std::uint64_t{0x1249249249249249} << axis; }
@@ -88,8 +88,8 @@ class CellWalk {
   bool inside_ = true;
 };
 
-// Throws std::invalid_argument unless all rays, reach_m before and behind their points, lie within a million cells of
-// the origin.
+// Throws std::invalid_argument unless all rays, from reach_m before to behind their points, lie within a million cells
+// of the origin.
 inline void check_rays(const float* points, const float* directions, std::int64_t count, double cell_size_m,
                        double reach_m) {
   const double limit_m = (kAxisBias - (1 << kMaxLevels)) * cell_size_m;

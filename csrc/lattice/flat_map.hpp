@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Flat open-addressing map from 64-bit keys to 32-bit values: power-of-two capacity, linear probing, at most half
-// full. Exact: keys are compared whole, so two keys never share a value.
+// Flat open-addressing map from 64-bit keys to 32-bit values: power-of-two capacity, linear probing, load factor at
+// most one half. Exact: full keys are compared, so two keys never share a value.
 #pragma once
 
 #include <algorithm>
@@ -23,7 +23,7 @@ struct Slot {
   std::int32_t value = -1;
 };
 
-// Look-up without the container, so that kernels compiled for other instruction sets share no library code.
+// Look-up without the container, so that kernels of different instruction sets share no library code.
 struct FlatMapView {
   const Slot* slots;
   std::uint64_t mask;  // capacity - 1
@@ -48,13 +48,12 @@ class FlatMap {
   std::int32_t find(std::uint64_t key) const { return view().find(key); }
   const LargeVector<Slot>& slots() const { return slots_; }
 
-  // Makes room for so many keys: to insert them then needs no memory.
+  // Reserves capacity: inserting this many keys then needs no allocation.
   void reserve(std::size_t size) {
     while (2 * size > slots_.size()) grow();
   }
 
-  // Keys that were moved on by the one that goes move back, so that no mark is left where it was. Returns false where
-  // it is not present.
+  // Erases a key by backward shift, without a tombstone. Returns false if it is not present.
   bool erase(std::uint64_t key) {
     const FlatMapView table = view();
     std::uint64_t gap = table.home(key);
@@ -73,13 +72,13 @@ class FlatMap {
     return true;
   }
 
-  // Keeps its memory.
+  // Removes all keys; keeps the memory.
   void clear() {
     std::fill(slots_.begin(), slots_.end(), Slot{});
     size_ = 0;
   }
 
-  // Returns false, and leaves the old value, where the key is present.
+  // Returns false, and keeps the old value, if the key is present.
   bool insert(std::uint64_t key, std::int32_t value) {
     if (2 * (size_ + 1) > slots_.size()) grow();
     const FlatMapView table = view();
@@ -103,7 +102,7 @@ class FlatMap {
   }
 
   void grow() {
-    const LargeVector<Slot> old = slots_;  // copied first: if memory runs out the map is as it was
+    const LargeVector<Slot> old = slots_;  // copied first: strong exception guarantee
     reset(slots_.size());
     for (const Slot& slot : old) {
       if (slot.key != kEmptyKey) insert(slot.key, slot.value);

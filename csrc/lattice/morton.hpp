@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Integer lattice coordinates as one sortable 64-bit key: 21 bits an axis, interleaved (Morton order), so that
-// neighbours in space are neighbours in memory and the key of the parent cell is `key >> 3`.
+// Integer lattice coordinates as one sortable 64-bit key: 21 bits per axis, interleaved (Morton order), so that spatial
+// neighbours are close in memory and the key of the parent cell is `key >> 3`.
 #pragma once
 
 #include <cstdint>
@@ -10,8 +10,8 @@
 namespace radarsdf {
 
 constexpr int kAxisBits = 21;
-// Added to a signed lattice coordinate before packing. Divisible by 2^level for every level that fits, so that
-// shifting a biased coordinate is the floor division that finds the parent.
+// Offset of a signed lattice coordinate before packing. Divisible by 2^level for every level, so that shifting a biased
+// coordinate is the floor division that yields the parent.
 constexpr std::int32_t kAxisBias = 1 << (kAxisBits - 1);
 
 // Without SSE4.1 (the baseline) std::floor is a library call.
@@ -47,16 +47,16 @@ inline std::uint64_t morton_key(std::uint32_t x, std::uint32_t y, std::uint32_t 
   return spread_bits(x) | spread_bits(y) << 1 | spread_bits(z) << 2;
 }
 
-// Of lattice coordinates, which may be negative. Of leaf cells the bias is kAxisBias.
+// Key of signed lattice coordinates. The bias of leaf cells is kAxisBias.
 inline std::uint64_t lattice_key(const std::int32_t* cell, std::int32_t bias = kAxisBias) {
   return morton_key(static_cast<std::uint32_t>(cell[0] + bias), static_cast<std::uint32_t>(cell[1] + bias),
                     static_cast<std::uint32_t>(cell[2] + bias));
 }
 
-// The key of the cell one step (1 or -1) further on an axis. Spreading the bits of all axes takes four times as long.
+// Key of the neighbour one step (1 or -1) along an axis. Spreading the bits of all axes takes four times as long.
 inline std::uint64_t morton_neighbour(std::uint64_t key, int axis, std::int32_t step) {
   const std::uint64_t unit = std::uint64_t{1} << axis, bits = std::uint64_t{0x1249249249249249} << axis;
-  // With the bits of other axes set, a carry passes through them; without, a borrow does.
+  // A carry propagates through set bits of the other axes, a borrow through cleared ones.
   const std::uint64_t moved = step > 0 ? (key | ~bits) + unit : (key & bits) - unit;
   return (key & ~bits) | (moved & bits);
 }

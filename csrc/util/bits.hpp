@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The two bit operations C++17 lacks (they are std::countr_zero and std::popcount from C++20 on).
+// Bit operations that C++17 lacks (C++20: std::countr_zero and std::popcount).
 #pragma once
 
 #include <cstdint>
@@ -12,7 +12,7 @@
 
 namespace radarsdf {
 
-// Position of the lowest bit that is set; bits must not be 0.
+// Position of the lowest set bit; bits must not be 0.
 inline int lowest_bit(std::uint32_t bits) {
 #ifdef _MSC_VER
   unsigned long position = 0;
@@ -28,7 +28,7 @@ inline int lowest_bit(std::uint64_t bits) {
   return low != 0 ? lowest_bit(low) : 32 + lowest_bit(static_cast<std::uint32_t>(bits >> 32));
 }
 
-// Sums pairs, then fours, then bytes: the x86-64 baseline has no instruction for it and its library call is slower.
+// Sums pairs, then nibbles, then bytes: the x86-64 baseline has no instruction for it, and the library call is slower.
 inline int count_bits(std::uint64_t bits) {
   bits -= (bits >> 1) & 0x5555555555555555u;
   bits = (bits & 0x3333333333333333u) + ((bits >> 2) & 0x3333333333333333u);

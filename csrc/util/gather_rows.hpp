@@ -11,18 +11,18 @@
 
 namespace radarsdf {
 
-// A matrix of `width` columns in C order.
+// Matrix of `width` columns in C order.
 template <typename T>
 struct Block {
   const T* data;
   std::int64_t width;
 };
 
-// Rows of blocks side by side, in this order: out (count, sum of the widths).
+// Gathers rows of blocks in this order and concatenates them: out (count, sum of the widths).
 template <typename T>
 void gather_rows(const std::vector<Block<T>>& blocks, const std::int32_t* order, std::int64_t count, T* out,
                  int num_threads) {
-  constexpr std::int64_t ahead = 16;  // rows far apart: each would be a wait for memory
+  constexpr std::int64_t ahead = 16;  // prefetch distance: scattered rows are cache misses
   std::int64_t columns = 0;
   for (const Block<T>& block : blocks) columns += block.width;
   parallel_blocks(count, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Memory of many megabytes. It asks for huge pages, as NumPy's arrays do. With small pages, page faults took a quarter
-// of the time of a large mesh, and address translation a quarter of that of a look-up in a large map.
+// Large arrays in huge pages, as in NumPy. With small pages, page faults took a quarter of the time of a large mesh,
+// and address translation a quarter of that of a look-up in a large map.
 #pragma once
 
 #include <cstddef>
@@ -18,20 +18,20 @@
 
 namespace radarsdf {
 
-// Before the memory is first written to.
+// Call before the memory is first written.
 inline void ask_for_huge_pages([[maybe_unused]] void* memory, [[maybe_unused]] std::size_t num_bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   constexpr std::uintptr_t page = 4096;
   constexpr std::uintptr_t huge_page = std::uintptr_t{1} << 21;
   const auto begin = (reinterpret_cast<std::uintptr_t>(memory) + page - 1) / page * page;
   const auto end = reinterpret_cast<std::uintptr_t>(memory) + num_bytes;
-  // Only a hint: it may fail where the kernel knows no huge pages.
+  // Only a hint: it may fail on kernels without huge pages.
   if (begin + 2 * huge_page <= end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
 #endif
 }
 
-// For results and scratch. It is uninitialised on purpose: the caller writes every entry that is read, and clearing
-// first would cost a pass over memory.
+// For results and scratch. Uninitialised on purpose: the caller writes every entry that is read, and clearing would
+// cost a pass over memory.
 template <typename T>
 std::unique_ptr<T[]> large_array(std::int64_t size) {
   std::unique_ptr<T[]> array(new T[static_cast<std::size_t>(size)]);
@@ -60,8 +60,8 @@ struct LargeAllocator : std::allocator<T> {
 template <typename T>
 using LargeVector = std::vector<T, LargeAllocator<T>>;
 
-// What a vector of this makes without a value is uninitialised, so that threads can write to it first: the system gives
-// each its own pages then.
+// Value-initialised elements of a vector stay uninitialised, so that threads can write them first: each then gets local
+// pages from the system.
 template <typename T>
 struct UninitialisedAllocator : LargeAllocator<T> {
   template <typename U>

@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: MIT
 //
 // Parallelism as a policy: the kernels are serial functions on a range, and this file runs them on threads.
-// The split depends on the sizes alone, never on which thread comes first, so results do not either.
+// The split depends on the sizes alone, never on timing, so results are deterministic.
 #pragma once
 
 #include <algorithm>
@@ -12,22 +12,21 @@
 
 namespace radarsdf {
 
-// 0 or less: as many as OpenMP would use (OMP_NUM_THREADS is respected); at most 1024. Never sets a global.
-// In a process that was forked, 1: OpenMP's threads stayed with the parent, and to wait for them would be for ever.
+// 0 or less: the number of OpenMP (OMP_NUM_THREADS is respected); at most 1024. Never sets a global.
+// 1 in a forked process: OpenMP's threads stay with the parent, and waiting for them would deadlock.
 int resolve_num_threads(int num_threads);
 
-// What a long call asks, at most ten times a second, on the thread that made it: `check` may throw to end the call. On
-// the threads that help it, check_interrupt does nothing: a task that takes long may ask on whichever it runs.
+// Sets the function that long calls poll, at most ten times a second, on the calling thread: `check` may throw to abort
+// the call. On worker threads, check_interrupt does nothing, so tasks may call it on any thread.
 void set_interrupt_check(void (*check)());
 void check_interrupt();
-void ignore_interrupts_here();  // for a thread that helps the one that made the call
+void ignore_interrupts_here();  // for worker threads
 
-// How often this process, or one that it came from, was forked: threads from before stayed with the parent.
+// Number of forks of this process and its ancestors: threads created before stay with the parent.
 int num_forks();
 
-// Runs task(i) for i in [0, num_tasks) on up to num_threads threads, each task whole on one thread.
-// An exception thrown by a task is rethrown here, and the tasks not yet begun are left out: it must not leave an OpenMP
-// region.
+// Runs task(i) for i in [0, num_tasks) on up to num_threads threads, each task on one thread. An exception of a task is
+// rethrown here, and tasks not yet started are skipped: it must not leave an OpenMP region.
 template <typename Task>
 void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
   const int threads = static_cast<int>(std::min<std::int64_t>(resolve_num_threads(num_threads), num_tasks));
@@ -55,8 +54,8 @@ void parallel_tasks(std::int64_t num_tasks, int num_threads, const Task& task) {
   if (error) std::rethrow_exception(error);
 }
 
-// Runs body(begin, end) over [0, size) in blocks; no thread is woken for less than min_block items. A block has an
-// upper bound, so that an interrupt does not wait long for its end.
+// Runs body(begin, end) over [0, size) in blocks; no thread is woken for less than min_block items. The size of a block
+// is bounded, to limit the latency of interrupts.
 template <typename Body>
 void parallel_blocks(std::int64_t size, std::int64_t min_block, int num_threads, const Body& body) {
   if (size <= 0) return;

@@ -7,7 +7,7 @@
 
 namespace radarsdf {
 
-// Sorts in place: blocks on threads, then merged pairwise.
+// Sorts in place: blocks in parallel, then pairwise merges.
 void parallel_sort(std::vector<std::uint64_t>& keys, int num_threads);
 
 }  // namespace radarsdf

@@ -4,7 +4,7 @@
 
 namespace radarsdf {
 
-// Asks for a cache line that will be needed soon. Static: the kernels of each instruction set have a copy of their own.
+// Prefetches a cache line. Static: the kernels of each instruction set need a copy of their own.
 static inline void prefetch(const void* address) {
 #if defined(__GNUC__)
   __builtin_prefetch(address);

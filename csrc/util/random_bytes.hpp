@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Random bytes that are found by their place, so that each thread makes those that it needs, and all make the same.
+// Counter-based random bytes: each thread generates those that it needs, independent of the number of threads.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@
 
 namespace radarsdf {
 
-// The number `index` of the sequence that begins at `seed`: SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
+// Number `index` of the sequence of `seed`: SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
 inline std::uint64_t random_word(std::uint64_t seed, std::uint64_t index) {
   std::uint64_t z = seed + (index + 1) * 0x9e3779b97f4a7c15u;
   z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
@@ -18,7 +18,7 @@ inline std::uint64_t random_word(std::uint64_t seed, std::uint64_t index) {
   return z ^ (z >> 31);
 }
 
-// Rows of a matrix of random bytes. Each row begins with a new word.
+// Rows of a matrix of random bytes. Each row starts with a new word.
 class RandomRows {
  public:
   RandomRows(std::uint64_t seed, std::int64_t columns)

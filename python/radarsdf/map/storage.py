@@ -175,7 +175,7 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     # A map with intensities needs a network or a closed form to predict them; one without has neither.
     trained = scale is not None and config.trains_intensity
     answered = trained or reflectance is not None
-    _check(answered == (scale is not None), "the predictor of intensities is missing, or there are no intensities")
+    _check(answered == (scale is not None), "a predictor of intensities is missing or superfluous")
     field = _field_of(tensors, keys.astype(np.uint64), config, trained)
     field.reflectance = reflectance
     return MapContents(
