@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Symmetric matrices of 6 x 6 blocks near the diagonal, one row of blocks for each scan's pose: their Cholesky factors,
-// and the blocks of their inverses near the diagonal.
+// Symmetric band matrices of 6 x 6 blocks, one row of blocks for each scan's pose: Cholesky factors, and the band of
+// the inverse.
 #pragma once
 
 #include <cstdint>
@@ -10,30 +10,30 @@
 
 namespace radarsdf {
 
-constexpr int kPose = 6;  // numbers of a pose's increment: translation, rotation
+constexpr int kPose = 6;  // degrees of freedom of a pose: translation, rotation
 constexpr int kBlock = kPose * kPose;
 
-// A lower triangle. All blocks are in C order.
+// Lower triangle; blocks in C order.
 class BlockBand {
  public:
-  // `rows` rows of blocks, of which each has `width` blocks left of the diagonal, or all that there are.
+  // `rows` rows of blocks, each with up to `width` blocks left of the diagonal.
   BlockBand(std::int64_t rows, std::int64_t width);
 
   std::int64_t rows() const { return rows_; }
   std::int64_t width() const { return width_; }
 
-  // The block in this row and column, row - width <= column <= row.
+  // Block in this row and column, row - width <= column <= row.
   double* block(std::int64_t row, std::int64_t column) { return &blocks_[offset(row, column)]; }
   const double* block(std::int64_t row, std::int64_t column) const { return &blocks_[offset(row, column)]; }
   std::int64_t first_column(std::int64_t row) const { return row > width_ ? row - width_ : 0; }
 
-  // Becomes its Cholesky factor L: L L^T is what it was. False: it is not positive definite, and is destroyed.
+  // In-place Cholesky factorisation L L^T. False if not positive definite; the contents are then invalid.
   bool factor();
 
-  // Of a factor: x (rows, 6) becomes (L L^T)^-1 x.
+  // Of a factor: replaces x (rows, 6) by (L L^T)^-1 x.
   void solve(double* x) const;
 
-  // Of a factor: the blocks of (L L^T)^-1 within the band (Takahashi et al. 1973), without those outside of it.
+  // Of a factor: the blocks of (L L^T)^-1 within the band (Takahashi et al. 1973).
   BlockBand inverse() const;
 
  private:

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The planes that a scan is held against while its pose is looked for: those of the scans before it.
+// Planes of previous scans, with which a scan is registered.
 #pragma once
 
 #include <array>
@@ -15,34 +15,34 @@
 
 namespace radarsdf {
 
-// How well returns lie on planes, as a function of the pose of their sensor.
+// Agreement of returns with planes, as a function of the pose of their sensor.
 struct Agreement {
-  std::array<double, kBlock> hessian{};  // of half the sum of squares, by increments as in CommonPlanes
+  std::array<double, kBlock> hessian{};  // of half the sum of squares, by increments of CommonPlanes
   std::array<double, kPose> gradient{};
-  // The part of the Hessian that errors of the normals make: along a wall, normals point a little along it by chance.
-  // Where it is all, the returns tell nothing.
+  // Contribution of errors of the normals to the Hessian: along a wall, normals are slightly tilted by chance. If it is
+  // all of the Hessian, the returns have no information.
   std::array<double, kBlock> doubt{};
   double weight = 0;  // sum over the returns, each at most 1
 };
 
-// Scans are added and taken out again, exactly: sums over their returns are integers. A cell's plane is that of the
-// returns in it and in the 26 cells round it.
+// Scans are added and removed exactly, with integer sums over their returns. A cell's plane is fitted to the returns in
+// it and its 26 neighbours.
 class LocalPlanes {
  public:
   explicit LocalPlanes(double cell_size_m);
 
-  // points: (count, 3), world frame, m. sign: 1 adds them, -1 takes them out. Throws std::invalid_argument, and changes
-  // nothing, if a point is too far away, or was never added.
+  // points: (count, 3), world frame, m. sign: 1 adds them, -1 removes them. Throws std::invalid_argument, without any
+  // change, if a point is too far away, or was never added.
   void add(const double* points, std::int64_t count, int sign);
 
   std::int64_t num_cells() const { return static_cast<std::int64_t>(cells_.size()); }
 
-  // points: (count, 3), sensor frame, m; pose: (4, 4) T_world_sensor. The variance of a residual is that of the return
-  // and that of the plane at its place; its weight is that of Geman and McClure.
+  // points: (count, 3), sensor frame, m; pose: (4, 4) T_world_sensor. The variance of a residual is the sum of that of
+  // the return and that of the plane at its position; weights are Geman-McClure.
   Agreement agreement(const double* points, std::int64_t count, const double* pose, const ReturnVariances& noise) const;
 
-  // scores: (num_poses, count), of each of the poses (num_poses, 4, 4) and the returns 1 / (1 + r^2 / (4 variance)); 0
-  // for a return without a plane.
+  // scores: (num_poses, count), 1 / (1 + r^2 / (4 variance)) for each pose (num_poses, 4, 4) and return; 0 for a return
+  // without a plane.
   void scores(const double* points, std::int64_t count, const double* poses, std::int64_t num_poses,
               const ReturnVariances& noise, double* scores) const;
 
@@ -67,7 +67,7 @@ class LocalPlanes {
 
   double cell_size_m_;
   std::unordered_map<std::uint64_t, Moments> cells_;
-  mutable std::unordered_map<std::uint64_t, Plane> planes_;  // that were asked for since scans changed
+  mutable std::unordered_map<std::uint64_t, Plane> planes_;  // cache, cleared when scans change
 };
 
 }  // namespace radarsdf

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// A quantity of returns as a sum of means in cells of several kinds, from coarse to fine, in space and by the view.
+// Additive model of a quantity of returns: means in cells of several kinds, by position and view, coarse to fine.
 #pragma once
 
 #include <cstdint>
@@ -11,54 +11,54 @@
 
 namespace radarsdf {
 
-// Cells of one kind. Their bins of direction and incidence are as wide as these steps; 0: they do not distinguish it.
+// Cells of one kind, with bin widths of direction and incidence; 0: not binned.
 struct CellKind {
   double edge_m;
-  double direction_step;  // of each component of the unit vector
+  double direction_step;  // per component of the unit vector
   double incidence_step_rad;
 };
 
-// Returns, or groups of returns, of which cells are asked. Positions in the local frame, m.
+// Queries: returns, or groups of returns. Positions in the local frame, m.
 struct Views {
   const float* points;         // (count, 3)
   const float* directions;     // (count, 3), unit vectors from the sensor
-  const float* incidence_rad;  // (count,), NaN where it is not known
+  const float* incidence_rad;  // (count,), NaN if unknown
   std::int64_t count;
 };
 
-// The cells of all kinds lie in tilings. Tiling t of T is moved by t / T of a cell along each axis, so the edges of
-// cells are in other places, and the mean of the tilings is smoother than each.
+// Cells of all kinds come in tilings. Tiling t of T is shifted by t / T of a cell along each axis, so that the mean
+// over tilings is smoother than each.
 struct CellMeans {
-  std::vector<std::uint64_t> keys;  // of a cell: a hash of its tiling, kind and place
+  std::vector<std::uint64_t> keys;  // hashes of tiling, kind and position of cells
   std::vector<float> means;
-  std::vector<float> explained;  // of each value, by the means of its cells, averaged over the tilings
+  std::vector<float> explained;  // prediction of each value, averaged over the tilings
 };
 
-// rows: (count,), for each view the number of its cell of this kind; cells are numbered as they first occur. Returns
-// how many there are.
+// rows: (count,), the cell of each view for one kind, numbered in order of first occurrence. Returns the number of
+// cells.
 std::int64_t cell_rows(const CellKind& kind, const Views& views, std::int32_t* rows);
 
 struct CellMeanOptions {
-  double shrinkage;  // a mean of weight n counts n / (n + shrinkage)
+  double shrinkage;  // means of weight n are multiplied by n / (n + shrinkage)
   int rounds;
-  float least_mean;  // smaller ones are left out of what is found
+  float least_mean;  // smaller means are dropped
 };
 
-// Splits `values` (count,) into means in the cells, tiling by tiling. Each kind takes the means of what the others
-// leave, in turn, some rounds long. After the first a value that is far off has less weight (Cauchy). The same bits
-// with any number of threads.
+// Decomposes `values` (count,) into cell means, for each tiling by backfitting: each kind in turn takes the means of
+// the residuals of the others, for some rounds, with Cauchy weights after the first. Independent of the number of
+// threads.
 CellMeans fit_cell_means(const std::vector<CellKind>& kinds, int num_tilings, const Views& views, const float* values,
                          const float* weights, const CellMeanOptions& options, int num_threads);
 
-// Answers from means of cells.
+// Predictions from cell means.
 class CellMeansAt {
  public:
-  // Throws std::invalid_argument where a key occurs twice.
+  // Throws std::invalid_argument for a duplicate key.
   CellMeansAt(std::vector<CellKind> kinds, int num_tilings, const std::uint64_t* keys, const float* means,
               std::int64_t count);
 
-  // sums: (count,), the means of each view's cells, added over the kinds and averaged over the tilings. A cell without
-  // a mean counts 0.
+  // sums: (count,), the means of each view's cells, summed over the kinds and averaged over the tilings; 0 for cells
+  // without a mean.
   void sums(const Views& views, float* sums, int num_threads) const;
 
  private:

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Sums over the returns in a cell, and over the cells round it.
+// Sums over the returns of cells, and over their neighbourhoods.
 #pragma once
 
 #include <cstdint>
@@ -11,19 +11,19 @@
 
 namespace radarsdf {
 
-// Of a return at (x, y, z): 1, x, y, z, xx, xy, xz, yy, yz, zz, its direction's three components, and its range.
+// Summands of a return at (x, y, z): 1, x, y, z, xx, xy, xz, yy, yz, zz, the direction (3), and the range.
 constexpr int kSums = 14;
-constexpr double kDirectionQuanta = 1 << 24;  // in 1
-// In the edge of a leaf cell: 3 um of 0.2 m, as float32 coordinates have at 50 m. Products of 1e8 returns have room.
+constexpr double kDirectionQuanta = 1 << 24;  // per unit
+// Per edge of a leaf cell: 3 um at 0.2 m, the resolution of float32 at 50 m. Products of 1e8 returns do not overflow.
 constexpr std::int64_t kQuanta = 1 << 16;
 
-// Halves to the even number, for sizes below 2^51. std::llrint is a call without -fno-math-errno.
+// Rounds half to even, for magnitudes below 2^51. std::llrint is a call without -fno-math-errno.
 inline std::int64_t rounded(double value) {
-  constexpr double kShift = 6755399441055744;  // 1.5 * 2^52: floats there are whole numbers
+  constexpr double kShift = 6755399441055744;  // 1.5 * 2^52: doubles there are integers
   return static_cast<std::int64_t>((value + kShift) - kShift);
 }
 
-// What a return adds to the sums of a cell with this corner, in quanta; quanta: in 1 m. Unsigned, which may wrap
+// Adds a return to the sums of a cell with this corner, in quanta; quanta: per m. Unsigned, since sums may wrap
 // around.
 inline void sum_terms(const float* point, const float* direction, float range_m, const std::int64_t* corner,
                       double quanta, std::uint64_t* terms) {
@@ -38,7 +38,7 @@ inline void sum_terms(const float* point, const float* direction, float range_m,
   terms[13] = static_cast<std::uint64_t>(rounded(quanta * range_m));
 }
 
-// Returns of scans, and the cell of each.
+// Returns of scans, and their cells.
 struct ReturnsInCells {
   const float* points;      // (count, 3), local frame, m
   const float* directions;  // (count, 3), unit vectors
@@ -47,37 +47,36 @@ struct ReturnsInCells {
   std::int64_t count;
 };
 
-// sums: (num_cells, kSums), over the returns of each cell, in integers, so that their order does not matter and some
-// can be taken out again. Lengths are in quanta, from the corners (num_cells, 3) of the cells; directions in 1 /
-// kDirectionQuanta. Sums wrap around: of products they mean nothing where a corner is far away.
+// sums: (num_cells, kSums), integer sums over the returns of each cell, independent of their order and exactly
+// reversible. Lengths are in quanta, relative to the corners (num_cells, 3) of the cells; directions in 1 /
+// kDirectionQuanta. Sums wrap around: those of products are invalid if a corner is far away.
 void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std::int64_t num_cells, double quantum_m,
                  std::int64_t* sums, int num_threads);
 
-// From sums over the returns of leaf cells with these ascending keys, in quanta, those of the cells twice as large:
-// their keys, ascending, and (keys, kSums - 1) numbers, without the range, of the local frame, in m.
+// Merges sums of leaf cells with ascending keys, in quanta, to those of the cells twice as large: ascending keys, and
+// sums (keys, kSums - 1), without the range, in the local frame, m.
 struct Moments {
   std::vector<std::uint64_t> keys;
   std::vector<double> numbers;
 };
 Moments merge_sums(const std::uint64_t* keys, const std::int64_t* sums, std::int64_t count, double leaf_size_m);
 
-// The mean ray of each leaf cell: points (count, 3) and ranges_m (count,), local frame, m, unit directions (count, 3),
-// downwards where the mean has no length, and the number of returns (count,).
+// Mean ray of each leaf cell: points (count, 3) and ranges_m (count,), local frame, m, unit directions (count, 3),
+// downwards if the mean is zero, and the number of returns (count,).
 struct MeanRays {
   float *points, *directions, *ranges_m, *counts;
 };
 void mean_rays(const std::uint64_t* keys, const std::int64_t* sums, std::int64_t count, double leaf_size_m,
                const MeanRays& means, int num_threads);
 
-// sums: (count, columns), for each key those over its cell and the 26 round it of values, (cells.size(), columns). A
-// cell that shares a face with the key's counts `weight` times, one that shares an edge weight^2, a corner weight^3.
-// Many keys of a block are best given one after another, as they are in ascending order.
+// sums: (count, columns), weighted sums of values (cells.size(), columns) over each key's cell and its 26 neighbours. A
+// neighbour has `weight` if it shares a face, weight^2 for an edge, weight^3 for a corner. Ascending keys are fastest,
+// since those of a block are consecutive.
 void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int64_t count, const double* values,
                     int columns, double weight, double* sums, int num_threads);
 
-// interpolated: (count, columns), of values (cells.size(), columns) that belong to the centres of cells of this size,
-// trilinear at points (count, 3), local frame, m; 0 where there is no cell. Throws std::invalid_argument for points
-// without a key.
+// interpolated: (count, columns), trilinear interpolation of values (cells.size(), columns) at cell centres to points
+// (count, 3), local frame, m; missing cells count as 0. Throws std::invalid_argument for points without a key.
 void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, int columns,
                        const float* points, std::int64_t count, float* interpolated, int num_threads);
 

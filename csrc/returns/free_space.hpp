@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Which leaf cells the rays passed on the way to their returns: all that a map knows of free space.
+// Free-space crossings: the leaf cells that rays crossed before their returns.
 #pragma once
 
 #include <cstdint>
@@ -9,24 +9,24 @@
 
 namespace radarsdf {
 
-// Leaf cells are kept in blocks of 2^kFreeSpaceLevels along each edge.
+// Leaf cells are stored in blocks of 2^kFreeSpaceLevels along each edge.
 constexpr int kFreeSpaceLevels = 3;
-constexpr int kFreeSpaceWords = 8;  // of 64 bits: one for each leaf cell of a block
-// Of a block: three planes are the bits of the number of scans with a ray through each leaf cell, which stays at 7, and
-// one says in which cells there are returns.
+constexpr int kFreeSpaceWords = 8;  // of 64 bits, one for each leaf cell of a block
+// Bit planes of a block: three for the number of scans with a ray through each leaf cell, saturated at 7, and one for
+// the cells with returns.
 constexpr int kCountPlanes = 3, kFreeSpacePlanes = kCountPlanes + 1;
 constexpr int kFreeSpaceStride = kFreeSpacePlanes * kFreeSpaceWords;
 
 struct FreeSpace {
-  std::vector<std::uint64_t> keys;    // (B,) of the blocks, ascending: those of leaf cells without their last 9 bits
+  std::vector<std::uint64_t> keys;    // (B,) ascending block keys: those of leaf cells without their last 9 bits
   std::vector<std::uint64_t> planes;  // (B, planes, words); bit i of the 512 of a plane: leaf cell i in Morton order
 };
 
-// The free-space crossings of rays. A ray passes the cells from its sensor to `passed_m` along it, and has a return in
-// that of its point. points, directions: (count, 3), ranges_m, passed_m: (count), local frame, m, passed_m at most
-// ranges_m; scans: (count), ascending. lower, upper: (3), leaf cells; blocks that lie wholly outside [lower, upper) are
-// left out. Integers that stay at a limit: they do not depend on the number of threads, nor on the order of the rays of
-// a scan. Throws std::invalid_argument for rays without keys.
+// Computes the free-space crossings of rays. A ray crosses the cells from its sensor to `passed_m` along it, and has a
+// return in the cell of its point. points, directions: (count, 3), ranges_m, passed_m: (count), local frame, m,
+// passed_m at most ranges_m; scans: (count), ascending. lower, upper: (3), leaf cells; blocks entirely outside [lower,
+// upper) are skipped. Saturated integers, independent of the number of threads and of the order of the rays of a scan.
+// Throws std::invalid_argument for rays without keys.
 FreeSpace find_free_space(const float* points, const float* directions, const float* ranges_m, const float* passed_m,
                           const std::int32_t* scans, std::int64_t count, double leaf_size_m, const std::int32_t* lower,
                           const std::int32_t* upper, int num_threads);

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Sums over scans in a table that grows in place: a scan is added, or taken out again, in time that depends on its
-// returns alone. All numbers are integers, so that a scan that was taken out leaves nothing, whatever the order.
+// Incremental sums over scans: adding or removing a scan takes time proportional to its returns, independent of the
+// size of the table. All numbers are integers, so that removal is exact, in any order.
 #pragma once
 
 #include <array>
@@ -23,35 +23,35 @@ struct RaysOfScan {
   std::int64_t count;
 };
 
-// A block has 8 x 8 x 8 leaf cells: the cube in which visibility is counted.
+// A block has 8 x 8 x 8 leaf cells, the unit of visibility counts.
 constexpr int kCellsOfBlock = 1 << (3 * kVisibilityLevels);
 
-// The contents of blocks, in Morton order.
+// Contents of blocks, in Morton order.
 struct SumsOfCells {
   std::vector<std::uint64_t> keys;   // of leaf cells with returns
-  std::vector<std::int64_t> sums;    // (keys.size(), kSums), as of sum_returns
-  std::vector<std::uint32_t> scans;  // that have returns in each
+  std::vector<std::int64_t> sums;    // (keys.size(), kSums), see sum_returns
+  std::vector<std::uint32_t> scans;  // number of scans with returns in each
 };
 struct VisibilityOfBlocks {
   std::vector<std::uint64_t> keys;        // of blocks
-  std::vector<std::uint32_t> visibility;  // numbers of scans with a ray through each, or to there
+  std::vector<std::uint32_t> visibility;  // number of scans with a ray through or into each
 };
 
-// What changes if scans come or go.
+// Accumulated change by added and removed scans.
 class SumsChange {
  public:
   SumsChange(double leaf_size_m, double quantum_m) : leaf_size_m_(leaf_size_m), quantum_m_(quantum_m) {}
 
-  // sign: 1 adds the scan, -1 takes it out. Throws std::invalid_argument for rays without keys.
+  // sign: 1 adds the scan, -1 removes it. Throws std::invalid_argument for rays without keys.
   void collect(const RaysOfScan& rays, std::int64_t sign);
 
-  std::vector<std::uint64_t> block_keys() const;  // that it may change, ascending
+  std::vector<std::uint64_t> block_keys() const;  // of the blocks that it may change, ascending
 
  private:
   friend class GrowingSums;
   struct Cell {
     std::uint64_t key;
-    std::int64_t sums[kSums], scans, last;  // last: the scan of this change that was counted
+    std::int64_t sums[kSums], scans, last;  // last: last scan of this change counted here
   };
   struct Visibility {
     std::uint64_t key;
@@ -65,14 +65,14 @@ class SumsChange {
   std::vector<Visibility> visibility_;
 };
 
-// Which blocks a change concerns, ascending.
+// Blocks affected by a change, ascending.
 struct ChangedBlocks {
   std::vector<std::uint64_t> returns, visibility;
 };
 
 class GrowingSums {
  public:
-  // Throws std::invalid_argument, and changes nothing, if a scan that was never added would be taken out.
+  // Throws std::invalid_argument, without any change, if a scan that was never added would be removed.
   ChangedBlocks apply(const SumsChange& change);
 
   std::int64_t num_cells() const { return static_cast<std::int64_t>(number_of_cell_.size()); }
@@ -81,12 +81,12 @@ class GrowingSums {
 
   std::vector<std::uint64_t> block_keys() const;  // ascending
 
-  // Of the blocks with these keys, ascending. Those that are not there have nothing.
+  // Contents of the blocks with these ascending keys; missing ones are empty.
   SumsOfCells sums_of(const std::uint64_t* block_keys, std::int64_t count) const;
   VisibilityOfBlocks visibility_of(const std::uint64_t* block_keys, std::int64_t count) const;
 
-  // Puts contents in that are not there yet, and takes blocks away with their contents. Throws std::invalid_argument,
-  // and changes nothing, if a cell or a block is there already.
+  // Inserts new contents, and erases blocks with their contents. Throws std::invalid_argument, without any change, if a
+  // cell or a block exists already.
   void insert(const SumsOfCells& cells, const VisibilityOfBlocks& visibility);
   void erase(const std::uint64_t* block_keys, std::int64_t count);
 
@@ -96,7 +96,7 @@ class GrowingSums {
     std::uint32_t scans;
   };
   struct Block {
-    std::array<std::uint64_t, kCellsOfBlock / 64> mask{};  // which of its cells have returns, in Morton order
+    std::array<std::uint64_t, kCellsOfBlock / 64> mask{};  // cells with returns, in Morton order
     std::uint32_t visibility = 0;
 
     bool is_empty() const;
@@ -105,7 +105,7 @@ class GrowingSums {
   template <typename Visit>
   void for_each_cell(std::uint64_t block_key, const Block& block, const Visit& visit) const;
 
-  Block& block_at(std::uint64_t key);  // made if it is not there
+  Block& block_at(std::uint64_t key);  // created if missing
   void drop_cell(std::uint64_t key, Block& block);
   void drop_if_empty(std::uint64_t block_key);
   void reserve(std::int64_t cells, std::int64_t blocks);

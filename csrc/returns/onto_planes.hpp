@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Moves noisy returns towards the planes that the returns round them lie on (Wiener 1949).
+// Shrinks noisy returns towards the planes of their neighbourhood (Wiener 1949).
 #pragma once
 
 #include <cstdint>
@@ -16,7 +16,7 @@ struct NoisyRays {
   const float* directions;     ///< (count, 3), unit, from the sensor
   const float* ranges_m;       ///< (count)
   const std::int32_t* scans;   ///< (count)
-  const std::int32_t* planes;  ///< (count), the plane of each return, -1 where it has none and stays
+  const std::int32_t* planes;  ///< (count), the plane of each return; -1: none, not moved
   std::int64_t count;
   const double* up_of_scan;  ///< (scans, 3), the z axis of the sensor
 };
@@ -33,8 +33,8 @@ struct MovedRays {
 };
 
 // A return keeps the share tau^2 / (tau^2 + sigma^2) of its distance from its plane: sigma^2 is the variance of its
-// noise across the plane, tau^2 that of the plane's returns less the mean of their sigma^2. The same bits with any
-// number of threads.
+// noise across the plane, tau^2 that of the plane's returns minus the mean of their sigma^2. Independent of the number
+// of threads.
 void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnVariances& noise, const MovedRays& moved,
                       int num_threads);
 

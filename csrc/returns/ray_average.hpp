@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The average, at the vertices of an octree's leaf cells, of what rays say of the distance to the surface, as truncated
-// signed distance fields have it (Curless and Levoy 1996).
+// Average over rays of truncated signed distances at the vertices of an octree's leaf cells (Curless and Levoy 1996).
 #pragma once
 
 #include <cstdint>
@@ -12,24 +11,23 @@
 namespace radarsdf {
 
 struct AveragedRays {
-  const float* points;      ///< (count, 3), where they end, local frame, m
+  const float* points;      ///< (count, 3), end points, local frame, m
   const float* directions;  ///< (count, 3), unit, from the sensor
   const float* normals;     ///< (count, 3), of the surface there, unit, towards the sensor
-  const float* weights;     ///< (count), whole numbers, fewer than 2^32 round a vertex
+  const float* weights;     ///< (count), integers, with a sum below 2^32 at a vertex
   std::int64_t count;
 };
 
-// Where a vertex lies for certain.
+// Side of the surface on which a vertex certainly lies.
 constexpr std::int8_t kInFront = 1, kBehind = -1;
 
-// distances_m: (table.num_rows()), for each vertex of a leaf cell the mean of its signed distances to the planes at the
-// ends of the rays that go, within truncation_m before and behind their ends, through one of its cells; each distance
-// cut at truncation_m, and counted once for each of these cells. Vertices that no ray concerns, and rows of coarser
-// levels, are 0.
-// sides: (table.num_rows()), kInFront where at least 64 returns, and a quarter of those counted, have planes more than
-// a leaf cell behind the vertex: rays passed it. kBehind where at least 512, and more than half, have planes more than
-// a leaf cell in front of it, and hardly any behind it: nothing was seen there. 0 elsewhere. Only the rays that concern
-// a vertex determine what it gets, to the bit. Throws std::invalid_argument for a table that is no octree's.
+// distances_m: (table.num_rows()), for each vertex of a leaf cell the mean of its signed distances, truncated at
+// truncation_m, to the planes at the ends of the rays that cross one of its cells within truncation_m of their ends;
+// a ray counts once for each of these cells. Vertices without rays, and rows of coarser levels, are 0.
+// sides: (table.num_rows()), kInFront if at least 64 returns, and a quarter of those counted, have planes more than a
+// leaf cell behind the vertex: rays passed it. kBehind if at least 512, and more than half, have planes more than a
+// leaf cell in front of it, and hardly any behind it: occluded. 0 elsewhere. Results at a vertex depend only on the
+// rays that reach it, to the last bit. Throws std::invalid_argument unless the table is an octree's.
 void average_rays(const VertexTable& table, const AveragedRays& rays, double truncation_m, float* distances_m,
                   std::int8_t* sides, int num_threads);
 

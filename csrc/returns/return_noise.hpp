@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The noise of a return's position, along its beam, in azimuth and in elevation.
+// Noise of a return's position along the beam, in azimuth and in elevation.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +15,7 @@ struct ReturnVariances {
   double range_m2, azimuth_rad2, elevation_rad2;
 };
 
-// The same as Python gives them: `SensorNoise.variances`.
+// From the array of `SensorNoise.variances` in Python.
 using VarianceNumbers = std::array<double, 3>;
 
 inline ReturnVariances variances_of(const VarianceNumbers& numbers) { return {numbers[0], numbers[1], numbers[2]}; }
@@ -31,12 +31,12 @@ inline void cross3(const double* a, const double* b, double* product) {
   product[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// Of a return's position along `normal`: its direction from a sensor whose z axis is `up`, at this range.
+// Variance of a return's position along `normal`, at this direction and range from a sensor with z axis `up`.
 inline double variance_along(const double* normal, const float* direction, double range_m, const double* up,
                              const ReturnVariances& noise) {
-  constexpr double kMinSine = 1e-6;  // of the angle between a ray and the z axis of its sensor, to divide by
+  constexpr double kMinSine = 1e-6;  // of the angle between a ray and the sensor's z axis, against division by 0
   const double along[3] = {direction[0], direction[1], direction[2]};
-  double azimuth[3], elevation[3];  // in which they grow
+  double azimuth[3], elevation[3];  // directions of increase
   cross3(up, along, azimuth);
   const double sine = std::max(std::sqrt(dot3(azimuth, azimuth)), kMinSine);
   for (double& component : azimuth) component /= sine;

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Which rays passed through a surface before they ended: the mark of a ghost, a return over a mirror that the sensor
-// places straight on, behind it.
+// Surface crossings of rays before their ends: the signature of a ghost, a return reflected by a mirror, which the
+// sensor places behind it.
 #pragma once
 
 #include <cstdint>
@@ -12,12 +12,12 @@
 
 namespace radarsdf {
 
-// A piece of plane in a cell, with what its returns tell about it.
+// Plane of the returns in a cell.
 struct Surfel {
   float centre[3];  ///< local frame, m
   float normal[3];  ///< unit, towards the sensors
   float thickness;  ///< standard deviation of the returns across the plane, m
-  float reach;      ///< how far from the centre a ray crosses it in its cell, m
+  float reach;      ///< largest distance of a crossing from the centre, within the cell, m
 };
 
 // Standard deviations of a return's position.
@@ -28,11 +28,11 @@ struct BeamNoise {
 
 class SurfelMap {
  public:
-  // keys: Morton keys of the surfels' cells, ascending, each once; surfels in the same order.
+  // keys: unique ascending Morton keys of the surfels' cells; surfels in the same order.
   SurfelMap(const std::uint64_t* keys, const Surfel* surfels, std::int64_t count, double cell_size_m);
 
-  // For each ray the first surfel that it crosses from the front and ends behind of by more than
-  // margin_m + sigmas standard deviations, -1 where there is none. points, directions: (count, 3), local frame, m.
+  // For each ray the first surfel that it crosses from the front and behind which it ends by more than margin_m +
+  // sigmas standard deviations, or -1. points, directions: (count, 3), local frame, m.
   void first_crossings(const float* points, const float* directions, const float* ranges_m, std::int64_t count,
                        BeamNoise noise, float margin_m, float sigmas, std::int32_t* crossed, int num_threads) const;
 
