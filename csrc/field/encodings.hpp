@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The encodings of a batch of points, on threads, by the kernels of the instruction set in use. All arrays are C-order;
-// `stride` is the distance between rows, so that encodings can be written side by side into one matrix.
+// Multi-threaded encodings of a batch of points, by the kernels of the instruction set in use. All arrays are in C
+// order; `stride` is the distance between rows, so that encodings can be written side by side into one matrix.
 #pragma once
 
 #include <cstdint>
@@ -16,7 +16,7 @@ namespace radarsdf {
 template <typename T>
 void locate(const VertexTable& table, const T* points, std::int64_t count, std::int32_t* located, int num_threads);
 
-// locate and interpolate in one pass.
+// Locates and interpolates in one pass.
 template <typename T>
 void encode(const VertexTable& table, const T* features, const T* points, std::int64_t count, std::int32_t* located,
             T* out, std::int64_t stride, int num_threads);
@@ -25,11 +25,11 @@ template <typename T>
 void interpolate(const VertexTable& table, const T* features, const PointBatch<T>& batch, T* out, std::int64_t stride,
                  int num_threads);
 
-// Adds to features_grad (num_rows, 8). The order of the sums is that of the points, for any number of threads.
+// Adds to features_grad (num_rows, 8), in the order of the points for any number of threads.
 template <typename T>
 void scatter(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
              T* features_grad, int num_threads);
-// One of its tasks, see level_tasks.hpp.
+// One of the tasks of `scatter`, see level_tasks.hpp.
 template <typename T>
 void scatter_task(const VertexTable& table, const PointBatch<T>& batch, const T* out_grad, std::int64_t stride,
                   T* features_grad, LevelTask task);
@@ -42,7 +42,7 @@ template <typename T>
 void fourier(const T* points, std::int64_t count, double half_width_m, int first_frequency, int num_frequencies, T* out,
              std::int64_t stride, int num_threads);
 
-constexpr int kHarmonics = 16;  // of degree 0 to 3
+constexpr int kHarmonics = 16;  // degrees 0 to 3
 
 // Real spherical harmonics of degree 0..3 of unit vectors (count, 3): out (count, 16), in the order l, m = -l..l.
 template <typename T>

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Losses and gradients of a part of a batch: what one thread computes for `FieldLoss`.
+// Losses and gradients of one part of a batch, computed by one thread for `FieldLoss`.
 #pragma once
 
 #include <cstdint>
@@ -12,7 +12,7 @@
 
 namespace radarsdf {
 
-// The samples of a part of a batch.
+// Samples of a part of a batch.
 template <typename T>
 struct PassInput {
   const T* points;
@@ -21,24 +21,24 @@ struct PassInput {
   const T* rays;
   std::int64_t ray_stride;
   std::int64_t num_labelled;
-  std::int64_t num_seen;             // the intensity network sees the first so many
-  std::int64_t before, seen_before;  // samples of the batch
+  std::int64_t num_seen;             // number of leading samples that the intensity network sees
+  std::int64_t before, seen_before;  // numbers of samples in previous parts
   Dropout dropout[2];
 };
 
-// What is asked for of a part.
+// Requested gradients of a part.
 template <typename T>
 struct PassRequest {
-  FieldLosses shares;                               // of one sample in the weighted means over the batch
+  FieldLosses shares;                               // weight of one sample in the means over the batch
   const std::vector<LayerGradients<T>>* sdf;        // null: features and SDF network are frozen, without a loss
-  const std::vector<LayerGradients<T>>* intensity;  // null: there is no loss of intensities
-  FeatureGradients<T> by_features;                  // `interpolated` is null where they are frozen
+  const std::vector<LayerGradients<T>>* intensity;  // null: no loss of intensities
+  FeatureGradients<T> by_features;                  // `interpolated` is null if they are frozen
 };
 
 // Weights of the networks, prepared once for all parts of a batch.
 template <typename T>
 struct PassWeights {
-  // `trains`: features and SDF network; `sees`: there is a loss of intensities.
+  // `trains`, `sees`: see FieldLoss.
   PassWeights(const FieldParameters<T>& field, bool trains, bool sees);
 
   ForwardWeights<T> sdf;
@@ -46,7 +46,7 @@ struct PassWeights {
   std::optional<BackwardWeights<T>> sdf_backward, intensity_backward;
 };
 
-// Sums over the samples of a part.
+// Returns the losses summed over the samples of a part.
 template <typename T>
 FieldLosses run_pass(const FieldParameters<T>& field, const PassWeights<T>& weights, const LossOptions& options,
                      const PassInput<T>& part, const PassRequest<T>& request);

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Steps of an optimiser on the rows of the feature matrix that a batch of points touches.
+// Sparse optimiser steps on the rows of the feature matrix that a batch of points touches.
 #pragma once
 
 #include <cstdint>
@@ -14,8 +14,8 @@
 
 namespace radarsdf {
 
-// One of the tasks (see level_tasks.hpp) of a step of Adam with the gradients that `scatter` would sum over the
-// batches, on the rows that they touch.
+// One task (see level_tasks.hpp) of a step of Adam on the rows that batches touch, with the gradients that `scatter`
+// would sum over the batches.
 template <typename T>
 void adam_task(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
                const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, LevelTask task);

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// How long rows of matrices are that product kernels multiply.
+// Padded row length of matrices for the product kernels.
 #pragma once
 
 #include <cstdint>

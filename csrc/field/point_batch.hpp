@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Points and the cells that hold them, as the interpolation kernels take them.
+// Points and their cells, the input of the interpolation kernels.
 #pragma once
 
 #include <cstdint>
@@ -11,7 +11,7 @@
 
 namespace radarsdf {
 
-// Points (count, 3) and the cells that hold them; `directions` as in interpolation_kernels.hpp.
+// Points (count, 3) and the cells that contain them; `directions` as in interpolation_kernels.hpp.
 template <typename T>
 struct PointBatch {
   const T* points;

@@ -1,32 +1,32 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Random samples on rays with the labels of their signed distances: a batch of the training in one call.
+// Random samples on rays with labels of their signed distances: a training batch in one call.
 #pragma once
 
 #include <cstdint>
 
 namespace radarsdf {
 
-// A sample is drawn uniformly from a segment of its ray, which begins start + start_of_range · range in front of the
-// return, m, and has the length length + length_of_range · range towards the sensor.
+// Segment of a ray from which a sample is drawn uniformly: it begins start + start_of_range · range before the return,
+// m, and extends by length + length_of_range · range towards the sensor.
 struct RaySegment {
   float start, start_of_range, length, length_of_range;
 };
 
-// Rays as rows (see field_loss.hpp), of which a batch takes those at `places`.
+// Rays as rows (see field_loss.hpp); a batch takes those at `places`.
 struct TakenRays {
   const float* rows;
   std::int64_t columns;
   const std::int64_t* places;
 };
 
-// Which of the taken rays each of `count` samples is on, the number that finds its random number, and its segment.
+// For each of `count` samples its ray among those taken, the index of its random number, and its segment.
 struct SampleLayout {
   const std::int32_t* ray;
   const std::int32_t* number;
   const std::uint8_t* kind;
-  const RaySegment* segments;  // of each kind
+  const RaySegment* segments;  // by kind
   std::int64_t count;
 };
 

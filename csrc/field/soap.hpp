@@ -8,14 +8,14 @@
 
 namespace radarsdf {
 
-// Of gradients G (rows, columns), Shampoo keeps running sums of G G' and G' G. SOAP is Adam on G turned into the bases
-// of their eigenvectors: there the numbers of G hardly depend on each other, so that steps of their own lengths are
-// right. A side too long for such a sum keeps its own axes.
+// Shampoo maintains running averages of G G' and G' G of gradients G (rows, columns). SOAP is Adam on G rotated into
+// their eigenbases, in which the components of G are nearly uncorrelated, so that individual step sizes are
+// appropriate. A side too long for an eigenbasis is not rotated.
 template <typename T>
 struct SoapMatrix {
   T* weights;         // (rows, columns)
-  const T* gradient;  // likewise
-  T* memory;          // soap_memory_size numbers, zero before the first step
+  const T* gradient;  // (rows, columns)
+  T* memory;          // state of soap_memory_size numbers, initially zero
   std::int64_t rows, columns;
 };
 

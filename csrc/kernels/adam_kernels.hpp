@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Adam (Kingma and Ba, ICLR 2015) on some rows of the feature matrix, compiled once for each instruction set (see
+// Sparse Adam (Kingma and Ba, ICLR 2015) on rows of the feature matrix, compiled once for each instruction set (see
 // interpolation_kernels.hpp).
 #pragma once
 
@@ -11,21 +11,21 @@
 
 namespace radarsdf {
 
-// What Adam remembers of a row besides its moments.
+// State of a row besides its moments.
 struct RowMark {
-  std::int32_t last_step;  // in which it last moved; 0: never
-  std::int32_t place;      // 1 + that of its sum among the sums of the step at hand; 0: the step has not touched it
+  std::int32_t last_step;  // step of its last update; 0: never
+  std::int32_t place;      // 1 + index of its sum in the current step; 0: not touched
 };
 
-// One step. It visits only the rows that the batch touches, so its cost does not grow with the map. The moments of a
-// row fade for the steps that it missed, as with gradients of zero. Adam would also have moved the row in these steps,
-// by what was left of its mean gradient: that movement is left out.
+// One step. It visits only the rows that the batch touches, so its cost is independent of the size of the map. The
+// moments of a row decay over the steps that it missed, as with gradients of zero. Adam would also have moved the row
+// in these steps, along its decaying mean gradient: these updates are omitted.
 template <typename T>
 struct AdamStep {
   T* features;        // (rows, 8)
   T* moments;         // (rows, 2, 8): mean and mean square of a row's gradients
   RowMark* marks;     // (rows)
-  const T* decays;    // (step + 1, 2): both betas to the power of the steps since
+  const T* decays;    // (step + 1, 2): powers of both betas by steps since the last update
   std::int32_t step;  // from 1 on
   T rate;             // learning rate / (1 - beta1^step)
   T square_scale;     // 1 / (1 - beta2^step)
@@ -34,7 +34,7 @@ struct AdamStep {
 
 template <typename T>
 struct AdamKernel {
-  // Moves rows[i], for i in [0, count), against gradients[i] (count, 8), which becomes zero, as does the row's place.
+  // Updates rows[i], for i in [0, count), by gradients[i] (count, 8); resets gradients and places to zero.
   void (*move)(const AdamStep<T>&, const std::int32_t* rows, T* gradients, std::int64_t count);
 };
 

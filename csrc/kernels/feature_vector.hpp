@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The features of one vertex as one vector.
+// The features of one vertex as a SIMD vector.
 #pragma once
 
 #include "kernels/vector.hpp"

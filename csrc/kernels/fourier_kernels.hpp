@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Fourier features of a position, compiled once for each instruction set (see interpolation_kernels.hpp).
+// Fourier features of positions, compiled once for each instruction set (see interpolation_kernels.hpp).
 #pragma once
 
 #include <cstdint>

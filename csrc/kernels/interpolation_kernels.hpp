@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: MIT
 //
 // Serial interpolation kernels on a range of points, compiled once for each instruction set from one source
-// (interpolation_kernels.cpp). Only plain data here: an inline library function compiled for a newer processor could
-// be the copy that the linker keeps for all.
+// (interpolation_kernels.cpp). Only plain data here: the linker might keep the copy of an inline library function that
+// was compiled for a newer processor.
 #pragma once
 
 #include <cstdint>
@@ -14,37 +14,37 @@ namespace radarsdf {
 
 // With F the features of the corners of the point's cell and w(x) the corner weights, a level's output is
 //   y = sum_k W_k F_k,   W = w(x), or with `directions` v: W = dw/dx . v   (metres).
-// The first and second derivatives that autograd needs are these same sums with other arrays in the places of F and v.
+// The first and second derivatives for autograd are the same sums with other arrays in place of F and v.
 template <typename T>
 struct Interpolation {
-  const Cell* cells;            // of the table
-  const std::int32_t* located;  // (n, num_levels) cell of each point, -1: none (VertexTable::locate)
+  const Cell* cells;            // cells of the table
+  const std::int32_t* located;  // (n, num_levels) cell of each point; -1: none (VertexTable::locate)
   const T* points;              // (n, 3) local frame, m
   const T* directions;          // (n, 3), or null
   int num_levels;
   T inverse_leaf_size;  // 1/m
 };
 
-// Sums for the rows that a batch touches, in the order in which it first touches them. They lie side by side and stay
-// in the cache. Sums at the places of the rows would be spread over the memory of a large map.
+// Compact sums of the rows that a batch touches, in order of first touch. They are contiguous and stay in the cache;
+// sums indexed by row would be scattered over the memory of a large map.
 template <typename T>
 struct RowSums {
-  RowMark* marks;      // of every row
-  std::int32_t* rows;  // those touched; room for one more
-  T* sums;             // (count, 8), beyond that zero
+  RowMark* marks;      // marks of all rows
+  std::int32_t* rows;  // touched rows; capacity for one more
+  T* sums;             // (count, 8), zero beyond
   std::int64_t count;
 };
 
 template <typename T>
 struct InterpolationKernels {
-  // out (n, num_levels * 8), rows `stride` apart. Zero where a point has no cell.
+  // out (n, num_levels * 8), rows `stride` apart. Zero for points without a cell.
   void (*interpolate)(const Interpolation<T>&, const T* features, T* out, std::int64_t stride, std::int64_t begin,
                       std::int64_t end);
   // features_grad (rows, 8) += W^T out_grad, for one level and one group of corners (a plane, or all of space):
   // different (level, group) touch different rows.
   void (*scatter)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, T* features_grad, int level,
                   int group, std::int64_t begin, std::int64_t end);
-  // The same into the sums of the rows that are touched.
+  // The same into the compact sums of touched rows.
   void (*scatter_rows)(const Interpolation<T>&, const T* out_grad, std::int64_t stride, RowSums<T>& touched, int level,
                        int group, std::int64_t begin, std::int64_t end);
   // points_grad (n, 3) = d(out . out_grad)/dx, 1/m.

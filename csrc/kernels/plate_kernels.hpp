@@ -2,37 +2,37 @@
 // SPDX-License-Identifier: MIT
 //
 // One iteration of returns/smooth_distances.cpp, compiled once for each instruction set (see
-// interpolation_kernels.hpp). Vertices lie in blocks of 2 x 2 x 2, x fastest: a block is one vector, and the two
-// vertices before and after it along an axis are those of the next block. Places that no vertex takes up are 0
-// throughout, as is one more block, which stands for those that are missing.
+// interpolation_kernels.hpp). Vertices are stored in blocks of 2 x 2 x 2, x fastest: a block is one vector, and the two
+// vertices before and after it along an axis are those of the adjacent block. Missing vertices are 0 throughout, as is
+// an extra block that stands for missing blocks.
 #pragma once
 
 #include <cstdint>
 
 namespace radarsdf {
 
-constexpr int kPlateVertices = 8;  // of a block
+constexpr int kPlateVertices = 8;  // per block
 
 struct PlateSweep {
-  const std::int32_t* neighbours;  ///< (blocks, 6), before and after along x, y, z
-  // (blocks, 6), bit i: whether vertex i has neighbours on both sides along x, y, z; then whether the vertex next to
-  // it has that belongs to the block before or after.
+  const std::int32_t* neighbours;  ///< (blocks, 6), blocks before and after along x, y, z
+  // (blocks, 6), bit i: whether vertex i has neighbours on both sides along x, y, z; then whether its neighbour in the
+  // adjacent block has.
   const std::uint8_t* is_bent;
-  const float* compliance;   ///< (blocks, 8), 1 / stiffness, 0 where nothing moves a vertex
-  const std::int8_t* sides;  ///< (blocks, 8), of average_rays
-  const float* before_m;     ///< (blocks + 1, 8), distances
-  float* after_m;            ///< (blocks + 1, 8), of the iteration before, and of this one
-  float* pulls_m;            ///< (blocks, 8), by the places of planes; 0 afterwards
-  float keep, gain;          ///< of Chebyshev's iteration
-  float least_m;             ///< distance of a vertex whose side is known
+  const float* compliance;   ///< (blocks, 8), 1 / stiffness, 0 for vertices without any
+  const std::int8_t* sides;  ///< (blocks, 8), see average_rays
+  const float* before_m;     ///< (blocks + 1, 8), current distances
+  float* after_m;            ///< (blocks + 1, 8), in: previous distances, out: next ones
+  float* pulls_m;            ///< (blocks, 8), data gradient of the planes; reset to 0
+  float keep, gain;          ///< coefficients of the Chebyshev iteration
+  float least_m;             ///< minimum distance of a vertex with a known side
 };
 
-// Places where the distance is known, in cells.
+// Places with known distances, by cell.
 struct PlatePlaces {
   const std::int32_t* corners;  ///< (cells, 8), vertices
-  const std::int32_t* first;    ///< (cells + 1), place of each cell
-  const float* shares;          ///< (places, 8), of the corners, times the square root of the weight
-  const float* targets_m;       ///< (places), times the square root of the weight
+  const std::int32_t* first;    ///< (cells + 1), first place of each cell
+  const float* shares;          ///< (places, 8), interpolation weights times the square root of the weight
+  const float* targets_m;       ///< (places), distances times the square root of the weight
 };
 
 struct PlateKernels {

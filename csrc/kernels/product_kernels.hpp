@@ -1,31 +1,31 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Products of small matrices that stay in the cache, compiled once for each instruction set (see
-// interpolation_kernels.hpp): what the layers of a network are made of, with what comes before and after.
+// Products of small matrices that fit the cache, with the prologue and epilogue of a network layer, compiled once for
+// each instruction set (see interpolation_kernels.hpp).
 #pragma once
 
 #include <cstdint>
 
 namespace radarsdf {
 
-constexpr int kColumnBlock = 16;  // columns are padded to a multiple: whole vectors on every processor
+constexpr int kColumnBlock = 16;  // columns are padded to a multiple, whole vectors for every instruction set
 
 // c[r][n] = finish(start + sum_k a[r][k] b[k][n])
 template <typename T>
 struct Product {
   const T* a;
-  std::int64_t a_row, a_depth;  // distances between rows and between columns: either may be 1, for a transpose
-  const T* b;                   // rows of `columns` numbers, b_row apart
+  std::int64_t a_row, a_depth;  // strides of rows and columns: either may be 1, for a transpose
+  const T* b;                   // rows of `columns` numbers, stride b_row
   std::int64_t b_row;
   T* c;  // like b
   std::int64_t c_row;
   std::int64_t rows, depth;
   std::int64_t columns;  // a multiple of kColumnBlock
-  bool add;              // start with what is in c,
-  const T* biases;       // or with these numbers in each row; null: with zeros
+  bool add;              // start = c,
+  const T* biases;       // else start = biases in each row; null: 0
   bool rectify;          // finish(x) = max(x, 0); NaN stays
-  const T* positive;     // finish(x) = x where this is positive, like c, else 0: the gradient of `rectify`; or null
+  const T* positive;     // or null. finish(x) = x where this, laid out like c, is positive, else 0: gradient of ReLU
   std::int64_t positive_row;
 };
 

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Several numbers as one vector, for kernels that are compiled once for each instruction set. Internal linkage, so that
-// no copy takes the place of another's.
+// SIMD vectors for kernels that are compiled once for each instruction set. Internal linkage, so that the linker does
+// not merge copies.
 #pragma once
 
 #include <string.h>  // not <cstring>: see fourier_kernels.cpp
@@ -14,7 +14,7 @@
 namespace radarsdf::RADARSDF_ISA {
 namespace {
 
-// Left to itself, the compiler unrolls short loops over numbers into scalars.
+// By default, compilers unroll short loops over elements into scalar code.
 #if defined(__GNUC__)
 template <typename T, int kLanes>
 struct VectorOf {
@@ -73,7 +73,7 @@ inline V not_negative(V v) {
 }
 #endif
 
-// Memory is aligned to the size of a number only.
+// Memory is aligned to the element size only.
 template <typename V, typename T>
 inline V load_vector(const T* numbers) {
   V v;

@@ -23,8 +23,7 @@ inline std::int64_t rounded(double value) {
   return static_cast<std::int64_t>((value + kShift) - kShift);
 }
 
-// Adds a return to the sums of a cell with this corner, in quanta; quanta: per m. Unsigned, since sums may wrap
-// around.
+// Summands of a return in a cell with this corner, in quanta; quanta: per m. Unsigned, since they may wrap around.
 inline void sum_terms(const float* point, const float* direction, float range_m, const std::int64_t* corner,
                       double quanta, std::uint64_t* terms) {
   std::uint64_t place[3];

@@ -1,13 +1,13 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Marching cubes on a dense volume and on a list of cells. Both make the same mesh of the same samples:
+// Marching cubes on a dense volume and on a list of cells, with identical meshes for identical samples:
 //  - a sample is positive iff it is > level; triangles face the positive side (in this project: free space);
-//  - one vertex per cut edge of the cells in use, so the mesh is closed and manifold except where those cells end;
-//  - vertices keep away from the samples by min_edge_fraction of an edge, so vertices of different edges never
-//    coincide and no triangle is empty, even where samples equal the level;
-//  - a cell with a NaN corner is not in use; infinite samples are signs like any other.
-// Vertices and faces come in an order that depends on the data alone, not on the number of threads.
+//  - one vertex per cut edge of the cells in use, so the mesh is closed and manifold except at their border;
+//  - vertices keep a distance of min_edge_fraction of an edge from the samples, so vertices of different edges never
+//    coincide and no triangle is degenerate, even where samples equal the level;
+//  - a cell with a NaN corner is not in use; of infinite samples only the sign matters.
+// The order of vertices and faces depends on the data alone, not on the number of threads.
 #pragma once
 
 #include <array>
@@ -23,18 +23,18 @@ struct Mesh {
   std::int64_t num_faces = 0;
   std::unique_ptr<double[]> vertices;     ///< (num_vertices, 3), world units
   std::unique_ptr<std::int32_t[]> faces;  ///< (num_faces, 3) rows of vertices
-  // Null unless asked for, of dense marching cubes: the edge that a vertex is on, which the derivatives below need.
+  // The edge of each vertex, for the derivatives below. Null unless requested from dense marching cubes.
   std::unique_ptr<std::int64_t[]> edges;  ///< (num_vertices,) 3 * sample + axis: the edge's lower sample, its axis
 };
 
-// Where the samples are: sample (i, j, k) at origin + spacing * (i, j, k).
+// Placement of the samples: sample (i, j, k) is at origin + spacing * (i, j, k).
 struct Lattice {
   std::array<double, 3> spacing{1, 1, 1};  ///< world units, finite and > 0
   std::array<double, 3> origin{0, 0, 0};   ///< world units, finite
 };
 
-// volume: shape[0] * shape[1] * shape[2] samples in C order. mask: null, or as many flags, true where the sample may
-// be used; a cell needs all eight of its corners. T is float or double.
+// volume: shape[0] * shape[1] * shape[2] samples in C order. mask: null, or as many flags, true for valid samples; a
+// cell needs all eight corners. T is float or double.
 template <typename T>
 Mesh marching_cubes_dense(const T* volume, const std::array<std::int64_t, 3>& shape, const bool* mask,
                           const Lattice& lattice, double level, int num_threads, bool with_edges = false);
@@ -46,9 +46,8 @@ Mesh marching_cubes_sparse(const std::int32_t* corners, const T* values, std::in
                            const std::int32_t* cells, std::int64_t num_cells, const Lattice& lattice, double level,
                            int num_threads);
 
-// The derivative of a sum over vertices by each sample, volume_grad (shape): vertices_grad
-// (num_vertices, 3) is the derivative of that sum by each vertex, edges are those of the mesh. A vertex
-// moves along its edge alone. It does not move where it was kept away from a sample, or where a sample is infinite.
+// Backward pass: volume_grad (shape) from vertices_grad (num_vertices, 3) and the edges of the mesh. A vertex moves
+// only along its edge, and not at all where it is clamped away from a sample, or where a sample is infinite.
 template <typename T>
 void marching_cubes_dense_backward(const T* volume, const std::array<std::int64_t, 3>& shape, const std::int64_t* edges,
                                    const double* vertices_grad, std::int64_t num_vertices,

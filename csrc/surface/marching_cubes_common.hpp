@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// What dense and sparse marching cubes share: where an edge is cut, the checks, the allocation of the result.
+// Shared code of dense and sparse marching cubes: cuts of edges, checks, allocation of the result.
 #pragma once
 
 #include <algorithm>
@@ -17,12 +17,12 @@
 
 namespace radarsdf {
 
-// The fraction of the way from sample a to sample b at which they cross the level; one of them is > level.
+// Fraction of the edge from sample a to sample b at which the level is crossed; exactly one of them is > level.
 inline double edge_fraction(double a, double b, double level) {
   double fraction = (level - a) / (b - a);
-  // An infinite sample puts the crossing at the other one; where b is infinite the division says so by itself.
+  // With an infinite sample, the crossing is at the other one; for an infinite b the division yields it.
   if (std::isinf(a)) fraction = std::isinf(b) ? 0.5 : 1.0;
-  // In this order of arguments a NaN, from samples so large that their difference overflows, ends at the minimum.
+  // In this order of arguments, a NaN, from an overflowing difference of samples, becomes the minimum.
   return std::max(min_edge_fraction, std::min(1 - min_edge_fraction, fraction));
 }
 

@@ -13,8 +13,8 @@ struct MeshComponents {
   std::vector<std::int64_t> sizes;         ///< faces per component
 };
 
-// faces: (num_faces, 3) vertices in [0, num_vertices). Faces are connected where they share a vertex. Serial: linear
-// time, and the chains it follows allow no more.
+// faces: (num_faces, 3) vertices in [0, num_vertices). Faces are connected if they share a vertex. Serial union-find in
+// nearly linear time.
 MeshComponents mesh_components(const std::int32_t* faces, std::int64_t num_faces, std::int64_t num_vertices);
 
 }  // namespace radarsdf

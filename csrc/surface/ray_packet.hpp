@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Rays that go through a tree of triangles together. Loops over the rays are vectors of the processor, and what one ray
-// passes, most of them pass, if they go about the same way.
+// Packets of rays that traverse a tree of triangles together. Loops over the rays are vectorised, and coherent rays
+// mostly visit the same nodes.
 #pragma once
 
 #include <cstdint>
@@ -15,11 +15,11 @@ struct RayPacket {
   static constexpr int kRays = 16;
 
   float directions[3][kRays];
-  float ranges_m[kRays];          // before: the farthest that counts; after: of the hit, about
-  std::int32_t triangles[kRays];  // row in the tree of the triangle that is hit; unchanged without one
+  float ranges_m[kRays];          // in: maximum range; out: approximate range of the hit
+  std::int32_t triangles[kRays];  // row in the tree of the triangle hit; unchanged without a hit
 };
 
-// The rays begin at `origin` (3), local frame, m.
+// origin: (3), of all rays, local frame, m.
 void trace(const TriangleTree& tree, const double* origin, bool front_only, RayPacket& packet);
 
 }  // namespace radarsdf

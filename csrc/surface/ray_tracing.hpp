@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Where rays first meet a triangle mesh. They are sorted by direction, and neighbours go through the tree of its
-// triangles together.
+// First hits of rays on a triangle mesh. Rays are sorted by direction, and traverse the tree of triangles in packets.
 #pragma once
 
 #include <cstdint>
@@ -18,9 +17,9 @@ class SurfaceTracer {
                 int num_threads)
       : tree_(vertices, num_vertices, faces, num_faces, num_threads) {}
 
-  // For each ray the distance to the first triangle, m, infinite without one, and the triangle's row, -1 without one.
-  // origin: (3), that of all rays; directions: (count, 3) unit vectors. Both sides of a triangle stop a ray, or the
-  // front alone: the side from which its corners are counter-clockwise. Throws std::invalid_argument.
+  // For each ray the distance to the first hit, m, or infinity, and the row of its triangle, or -1. origin: (3), of all
+  // rays; directions: (count, 3) unit vectors. front_only: only triangles seen from the front, with counter-clockwise
+  // corners, are hit. Throws std::invalid_argument.
   void first_hits(const double* origin, const float* directions, std::int64_t count, double max_range_m,
                   bool front_only, float* ranges_m, std::int32_t* faces, int num_threads) const;
 

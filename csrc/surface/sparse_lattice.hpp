@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// From a list of cells to its set of cells, the set of their corners, and which corners each cell has.
+// Unique cells of a list, their unique corners, and the corners of each cell.
 #pragma once
 
 #include <cstdint>
@@ -17,7 +17,7 @@ struct SparseLattice {
   std::unique_ptr<std::int32_t[]> cell_corners;  ///< (num_cells, 8) rows of corners, in C order of the 2x2x2 block
 };
 
-// cells: (num_cells, 3) lattice coordinates of the lower corners, in any order, any number of times.
+// cells: (num_cells, 3) lattice coordinates of the lower corners, in any order, possibly repeated.
 SparseLattice sparse_lattice(const std::int32_t* cells, std::int64_t num_cells, int num_threads);
 
 }  // namespace radarsdf

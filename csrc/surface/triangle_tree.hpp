@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The triangles of a mesh in a balanced tree of boxes.
+// Balanced bounding-box tree of the triangles of a mesh.
 #pragma once
 
 #include <cstdint>
@@ -13,7 +13,7 @@ namespace radarsdf {
 struct TreeTriangle {
   double corner[3];   // local frame, m
   float edges[2][3];  // from it to the other two, m
-  float lengths[2];   // of these: sums of absolute coordinates
+  float lengths[2];   // their L1 norms
   std::int32_t face;
 };
 
@@ -21,8 +21,8 @@ struct TreeBox {
   float low[3], high[3];  // m from `lower`, rounded outwards
 };
 
-// The tree is complete: box 1 holds all triangles, box i those of boxes 2 i and 2 i + 1, and box `leaves` + k those of
-// leaf k, which begin at `first(k)`.
+// Complete binary tree: box 1 is the root, boxes 2 i and 2 i + 1 are the children of box i, and box `leaves` + k holds
+// the triangles of leaf k, from `first(k)` on.
 struct TriangleTree {
   // vertices: (num_vertices, 3), finite, m; faces: (num_faces, 3) rows of them. Throws std::invalid_argument.
   TriangleTree(const double* vertices, std::int64_t num_vertices, const std::int32_t* faces, std::int64_t num_faces,
@@ -33,7 +33,7 @@ struct TriangleTree {
   std::int64_t num_bytes() const;
 
   double lower[3] = {};     // corner of box 1, local frame, m
-  std::int64_t leaves = 0;  // a power of two, or none
+  std::int64_t leaves = 0;  // a power of two, or 0
   LargeVector<TreeBox> boxes;
   LargeVector<TreeTriangle> triangles;
 };

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The signs of a volume's samples, one bit each: what marching cubes needs to know of all of them.
+// Signs of a volume's samples, one bit each, for marching cubes.
 #pragma once
 
 #include <array>
@@ -13,8 +13,8 @@ namespace radarsdf {
 
 constexpr std::int64_t word_bits = 32;
 
-// One bit for each sample of a volume, or for the cell of which it is the lower corner. A row ends with a word of
-// zeros, so that a window may begin in any word before it.
+// One bit for each sample of a volume, or for the cell with this lower corner. A row ends with a word of zeros, so that
+// a window may begin in any word before it.
 class BitVolume {
  public:
   BitVolume() = default;
@@ -36,12 +36,12 @@ class BitVolume {
   std::unique_ptr<std::uint32_t[]> bits_;
 };
 
-// 64 bits from word m on: those of 32 samples and of the samples after them.
+// 64 bits from word m on: those of 32 samples and of the next 32.
 inline std::uint64_t window(const std::uint32_t* row, std::int64_t m) {
   return row[m] | static_cast<std::uint64_t>(row[m + 1]) << word_bits;
 }
 
-// What is > level, and the cells in use; `cells` is empty where all are.
+// Signs of samples (> level), and cells in use; `cells` is empty if all are.
 struct VolumeSigns {
   std::array<std::int64_t, 3> shape;
   BitVolume positive;
