@@ -57,7 +57,7 @@ class SurfaceReturns:
         inside: NDArray[np.bool_] | None = None,
         sums: ScanSums | None = None,
     ) -> SurfaceReturns:
-        """Clean `rays` as ``config.returns`` says and keep those `inside`, (N,); None for all. `sums`: of the rays, if known."""
+        """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`: of the rays, if known."""
         sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if sums is None else sums
         surfels = Surfels.of_sums(sums, num_threads)
         means = None if config.train else MeanRays.of_sums(sums, num_threads)

@@ -42,7 +42,7 @@ def near_and_labelled(config: FitConfig, batch_size: int) -> tuple[int, int]:
     """
     near = max(1, round(batch_size * (NEAR_SAMPLES / (NEAR_SAMPLES + FREE_SAMPLES))))
     training = config.training
-    # With labels in free space, a sample without a label of its own would have that of free space.
+    # With labels in free space, an unlabelled near sample would get the label of free space.
     return near, near if training.intensity_in_free_space else min(near, training.intensity_batch_size)
 
 
@@ -53,12 +53,12 @@ def seen_jointly(config: FitConfig, batch_size: int) -> int:
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on rays. Those near the surface come first."""
+    """Samples on rays, those near the surface first."""
 
     points: Tensor  # (B, 3) float32, local frame, m
     sdf_m: Tensor  # (B,) label: distance along the ray to the return, m, positive in front of it
     num_labelled: int  # number of leading samples with intensity labels
-    of_ray: Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; perhaps scaled intensity
+    of_ray: Tensor  # (B, 7 or 8) return (3), local, m; direction (3); range, m; optionally scaled intensity
     share: float = 1.0  # weight of the mean of a part in that of the batch; 0 without samples
     labelled_share: float = 1.0  # the same for the labelled samples
 

@@ -40,7 +40,7 @@ class Schedule:
     """Batch sizes and iterations of the sdf stage and the intensity stage. Joint iterations count for both."""
 
     batch_size: int = 0  # samples in an iteration of the sdf stage
-    neighbours: int = 1  # neighbouring rays that a batch takes together
+    neighbours: int = 1  # length of the runs of neighbouring rays in a batch
     sdf_iterations: int = 0
     passes: float = 0.0  # passes of the sdf stage over the samples
     intensity_iterations: int = 0  # iterations that train the intensity network

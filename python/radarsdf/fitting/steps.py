@@ -46,7 +46,7 @@ class FitInput:
     why_none_moving: str | None = None  # see :class:`radarsdf.returns.moving.MovingReturns`
     inside: NDArray[np.bool_] | None = None
     """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
-    clutter_ratio: float | None = None  # share of the returns that lie on no thin surface
+    clutter_ratio: float | None = None  # share of the returns not on a thin surface
     returns_per_cell: float | None = None  # mean number of returns in the cells of surfels
     sensor: Sensor | None = None
     box_cells: NDArray[np.int64] | None = None

@@ -43,7 +43,7 @@ _WORST = {
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during a fit.
+    """A fit was interrupted by Ctrl-C.
 
     Attributes
     ----------

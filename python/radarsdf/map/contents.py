@@ -26,7 +26,7 @@ class WholeMap:
 
     origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
-    clutter_ratio: float  # share of the returns that lie on no thin surface, in [0, 1]
+    clutter_ratio: float  # share of the returns not on a thin surface, in [0, 1]
     returns_per_cell: float  # mean number of returns in the cells of surfels with returns
 
 

@@ -339,7 +339,7 @@ class Map(ABC):
 
     @property
     def clutter_ratio(self) -> float:
-        """Share of the returns that lie on no thin surface, in [0, 1]."""
+        """Share of the returns that do not lie on a thin surface, in [0, 1]."""
         return self._contents_of_any.clutter_ratio
 
     @property

@@ -75,7 +75,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     write_whole(path, tensor_bytes(tensors, metadata))
 
 
-@torch.inference_mode(mode=False)  # or the map could not give gradients
+@torch.inference_mode(mode=False)  # or the map could not compute gradients
 def load_contents(path: str | PathLike[str]) -> MapContents:
     """Read the file of a map. Raise a ValueError if it is damaged, of another program or of another version."""
     check_regular_file(path)

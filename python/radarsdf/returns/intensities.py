@@ -79,7 +79,7 @@ class Intensities:
 def _farthest(distances: NDArray[Any], count: int) -> float:
     """Return the largest inlier distance from the median of `count` intensities, from a sample of distances (M,), ascending."""
     of_all = len(distances)
-    distances = distances[distances > 0]  # half of the returns may have the same intensity
+    distances = distances[distances > 0]  # up to half of the returns may have the same intensity
     gaps = np.flatnonzero(distances[1:] > _GAP * distances[:-1]) + 1
     for first in gaps[gaps >= _FEWEST]:
         usual, beyond = distances[:first], distances[first:]
