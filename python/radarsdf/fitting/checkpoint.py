@@ -100,7 +100,7 @@ class Checkpoint:
             mine, other = flat_settings(ours["config"]), flat_settings(found["config"])
             differing = [name for name in ours if found[name] != ours[name]]
         except (SafetensorError, AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-            msg = f"{self._path} is not a checkpoint of a fit: it is left as it is"
+            msg = f"{self._path} is not a checkpoint of a fit: it is not overwritten"
             raise ValueError(msg) from error
         changed = sorted(k for k in mine.keys() | other.keys() if mine.get(k, _NONE) != other.get(k, _NONE))
         words = {

@@ -217,7 +217,7 @@ def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = 
     expected = estimate_rays(rays, config, inside)
     if expected.peak_memory_bytes > available:
         msg = (
-            f"the fit would take more than the {available / 1e9:.2f} GB there are (max_memory_bytes): {expected}. "
+            f"the fit would need more than the {available / 1e9:.2f} GB available (max_memory_bytes): {expected}. "
             "Use larger cells (leaf_size_m), or drop far returns (max_range_m)"
         )
         raise MemoryError(msg)

@@ -74,7 +74,7 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
     counts = np.maximum(1, np.ceil(corners[1] / size - 1e-6) - first)
     voxels = np.prod(counts) * parts**3
     if voxels > _MAX_VOXELS:
-        msg = f"the box has {voxels:.3g} voxels: at most {_MAX_VOXELS} fit; take a smaller one, or larger voxels"
+        msg = f"the box has {voxels:.3g} voxels, more than {_MAX_VOXELS}: use a smaller box, or larger voxels"
         raise MemoryError(msg)
     shape = tuple((counts.astype(np.int64) * parts).tolist())
     fine = _fine_grid(radar_map, first * size, size / parts, shape)

@@ -64,7 +64,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     tensors, description = parts_of(contents)
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():
-            msg = f"{name} of the map holds something other than finite numbers: it is not saved"
+            msg = f"{name} of the map contains non-finite numbers: the map is not saved"
             raise ValueError(msg)
     metadata = {
         "format": FORMAT,
@@ -205,7 +205,7 @@ def _field_of(
             field = GridField(keys, config.leaf_size_m)
     for name, tensor in tensors.items():
         finite = tensor.dtype == torch.float32 and tensor.isfinite().all()
-        _check(finite, f"{name} holds something other than finite float32 numbers")
+        _check(finite, f"{name} is not finite float32 numbers")
     state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
     field.load_state_dict(state, assign=True)  # raises a RuntimeError for wrong names or shapes
     field.requires_grad_(False)

@@ -42,12 +42,12 @@ class CheckedScans:
     ) -> CheckedScans:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
         if doppler_mps is not None and times is None and not isinstance(points, Scans):
-            msg = "Doppler needs times: when each scan was taken, s"
+            msg = "Doppler needs times: the time of each scan (times_s), s"
             raise ValueError(msg)
         given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
         if (range_m := median_range_m(scans)) > _MOST_M:
-            msg = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: give them in m"
+            msg = f"points have a median range of {range_m:.0f} m. They may be in mm or cm: convert them to m"
             raise ValueError(msg)
         times_s, begin_s, notes = None, 0.0, left_out.notes
         if times is not None:

@@ -132,7 +132,7 @@ def odometry(
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     checked = CheckedScans.of(points, doppler_mps, times_s)
     if checked.times_s is None:
-        msg = "times_s are missing: when each scan was taken, s"
+        msg = "times_s are missing: the time of each scan, s"
         raise ValueError(msg)
     checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1

@@ -232,7 +232,7 @@ def prepare(
     if intensity is not None and whole:
         intensity = Plausible.of(intensity).kept(intensity)
         if np.isnan(intensity).all():
-            msg = "no intensity is finite: leave them out if the sensor does not measure them"
+            msg = "no intensity is finite: omit intensities if the sensor does not measure them"
             raise ValueError(msg)
         check_range(float(np.nanmin(intensity)), float(np.nanmax(intensity)))
     return Rays(
@@ -250,7 +250,7 @@ def prepare(
 def check_range(low: float, high: float) -> None:
     """Raise a ValueError if intensities from `low` to `high`, sensor units, are all equal or too far apart for float32."""
     if low == high:
-        msg = f"all intensities are {low}: leave them out if the sensor does not measure them"
+        msg = f"all intensities are {low}: omit them if the sensor does not measure them"
         raise ValueError(msg)
     if high - low > float(np.finfo(np.float32).max):
         msg = f"intensities from {low} to {high} are too far apart for float32"
