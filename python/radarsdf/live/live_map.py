@@ -81,7 +81,7 @@ class LiveMap:
     Raises
     ------
     ValueError
-        If a setting is out of range, `returns.accumulate_scans` is not 1, or `folder` contains other files.
+        If a setting is out of range, ``returns.accumulate_scans`` is not 1, or `folder` contains other files.
     OSError
         If `folder` cannot be written, or another map uses it.
 
