@@ -196,7 +196,7 @@ class Map(ABC):
             In [0, 1]. Triangles with a vertex of less :meth:`confidence` are left out. Default: the value at which the
             F-score of the observed surface is expected to be highest. 0 keeps all (3QFP).
         max_uncertainty : float, optional
-            Triangles with a vertex of more :meth:`uncertainty`, m, or of none, are left out. Default: no limit;
+            Triangles with a vertex of larger :meth:`uncertainty`, m, or NaN, are omitted. Default: no limit;
             what is uncertain is improbable, too.
         min_component_triangles : int, optional
             Components of fewer triangles are then left out. Default: 30 in voxels of up to 0.1 m, and fewer in larger
