@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from radarsdf.map.threshold import Threshold
 from radarsdf.view.framing import FOV_RAD, look_at_all
 from radarsdf.view.glb import glb
 from radarsdf.view.surface import ShownSurface, first_hit, spread_evenly, thinned
@@ -49,6 +50,17 @@ def test_points_that_fill_a_volume_are_thinned_to_those_nearest_to_the_mean_of_t
 def test_a_map_without_a_surface_here(sharp_map):
     with pytest.raises(ValueError, match="no surface here"):
         ShownSurface.of(sharp_map, 0.2, max_vertices=1000, box=[[90, 90, 90], [91, 91, 91]], progress=False)
+
+
+def test_a_vertex_without_uncertainty_is_shown_unless_the_uncertainty_is_limited():
+    uncertainty_m = np.array([0.1, np.nan, 0.3], np.float32)
+    confidence = np.array([0.2, 0.5, 0.9], np.float32)
+    threshold = Threshold(0.0, 1.0, 1.0, 1.0, 1.0)
+    surface = ShownSurface(
+        np.eye(3), np.array([[0, 1, 2]], np.int32), uncertainty_m, confidence, confidence, threshold, 0.1
+    )
+    assert surface.kept(np.inf, 0.5).tolist() == [False, True, True]
+    assert surface.kept(0.3, 0.0).tolist() == [True, False, True]
 
 
 def test_a_glb_has_the_colors_that_were_given():

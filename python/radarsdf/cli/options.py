@@ -143,7 +143,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o
     "--quiet": (_FLAG, "show no progress bar"),
     "--json": (_FLAG, "print the results as one JSON object, lengths in m; all else goes to standard error"),
     "--paper": (_FLAG, "use the published configuration: slower, for comparison"),
-    "--quick": (_FLAG, "average distances instead of training: less accurate, under a second; mesh with --voxel 0.2"),
+    "--quick": (_FLAG, "average distances instead of training: under a second, no free space; mesh with --voxel 0.2"),
     "--config": (_FILE, "change the settings in this TOML file; radarsdf config prints all"),
     "--set": (_NAMES | {"metavar": "NAME=VALUE"}, "change a setting, such as training.sdf_iterations=200; may be repeated"),
     "--voxel": (_FLOAT | {"default": 0.1}, "edge length of a voxel; default: 0.1 m"),

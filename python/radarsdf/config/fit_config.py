@@ -98,7 +98,7 @@ class FitConfig:
     """A fit or mesh that takes more is refused with a MemoryError, bytes. None: what the system has left."""
     train: bool = True
     """Whether a field is trained (stage 2). Otherwise the surface is the smoothed average of the rays (stage 1), intensities
-    are in closed form, and of the groups only `returns` and `encoding.bridge_cells` count."""
+    are in closed form, and of the groups only `returns` (but for `onto_planes`) and `encoding.bridge_cells` count."""
     returns: Annotated[ReturnsConfig, BeforeValidator(_from_mapping(ReturnsConfig))] = ReturnsConfig()
     """Which returns are used, and how they are cleaned."""
     encoding: Annotated[EncodingConfig, BeforeValidator(_from_mapping(EncodingConfig))] = EncodingConfig()

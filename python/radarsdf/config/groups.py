@@ -52,9 +52,9 @@ class ReturnsConfig:
     no). Measured: 0.1 to 8.6 points of F-score on five real drives, 5.9 on a simulated street with cars, 0.0 on one
     without."""
     drop_ghosts: bool = True
-    """Whether the sdf stage leaves out ghosts: returns behind a surface that their rays crossed, as mirrors
-    cause them (3QFPI: no). Measured on twelve kinds of simulated scenes: half to three quarters of the
-    ghosts go, and 0 to 2 % of the true returns, 6 % along fences. The intensity stage still uses ghosts."""
+    """Whether the surface is fitted without ghosts: returns behind a surface that their rays crossed, caused by mirrors
+    (3QFPI: no). Measured on twelve kinds of simulated scenes: half to three quarters of the
+    ghosts go, and 0 to 2 % of the true returns, 6 % along fences. Intensities are still fitted with them."""
     range_noise_m: _NoiseM | None = None
     """Standard deviation of a return along the beam, m. None: estimated from the returns; see
     :func:`radarsdf.returns.noise.sensor_noise`."""
@@ -63,8 +63,8 @@ class ReturnsConfig:
     elevation_noise_rad: _NoiseRad | None = None
     """The same in elevation, rad."""
     pose_sigma_m: Annotated[float, Field(ge=0, le=_MAX_NOISE_M)] = 0.0
-    """Standard deviation of the position of a scan, m. It only makes the map's uncertainty larger: all returns
-    of a scan share the error, so that only more scans make it smaller."""
+    """Standard deviation of the position of a scan, m. All returns of a scan share the error, so that only more scans
+    average it out. It enters the uncertainty, and the weights with which distances are smoothed."""
     pose_sigma_rad: Annotated[float, Field(ge=0, le=_MAX_NOISE_RAD)] = 0.0
     """The same of the orientation of a scan, rad. At a return it counts times the range."""
     onto_planes: bool = True

@@ -156,9 +156,8 @@ def within(
     confidence: NDArray[np.float32],
     uncertainty_m: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
-    """Return a mask (F,) of the faces (F, 3) with all vertices within the limits: the one place that compares them."""
-    certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= limits.max_uncertainty
-    return with_all(certain & (confidence >= min_confidence), faces)
+    """Return a mask (F,) of the faces (F, 3) with all vertices within the limits."""
+    return with_all(limits.met(min_confidence, confidence, uncertainty_m), faces)
 
 
 def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:

@@ -55,6 +55,14 @@ class Limits(NamedTuple):
         components = whole_number(min_component_triangles, "min_component_triangles", 0)
         return cls(min_confidence, max_uncertainty, components)
 
+    def met(
+        self, threshold: float, confidence: NDArray[np.float32], uncertainty_m: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Return a mask (V,) of vertices within the limits at a confidence threshold. NaN exceeds any finite uncertainty."""
+        certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= self.max_uncertainty
+        found: NDArray[np.bool_] = certain & (confidence >= threshold)
+        return found
+
 
 @dataclass(frozen=True)
 class Threshold:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from radarsdf._core import SurfaceTracer
 from radarsdf.checks import whole_number
 from radarsdf.map.mesh import renumbered, with_all
-from radarsdf.map.threshold import Threshold
+from radarsdf.map.threshold import Limits, Threshold
 from radarsdf.view.glb import lightness_of
 
 if TYPE_CHECKING:
@@ -70,8 +70,8 @@ class ShownSurface:
         )
 
     def kept(self, max_uncertainty_m: float, min_confidence: float) -> NDArray[np.bool_]:
-        """(V,) whether a vertex is within the limits."""
-        return (self.uncertainty_m <= max_uncertainty_m) & (self.confidence >= min_confidence)
+        """Return a mask (V,) of vertices within the limits."""
+        return Limits(None, max_uncertainty_m, 0).met(min_confidence, self.confidence, self.uncertainty_m)
 
     def part(self, kept: NDArray[np.bool_]) -> tuple[_Rows, NDArray[np.int32]]:
         """Rows (N,) of the vertices of triangles with all vertices kept, and these triangles (M, 3) as rows of them."""

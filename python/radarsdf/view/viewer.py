@@ -109,7 +109,7 @@ class Viewer(Page):
         panel = gui.add_panel()
         panel.dock_below(gui.main_panel)
         tab = panel.add_tab("controls")
-        largest_m = float(surface.uncertainty_m.max())
+        largest_m = float(np.nanmax(surface.uncertainty_m, initial=0.0))
         step_m = 10.0 ** math.floor(math.log10(max(largest_m, 1e-6) / 100))
         end_m = math.ceil(largest_m / step_m) * step_m
         with tab, gui.add_folder("surface"):
@@ -161,9 +161,10 @@ class Viewer(Page):
         return clouds
 
     def _surface_state(self) -> dict[str, Any]:
-        """The fields of :class:`State` that the controls of the surface set."""
+        """The fields of :class:`State` that the controls of the surface set. At its end, the slider limits nothing."""
+        uncertainty_m = self._uncertainty.value
         return {
-            "max_uncertainty_m": float(self._uncertainty.value),
+            "max_uncertainty_m": math.inf if uncertainty_m >= self._uncertainty.max else float(uncertainty_m),
             "min_confidence": float(self._confidence.value),
             "quantity": str(self._quantity.value),
         }
