@@ -86,7 +86,7 @@ def test_rates_are_those_of_the_seconds(capsys):
         "4 of 5 scans in the map, 1 dropped, 0 lost",
         "a scan took 25.0 ms (median), 59.1 ms (99 of 100), 60.0 ms (worst): 33 scans a second",
     ]
-    with pytest.raises(ValueError, match="no scan came into the map"):
+    with pytest.raises(ValueError, match="no scan was integrated"):
         _add_rates(Results(), Replay(), 5)
 
 
