@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The viewer of a map."""
+"""Interactive viewer of a map in the browser."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from radarsdf.view.scene import (
 from radarsdf.view.serving import Page, begin_at
 from radarsdf.view.surface import ShownSurface, first_hit
 
-_GIZMO_SHARE = 0.06  # size of the sensor's handles, in diagonals of the surface
-_MARK_SHARE = 0.012  # radius of the mark of a click, in distances to it: of one size on the screen
+_GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
+_MARK_SHARE = 0.012  # radius of a click's mark, as a share of its distance: of constant size on the screen
 _MARK_COLOR = (0, 190, 255)  # not on the colour scale
 
 
 class Viewer(Page):
     """Serves a map, and scans to browse, in the browser until it is stopped.
 
-    While the sensor is dragged, 30,000 vertices are recoloured; all of them are when the drag ends. The page computes in
+    During a drag of the sensor, 30,000 vertices are recoloured; all of them are when it ends. The page computes in
     float32 in the map's local frame, but displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for
     :meth:`Map.mesh`, with its errors.
     """
@@ -67,7 +67,7 @@ class Viewer(Page):
             raise
 
     def wait(self) -> None:
-        """Wait until the viewer is stopped. Raises an error of its thread."""
+        """Wait until the viewer is stopped. Raises an error of the drawing thread."""
         self._painter.wait()
 
     def stop(self) -> None:
@@ -76,14 +76,14 @@ class Viewer(Page):
         super().stop()
 
     def _fill(self, scans: Scans | None) -> None:
-        """Add everything to the page."""
+        """Add all elements to the page."""
         server, radar_map, surface = self._server, self._map, self.surface
         origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.poses[:, :3, 3] - origin
         self._extent = np.concatenate([surface.vertices - origin, path])
         begin_at(server, look_at_all(self._extent))
         x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
-        self.quantities = quantities_of(radar_map, surface, (x, y, z))  # what the surface can be coloured by
+        self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
         self._clicked: NDArray[np.float64] | None = None
         panel = self._add_controls()
         self._clouds = None if scans is None else self._add_scans(panel, scans)
@@ -96,9 +96,9 @@ class Viewer(Page):
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
 
-    # Callbacks are coroutines, because viser would run functions in several threads, in any order.
+    # Callbacks are coroutines, since viser would run functions in several threads, in any order.
     def _add_controls(self) -> Any:
-        """Add the panels. A narrow screen shows the second one, which is returned, folded, so that little covers the map."""
+        """Add the panels. A narrow screen shows the second one, which is returned, folded, to cover little of the map."""
         gui, surface = self._server.gui, self.surface
         self._legend = gui.add_html(legend(next(iter(self.quantities.values()))))
         self._quantity = gui.add_dropdown("colour by", tuple(self.quantities), hint="what the surface shows")
@@ -113,9 +113,9 @@ class Viewer(Page):
         step_m = 10.0 ** math.floor(math.log10(max(largest_m, 1e-6) / 100))
         end_m = math.ceil(largest_m / step_m) * step_m
         with tab, gui.add_folder("surface"):
-            hint = "hides what is more uncertain"
+            hint = "hides surface with a larger standard error"
             self._uncertainty = gui.add_slider("uncertainty ≤ m", 0.0, end_m, step_m, end_m, hint=hint)
-            hint = f"hides what is less probable; the mesh is {surface.threshold}"
+            hint = f"hides surface with a lower confidence; the mesh is {surface.threshold}"
             self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
 
         async def on_limit(_: Any) -> None:
@@ -135,7 +135,7 @@ class Viewer(Page):
         return tab
 
     def _add_scans(self, tab: Any, scans: Scans) -> ScanClouds:
-        """Add the returns of scans, and the controls that choose one and what is shown of it."""
+        """Add the returns of scans, and controls to choose a scan and its elements."""
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
         colors = {"measured": scale or MEASURED_COLOR, "predicted": PREDICTED_COLOR, "trajectory": PATH_COLOR}
@@ -161,7 +161,7 @@ class Viewer(Page):
         return clouds
 
     def _surface_state(self) -> dict[str, Any]:
-        """The fields of :class:`State` that the controls of the surface set."""
+        """Fields of :class:`State` set by the controls of the surface."""
         return {
             "max_uncertainty_m": float(self._uncertainty.value),
             "min_confidence": float(self._confidence.value),
@@ -178,8 +178,8 @@ class Viewer(Page):
         return look
 
     async def _on_connect(self, client: Any) -> None:
-        """Let a new page show everything, also after its frame has changed, until the user moves the camera."""
-        first = look_at_all(self._extent)  # which a page may take after it was told a better one
+        """Frame the whole scene in a new page, also after its frame has changed, until the user moves the camera."""
+        first = look_at_all(self._extent)  # a page may apply this one after a better one
         aspect, look = _aspect(client.camera), self._look_at_all(client)
 
         async def on_update(camera: Any) -> None:
@@ -230,7 +230,7 @@ class Viewer(Page):
         self._describe(self._painter.newest)
 
     def _describe(self, state: State) -> None:
-        """Show what the map knows about the point that was clicked, for the sensor of a state."""
+        """Show the map's values at the clicked point, for the sensor of a state."""
         if self._clicked is None:
             return
         x, sensor = self._clicked[None], np.array(state.sensor)
@@ -247,7 +247,7 @@ class Viewer(Page):
 
     @property
     def notes(self) -> list[str]:
-        """What is shown more coarsely than it is, in words."""
+        """Sentences on reduced details of the page."""
         shown, spacing_m = len(self.surface.vertices), self.surface.spacing_m
         thinned = (
             f"the mesh is thinned to {shown} vertices, {spacing_m:.2g} m apart: --max-vertices allows more"
@@ -256,7 +256,7 @@ class Viewer(Page):
 
 
 def _aspect(camera: Any) -> float:
-    """Width of a page's frame over its height, within what a screen can have."""
+    """Aspect ratio of a page's frame, clipped to what a screen can have."""
     return float(np.clip(camera.image_width / max(camera.image_height, 1), 0.1, 10.0))
 
 
