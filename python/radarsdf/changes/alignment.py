@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Where the frame of one map lies in that of another, by their surfaces."""
+"""Registration of two maps by their surfaces."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 
-# Standard deviations of how far frames are apart before maps are compared: translation, m, and rotation vector, rad.
+# Prior standard deviations of the offset between the frames of two maps: translation, m, and rotation vector, rad.
 _APART = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
 _ITERATIONS = 15
 _MOST_POINTS = 10_000  # of the later surface
-_PATCH_M = 4.0  # edge of a patch, whose errors are correlated
+_PATCH_M = 4.0  # edge of a patch within which errors are correlated
 _BY_CHANCE = 1e-3  # significance level
-# Standard error, in leaf cells, from which on an axis is not determined: fields reach two cells.
+# Largest standard error of a determined axis, in leaf cells: fields reach two cells.
 _UNSURE_CELLS = 0.5
-_ALIKE_CELLS = 0.25  # surfaces that are nearer lie on each other
-_SEARCH_CELLS = 8.0  # edge of the cells of a search, in leaf cells
+_ALIKE_CELLS = 0.25  # surfaces within this distance coincide
+_SEARCH_CELLS = 8.0  # edge of the cells of the coarse search, in leaf cells
 _SEARCHED = 500  # points of a search
-_TRIED, _FOLLOWED = 8192, 200  # poses of a search, and the best of them
-_ERRORS = 3.0  # standard errors by which poses that agree about as well differ at most
+_TRIED, _FOLLOWED = 8192, 200  # poses of the coarse search, and the best ones that are refined
+_ERRORS = 3.0  # poses within these standard errors agree about equally well
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where one map lies in the frame of another."""
+    """Pose of one map in the frame of another."""
 
     T_before_after: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) m
-    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of an offset from the `centre`
+    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of an offset about the `centre`
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
-    improved: bool = False  # whether the surfaces show that the frames are apart
+    improved: bool = False  # whether the surfaces show an offset between the frames
     words: str = "The maps were taken as they are."  # the verdict in one sentence
 
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
@@ -58,16 +58,16 @@ class Alignment:
 
 
 def align(before: PlacedMap, after: PlacedMap) -> Alignment:
-    """Move the later map so that its surface lies on that of the earlier one, if that is more than chance explains.
+    """Register the later map to the surface of the earlier one, if the offset between them is significant.
 
-    The verdict is on the offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
+    The test is on the offset over its standard errors: along a surface, it brings the surfaces no nearer, however large it is.
     """
     if min(len(before.faces), len(after.faces)) < CELLS_OF_SURFACE:
         return Alignment()
     surface = _Surface.of(after)
 
     def far(pose: Floats) -> Floats:
-        """(N,) logarithms of the distances between the surfaces, about equal where they lie on each other."""
+        """(N,) logarithms of the distances between the surfaces, about equal where the surfaces coincide."""
         near_m, _, distance_m = before.nearest(_placed(surface.points, pose))
         distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
         found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
@@ -82,30 +82,30 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
     by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
     if sigmas <= by_chance or far(pose).mean() >= far(np.eye(4)).mean():
-        words = "The frames were taken as they are: surfaces do not show that they are apart."
+        words = "The frames were taken as they are: surfaces do not show an offset between them."
         return Alignment(covariance=covariance, centre=surface.centre, words=words)
     moved_m = np.sqrt(((_placed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
     words = (
         f"The later map was moved by {moved_m:.3f} m, {sigmas:.1f} standard errors; "
-        f"surfaces do not determine {undetermined} of 6 axes, along which it stays as given."
+        f"surfaces do not determine {undetermined} of 6 axes, along which its pose was kept."
     )
     return Alignment(pose, covariance, surface.centre + offset[:3], True, words)
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """Points of the later surface, in its given frame."""
+    """Points of the later surface, in its original frame."""
 
     points: Floats  # (N, 3) m
     normals: Floats  # (N, 3)
     sigma_m: Floats  # (N,) standard errors, m
-    patches: NDArray[np.int64]  # (N,) number of the patch of each
+    patches: NDArray[np.int64]  # (N,) index of each point's patch
     centre: Floats  # (3,) m
     radius_m: float  # root mean square distance of the points from the centre
 
     @classmethod
     def of(cls, placed: PlacedMap) -> _Surface:
-        """Points on triangles: vertices are in the lattice of cells, and would be aligned with that of the other map."""
+        """Sample points on triangles: vertices lie on the lattice of cells, and would align with that of the other map."""
         rng = np.random.default_rng(0)
         _, areas = across_triangles(placed.vertices, placed.faces)
         chosen = rng.choice(len(areas), min(len(areas), _MOST_POINTS), p=areas / areas.sum())
@@ -121,23 +121,23 @@ class _Surface:
         return cls(points, normals, sigma_m, patches, centre, radius_m)
 
     def offset(self, pose: Floats) -> Floats:
-        """(6,) by how far a pose (4, 4) moves the centre, m, and its rotation vector, rad."""
+        """(6,) translation of the centre, m, and rotation vector, rad, of a pose (4, 4)."""
         shift = np.einsum("ij,j->i", pose[:3, :3], self.centre) + pose[:3, 3] - self.centre
         return np.concatenate([shift, rotation_vector(pose[:3, :3])])
 
     def pose(self, offset: Floats) -> Floats:
-        """The inverse of :meth:`offset`."""
+        """Inverse of :meth:`offset`."""
         found: Floats = moved(np.eye(4)[None], offset[None])[0]
         found[:3, 3] += self.centre - np.einsum("ij,j->i", found[:3, :3], self.centre)
         return found
 
 
 def _searched(before: PlacedMap, surface: _Surface) -> Floats:
-    """The nearest of the poses at which points agree about as well with planes of the earlier surface as anywhere."""
+    """Search coarsely; of the poses that fit the earlier surface about equally well, return the one nearest to the identity."""
     planes = LocalPlanes(_SEARCH_CELLS * before.leaf_m)
     planes.add(np.ascontiguousarray(before.vertices - surface.centre))
     points = np.ascontiguousarray((surface.points - surface.centre)[:: -(-len(surface.points) // _SEARCHED)])
-    # A quasi-random sequence leaves fewer holes than random numbers (Sobol 1967).
+    # A quasi-random sequence leaves smaller gaps than random numbers (Sobol 1967).
     offsets = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(_TRIED) * _APART
     poses = moved(np.tile(np.eye(4), (_TRIED, 1, 1)), offsets)
     width_m = 0.25 * _SEARCH_CELLS * before.leaf_m
@@ -149,7 +149,7 @@ def _searched(before: PlacedMap, surface: _Surface) -> Floats:
 
 
 def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, int]:
-    """The pose that fits the surfaces, its covariance, and how many axes they do not determine: there it stays as given."""
+    """The pose that fits the surfaces, its covariance, and the number of undetermined axes, along which the pose is kept."""
     pose, covariance = _settled(before, surface, start)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
     variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
@@ -157,15 +157,15 @@ def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Fl
     unsure = axes[:, variances > most]
     offset = surface.offset(pose) * lever_m
     offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
-    # Errors of normals would make larger ones errors of all surfaces.
+    # With larger ones, errors of the normals would bias all surfaces.
     covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
     return surface.pose(offset / lever_m), covariance / np.outer(lever_m, lever_m), unsure.shape[1]
 
 
 def _settled(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats, Floats]:
-    """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change."""
-    # Errors of the normals of both maps are independent: products of normals of different maps show along which axes
-    # surfaces determine the pose (instrumental variables). Errors are correlated in a patch, so the scatter of its sums
+    """Fit the pose by Gauss-Newton, with its covariance. Weights are probabilities that points did not change."""
+    # Errors of the normals of the two maps are independent, so products of normals from both show which axes the
+    # surfaces determine (instrumental variables). Errors are correlated within a patch, so the scatter of its sums
     # is the covariance of the equations (Hansen 1982).
     prior = np.diag(_APART**-2.0)
     covariance = np.linalg.inv(prior)
@@ -201,11 +201,11 @@ def _settled(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats
 
 
 def _placed(points: Floats, pose: Floats) -> Floats:
-    """Points (N, 3) moved by a pose (4, 4)."""
+    """Transform points (N, 3) by a pose (4, 4)."""
     return turned(points, pose[:3, :3]) + pose[:3, 3]
 
 
 def _jacobian(from_centre: Floats, normals: Floats) -> Floats:
-    """(N, 6) derivatives of the places along their normals by a translation, and by a rotation about a centre."""
+    """(N, 6) derivatives of positions along their normals by a translation, and by a rotation about a centre."""
     turns = np.einsum("ni,nij->nj", normals, -skew(from_centre))
     return np.concatenate([normals, turns], axis=1)
