@@ -157,7 +157,7 @@ def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Fl
     unsure = axes[:, variances > most]
     offset = surface.offset(pose) * lever_m
     offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
-    # With larger ones, errors of the normals would bias all surfaces.
+    # Larger variances would turn errors of the normals into errors of all surfaces.
     covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
     return surface.pose(offset / lever_m), covariance / np.outer(lever_m, lever_m), unsure.shape[1]
 
