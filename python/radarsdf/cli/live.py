@@ -97,7 +97,7 @@ def live(given: Namespace, results: Results) -> None:
         check_address(given)
     scans, unposed = scans_or_unposed(given, find=given.find)
     if unposed and scans.times_s is None:
-        msg = f"{given.scans}: scans without poses need a time for each"
+        msg = f"{given.scans}: scans without poses need times, one per scan"
         raise ValueError(msg)
     if trajectory is not None:
         check_pose_times(trajectory, scans.times_s)

@@ -27,7 +27,7 @@ MAX_GAP_S = 0.5  # longest gap to interpolate across, by default
 # Files of poses that are looked for next to scans.
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 POSE_SUFFIXES = (".tum", ".kitti", ".npy")  # formats of write_poses
-FIND_POSES = "radarsdf poses finds them from the radar alone"  # last part of messages on scans without poses
+FIND_POSES = "radarsdf poses estimates them from the radar alone"  # last part of messages on scans without poses
 
 _MAX_NORM_ERROR = 1e-2  # tolerance for unit quaternions: three digits suffice, other columns are refused
 _ROUNDED_S = 1e-3
