@@ -117,7 +117,7 @@ def compared(
     of the uncertainty are those of the other points. The standard error of the truth is added to the prediction in
     quadrature. `core_m` is the deviation of the errors up to `TRUE_M` without a uniform background: points near another
     surface by chance raise the root mean square, but not this. A map that reports surface there has a wrong
-    confidence, not a wrong uncertainty. A confidence is right if a surface is within `leaf_size_m` of so many points.
+    confidence, not a wrong uncertainty. A confidence is right if surface is within `leaf_size_m` for that share of points.
 
     Raises
     ------

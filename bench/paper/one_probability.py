@@ -178,7 +178,7 @@ def logistic_regression(columns: FloatArray, shares: FloatArray, weights: FloatA
 
 
 def examples_of(specs: list[str], seed: int, presets: list[str]) -> list[Example]:
-    """Of each scene, all scans, every sixth, and the beginning."""
+    """Build examples of all scans, every sixth, and the beginning of each scene."""
     found = []
     for spec in specs:
         scene, kind = load_scene(spec, seed=seed), Path(spec).stem

@@ -16,7 +16,7 @@ import numpy as np
 def kiss_icp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> list[np.ndarray]:
     """KISS-ICP: point-to-point ICP on a voxel map with an adaptive threshold."""
     from kiss_icp.config import KISSConfig  # noqa: PLC0415 - an optional peer
-    from kiss_icp.kiss_icp import KissICP  # noqa: PLC0415 - likewise
+    from kiss_icp.kiss_icp import KissICP  # noqa: PLC0415 - an optional peer
 
     config = KISSConfig()
     config.data.deskew = False  # returns have no times of their own
@@ -31,7 +31,7 @@ def kiss_icp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> lis
 
 def small_gicp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> list[np.ndarray]:
     """GICP of each scan on a Gaussian voxel map, starting from constant velocity."""
-    import small_gicp as peer  # noqa: PLC0415 - likewise
+    import small_gicp as peer  # noqa: PLC0415 - an optional peer
 
     target, T, step, poses = peer.GaussianVoxelMap(voxel_m), np.eye(4), np.eye(4), []
     for number, scan in enumerate(scans):

@@ -36,7 +36,7 @@ _UNSURE_CELLS = 0.5
 _ALIKE_CELLS = 0.25  # surfaces within this distance coincide
 _SEARCH_CELLS = 8.0  # edge of the cells of the coarse search, in leaf cells
 _SEARCHED = 500  # points of a search
-_TRIED, _FOLLOWED = 8192, 200  # poses of the coarse search, and the best ones that are refined
+_TRIED, _FOLLOWED = 8192, 200  # poses of the coarse search, and the best of them, which are compared
 _ERRORS = 3.0  # poses within these standard errors agree about equally well
 
 

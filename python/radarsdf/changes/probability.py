@@ -53,7 +53,7 @@ class PlaceEvidence:
     sigma_m: Floats  # (N,) standard error of the surface's position. NaN where there are no returns
     confidence: Floats  # (N,) probability of a surface there
     hits: Floats  # (N,) scans with returns in the 27 leaf cells near the place, summed over the cells
-    # (N,) scans with rays through the 27 cells near a place behind the surface, summed likewise, one count per ray. Rays that
+    # (N,) scans with rays through the 27 cells near a place behind the surface, also summed, one count per ray. Rays that
     # graze a surface pass in front of it, and are no evidence against it.
     passes: Floats
 

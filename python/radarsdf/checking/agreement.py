@@ -28,7 +28,7 @@ _MOTION = 0.05  # of the median range: smaller motions hardly show errors of the
 
 
 class Agreement:
-    """Compares scans (N_i, 3), each with the k-d tree of at most `returns` returns of another one.
+    """Agreement of scans (N_i, 3), each compared with the k-d tree of at most `returns` returns of another one.
 
     About `queries` returns per scan are looked up. They are sampled at equal steps, not at random.
     """

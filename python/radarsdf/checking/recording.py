@@ -32,7 +32,7 @@ _SAMPLE = 40  # scans from which properties of the sensor are estimated
 _LEFT_OUT = "No action needed: a fit leaves them out."
 _FRAME = "Pass points of the sensor frame in metres, x forward, y left, z up, and T_world_sensor."
 _ANGLES = "Recompute the rotations of the poses from angles in rad or unit quaternions x y z w."
-_NO_VALUE = "Look up in the driver what they stand for. A fit leaves them out of the reflectance."
+_NO_VALUE = "Look up their meaning in the driver. A fit leaves them out of the reflectance."
 FIXES = {
     "returns_not_finite": _LEFT_OUT,
     "padding": _LEFT_OUT,

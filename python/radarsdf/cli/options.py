@@ -189,7 +189,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "--distances": (_FILE, "also write the Euclidean distance field of the grid, as .npz"),
     "--costmap": (_FILE, "also write heights, slopes, steps and traversal costs, as .npz"),
     "--tile-size": (_FLOAT, "edge of a tile; default: 512 leaf cells"),
-    "--halo": (_FLOAT, "margin around a tile whose returns are fitted, too"),
+    "--halo": (_FLOAT, "margin of returns around a tile that are fitted, too"),
     "--tile": (_NAMES, "only the tile of this name; may be repeated"),
     "--processes": (_COUNT, "worker processes; each fits one tile at a time"),
     "--cluster": ({"metavar": "ADDRESS"}, "address of the dask.distributed scheduler, such as tcp://host:8786"),

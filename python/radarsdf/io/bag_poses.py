@@ -204,7 +204,7 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
 def _tracks_and_tree(
     paths: list[Path], pose_topics: set[str], transform_topics: set[str], request: Request
 ) -> tuple[dict[str, Track], TransformTree]:
-    """Read the poses of `pose_topics` and the transforms in one pass through the bags. Topics without motion are left out."""
+    """Read the poses of `pose_topics` and the transforms in one pass through the bags. Topics with a single pose are left out."""
     by_topic: dict[str, Track] = {}
     parents: dict[str, dict[str, Track]] = {}
     for message in read_messages(paths, pose_topics | transform_topics, request.notes):

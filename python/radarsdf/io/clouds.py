@@ -35,7 +35,7 @@ _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a PCD header has eleven lines
 _PLY_HEADER_BYTES = 1 << 16
 _KITTI_WIDTH, _JUDGED_FILES = 4, 20  # columns, and number of .bin files that are inspected
 _MAX_POSITION_M, _FEW = 1e7, 0.02  # limit of coordinates, and share of numbers that may be damaged
-_LESS, _ENOUGH_ROWS = 0.8, 30  # least reduction of the variance within columns by another width
+_LESS, _ENOUGH_ROWS = 0.8, 30  # another width must leave less than this share of the variance within columns
 
 GivenColumns: TypeAlias = int | Sequence[str] | None
 

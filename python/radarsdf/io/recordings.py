@@ -48,7 +48,7 @@ _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
 Truth = Callable[[], NDArray[np.float64] | None]
-"""Reads ground truth on demand, (M, 3), world frame, m; None if there is none."""
+"""Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
 
 FindPoses = Callable[[str], Poses | None]
 

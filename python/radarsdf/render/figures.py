@@ -26,7 +26,7 @@ def new_figure(**options: Any) -> Any:
     """Create a matplotlib figure that needs no display; `options` are those of ``matplotlib.figure.Figure``."""
     require("matplotlib", what="pictures need")
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - an extra
-    from matplotlib.figure import Figure  # noqa: PLC0415 - likewise
+    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     figure = Figure(**options)
     FigureCanvasAgg(figure)

@@ -62,7 +62,7 @@ def fit_tiles(
     tile_size : float, optional
         Edge of a tile, m, rounded to blocks of ``config.lattice``. Default: 512 leaf cells.
     halo : float, optional
-        Width of the margin round each tile whose returns are fitted, too, m, rounded to blocks. Tiles overlap in half of it.
+        Width of the margin of returns round each tile that are fitted, too, m, rounded to blocks. Tiles overlap in half of it.
         Default: 64 leaf cells.
     executor : concurrent.futures.Executor, optional
         Executor of the fits: of processes, or of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
