@@ -29,7 +29,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _TRANSCENDENTAL = ("cos", "erf", "exp", "log", "log10", "log1p", "log2", "pow", "sigmoid", "sin", "tanh")
-_AT_ONCE = 1024  # elements: enough for vectors, too few for PyTorch to split among threads
+_VECTOR_LENGTH = 1024  # elements: enough for vectors, too few for PyTorch to split among threads
 
 _wanted, _known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
 if _wanted and _wanted not in _known:  # the core keeps its own choice
@@ -81,11 +81,11 @@ def start_vector_library() -> None:
             return
         with torch.no_grad():
             for dtype in (torch.float32, torch.float64):
-                numbers = torch.full((_AT_ONCE,), 0.5, dtype=dtype, device="cpu")
+                numbers = torch.full((_VECTOR_LENGTH,), 0.5, dtype=dtype, device="cpu")
                 for name in _TRANSCENDENTAL:
                     getattr(torch, name)(*[numbers] * (2 if name == "pow" else 1))
                 functional.binary_cross_entropy_with_logits(numbers, numbers)
-                torch.randn(_AT_ONCE, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
+                torch.randn(_VECTOR_LENGTH, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
         _vector_library_started = True
 
 

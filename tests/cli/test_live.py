@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli.live import Replay, _add_rates, _Shown, replay
+from radarsdf.cli.live import Replay, _add_rates, _PeriodicView, replay
 from radarsdf.cli.results import Results
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
@@ -92,7 +92,7 @@ def test_rates_are_those_of_the_seconds(capsys):
 
 def test_the_page_shows_the_surface_from_time_to_time():
     page, done = Mock(), Replay(poses=[np.eye(4) + np.eye(4)[:, :1] * np.eye(4)[3]])
-    shown = _Shown(Mock(**{"mesh.return_value": "mesh"}), page)
+    shown = _PeriodicView(Mock(**{"mesh.return_value": "mesh"}), page)
     for due, times in ((True, 1), (False, 1), (True, 2)):
         shown._next_s = 0.0 if due else shown._next_s
         shown(done)

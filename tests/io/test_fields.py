@@ -99,7 +99,7 @@ def polar(text):
     names, *rows = [line.split() for line in text.splitlines()]
     columns = dict(zip(names, np.array(rows, np.float64).T, strict=True))
     notes = Notes()
-    return scan_of(Fields.of(names).judged(columns, notes), columns).points, notes.lines
+    return scan_of(Fields.of(names).with_unit(columns, notes), columns).points, notes.lines
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def polar(text):
 def test_units_in_names_become_metres_rad_and_metres_per_second(columns):
     rows = {name: np.full(2, value, np.float64) for name, value in columns.items()}
     notes = Notes()
-    scan = scan_of(Fields.of(list(rows)).judged(rows, notes), rows)
+    scan = scan_of(Fields.of(list(rows)).with_unit(rows, notes), rows)
     assert_allclose(scan.points, [[3, -4, 5]] * 2, rtol=1e-6)
     assert_allclose(scan.doppler_mps, [-10, -10], rtol=1e-6)
     assert (scan.intensities.tolist(), notes.lines) == ([7, 7], [])

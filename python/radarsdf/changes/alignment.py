@@ -26,18 +26,18 @@ from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 
 # Prior standard deviations of the offset between the frames of two maps: translation, m, and rotation vector, rad.
-_APART = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
+_PRIOR_SIGMAS = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
 _ITERATIONS = 15
-_MOST_POINTS = 10_000  # of the later surface
+_MAX_POINTS = 10_000  # of the later surface
 _PATCH_M = 4.0  # edge of a patch within which errors are correlated
-_BY_CHANCE = 1e-3  # significance level
+_SIGNIFICANCE = 1e-3  # significance level
 # Largest standard error of a determined axis, in leaf cells: fields reach two cells.
-_UNSURE_CELLS = 0.5
-_ALIKE_CELLS = 0.25  # surfaces within this distance coincide
+_MAX_SIGMA_CELLS = 0.5
+_COINCIDENT_CELLS = 0.25  # surfaces within this distance coincide
 _SEARCH_CELLS = 8.0  # edge of the cells of the coarse search, in leaf cells
-_SEARCHED = 500  # points of a search
-_TRIED, _FOLLOWED = 8192, 200  # poses of the coarse search, and the best of them, which are compared
-_ERRORS = 3.0  # poses within these standard errors agree about equally well
+_SAMPLES = 500  # points of a search
+_SEARCH_POSES, _BEST_POSES = 8192, 200  # poses of the coarse search, and the best of them, which are compared
+_TIE_SIGMAS = 3.0  # poses within these standard errors agree about equally well
 
 
 @dataclass(frozen=True)
@@ -68,23 +68,23 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
 
     def far(pose: Floats) -> Floats:
         """(N,) logarithms of the distances between the surfaces, about equal where the surfaces coincide."""
-        near_m, _, distance_m = before.nearest(_placed(surface.points, pose))
+        near_m, _, distance_m = before.nearest(_transformed(surface.points, pose))
         distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
-        found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
+        found: Floats = np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
         return found
 
-    found = _determined(before, surface, np.eye(4))
-    searched = _determined(before, surface, _searched(before, surface))
+    found = _constrained_pose(before, surface, np.eye(4))
+    searched = _constrained_pose(before, surface, _coarse_pose(before, surface))
     if Verdict.by_groups(far(found[0]) - far(searched[0]), surface.patches).improved:
         found = searched
     pose, covariance, undetermined = found
     offset = surface.offset(pose)
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
-    by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
+    by_chance = np.sqrt(chi2.isf(_SIGNIFICANCE, len(offset)))
     if sigmas <= by_chance or far(pose).mean() >= far(np.eye(4)).mean():
         words = "The frames were taken as they are: surfaces do not show an offset between them."
         return Alignment(covariance=covariance, centre=surface.centre, words=words)
-    moved_m = np.sqrt(((_placed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
+    moved_m = np.sqrt(((_transformed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
     words = (
         f"The later map was moved by {moved_m:.3f} m, {sigmas:.1f} standard errors; "
         f"surfaces do not determine {undetermined} of 6 axes, along which its pose was kept."
@@ -108,7 +108,7 @@ class _Surface:
         """Sample points on triangles: vertices lie on the lattice of cells, and would align with that of the other map."""
         rng = np.random.default_rng(0)
         _, areas = across_triangles(placed.vertices, placed.faces)
-        chosen = rng.choice(len(areas), min(len(areas), _MOST_POINTS), p=areas / areas.sum())
+        chosen = rng.choice(len(areas), min(len(areas), _MAX_POINTS), p=areas / areas.sum())
         corners, shares = placed.faces[chosen], rng.dirichlet(np.ones(3), len(chosen))
         points, normals = (
             np.einsum("nk,nki->ni", shares, values[corners]) for values in (placed.vertices, placed.normals)
@@ -132,28 +132,28 @@ class _Surface:
         return found
 
 
-def _searched(before: PlacedMap, surface: _Surface) -> Floats:
+def _coarse_pose(before: PlacedMap, surface: _Surface) -> Floats:
     """Search coarsely; of the poses that fit the earlier surface about equally well, return the one nearest to the identity."""
     planes = LocalPlanes(_SEARCH_CELLS * before.leaf_m)
     planes.add(np.ascontiguousarray(before.vertices - surface.centre))
-    points = np.ascontiguousarray((surface.points - surface.centre)[:: -(-len(surface.points) // _SEARCHED)])
+    points = np.ascontiguousarray((surface.points - surface.centre)[:: -(-len(surface.points) // _SAMPLES)])
     # A quasi-random sequence leaves smaller gaps than random numbers (Sobol 1967).
-    offsets = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(_TRIED) * _APART
-    poses = moved(np.tile(np.eye(4), (_TRIED, 1, 1)), offsets)
+    offsets = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(_SEARCH_POSES) * _PRIOR_SIGMAS
+    poses = moved(np.tile(np.eye(4), (_SEARCH_POSES, 1, 1)), offsets)
     width_m = 0.25 * _SEARCH_CELLS * before.leaf_m
     scores = planes.scores(points, poses, [width_m**2, *[(width_m / surface.radius_m) ** 2] * 2])
-    best = np.argsort(-scores.mean(axis=1))[:_FOLLOWED]
+    best = np.argsort(-scores.mean(axis=1))[:_BEST_POSES]
     losses = scores[best[0]] - scores[best]
-    alike = offsets[best[losses.mean(axis=1) <= _ERRORS * losses.std(axis=1) / np.sqrt(len(points))]]
-    return surface.pose(alike[((alike / _APART) ** 2).sum(axis=1).argmin()])
+    alike = offsets[best[losses.mean(axis=1) <= _TIE_SIGMAS * losses.std(axis=1) / np.sqrt(len(points))]]
+    return surface.pose(alike[((alike / _PRIOR_SIGMAS) ** 2).sum(axis=1).argmin()])
 
 
-def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, int]:
+def _constrained_pose(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, int]:
     """The pose that fits the surfaces, its covariance, and the number of undetermined axes, along which the pose is kept."""
-    pose, covariance = _settled(before, surface, start)
+    pose, covariance = _gauss_newton(before, surface, start)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
     variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
-    most = (_UNSURE_CELLS * before.leaf_m) ** 2
+    most = (_MAX_SIGMA_CELLS * before.leaf_m) ** 2
     unsure = axes[:, variances > most]
     offset = surface.offset(pose) * lever_m
     offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
@@ -162,15 +162,15 @@ def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Fl
     return surface.pose(offset / lever_m), covariance / np.outer(lever_m, lever_m), unsure.shape[1]
 
 
-def _settled(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats, Floats]:
+def _gauss_newton(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats, Floats]:
     """Fit the pose by Gauss-Newton, with its covariance. Weights are probabilities that points did not change."""
     # Errors of the normals of the two maps are independent, so products of normals from both show which axes the
     # surfaces determine (instrumental variables). Errors are correlated within a patch, so the scatter of its sums
     # is the covariance of the equations (Hansen 1982).
-    prior = np.diag(_APART**-2.0)
+    prior = np.diag(_PRIOR_SIGMAS**-2.0)
     covariance = np.linalg.inv(prior)
     for _ in range(_ITERATIONS):
-        there, own = _placed(surface.points, pose), turned(surface.normals, pose[:3, :3])
+        there, own = _transformed(surface.points, pose), turned(surface.normals, pose[:3, :3])
         offset = surface.offset(pose)
         near_m, rows, distance_m = before.nearest(there)
         normals = before.normals[rows]
@@ -200,7 +200,7 @@ def _settled(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats
     return pose, np.asarray(covariance, np.float64)
 
 
-def _placed(points: Floats, pose: Floats) -> Floats:
+def _transformed(points: Floats, pose: Floats) -> Floats:
     """Transform points (N, 3) by a pose (4, 4)."""
     return turned(points, pose[:3, :3]) + pose[:3, 3]
 

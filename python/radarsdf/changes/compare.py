@@ -103,7 +103,7 @@ def compare(
     corners = None if box is None else check_box(box)
     check_free_space(before, "before")
     if not isinstance(after, Map):
-        after = fit(after, poses, intensities, config=_quick(before.config), progress=progress)
+        after = fit(after, poses, intensities, config=_quick_config(before.config), progress=progress)
     elif poses is not None or intensities is not None:
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)
@@ -120,8 +120,8 @@ def compare(
     errors = Errors.of(sides)
     (absent, shifted), (absent_later, shifted_later) = map(errors.log_odds, sides)
     share = share_of_changes(np.concatenate([absent, absent_later]))
-    gone = _changed(sides[0], absent, shifted, share, GONE)
-    appeared = _changed(sides[1], absent_later, shifted_later, share, APPEARED)
+    gone = _classify(sides[0], absent, shifted, share, GONE)
+    appeared = _classify(sides[1], absent_later, shifted_later, share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
     report: dict[str, Any] = {
@@ -137,11 +137,11 @@ def compare(
             f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
         )
     if corners is not None:
-        gone, appeared = _inside(corners, gone), _inside(corners, appeared)
+        gone, appeared = _crop(corners, gone), _crop(corners, appeared)
     return Changes(gone, appeared, alignment.T_before_after, report | areas_of(gone, appeared))
 
 
-def _quick(config: FitConfig) -> FitConfig:
+def _quick_config(config: FitConfig) -> FitConfig:
     """Settings of a quick map of new scans."""
     names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
     same = {name: getattr(config.returns, name) for name in names}
@@ -162,7 +162,7 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
-def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
+def _classify(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
     """Assign kinds, probabilities and displacements by log odds (V,). `lost`: kind of surface missing from the other map."""
     own, other = side.own, side.other
     gone = own.confidence * posterior(absent, share)
@@ -197,7 +197,7 @@ def _reflectance_changed(
     )
 
 
-def _inside(box: Floats, surface: ChangedSurface) -> ChangedSurface:
+def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
     """Keep the triangles in a box (2, 3), world of the earlier map, m."""
     within = ((surface.vertices >= box[0]) & (surface.vertices <= box[1])).all(axis=1)
     used, faces = renumbered(len(within), surface.faces[within[surface.faces].all(axis=1)])

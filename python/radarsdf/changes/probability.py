@@ -35,13 +35,13 @@ _BLOCK_M = 32.0  # edge of blocks in which cells are looked up, to limit memory
 _BEHIND_CELLS = 1.5
 _CELLS_ALONG_RAY = 3.0  # mean number of the 27 cells near a place that one ray crosses
 _LEAST_SHARE, _MOST_SHARE = 1e-6, 0.5
-_ROUNDS, _SETTLED = 50, 1e-4  # iterations and tolerance of the share
+_MAX_ITERATIONS, _TOLERANCE = 50, 1e-4  # iterations and tolerance of the share
 # Returns of a scan in adjacent cells are correlated: this many count as one. Tuned on facade, hall and
 # forest of seed 31.
 _CELLS_PER_SCAN = 2.0
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-_MOST_DISTANCES = 5_000  # evenly spread, for both maps
+_MAX_DISTANCES = 5_000  # evenly spread, for both maps
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class Errors:
         known = np.concatenate(columns, axis=1)
         if known.size == 0:
             return cls(_FREEDOMS[-1], 1.0)
-        distance_m, sigma_m, reach_m = known[:, :: -(-known.shape[1] // _MOST_DISTANCES)]
+        distance_m, sigma_m, reach_m = known[:, :: -(-known.shape[1] // _MAX_DISTANCES)]
 
         def likelihood(errors: Errors) -> float:
             same, other = errors.log_density(distance_m, sigma_m), -np.log(2 * reach_m)
@@ -209,14 +209,14 @@ class Errors:
             found: Floats = np.log(inside / (reach_m - lower_m)) - same
             return found
 
-        absent = _passed(side.own, side.other)
+        absent = _free_space_odds(side.own, side.other)
         shifted = np.full(len(absent), -np.inf)
         shifted[observed] = elsewhere(-reach_m)
         absent[observed] += elsewhere(0.0)
         return absent, shifted
 
 
-def _passed(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
+def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
     """(N,) log likelihood ratio of the other map's rays: surface gone against unchanged.
 
     Of all scans whose rays reach a place, some have returns there, and others pass behind it. If nothing changed, the share
@@ -242,9 +242,9 @@ def share_of_changes(log_odds: Floats) -> float:
     share = 0.01
     if len(log_odds) == 0:
         return _LEAST_SHARE
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         before, share = share, float(np.clip(posterior(log_odds, share).mean(), _LEAST_SHARE, _MOST_SHARE))
-        if abs(share - before) < _SETTLED * share:
+        if abs(share - before) < _TOLERANCE * share:
             break
     return share
 

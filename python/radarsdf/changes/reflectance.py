@@ -14,8 +14,8 @@ from radarsdf.changes.probability import Floats, PlacedMap, odds_of_differences,
 from radarsdf.products import turned
 from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
-_OTHER_UNITS = 1.7  # ratio of spreads that shows different units: half decibels and decibels differ by 2
-_FEWEST_VIEWS = 100  # needed to determine the units
+_UNITS_RATIO = 1.7  # ratio of spreads that shows different units: half decibels and decibels differ by 2
+_MIN_VIEWS = 100  # needed to determine the units
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Differences:
         if first.size == 0:
             return "Reflectance was not compared: the maps share no view."
         spreads = [np.subtract(*np.percentile(day[2] / day[0], [95, 5])) for day in (first, second)]
-        if first.shape[1] > _FEWEST_VIEWS and max(spreads) > _OTHER_UNITS * min(spreads):
+        if first.shape[1] > _MIN_VIEWS and max(spreads) > _UNITS_RATIO * min(spreads):
             return "Reflectance was not compared: spreads of intensities from equal views imply other units."
         values = second[1] / second[0] - first[1] / first[0]
         offset = float(np.median(values))

@@ -107,7 +107,7 @@ def live(given: Namespace, results: Results) -> None:
         if given.view:
             page = stack.enter_context(GrowingView(host=given.host, port=given.port))
             results.add(f"the map grows on {url_of(page.host, page.port)}; Ctrl-C ends it")
-            shown = _Shown(growing, page)
+            shown = _PeriodicView(growing, page)
         done = replay(growing, scans, with_poses=not unposed, rate=given.rate, on_scan=shown)
         _add_rates(results, done, len(scans))
         if out is not None:
@@ -124,7 +124,7 @@ def live(given: Namespace, results: Results) -> None:
             until_stopped(page)
 
 
-class _Shown:
+class _PeriodicView:
     """Callback after each scan that updates the page periodically, in its own thread."""
 
     def __init__(self, live_map: LiveMap, page: GrowingView) -> None:

@@ -38,11 +38,11 @@ from radarsdf.io.recordings import FindPoses, Request
 from radarsdf.scans import Notes
 
 # Names of topics with desired or assumed poses, not measured ones.
-_WANTED_POSE = re.compile(
+_DESIRED_POSE = re.compile(
     r"goal|set_?point|way_?point|initial_?pose|desired|(^|[/_.-])(plans?|planned|planner|target|cmd)(?![a-z])",
     re.IGNORECASE,
 )
-_SAME = 1e-9  # largest change of a constant transform that is published repeatedly
+_CONSTANT = 1e-9  # largest change of a constant transform that is published repeatedly
 
 FloatArray = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class Track:
     @cached_property
     def constant(self) -> bool:
         """Whether all poses are the same."""
-        return self.static or bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _SAME).all())
+        return self.static or bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
 
     @cached_property
     def matrix(self) -> FloatArray:
@@ -171,13 +171,13 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     listed = ", ".join(sorted(fitting | transforms)) or "none"
     known = wanted is None or wants_tf or wanted in fitting
     check(known, f"{paths[0]} has no poses in {wanted}: topics with poses are {listed}")
-    names = {n for n in fitting if not _WANTED_POSE.search(n)} if wanted is None else fitting & {wanted}
+    names = {n for n in fitting if not _DESIRED_POSE.search(n)} if wanted is None else fitting & {wanted}
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
     name = wanted if wanted is not None else _choose(tracks, tree, sensor, preferred)
     if wants_tf or name is None:
         try:
-            find = _of_tree(tree, sensor, request)
+            find = _tree_poses(tree, sensor, request)
         except ValueError:
             if wants_tf or not tracks:
                 raise
@@ -255,7 +255,7 @@ def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes)
     return base
 
 
-def _of_tree(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
+def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about = request.notes.about
     moving = {frame for frame, track in tree.tracks.items() if not track.constant}

@@ -72,13 +72,13 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
-        find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
+        find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     recorded = by_recording[scan_topics[0].name]
     imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
 
-def _given(
+def _user_poses(
     poses: Poses,
     paths: list[Path],
     topics: list[Topic],

@@ -33,9 +33,9 @@ _LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # layers of a chunk by point 
 _VARIABLE = 2**32 - 1  # marks chunks of varying size, in place of the number of points per chunk
 _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a PCD header has eleven lines
 _PLY_HEADER_BYTES = 1 << 16
-_KITTI_WIDTH, _JUDGED_FILES = 4, 20  # columns, and number of .bin files that are inspected
-_MAX_POSITION_M, _FEW = 1e7, 0.02  # limit of coordinates, and share of numbers that may be damaged
-_LESS, _ENOUGH_ROWS = 0.8, 30  # another width must leave less than this share of the variance within columns
+_KITTI_WIDTH, _INSPECTED_FILES = 4, 20  # columns, and number of .bin files that are inspected
+_MAX_POSITION_M, _DAMAGED = 1e7, 0.02  # limit of coordinates, and share of numbers that may be damaged
+_VARIANCE_RATIO, _MIN_ROWS = 0.8, 30  # limit of the variance left by another width
 
 GivenColumns: TypeAlias = int | Sequence[str] | None
 
@@ -84,7 +84,7 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     file = path_of(path, "path")
     columns = read_columns(file)
     with reading(path, "a file of points"):
-        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler"))).judged(columns, Notes())
+        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler"))).with_unit(columns, Notes())
         points = fields.scan(columns, np.eye(4), None, Notes()).points.astype(np.float64)
         check(len(points), "it holds no points")
     if file.suffix.lower() == ".pcd":
@@ -108,21 +108,21 @@ def _bin(path: Path, columns: GivenColumns) -> Columns:
 
 def check_kitti(paths: Sequence[Path]) -> None:
     """Raise a ValueError if ``.bin`` files of a recording do not look like points of four float32."""
-    paths = [path for path in paths if path.stat().st_size][:_JUDGED_FILES]
+    paths = [path for path in paths if path.stat().st_size][:_INSPECTED_FILES]
     fitting = [path for path in paths if path.stat().st_size % (4 * _KITTI_WIDTH) == 0]
     remedy = "give columns (--columns), how many float32 a point has, or their names"
     check(2 * len(fitting) >= len(paths), f"most .bin files are no points of four float32 each: {remedy}")
     numbers = np.concatenate([np.zeros(0, "<f4"), *(np.fromfile(path, "<f4") for path in fitting)])
     positions = numbers.reshape(-1, _KITTI_WIDTH)[:, :3]
     far = np.abs(positions[np.isfinite(positions)]) > _MAX_POSITION_M
-    check(far.sum() <= _FEW * far.size, f"float32 numbers in the .bin files are no positions in m: {remedy}")
+    check(far.sum() <= _DAMAGED * far.size, f"the .bin files hold numbers that are no positions in m: {remedy}")
     # Numbers within a column are similar. Logarithms keep a single column from dominating the variance.
     numbers = np.nan_to_num(np.sign(numbers) * np.log1p(np.abs(numbers)))
     within = _variance(numbers, _KITTI_WIDTH)
     for width in range(3, min(21, len(numbers) // 2 + 1)):
-        other, few = _variance(numbers, width), len(numbers) < _ENOUGH_ROWS * width
+        other, few = _variance(numbers, width), len(numbers) < _MIN_ROWS * width
         check(
-            other >= _LESS * within or (few and other),
+            other >= _VARIANCE_RATIO * within or (few and other),
             f"the numbers of the .bin files look like {width} columns, not four: {remedy}",
         )
 

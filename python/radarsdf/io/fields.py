@@ -71,7 +71,7 @@ class Fields:
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
         # AzimuthAngle, azimuth_angle and Azimuth Angle are the same name.
-        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
+        squeezed = {_squeeze(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
         for role, aliases in _ALIASES.items():
             name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
@@ -96,7 +96,7 @@ class Fields:
         """Whether positions are given by range and angles."""
         return not set(_XYZ) <= set(self.names)
 
-    def judged(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
+    def with_unit(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
         """Return these fields with the unit of their angles, from their names or else from the values in a cloud."""
         names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
         if all(plain_name(name)[1] for name in names):
@@ -160,7 +160,7 @@ class Fields:
         if not set(SIGMA) <= set(self.names):
             return None
         sigma = np.stack([self._values(columns, role) for role in SIGMA], axis=1).astype(np.float32)
-        if _squeezed(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
+        if _squeeze(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
             sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
         return sigma
 
@@ -170,5 +170,5 @@ def plain_name(name: str) -> tuple[str, str]:
     return without_unit(name.lower().removeprefix("scalar_"))
 
 
-def _squeezed(name: str) -> str:
+def _squeeze(name: str) -> str:
     return re.sub(r"[\W_]+", "", name.lower())

@@ -27,10 +27,10 @@ MAX_GAP_S = 0.5  # longest gap to interpolate across, by default
 # Files of poses that are looked for next to scans.
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
 POSE_SUFFIXES = (".tum", ".kitti", ".npy")  # formats of write_poses
-FIND_POSES = "radarsdf poses estimates them from the radar alone"  # last part of messages on scans without poses
+FIND_POSES = "radarsdf poses estimates them from the radar alone"  # ends messages on scans without poses
 
 _MAX_NORM_ERROR = 1e-2  # tolerance for unit quaternions: three digits suffice, other columns are refused
-_ROUNDED_S = 1e-3
+_ROUNDING_S = 1e-3
 
 _POSITION = "(?:t|p|pos|position|trans|translation|loc|location|pose)"
 _QUATERNION = "(?:q|quat|quaternion|orientation|rot|rotation)"
@@ -80,7 +80,7 @@ class Trajectory:
         first_s, last_s = self.times_s[after - 1 : after + 1]
         if not first_s <= time_s <= last_s or last_s - first_s > max_gap_s:
             nearest_s = min(first_s, last_s, key=lambda known_s: abs(known_s - time_s))
-            if not abs(time_s - nearest_s) <= _ROUNDED_S:
+            if not abs(time_s - nearest_s) <= _ROUNDING_S:
                 return None
             time_s = nearest_s
         pose: NDArray[np.float64] = self.poses(np.array([time_s]))[0]
@@ -199,7 +199,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
         columns = _pose_columns(names, values)
         if columns:
-            return _of_columns(columns, path, notes)
+            return _from_columns(columns, path, notes)
     if width == 12:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
@@ -237,7 +237,7 @@ def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
     return found if set(_TUM[1:]) <= set(found) else {}
 
 
-def _of_columns(columns: Columns, path: Path, notes: Notes) -> Poses:
+def _from_columns(columns: Columns, path: Path, notes: Notes) -> Poses:
     """Build poses from named columns: by time if there is one, else in their order."""
     poses = np.column_stack([columns[role] for role in _TUM[1:]])
     if "time" not in columns:

@@ -145,7 +145,7 @@ def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields]
     """Roles of the columns: those of an earlier scan of the topic with the same columns, or by name."""
     layout, notes = (topic, *columns), request.notes
     if layout not in layouts:
-        fields = Fields.of(list(columns), request.fields).judged(columns, notes)
+        fields = Fields.of(list(columns), request.fields).with_unit(columns, notes)
         if not request.fields and topic not in {known for known, *_ in layouts}:
             fields.note_use(columns, notes)
         layouts[layout] = fields

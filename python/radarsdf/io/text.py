@@ -30,7 +30,7 @@ _UNIT = re.compile(
 )
 _SINCE_1970 = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
 _LIMITS = (1e11, 1e14, 1e17)  # bounds of absolute times since 1970 in one of these units and the next
-_BEYOND = 1.05  # tolerance for angles that exceed a limit by rounding
+_SLACK = 1.05  # tolerance for angles that exceed a limit by rounding
 
 
 class Table(NamedTuple):
@@ -53,7 +53,7 @@ def read_table(path: Path) -> Table:
     for line in read_text(path).splitlines():
         bare = _COMMENT.sub("", line).strip()
         if not rows and line.strip():
-            words = _words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
+            words = _split_words((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
             if not bare or not any(map(_is_number, words)):
                 heads.append(words)
                 continue
@@ -107,7 +107,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _words_of(line: str) -> list[str]:
+def _split_words(line: str) -> list[str]:
     """Split a line at commas, semicolons, tabs or else white space."""
     separator = next((sign for sign in (";", ",", "\t") if sign in line), None)
     if separator == ";":
@@ -148,4 +148,4 @@ def are_degrees(azimuth: NDArray[Any], elevation: NDArray[Any]) -> bool:
     azimuth, elevation = azimuth[finite], elevation[finite]
     largest, highest = (np.quantile(np.abs(angles), 0.99) / np.pi for angles in (azimuth, elevation))
     # Azimuths in rad are from -pi to pi, or from 0 to 2 pi.
-    return bool(highest > _BEYOND / 2 or largest > (_BEYOND if azimuth.min() < 0 else 2 * _BEYOND))
+    return bool(highest > _SLACK / 2 or largest > (_SLACK if azimuth.min() < 0 else 2 * _SLACK))

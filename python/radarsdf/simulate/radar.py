@@ -264,7 +264,7 @@ class RadarSensor:
         points = rays.origin + range_m[:, None] * rays.directions[beam]
         cells = np.floor(points[passing:] / _PHANTOM_CELL_M)
         key = int(generator(seed, _PLACES).integers(2**63))
-        is_place, *offsets = (_hashed(cells.astype(np.int64), key + k) for k in range(4))
+        is_place, *offsets = (_hash(cells.astype(np.int64), key + k) for k in range(4))
         places = _PHANTOM_CELL_M * (cells + np.stack(offsets, axis=1))
         phantoms = np.concatenate([points[:passing], places[is_place < _PHANTOM_SHARE]])
         x, y, z = ((phantoms - rays.origin) @ R).T
@@ -301,7 +301,7 @@ def unit_vectors(angles: FloatArray) -> FloatArray:
     return np.stack([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
-def _hashed(cells: NDArray[np.int64], key: int) -> FloatArray:
+def _hash(cells: NDArray[np.int64], key: int) -> FloatArray:
     """Hash rows (N, 3) of integers to numbers in [0, 1), reproducible by key."""
     mixed = np.full(len(cells), key, dtype=np.uint64)
     for column in (*cells.astype(np.uint64).T, np.uint64(0)):

@@ -236,10 +236,10 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.45, materials.GRASS)
     sway, phase = rng.uniform(1.0, 3.5), rng.uniform(0, 2 * np.pi)
-    path = _winding(60.0, sway, 70, phase)
+    path = _lane(60.0, sway, 70, phase)
     site = Site(rng, terrain, taken=[(x, y, 2.2) for x, y in path(np.linspace(-0.1, 1.5, 200))])
     site.fill(_LANE, lambda near, far: site.beside(path, rng.uniform(0.1, 1.45), near, far))
-    return _driven(site, path, (frames, 120), HUGIN_A3, "hugin", seed, height_m=1.5)
+    return _drive(site, path, (frames, 120), HUGIN_A3, "hugin", seed, height_m=1.5)
 
 
 def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -279,7 +279,7 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
     for angle in np.arange(0, 2 * np.pi, 2 * np.pi / rng.integers(14, 22)):
         corner = np.clip(1.45 * np.array([np.cos(angle), np.sin(angle)]), -1, 1)
         site.pole(corner * np.array([length, width]), 0.0)
-    return _driven(site, path, (frames, 120), OCULII_EAGLE, "oculii", seed, height_m=1.1)
+    return _drive(site, path, (frames, 120), OCULII_EAGLE, "oculii", seed, height_m=1.1)
 
 
 def wall(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -319,7 +319,7 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
         xy: FloatArray = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return xy
 
-    return _driven(site, path, (frames, 90), HUGIN_A4, "wall", seed, height_m=1.2, look_at=mounted[:2])
+    return _drive(site, path, (frames, 90), HUGIN_A4, "wall", seed, height_m=1.2, look_at=mounted[:2])
 
 
 def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -343,14 +343,14 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, rng.uniform(0.05, 0.3), materials.GRASS)
     length = 4.0 * rng.uniform(5, 10)
-    path = _winding(length, rng.uniform(1.0, 5.0), rng.uniform(80, 140), rng.uniform(0, 2 * np.pi))
+    path = _lane(length, rng.uniform(1.0, 5.0), rng.uniform(80, 140), rng.uniform(0, 2 * np.pi))
     first, last = -10.0, length + 100.0
     site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in path(np.arange(first, last, 2.0) / length)])
     site.fill(_STREET, lambda near, far: site.beside(path, rng.uniform(first, last) / length, near, far))
-    return _driven(site, path, (frames, 20), ASTYX_HIRES, "astyx", seed, height_m=1.25)
+    return _drive(site, path, (frames, 20), ASTYX_HIRES, "astyx", seed, height_m=1.25)
 
 
-def _winding(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
+def _lane(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
     """A lane along x that meanders as a sine."""
 
     def path(u: FloatArray) -> FloatArray:
@@ -360,7 +360,7 @@ def _winding(length_m: float, sway_m: float, wave_m: float, phase: float) -> Pat
     return path
 
 
-def _driven(
+def _drive(
     site: Site,
     path: Path,
     frames: tuple[int | None, int],

@@ -80,11 +80,11 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     }
     for name, (label, values) in of_vertices.items():
         scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
-        found[name] = Quantity(label, _looked_up(values), scale)
+        found[name] = Quantity(label, _lookup(values), scale)
     return found
 
 
-def _looked_up(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
+def _lookup(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
     return lambda rows, _: values[rows]
 
 
