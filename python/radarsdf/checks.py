@@ -113,7 +113,7 @@ def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.
     T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
     shape = T_world_sensor.shape
     count = (shape or (0,))[0] if num_scans is None else num_scans
-    wanted = f"({count}, 4, 4), one T_world_sensor a scan"
+    wanted = f"({count}, 4, 4), one T_world_sensor per scan"
     check(shape == (count, 4, 4), f"poses must have shape {wanted}, not {shape}")
     return T_world_sensor
 
@@ -178,7 +178,7 @@ def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
     """Return `values` if they are iterable, else raise a TypeError."""
     one_by_one = hasattr(values, "__iter__") or hasattr(values, "__getitem__")
     if not one_by_one or getattr(values, "ndim", 1) == 0:
-        raise _wrong_type(name, "a list of arrays, one a scan", values)
+        raise _wrong_type(name, "a list of arrays, one per scan", values)
     return values  # type: ignore[no-any-return]
 
 

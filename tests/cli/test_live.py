@@ -84,7 +84,7 @@ def test_rates_are_those_of_the_seconds(capsys):
     _add_rates(Results(), Replay([0, 1, 2, 4], [], [0.01, 0.02, 0.03, 0.06], [3], []), 5)
     assert capsys.readouterr().out.splitlines() == [
         "4 of 5 scans in the map, 1 dropped, 0 lost",
-        "a scan took 25.0 ms (median), 59.1 ms (99 of 100), 60.0 ms (worst): 33 scans a second",
+        "a scan took 25.0 ms (median), 59.1 ms (99th percentile), 60.0 ms (worst): 33 scans per second",
     ]
     with pytest.raises(ValueError, match="no scan was integrated"):
         _add_rates(Results(), Replay(), 5)

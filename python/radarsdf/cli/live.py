@@ -106,7 +106,7 @@ def live(given: Namespace, results: Results) -> None:
         shown = None
         if given.view:
             page = stack.enter_context(GrowingView(host=given.host, port=given.port))
-            results.add(f"the map grows on {url_of(page.host, page.port)}; Ctrl-C ends it")
+            results.add(f"live map on {url_of(page.host, page.port)}; Ctrl-C ends it")
             shown = _PeriodicView(growing, page)
         done = replay(growing, scans, with_poses=not unposed, rate=given.rate, on_scan=shown)
         _add_rates(results, done, len(scans))
@@ -154,8 +154,8 @@ def _add_rates(results: Results, done: Replay, scans: int) -> None:
     hertz = in_map / max(sum(done.seconds), 1e-9)
     p50, p99, worst = np.percentile(done.seconds, [50, 99, 100])
     results.add(
-        f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99 of 100), {1e3 * worst:.1f} ms (worst): "
-        f"{hertz:.0f} scans a second",
+        f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99th percentile), {1e3 * worst:.1f} ms (worst): "
+        f"{hertz:.0f} scans per second",
         p50_s=p50,
         p99_s=p99,
         worst_s=worst,

@@ -65,7 +65,7 @@ def compare(given: Namespace, results: Results) -> None:
     if given.view:
         results.end()
         with ChangesView(changes, regions, edge_m, host=given.host, port=given.port) as page:
-            print(f"what changed is on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
+            print(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
             until_stopped(page)
 
 

@@ -126,7 +126,7 @@ def _point_cloud2(message: Any) -> Columns:
     columns: Columns = {}
     for field in message.fields:
         kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")
-        check(field.offset + int(kind[1:]) <= step, f"its field {field.name} is beyond its points")
+        check(field.offset + int(kind[1:]) <= step, f"its field {field.name} exceeds the size of a point")
         if field.count > 1 or not field.name or field.name in columns:  # some drivers write 0 for 1
             continue
         dtype = np.dtype((">" if message.is_bigendian else "<") + kind)

@@ -190,12 +190,12 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
             (name,) = tracks
         else:
             for other in sorted(fitting):
-                notes.add(f"poses of {other} are passed over; pose_topic chooses them")
+                notes.add(f"poses of {other} are ignored; pose_topic selects them")
             return find
     check(name in tracks, f"{paths[0]}: {name} holds no poses")
     trajectory = tracks[name].trajectory(name, request)
     for other in sorted(fitting - {name}):
-        notes.add(f"poses of {other} are passed over; pose_topic chooses them")
+        notes.add(f"poses of {other} are ignored; pose_topic selects them")
     notes.add(f"poses: {len(trajectory.times_s)} of {name}")
     base = sensor if request.extrinsic is not None else _base(tracks[name].child, name, tree, sensor, notes)
     return tree.attach(trajectory, base, request)

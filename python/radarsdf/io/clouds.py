@@ -102,7 +102,7 @@ def _bin(path: Path, columns: GivenColumns) -> Columns:
     width = columns if isinstance(columns, int) else len(columns or range(_KITTI_WIDTH))
     numbers = np.fromfile(path, "<f4")
     whole = path.stat().st_size % (4 * width) == 0
-    check(whole, f"its size is no whole number of points of {width} float32 each: give columns (--columns)")
+    check(whole, f"its size is not a multiple of {width} float32 per point: give columns (--columns)")
     return dict(zip(names_of(width, columns), numbers.reshape(-1, width).T, strict=True))
 
 
@@ -111,11 +111,11 @@ def check_kitti(paths: Sequence[Path]) -> None:
     paths = [path for path in paths if path.stat().st_size][:_INSPECTED_FILES]
     fitting = [path for path in paths if path.stat().st_size % (4 * _KITTI_WIDTH) == 0]
     remedy = "give columns (--columns), how many float32 a point has, or their names"
-    check(2 * len(fitting) >= len(paths), f"most .bin files are no points of four float32 each: {remedy}")
+    check(2 * len(fitting) >= len(paths), f"most .bin files are not points of four float32 each: {remedy}")
     numbers = np.concatenate([np.zeros(0, "<f4"), *(np.fromfile(path, "<f4") for path in fitting)])
     positions = numbers.reshape(-1, _KITTI_WIDTH)[:, :3]
     far = np.abs(positions[np.isfinite(positions)]) > _MAX_POSITION_M
-    check(far.sum() <= _DAMAGED * far.size, f"the .bin files hold numbers that are no positions in m: {remedy}")
+    check(far.sum() <= _DAMAGED * far.size, f"numbers in the .bin files are not positions in m: {remedy}")
     # Numbers within a column are similar. Logarithms keep a single column from dominating the variance.
     numbers = np.nan_to_num(np.sign(numbers) * np.log1p(np.abs(numbers)))
     within = _variance(numbers, _KITTI_WIDTH)
@@ -136,7 +136,7 @@ def _npy(path: Path, columns: GivenColumns) -> Columns:
     if array.dtype.names is not None and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names}
     rows = array.ndim == 2 and array.dtype.kind in "iuf"
-    check(rows, f"it holds an array {array.shape} of {array.dtype}, not one row of numbers a point")
+    check(rows, f"it holds an array {array.shape} of {array.dtype}, not one row of numbers per point")
     return dict(zip(names_of(array.shape[1], columns), np.array(array).T, strict=True))
 
 
@@ -241,7 +241,7 @@ def _ply(path: Path, _: GivenColumns) -> Columns:
     names = data.keys() if isinstance(data, dict) else data.dtype.names
     columns = {str(name): np.asarray(data[name]).reshape(-1) for name in names}
     whole = all(len(column) == vertex["length"] for column in columns.values())
-    check(whole, f"its header says {vertex['length']} points, which it does not hold")
+    check(whole, f"its header claims {vertex['length']} points, but it holds fewer")
     return columns
 
 
@@ -253,13 +253,13 @@ def _las(path: Path, _: GivenColumns) -> Columns:
         raw.seek(_VLRS_AT)
         records = int.from_bytes(raw.read(4), "little")
     # laspy would loop up to four billion times.
-    check(records * _VLR_BYTES <= size, f"its header says {records} records, for which the file is too small")
+    check(records * _VLR_BYTES <= size, f"its header claims {records} records, for which the file is too small")
     # Of laspy's two LAZ readers, the parallel one allocates by sizes that cannot be checked beforehand.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
         header = file.header
         largest = size * (_MAX_COMPRESSION if header.are_points_compressed else 1)
         fits = header.point_count * header.point_format.size <= largest
-        check(fits, f"its header says {header.point_count} points, for which the file is too small")
+        check(fits, f"its header claims {header.point_count} points, for which the file is too small")
         if header.are_points_compressed:
             check(_has_chunks(path, header), "its chunks of points are damaged, or it is too small for them")
         cloud = file.read_points(header.point_count)

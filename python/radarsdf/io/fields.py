@@ -105,7 +105,7 @@ class Fields:
         in_degrees = are_degrees(azimuth, elevation)
         unit = "degrees" if in_degrees else "rad"
         notes.add(
-            f"{' and '.join(names)} are taken as {unit} by their numbers: azimuth_deg or azimuth_rad would decide"
+            f"{' and '.join(names)} are taken as {unit} by their values: azimuth_deg or azimuth_rad would be explicit"
         )
         return replace(self, in_degrees=in_degrees)
 
@@ -113,11 +113,11 @@ class Fields:
         """Note intensities in linear units, and unused fields."""
         if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
             notes.add(
-                f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
+                f"{self.names['intensity']} is used as intensity unchanged: in dB, 10 log10, it gives a better map"
             )
         if unused := [name for name in names if name and name not in self.names.values()]:
             listed = ", ".join(unused)
-            notes.add(f"fields that are not used: {listed}; fields={{role: name}} or --field chooses others")
+            notes.add(f"unused fields: {listed}; fields={{role: name}} or --field selects others")
 
     def scan(
         self,

@@ -151,7 +151,7 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    what = "are left out, not finite, not unit quaternions or of a repeated time"
+    what = "are left out: not finite, no unit quaternion, or a repeated time"
     left_out = (
         ""
         if kept.all()
@@ -289,7 +289,7 @@ def read_calibration(path: Path) -> NDArray[np.float64] | None:
 def check_pose_suffix(path: str | PathLike[str]) -> None:
     """Raise a ValueError for a suffix that :func:`write_poses` does not support."""
     known = path_of(path, "path").suffix.lower() in POSE_SUFFIXES
-    check(known, f"{path} is no file of poses that can be written: those end in {', '.join(POSE_SUFFIXES)}")
+    check(known, f"{path} is not a supported file of poses: those end in {', '.join(POSE_SUFFIXES)}")
 
 
 def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
@@ -340,7 +340,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike 
     else:
         times_s = real_array(times_s, "times_s")
         fits = times_s.shape == (len(matrices),) and np.isfinite(times_s).all()
-        check(fits, f"times_s must be {len(matrices)} finite numbers, one a pose, not {times_s.shape}")
+        check(fits, f"times_s must be {len(matrices)} finite numbers, one per pose, not {times_s.shape}")
         quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
         np.savetxt(text, np.column_stack([times_s, matrices[:, :3, 3], quaternions]), "%.9f")
     write_whole(path, text.getvalue())

@@ -166,7 +166,7 @@ def scan_poses(
         check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
     elif times_s is None:
         if not isinstance(poses, Trajectory) or len(poses.times_s) != count:
-            msg = f"{about}: the {count} scans have no time stamps, and the poses ({poses.span()}) are not as many"
+            msg = f"{about}: the {count} scans have no time stamps, and the number of poses ({poses.span()}) differs"
             raise ValueError(msg)
         request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()

@@ -80,7 +80,7 @@ def _values(rows: list[str]) -> NDArray[np.float64]:
     of_words = ~known.any(axis=0)  # a column of labels is no damage
     damaged = ~known[:, ~of_words].all(axis=1)
     most = of_words.all() or 2 * damaged.sum() > len(words)
-    check(not most, f"a line is no row of {width} numbers: {rows[int(np.argmax(damaged))]!r:.50}")
+    check(not most, f"a line is not a row of {width} numbers: {rows[int(np.argmax(damaged))]!r:.50}")
     return table
 
 

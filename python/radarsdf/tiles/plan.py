@@ -201,7 +201,7 @@ class Plan:
         """Load the plan of a folder. Raises a ValueError if it is missing, damaged, or of another version."""
         path = folder / PLAN
         if folder.is_dir() and not path.exists():
-            msg = f"{folder} is no map: a folder that radarsdf tiles wrote has a {PLAN}"
+            msg = f"{folder} is not a map: folders written by radarsdf tiles have a {PLAN}"
             raise ValueError(msg)
         check_regular_file(path)
         try:
