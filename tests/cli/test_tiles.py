@@ -102,7 +102,7 @@ def test_folders_and_words_that_are_wrong(city, tmp_path, capsys):
         folder.mkdir()
     shutil.copy(city / "plan.json", planned)
     for words, named in (
-        (["info", nothing], f"{nothing} is no map"),
+        (["info", nothing], f"{nothing} is not a map"),
         (["mesh", planned, "-o", ply], "radarsdf tiles fit"),
         (["mesh", city, "-o", ply, "--voxel", 0.15], "0.1 or 0.2"),
         (["tiles", "status", tmp_path / "nowhere"], "nowhere"),

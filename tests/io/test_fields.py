@@ -123,19 +123,19 @@ LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("range azimuth elevation\n10 45 0", "degrees by their numbers"),
-        ("r az el\n10 45 0", "degrees by their numbers"),
+        ("range azimuth elevation\n10 45 0", "degrees by their values"),
+        ("r az el\n10 45 0", "degrees by their values"),
         ("r_m az_deg el_deg\n10 45 0", None),
-        ("range(mm) azimuth[deg] elevation\n10000 45 0", "degrees by their numbers"),
+        ("range(mm) azimuth[deg] elevation\n10000 45 0", "degrees by their values"),
         ("range azimuth_rad elevation_rad\n10 0.78539816339745 0", None),
-        ("range azimuth elevation\n10 0.78539816339745 0", "rad by their numbers"),
+        ("range azimuth elevation\n10 0.78539816339745 0", "rad by their values"),
         (
             "scalar_Range scalar_Azimuth_Angle scalar_Elevation_Angle\n10 0.78539816339745 0",
-            "rad by their numbers",
+            "rad by their values",
         ),
         (
             "range azimuth elevation\n10 0.78539816339745 0\n1 6.2 0.1",
-            "rad by their numbers",
+            "rad by their values",
         ),  # from 0 to a turn
     ],
 )

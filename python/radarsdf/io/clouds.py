@@ -253,13 +253,13 @@ def _las(path: Path, _: GivenColumns) -> Columns:
         raw.seek(_VLRS_AT)
         records = int.from_bytes(raw.read(4), "little")
     # laspy would loop up to four billion times.
-    check(records * _VLR_BYTES <= size, f"its header claims {records} records, for which the file is too small")
+    check(records * _VLR_BYTES <= size, f"its header claims {records} records: the file is too small")
     # Of laspy's two LAZ readers, the parallel one allocates by sizes that cannot be checked beforehand.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
         header = file.header
         largest = size * (_MAX_COMPRESSION if header.are_points_compressed else 1)
         fits = header.point_count * header.point_format.size <= largest
-        check(fits, f"its header claims {header.point_count} points, for which the file is too small")
+        check(fits, f"its header claims {header.point_count} points: the file is too small")
         if header.are_points_compressed:
             check(_has_chunks(path, header), "its chunks of points are damaged, or it is too small for them")
         cloud = file.read_points(header.point_count)
