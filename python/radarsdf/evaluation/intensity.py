@@ -117,8 +117,8 @@ class KNNIntensity:
         Position of the sensor for each return, world frame, m.
     intensities : (N,) array_like
         Sensor units.
-    Sizes of the two selections, 1 ≤ k ≤ candidates, capped at the number of returns.
-        Sizes of the two selections, 1 ≤ k ≤ candidates; at most the number of returns is taken.
+    candidates, k : int
+        Sizes of the two selections, 1 ≤ k ≤ candidates, capped at the number of returns.
 
     Raises
     ------

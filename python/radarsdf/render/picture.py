@@ -45,8 +45,8 @@ def render(
         Vertex colours. Alpha is ignored. None: light grey.
     width, height : int
         Size of the picture in pixels.
-    Position of the viewer, world frame, m. The view is centred on the mesh and zoomed to fill the picture. None:
-        obliquely from above one of its longer sides. Triangles that reach behind the viewer are not drawn.
+    viewpoint : (3,) array_like, optional
+        Position of the viewer, world frame, m. The view is centred on the mesh and zoomed to fill the picture. None:
         obliquely from above one of its longer sides. Triangles that reach behind the viewer are not drawn.
 
     Returns

@@ -225,7 +225,7 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     ----------
     seed : int
         Seed of layout, path and noise.
-    Number of scans, always along the whole path. Default: 120, with 170,000 to 220,000 returns.
+    frames : int, optional
         Number of scans, always along the whole path. Default: 120, with 170,000 to 220,000 returns.
 
     Returns
