@@ -16,9 +16,9 @@ from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.report.page import css_color
 from radarsdf.report.subject import Subject
-from radarsdf.view.framing import Look, look_at_all
+from radarsdf.view.framing import CameraPose, framing_pose
 from radarsdf.view.glb import glb
-from radarsdf.view.serving import begin_at, free_port, start_server, stop_server
+from radarsdf.view.serving import free_port, set_initial_camera, start_server, stop_server
 
 _Floats = NDArray[np.float64]
 _Colors = NDArray[np.uint8]
@@ -101,7 +101,7 @@ def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Flo
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
     to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
-    look: Look = look_at_all(everything, to_eye, _SCENE_ASPECT)
+    pose: CameraPose = framing_pose(everything, to_eye, _SCENE_ASPECT)
     host = "127.0.0.1"
     server: Any = start_server(host, free_port(host, 0))
     try:
@@ -112,11 +112,11 @@ def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Flo
                 "/sensor",
                 sensors.astype(np.float32),
                 _SENSOR_COLOR,
-                point_size=0.008 * float(np.linalg.norm(look.position - look.look_at)),
+                point_size=0.008 * float(np.linalg.norm(pose.position - pose.look_at)),
                 point_shape="circle",
                 precision="float32",
             )
-        begin_at(server, look)
+        set_initial_camera(server, pose)
         document: str = server.get_scene_serializer().as_html()
     finally:
         stop_server(server)

@@ -18,14 +18,14 @@ _MARGIN = 1.08
 _Floats = NDArray[np.float64]
 
 
-class Look(NamedTuple):
+class CameraPose(NamedTuple):
     """A camera pose."""
 
     position: _Floats  # (3,) m
     look_at: _Floats  # (3,) m, centre of the orbit of the user's rotations
 
 
-def look_at_all(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT) -> Look:
+def framing_pose(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT) -> CameraPose:
     """Nearest camera, with z up, that sees all points (N, 3), m, in the direction `to_eye` (3,), which must not be vertical."""
     back = to_eye / np.linalg.norm(to_eye)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -45,4 +45,4 @@ def look_at_all(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPE
             a += (at.max() + at.min()) / 2 * float(far_m - depth_m.mean())
         middle = middle + a * axis
     center_m = float(depth_m.min() + depth_m.max()) / 2
-    return Look(middle + far_m * back, middle + center_m * back)
+    return CameraPose(middle + far_m * back, middle + center_m * back)

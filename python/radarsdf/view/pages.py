@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
-from radarsdf.view.framing import look_at_all
+from radarsdf.view.framing import framing_pose
 from radarsdf.view.glb import glb, lightness_of, shaded
 from radarsdf.view.quantities import key, paragraph, table
 from radarsdf.view.scene import add_path
-from radarsdf.view.serving import Page, begin_at
+from radarsdf.view.serving import Page, set_initial_camera
 from radarsdf.view.surface import thinned
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class GrowingView(Page):
         server = self._server
         if self._origin is None:  # origin of the page, which computes in float32
             self._origin = path[0].copy()
-            begin_at(server, look_at_all(vertices - self._origin))
+            set_initial_camera(server, framing_pose(vertices - self._origin))
         local, faces = (vertices - self._origin).astype(np.float32), np.asarray(mesh.faces, np.uint32)
         with server.atomic():
             server.scene.add_mesh_simple(
@@ -84,7 +84,7 @@ class ChangesView(Page):
         colors = shaded(colors_of(mesh.vertex_attributes["kind"]), lightness_of(mesh.vertex_normals))
         self._start()
         server = self._server
-        begin_at(server, look_at_all(local))
+        set_initial_camera(server, framing_pose(local))
         data = glb(local, mesh.faces, colors)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
         rows = {

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from radarsdf.checks import whole_number
 from radarsdf.extras import require
-from radarsdf.view.framing import FOV_RAD, Look
+from radarsdf.view.framing import FOV_RAD, CameraPose
 from radarsdf.view.guarding import guarded
 
 if TYPE_CHECKING:
@@ -91,11 +91,11 @@ def stop_server(server: Any) -> None:
         server.stop()
 
 
-def begin_at(server: Any, look: Look) -> None:
+def set_initial_camera(server: Any, pose: CameraPose) -> None:
     """Set the initial camera of new pages."""
     camera = server.initial_camera
     camera.fov = FOV_RAD
-    camera.position, camera.look_at = map(tuple, look)
+    camera.position, camera.look_at = map(tuple, pose)
 
 
 def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: float = 20.0) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
-from radarsdf.view.framing import FOV_RAD, Look, look_at_all
+from radarsdf.view.framing import FOV_RAD, CameraPose, framing_pose
 from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
 from radarsdf.view.scene import (
     HELD_S,
@@ -25,7 +25,7 @@ from radarsdf.view.scene import (
     ScanClouds,
     State,
 )
-from radarsdf.view.serving import Page, begin_at
+from radarsdf.view.serving import Page, set_initial_camera
 from radarsdf.view.surface import ShownSurface, first_hit
 
 _GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
@@ -81,7 +81,7 @@ class Viewer(Page):
         origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.poses[:, :3, 3] - origin
         self._extent = np.concatenate([surface.vertices - origin, path])
-        begin_at(server, look_at_all(self._extent))
+        set_initial_camera(server, framing_pose(self._extent))
         x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
         self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
         self._clicked: NDArray[np.float64] | None = None
@@ -126,7 +126,7 @@ class Viewer(Page):
             self._painter.change(**self._surface_state(), coarse=False, settle_s=0.0)
 
         async def on_reset(event: Any) -> None:
-            self._look_at_all(event.client)
+            self._frame_all(event.client)
 
         self._uncertainty.on_update(on_limit)
         self._confidence.on_update(on_limit)
@@ -168,25 +168,25 @@ class Viewer(Page):
             "quantity": str(self._quantity.value),
         }
 
-    def _look_at_all(self, client: Any) -> Look:
+    def _frame_all(self, client: Any) -> CameraPose:
         camera = client.camera
-        look = look_at_all(self._extent, aspect=_aspect(camera))
+        pose = framing_pose(self._extent, aspect=_aspect(camera))
         with client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.fov = FOV_RAD
-            camera.position, camera.look_at = look
-        return look
+            camera.position, camera.look_at = pose
+        return pose
 
     async def _on_connect(self, client: Any) -> None:
         """Frame the whole scene in a new page, also after its frame has changed, until the user moves the camera."""
-        first = look_at_all(self._extent)  # a page may apply this one after a better one
-        aspect, look = _aspect(client.camera), self._look_at_all(client)
+        first = framing_pose(self._extent)  # a page may apply this one after a better one
+        aspect, pose = _aspect(client.camera), self._frame_all(client)
 
         async def on_update(camera: Any) -> None:
-            nonlocal aspect, look
-            untouched = _is_at(camera, look) and _aspect(camera) != aspect
-            if untouched or (_is_at(camera, first) and not _is_at(camera, look)):
-                aspect, look = _aspect(camera), self._look_at_all(client)
+            nonlocal aspect, pose
+            untouched = _is_at(camera, pose) and _aspect(camera) != aspect
+            if untouched or (_is_at(camera, first) and not _is_at(camera, pose)):
+                aspect, pose = _aspect(camera), self._frame_all(client)
 
         client.camera.on_update(on_update)
 
@@ -260,5 +260,5 @@ def _aspect(camera: Any) -> float:
     return float(np.clip(camera.image_width / max(camera.image_height, 1), 0.1, 10.0))
 
 
-def _is_at(camera: Any, look: Look) -> bool:
-    return bool(np.allclose(camera.position, look.position, atol=0.01))
+def _is_at(camera: Any, pose: CameraPose) -> bool:
+    return bool(np.allclose(camera.position, pose.position, atol=0.01))
