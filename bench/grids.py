@@ -28,7 +28,7 @@ VOXEL_M = 0.2
 _SIZE_M = np.array([50.0, 50.0, 10.0])
 _SENSOR_ABOVE_M = 3.5  # height above the lower face of the box
 _PLACE_M = 0.05  # at most one place per cube of this edge, which makes places uniform over the surface
-_RAYS = 10_000  # per batch, from a pose
+_RAYS = 10_000  # rays per batch, from a pose
 _DISTANCES = 20_000
 _PLACES = 100_000  # largest number per scene
 

@@ -39,7 +39,7 @@ _MIN_RANGE_OCULII_M = 1.0
 _MAX_RANGE_FILE_M = 60.0
 _HOLDOUT_EVERY = 10
 _HOLDOUT_EVERY_SHORT = 5
-_SHORT_FRAMES = 50  # of fewer scans, every tenth would be too few for a test
+_SHORT_FRAMES = 50  # below this, every tenth scan would be too few for a test
 _QUICK_FRAMES = 4
 
 QUICK: Changes = {"training": {"sdf_iterations": 60, "intensity_iterations": 60}}

@@ -178,7 +178,7 @@ def test_fourier(benchmark, batch, way):
     out = benchmark(fused if way == "ours" else plain)
     angle = (points.double()[:, None, :] * frequencies.double()[:, None]).flatten(1)
     expected = torch.cat([torch.sin(angle), torch.cos(angle)], 1)
-    assert (out - expected).abs().max() < 3e-4  # of float32 angles up to 4000; ours is exact to 1e-6
+    assert (out - expected).abs().max() < 3e-4  # float32 angles reach 4000; ours is exact to 1e-6
 
 
 @pytest.fixture(scope="module", params=[1_000_000, 10_000_000], ids=["1e6", "1e7"])

@@ -18,12 +18,12 @@ FloatArray = NDArray[np.float64]
 REACH_M = 1.0
 """Search distance of errors along the normal."""
 
-_STARTS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.0)  # of the search distance
+_STARTS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.0)  # shares of the search distance
 _LIDAR_SIGMA_M = 0.03  # range accuracy of a VLP-16 by its data sheet; also that of other lidars of its time
 _PIECES_M = (0.2, 0.4)  # radii of neighbourhoods on the lidar's surface; the first flat one is used
-_PIECE_RAD = 0.04  # and as a share of the range: two of 16 rings are 0.035 of it apart
+_PIECE_RAD = 0.04  # radius as a share of the range: two of 16 rings are 0.035 of it apart
 _PIECE_POINTS = 10
-_MOST_POINTS = 1000  # of a neighbourhood; more change nothing
+_MOST_POINTS = 1000  # largest neighbourhood; more points change nothing
 _THICKNESS_M = 0.06
 _THIN = 0.1  # variance across a flat neighbourhood, as a share of the smaller one along it
 _WIDE = 0.03  # smaller variance along a neighbourhood, over its squared radius. A single ring is a line

@@ -42,7 +42,7 @@ _BEGINNING = 1 / 10
 _BEGINNING_OF_DRIVE = 1 / 3  # those with lidar are short
 
 _TRUTH_POINTS = 60_000
-_BEST = 0.98  # of the highest probability near a point of the truth: these vertices share it
+_BEST = 0.98  # vertices above this share of the highest probability near a point share the point
 _LEARNT = 20_000  # vertices per map to fit
 _SAMPLES = 300_000
 _STEPS = 50

@@ -8,7 +8,7 @@ from pathlib import Path
 
 # Bytes, measured.
 _PER_VOXEL = 220.0
-_PER_TRIANGLE = 320.0  # of a welded mesh and its normals: measured on hugin in tiles
+_PER_TRIANGLE = 320.0  # a welded mesh and its normals, measured on hugin in tiles
 # For a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
 _PER_CELL_TRACED = 300.0  # surface for ray casting, built once per map
 _PER_PATCH_SEEN = 100.0

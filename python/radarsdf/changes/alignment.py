@@ -28,7 +28,7 @@ from radarsdf.returns.evidence import CELLS_OF_SURFACE
 # Prior standard deviations of the offset between the frames of two maps: translation, m, and rotation vector, rad.
 _PRIOR_SIGMAS = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
 _ITERATIONS = 15
-_MAX_POINTS = 10_000  # of the later surface
+_MAX_POINTS = 10_000  # sampled on the later surface
 _PATCH_M = 4.0  # edge of a patch within which errors are correlated
 _SIGNIFICANCE = 1e-3  # significance level
 # Largest standard error of a determined axis, in leaf cells: fields reach two cells.
@@ -45,7 +45,7 @@ class Alignment:
     """Pose of one map in the frame of another."""
 
     T_before_after: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) m
-    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of an offset about the `centre`
+    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of offsets about the `centre`
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
     improved: bool = False  # whether the surfaces show an offset between the frames
     words: str = "The maps were taken as they are."  # the verdict in one sentence

@@ -24,7 +24,7 @@ MIN_RETURNS = _NEIGHBOURS + 2  # scans with fewer are not compared
 _LEAST, _MOST = 0.1, 1.5
 LAGS = (1, 2, 4, 8)
 """Lags between the scans of a pair; multiplied by a stride if the sensor is slow."""
-_MOTION = 0.05  # of the median range: smaller motions hardly show errors of the poses
+_MOTION = 0.05  # share of the median range: smaller motions hardly show errors of the poses
 
 
 class Agreement:
@@ -74,7 +74,7 @@ class Agreement:
             )
             tree = cKDTree(kept)
             spacing = tree.query(kept, _NEIGHBOURS + 1)[0][:, 1:].mean(axis=1)
-            least = 1e-9 * max(float(np.abs(kept).max()), 1.0)  # of coincident returns
+            least = 1e-9 * max(float(np.abs(kept).max()), 1.0)  # coincident returns have no spacing
             self._trees[i] = tree, np.maximum(spacing, least), queries
         return self._trees[i]
 

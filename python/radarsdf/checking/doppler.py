@@ -15,7 +15,7 @@ from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, 
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
 from radarsdf.scans import Scans
 
-_STILL_MPS = 0.3  # at lower speeds, the direction of a velocity is noise
+_STILL_MPS = 0.3  # slower velocities have no reliable direction
 _MIN_SCANS = 4
 _MIN_SIGNIFICANCE = 4.0
 _MIN_YAW_RAD = np.radians(3)

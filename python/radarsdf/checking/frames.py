@@ -41,7 +41,7 @@ _ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.
 # World points agree equally badly if the poses move them forwards or backwards. Measured: at most 0.06; on good
 # recordings of a sensor with coarse cells, 0.15 and more.
 _FORWARDS_GAIN = 0.1
-_EQUAL = 0.8  # of the best gain: mistakes with nearly equal gains are indistinguishable; the most common is reported
+_EQUAL = 0.8  # share of the best gain: among nearly equal mistakes, the most common is reported
 _NOT_BEHIND = 2.5  # standard errors
 # Standard errors. Measured: below -2.3 in the sensor frame, above -0.5 in the world frame.
 _FIELD_OF_VIEW_STAYS = -1.5
@@ -55,7 +55,7 @@ _MIN_PAIRS = 3
 class Effort:
     """Amounts of data that a check uses."""
 
-    pairs: int  # of scans
+    pairs: int  # number of pairs of scans
     returns: int  # largest number of returns of a scan in the tree
     queries: int  # returns of a scan looked up in another one
     all_axes: bool  # whether to try all permutations of axes

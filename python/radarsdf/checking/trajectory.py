@@ -23,13 +23,13 @@ from radarsdf.scans import Scans
 _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
 _COARSE_M = 0.01  # spacing of positions: finer rounding is below the noise of any radar
 _FAST_MPS = 100.0  # faster than cars and drones
-_JUMP = 3.0  # times the neighbouring steps
-_LEAST_JUMP = 0.2  # in spacings of a scan's returns: smaller jumps are below the resolution
+_JUMP = 3.0  # ratio to the neighbouring steps
+_LEAST_JUMP = 0.2  # smallest jump, in spacings of a scan's returns: the resolution
 _NEAR = 3  # neighbouring steps on each side
 _JUMPS_TRIED = 12
 _MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs straddle a jump
-_CLOSES = 0.5  # of the difference to scans next to the jump
-_CAUGHT_UP = 1.5  # times the median step
+_CLOSES = 0.5  # share of the difference to scans next to the jump
+_CAUGHT_UP = 1.5  # ratio to the median step
 
 
 def check_rigid(recording: Scans) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ _Floats = NDArray[np.float64]
 _ENCE_BINS = 20
 _DECILES = 10
 _LEAST_M = 1e-12  # keeps ratios of squares from overflowing
-_LEAST_SHARE = 0.01  # of the points: smaller bins are too uncertain
+_LEAST_SHARE = 0.01  # smallest share of points in a bin
 
 
 def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[str, Any]:

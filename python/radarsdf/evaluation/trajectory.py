@@ -15,7 +15,7 @@ from radarsdf.poses.rigid import Floats, aligned, between, nearest_rotation, pla
 
 Alignment = Literal["positions", "poses", "none"]
 
-_SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # of the length, for trajectories of less than 800 m
+_SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # segment lengths of short trajectories
 _KITTI_M = np.arange(100.0, 900.0, 100.0)
 
 

@@ -88,7 +88,7 @@ class TransformTree:
     """A tree of frames, each with the transform from its parent."""
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
-        self.tracks = dict(tracks)  # by child
+        self.tracks = dict(tracks)  # keyed by child frame
 
     def chain(self, frame: str) -> list[str]:
         """Return the frame and its ancestors up to the root. Raises a ValueError on a cycle."""

@@ -59,7 +59,7 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
 class Fields:
     """The field of a cloud for each role. Positions are x, y and z, or else range, azimuth and elevation."""
 
-    names: dict[str, str]  # by role
+    names: dict[str, str]  # field name by role
     in_degrees: bool = False  # unit of angles whose names have none
 
     @classmethod

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import check, path_of
 
-_MAX_NAME_BYTES = 255  # of nearly all file systems
+_MAX_NAME_BYTES = 255  # limit of nearly all file systems
 _MAX_STEM = 50  # characters of at most four bytes: keeps the temporary name within the limit
 _MAX_FLOAT32_M = 16_384.0  # further from the origin, float32 resolves less than 1 mm
 _LOCK_FLAGS = ("O_CREAT", "O_RDWR", "O_BINARY", "O_NOFOLLOW", "O_NONBLOCK")  # flags that the system supports

@@ -25,7 +25,7 @@ MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
 _TRUTH_ARRAYS = ("lidar_points", "points")  # the first of these that a file has is used
-_SAMPLES = 1_000_000  # of a surface, since a triangle of a building may be 20 m long
+_SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 
 def holds_mesh(path: str | PathLike[str]) -> bool:

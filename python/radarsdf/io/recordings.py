@@ -77,9 +77,9 @@ class RawScan:
 
     read: Callable[[], Columns]
     time_s: float | None
-    name: str  # for messages
-    frame: str = ""  # of a bag
-    topic: str = ""  # of a bag
+    name: str  # shown in messages
+    frame: str = ""  # header frame; only in bags
+    topic: str = ""  # topic name; only in bags
     number: int | None = None  # index of its pose. None: the number of scans before it
 
 

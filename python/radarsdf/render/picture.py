@@ -90,7 +90,7 @@ def render(
     image = np.full((rows, columns, 3), 255.0, np.float32)
     depth = np.full((rows, columns), np.inf)
     for part in np.array_split(np.arange(rows), -(-rows * columns // _PIXELS_AT_ONCE)):
-        rays = u[None, :, None] * right - v[part][:, None, None] * up + forward  # of depth 1
+        rays = u[None, :, None] * right - v[part][:, None, None] * up + forward  # depth 1
         length = np.linalg.norm(rays, axis=2)
         directions = np.asarray(rays / length[..., None], np.float32).reshape(-1, 3)
         range_m, face = tracer.first_hits(eye.tolist(), directions, np.inf, False, threads)

@@ -18,7 +18,7 @@ from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.surface import thinned
 
-MAX_VERTICES = 160_000  # of the mesh in the 3D scene and the pictures, which is thinned if it has more
+MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Subject:
     name: str  # title of the page
     scans: Scans | None = None  # those fitted, or those to compare with
     held_out: Scans | None = None  # those that the fit left out, if known
-    findings: Sequence[Finding] | None = None  # of `radarsdf.check` on all scans; None: not checked
+    findings: Sequence[Finding] | None = None  # result of `radarsdf.check` on all scans; None: not checked
     voxel_size_m: float = 0.1  # voxels of the evaluated mesh
     box: ArrayLike | None = None  # (2, 3) corners of the reported part of the world, m; None: all
     progress: bool | None = None

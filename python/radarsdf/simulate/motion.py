@@ -22,8 +22,8 @@ FloatArray = NDArray[np.float64]
 
 _MOTION_STREAM, _IMU_STREAM = 2**31 + 1, 2**31 + 2  # no scan has these numbers
 _DOPPLER_SIGMA_MPS = 0.1
-_MOVING_SHARE, _MOVING_SIGMA_MPS = 0.1, 5.0  # of returns, at places without moving objects
-_GYROSCOPE_SIGMA_RAD_S = 0.005  # of each component of each measurement
+_MOVING_SHARE, _MOVING_SIGMA_MPS = 0.1, 5.0  # share and speed of moving returns
+_GYROSCOPE_SIGMA_RAD_S = 0.005  # per component
 _GYROSCOPE_BIAS_RAD_S = (0.002, -0.003, 0.0035)
 _ACCELEROMETER_SIGMA_MPS2 = 0.05
 _ACCELEROMETER_BIAS_MPS2 = (0.03, -0.02, 0.04)

@@ -112,8 +112,8 @@ class RadarSensor:
     gain_db: _Power = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
     range_loss_db: _NotNegative = 40.0  # loss per decade of range, less if the receiver compensates [dB]
     threshold_db: _Power = 64.0  # weaker returns are not detected [dB]
-    floor_db: _Power | None = None  # intensities are clipped to at least this [dB]; None: no clipping
-    saturation_db: _Power = 118.0  # and to at most this [dB], > threshold_db and floor_db
+    floor_db: _Power | None = None  # lower clipping limit of intensities [dB]; None: no clipping
+    saturation_db: _Power = 118.0  # upper clipping limit [dB], > threshold_db and floor_db
     step_db: _NotNegative = 0.1  # quantisation of intensities [dB]; 0: continuous
     clutter_per_scan: _NotNegative = 0.0  # expected number of false returns in free space
     clutter_near_share: _Share = 0.5  # share of clutter near the sensor; the rest is uniform along the beams

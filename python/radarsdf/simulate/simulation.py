@@ -17,7 +17,7 @@ from .world import Scene
 
 FloatArray = NDArray[np.float64]
 
-_LIDAR_RAYS = 10_000  # per pose
+_LIDAR_RAYS = 10_000  # rays per pose
 _LIDAR_SIGMA_M = 0.01
 _LIDAR_CELL_M = 0.05  # one lidar point per cell, or most would lie on the ground near the sensor
 _LIDAR_STREAM = 2**31  # no scan has this index

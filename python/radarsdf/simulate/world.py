@@ -139,7 +139,7 @@ class CornerReflector(Primitive):
     apex: FloatArray  # (3,) world, m
     axis: FloatArray  # (3,) unit vector out of the opening, world
     edge_m: float  # length of the three edges that meet in the apex
-    material: Material  # of the plates
+    material: Material  # material of the plates
     retro_db: float = 25.0  # echo on the axis relative to `material.reflectivity_db` [dB]
     retro_width_rad: float = 0.28  # standard deviation of the lobe; 0.28 is the usual 3 dB cone of 38 degrees
 

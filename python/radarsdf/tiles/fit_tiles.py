@@ -109,7 +109,7 @@ def plan_tiles(
         lock = take_lock(folder / _LOCK, "planned")
         try:
             if not (folder / PLAN).is_file():  # another process may have just written it
-                shutil.rmtree(folder / TILES, ignore_errors=True)  # of an unfinished plan
+                shutil.rmtree(folder / TILES, ignore_errors=True)  # left by an unfinished plan
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
                 plan = make_plan(given, folder, config, grid)
                 plan.save(folder)

@@ -42,8 +42,8 @@ from radarsdf.tiles.tileset import content_folder, write_tileset
 if TYPE_CHECKING:
     import trimesh
 
-_ON_LATTICE = 1e-4  # in voxels: vertices are at least 1e-3 from the corners of their edges
-_BYTES_PER_TRIANGLE = 28  # in the file of a part
+_ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
+_BYTES_PER_TRIANGLE = 28  # size in the file of a part
 _Floats = NDArray[np.float64]
 _Box = NDArray[np.float64] | None  # (2, 3) lower and upper corner, world, m
 

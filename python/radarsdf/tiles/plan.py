@@ -124,9 +124,9 @@ class TilePlan:
     """Properties of a tile known before its fit."""
 
     tile: Annotated[tuple[_Number, _Number], _FromList]
-    returns: _Count  # in the tile itself
+    returns: _Count  # number of returns in the tile itself
     rays: Annotated[_Count, Field(ge=1)]  # crossing it or its halo
-    origin_cells: Annotated[tuple[_Number, _Number, _Number], _FromList]  # of its map, in the lattice
+    origin_cells: Annotated[tuple[_Number, _Number, _Number], _FromList]  # origin of its map, in the lattice
     memory_bytes: _Count = 0  # estimates for its fit
     seconds: Annotated[float, Field(ge=0)] = 0.0
 
@@ -140,15 +140,15 @@ class TilePlan:
 class Plan:
     """Settings common to all tasks, and the tiles. Its numbers name folders, so their types are checked."""
 
-    config: FitConfig  # of all fits, with the sensor's noise and the number of threads
+    config: FitConfig  # settings of all fits, with the sensor's noise and the number of threads
     tile_m: _Length
     halo_m: _Length
     intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, sensor units
-    clutter_ratio: Annotated[float, Field(ge=0, le=1)]  # of the largest tiles
+    clutter_ratio: Annotated[float, Field(ge=0, le=1)]  # clutter ratio of the largest tiles
     returns_per_cell: Annotated[float, Field(ge=0)]  # mean over the cells of surfels of the same tiles
     sensor: Sensor
     scans: Annotated[_Count, Field(ge=1)]
-    input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # of all scans
+    input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # hash of all scans
     tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]  # ascending: tiles that contain a return
 
     @cached_property

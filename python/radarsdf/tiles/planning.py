@@ -40,7 +40,7 @@ _CHUNK_SCANS = 256  # scans in memory at a time
 _CHUNK_RETURNS = 500_000  # returns in memory at a time: fewer scans of a dense sensor
 _CHUNK_M = 1000.0  # scans of a chunk share a local frame, in which float32 must be precise
 _SENSOR_SCANS = 512  # largest sample of scans for the sensor model
-_SAMPLED_TILES = 4  # whose noise and clutter ratio represent all
+_SAMPLED_TILES = 4  # tiles that estimate noise and clutter ratio
 
 
 class CheckedScans:
@@ -48,7 +48,7 @@ class CheckedScans:
 
     def __init__(self, scans: Iterable[Any]) -> None:
         self._scans = scans
-        self.digest = ""  # of all scans, after a pass
+        self.digest = ""  # hash of all scans, after a pass
 
     def __iter__(self) -> Iterator[Scan]:
         digest = hashlib.blake2b(digest_size=16)

@@ -138,7 +138,7 @@ class TiledMap(TileBlend):
             nearest = np.clip(position[:2], lower, lower + self.plan.tile_m)
             if np.linalg.norm(nearest - position[:2]) <= range_m:
                 tiles.append(planned.tile)
-        tiles = tiles or [self.tiles[0].tile]  # for a pose far from all tiles, any tile shows nothing
+        tiles = tiles or [self.tiles[0].tile]  # far from all tiles, any tile shows nothing
         if self._viewed is None or self._viewed[0] != tiles:
             self._viewed = tiles, viewed_tiles(self, tiles)
         return self._viewed[1]

@@ -30,7 +30,7 @@ _IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.028
 _OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 _EXPOSURE = 0.6
 _FIT = (0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081)
-_BITS = np.uint32(13)  # of the 23 bits of a mantissa, below the 256 levels of a screen: zeros compress better
+_BITS = np.uint32(13)  # dropped mantissa bits, below the 256 levels of a screen: zeros compress better
 
 
 def glb(vertices: NDArray[Any], faces: NDArray[Any], colors: NDArray[np.uint8]) -> bytes:

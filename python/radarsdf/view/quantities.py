@@ -51,7 +51,7 @@ class Scale:
 class Quantity:
     """A scalar per vertex."""
 
-    label: str  # with its unit
+    label: str  # name and unit
     values: Callable[[_Rows, Position], NDArray[Any]]  # (N,) of vertices (N,), for a sensor at a position
     scale: Scale
     of_sensor: bool = False  # whether it depends on the sensor position

@@ -34,7 +34,7 @@ PREDICTED_COLOR = (0, 158, 115)  # not on the intensity scale, so that predictio
 
 # On two cores, intensities of 30,000 points take about 0.025 s, of 400,000 about 0.4 s.
 _DRAG_POINTS = 30_000
-_POINT_SIZE = 1.4  # in vertex spacings, so that there are no holes between points
+_POINT_SIZE = 1.4  # size in vertex spacings, which leaves no holes between points
 _STYLES = {"measured": ("circle", 0.25), "predicted": ("diamond", 0.2)}  # size, m
 # In float16, points would lie on a grid of 3 cm at 60 m.
 _POINTS = {"point_shading": "flat", "precision": "float32"}

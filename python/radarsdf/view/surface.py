@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
 
-_MIN_VERTICES = 1000  # of max_vertices: fewer show nothing useful
+_MIN_VERTICES = 1000  # smallest max_vertices: fewer show nothing useful
 
 
 @dataclass(frozen=True)
