@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``python -m bench.changes [KIND ...]``: what is found of cubes that come, go, move or change their reflectance.
+"""``python -m bench.changes [KIND ...]``: detection of cubes that appear, disappear, move or change their reflectance.
 
-The second of two simulated drives has other noise and another path: half a metre aside, between the scans, and a little turned.
-Area within half a metre of a cube is no false one: precision is the share of the changed area that is near one. Recall is the
-share of a cube's area on its map that is called gone, appeared or moved. Cubes and flat patches of the ground that change their
-reflectance answer 6 dB more or less on the second day; their recall is the share of the later surface that is called so.
+The second of two simulated drives has other noise and another path: half a metre aside, between the scans, and slightly rotated.
+Area within half a metre of a cube is not a false alarm: precision is the share of the changed area that is near one. Recall is
+the share of a cube's area on its map that is classified as gone, appeared or moved. Cubes and flat patches of the ground that
+change their reflectance return 6 dB more or less in the second drive; recall is the share of the later surface so classified.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _SIZES_M = (0.3, 0.6, 1.0, 2.0, 3.0)
 _CHANGES = ("put in", "taken out", "moved")
 _OF_REFLECTANCE = ("reflectance_changed", "patch of changed reflectance")
 _STRONGER_DB = 6.0
-_PATCH_M = 0.02  # half the thickness of a patch, of which half is above the ground
+_PATCH_M = 0.02  # half the thickness of a patch, half of which is above the ground
 _ON_M, _NEAR_M = 0.2, 0.5
-_FOUND = 0.2  # of a cube's area
+_FOUND = 0.2  # recall of a detected cube
 _TRIES = 20
 
 
@@ -50,15 +50,15 @@ class Change:
 
 
 COLUMNS = {
-    "false_share": Column("false area, %", 100, 3),
+    "false_share": Column("false positives, % of area", 100, 3),
     "precision": Column("precision"),
     "recall": Column("recall"),
-    "found": Column("a fifth found"),
+    "found": Column("detected"),
 }
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
-    """For each kind of scene a row without changes and one with them, and for each cube a row with its recall."""
+    """Per kind of scene, yield a row without changes and one with them, and a row per cube with its recall."""
     for kind in options.cases:
         first = KINDS[kind](seed=options.seed)
         rng = np.random.default_rng([options.seed, len(kind)])
@@ -81,7 +81,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def other_way(poses: Floats, rng: np.random.Generator) -> Floats:
-    """Poses (F, 4, 4) of a second day."""
+    """Poses (F, 4, 4) of the second drive."""
     count = len(poses)
     step = np.arange(count)
     first = np.minimum(step, count - 2)
@@ -98,7 +98,7 @@ def other_way(poses: Floats, rng: np.random.Generator) -> Floats:
 
 
 def cubes(drive: Simulation, rng: np.random.Generator) -> list[Change]:
-    """One cube of each size and change, on the ground next to the path where there is room. What changes its reflectance has what is left."""
+    """One cube per size and change, on the ground next to the path where there is room; changes of reflectance take the rest."""
     found: list[Change] = []
     centres: list[tuple[Floats, float]] = []
     for kinds in (_CHANGES, _OF_REFLECTANCE):
@@ -143,7 +143,7 @@ def reflectance_changed(kind: str, cube: Box, ground: float, rng: np.random.Gene
 def compare(
     drive: Simulation, ways: tuple[Floats, Floats], changes: list[Change], options: argparse.Namespace
 ) -> Changes:
-    """Two quick maps of scenes before and after the changes, compared."""
+    """Compare quick maps of the scenes before and after the changes."""
     drift, seed = options.drift, options.seed
     maps = []
     for day, poses in enumerate(ways):
@@ -163,7 +163,7 @@ def compare(
 
 
 def areas(found: Changes, changes: list[Change]) -> tuple[float, float, float]:
-    """Area away from the cubes that is called changed, all there that both drives saw, and what is called changed near them, m²."""
+    """Changed area away from the cubes, all area there that both drives observed, and changed area near the cubes, m²."""
     false = seen = true = 0.0
     boxes = [box for change in changes for box in (change.before, change.after) if box is not None]
     for surface in (found.before, found.after):
@@ -179,7 +179,7 @@ def areas(found: Changes, changes: list[Change]) -> tuple[float, float, float]:
 
 
 def recalls(found: Changes, change: Change) -> list[float]:
-    """Share of the area on the cube that is called changed, on each day that it is mapped; 0 if it is not mapped."""
+    """Share of the area on the cube classified as changed, per drive that maps it; 0 if none does."""
     shares = []
     for surface, box in ((found.before, change.before), (found.after, change.after)):
         if box is None or (change.kind in _OF_REFLECTANCE and surface is found.before):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Test data that several benchmarks share. Seeds fix it, and its memory accesses are as those of a real fit."""
+"""Data shared by benchmarks, fixed by seeds, with memory accesses as in a real fit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NUM_LEVELS = 3
 FEATURE_DIM = 8
 PLANES = ((0, 1), (0, 2), (1, 2))
 _HALF_M = 24.0  # half the width of the scene of `surface_points`
-_BIAS = 1 << 20  # added to lattice coordinates, as in `VertexTable`, so that they are not negative
+_BIAS = 1 << 20  # added to lattice coordinates, as in `VertexTable`, to make them non-negative
 
 
 def surface_points(count, seed=0, dtype=np.float32):
@@ -38,7 +38,7 @@ def surface_points(count, seed=0, dtype=np.float32):
 
 
 def _spread(values):
-    """The bits of non-negative integers with two zeros between each, as in a Morton code."""
+    """Interleave the bits of non-negative integers with two zeros each, as in a Morton code."""
     out = np.zeros(values.shape, np.uint64)
     for bit in range(21):
         out |= ((values >> bit & 1).astype(np.uint64)) << np.uint64(3 * bit)
@@ -126,7 +126,7 @@ def batch(request, surface):
 
 @pytest.fixture(scope="session")
 def roofline(tmp_path_factory):
-    """The library of `roofline.cpp`, compiled for this machine."""
+    """Library of `roofline.cpp`, compiled for this machine."""
     compiler = shutil.which(os.environ.get("CXX", "c++"))
     if compiler is None:
         pytest.skip("no C++ compiler for roofline.cpp")

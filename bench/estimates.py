@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Memory and time of fits against their estimates: `python -m bench.estimates memory|durations`, on Linux."""
+"""Memory and time of fits compared with their estimates: `python -m bench.estimates memory|durations`, on Linux."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ MEMORY_CASES: list[tuple[int, bool, Changes]] = [
     (3_000_000, False, {}),
     (3_000_000, True, {}),
 ]
-"""Returns, whether with intensities, settings."""
+"""Number of returns, whether with intensities, settings."""
 _FEW: Changes = {"training": {"sdf_iterations": 20, "intensity_iterations": 24, "batch_size": 16384}}
-"""Enough iterations for the peak: pages of zeros take no memory until the training writes to them."""
+"""Enough iterations to reach the peak: pages of zeros take no memory until the training writes to them."""
 
 
 def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
@@ -40,7 +40,7 @@ def _street(count: int, with_intensities: bool) -> tuple[Any, Any, Any]:
 
 
 def memory(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each case: growth of the peak memory, and its estimate."""
+    """Yield a row per case: growth of the peak memory, and its estimate."""
     for count, with_intensities, changes in MEMORY_CASES[: 1 if options.quick else None]:
         estimate, peak = peak_of_a_fit(count, with_intensities, changes)
         row: Row = {"returns": count, "intensities": with_intensities, "settings": words_of(changes)}
@@ -49,14 +49,14 @@ def memory(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def peak_of_a_fit(count: int, with_intensities: bool, changes: Changes) -> tuple[Estimate, float]:
-    """The estimate, and the measured growth of the peak memory, bytes, in a new process."""
+    """Estimate, and measured growth of the peak memory, bytes, in a new process."""
     case = count, with_intensities, merged(_FEW, changes)
     values, peak = in_new_process("bench.estimates:measured_peak", *case)
     return Estimate(**values), peak
 
 
 def measured_peak(count: int, with_intensities: bool, changes: Changes) -> tuple[dict[str, Any], float]:
-    """The fields of the estimate, and the growth of the peak memory of this process, bytes."""
+    """Fields of the estimate, and growth of the peak memory of this process, bytes."""
     scans, config = _street(count, with_intensities), FitConfig().override(**changes)
     estimate = radarsdf.estimate(*scans, config=config)
     with measured() as taken:
@@ -107,7 +107,7 @@ DURATION_CASES: list[tuple[int, bool, str, Changes]] = [
 
 
 def durations(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each case: time of a fit, and its estimate."""
+    """Yield a row per case: time of a fit, and its estimate."""
     for count, with_intensities, preset, changes in DURATION_CASES[: 1 if options.quick else None]:
         fits = [
             in_new_process("bench.estimates:measured_duration", count, with_intensities, preset, changes)
@@ -123,7 +123,7 @@ def measured_duration(count: int, with_intensities: bool, preset: str, changes: 
     """Estimated and measured time of a fit."""
     returns, config = _street(count, with_intensities), PRESETS[preset].override(**changes)
     estimate = radarsdf.estimate(*returns, config=config)
-    # A small fit first: the estimate does not include what PyTorch sets up in its first steps.
+    # Warm up with a small fit: the estimate does not include PyTorch's initialisation in its first steps.
     tiny = FitConfig().override(training={"sdf_iterations": 5, "intensity_iterations": 10})
     radarsdf.fit(*_street(2000, True), config=tiny, progress=False)
     with timed() as taken:

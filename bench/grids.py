@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``python -m bench.grids [SCENE ...]``: what planners' grids call free though it is occupied, and their distances.
+"""``python -m bench.grids [SCENE ...]``: occupied places that planners' grids report as free, and errors of distances.
 
-A place is a point on a true surface that the radar could detect from one of its poses, in a box of 50 × 50 × 10 m round the
-middle of the way. Distances are those of free voxels, beside the true distance from their centres.
+A place is a point on a true surface that the radar can detect from one of its poses, in a box of 50 × 50 × 10 m round the
+middle of the path. Distances of free voxels are compared with the true distances from their centres.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ Floats = NDArray[np.float64]
 
 VOXEL_M = 0.2
 _SIZE_M = np.array([50.0, 50.0, 10.0])
-_SENSOR_ABOVE_M = 3.5  # over the lower face of the box
-_PLACE_M = 0.05  # at most one place in each cube of this edge: places are even over the surface
-_RAYS = 10_000  # a round from a pose
+_SENSOR_ABOVE_M = 3.5  # height above the lower face of the box
+_PLACE_M = 0.05  # at most one place per cube of this edge, which makes places uniform over the surface
+_RAYS = 10_000  # rays per batch, from a pose
 _DISTANCES = 20_000
-_PLACES = 100_000  # of a scene, at most
+_PLACES = 100_000  # largest number per scene
 
 
 def box_of(drive: Simulation) -> Floats:
@@ -41,7 +41,7 @@ def box_of(drive: Simulation) -> Floats:
 
 
 def seen_places(drive: Simulation, box: Floats, number: int, rng: np.random.Generator) -> Floats:
-    """At most so many places (N, 3), world, m: exact points of surfaces in view, in range and above the threshold."""
+    """At most `number` places (N, 3), world, m: exact surface points in view, in range and above the threshold."""
     sensor = drive.sensor
     found = np.zeros((0, 3))
     poses = drive.poses[:: max(1, len(drive.poses) // 40)]
@@ -67,7 +67,7 @@ def seen_places(drive: Simulation, box: Floats, number: int, rng: np.random.Gene
 
 
 def judged(grid: Grid, places: Floats) -> dict[str, float]:
-    """Shares of places in free and occupied voxels, of all and of those that are not unknown, %; of voxels, m³."""
+    """Shares of places in free and occupied voxels, of all and of those that are not unknown, %; volume of voxels, m³."""
     state = grid.at(places)
     free, occupied = float((state == 0).mean()), float((state == 1).mean())
     return {
@@ -79,7 +79,7 @@ def judged(grid: Grid, places: Floats) -> dict[str, float]:
 
 
 def distances(grid: Grid, drive: Simulation, rng: np.random.Generator) -> dict[str, float]:
-    """Errors of the distances of free voxels, m, and how often they are beyond the stated error, %."""
+    """Errors of the distances of free voxels, m, and the share beyond the stated error, %."""
     field = grid.distances()
     x = grid.centres(grid.free)
     rows = rng.choice(len(x), min(_DISTANCES, len(x)), replace=False)
@@ -95,7 +95,7 @@ def distances(grid: Grid, drive: Simulation, rng: np.random.Generator) -> dict[s
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene."""
+    """Yield a row per scene."""
     threads = options.threads[0]
     torch.set_num_threads(threads)
     for name in options.cases:

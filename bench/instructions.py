@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Instructions of a small fit and of training steps, counted by callgrind: `python -m bench.instructions`.
+"""Instruction counts of a small fit and of training steps by callgrind: `python -m bench.instructions`.
 
-Other programs move no count. Two checks end with an error: the core executes 1.15 times as many as ``instructions.json`` has for
-this compiler and instruction set; or a training step depends on the number of returns, on any machine.
+Load on the machine does not change counts. Two checks end with an error: the core executes 1.15 times the instructions that
+``instructions.json`` lists for this compiler and instruction set; or a step depends on the number of returns, on any machine.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from bench.measure import ROOT, failure
 
 EXPECTED = Path(__file__).with_suffix(".json")
 _MOST = 1.15
-# Of all objects, of a step with many returns compared with one with few: the numbers of touched rows differ by chance.
+# Ratio of a step with many returns to one with few, over all objects: numbers of touched rows differ by chance.
 _MOST_BY_RETURNS = 1.05
 _FEW, _MANY, _STEPS = 2_000, 100_000, 3
-# Functions that begin a count, and write it. To turn the counting off would make valgrind translate all code again.
+# Client requests that start and dump a count. Turning the count off would make valgrind retranslate all code.
 _SWITCH = """#include <valgrind/callgrind.h>
 void start(void) { CALLGRIND_START_INSTRUMENTATION; CALLGRIND_ZERO_STATS; }
 void stop(const char* name) { CALLGRIND_DUMP_STATS_AT(name); }
@@ -50,12 +50,12 @@ void stop(const char* name) { CALLGRIND_DUMP_STATS_AT(name); }
 
 
 def counted(out: Path) -> dict[str, Counter[str]]:
-    """Instructions of each case by shared object. `out` is an empty folder.
+    """Instructions per case and shared object. `out` is an empty folder.
 
     Raises
     ------
     RuntimeError
-        If they cannot be counted here; the message says why.
+        If counting is impossible here; the message states the reason.
     """
     for tool in ("valgrind", "cc"):
         if shutil.which(tool) is None:
@@ -66,7 +66,7 @@ def counted(out: Path) -> dict[str, Counter[str]]:
     compile_ = ["cc", "-shared", "-fPIC", "-o", str(switch), str(switch.with_suffix(".c"))]
     if (done := subprocess.run(compile_, capture_output=True, text=True, check=False)).returncode != 0:
         raise RuntimeError(failure(done))
-    # One thread, and none that waits in a loop.
+    # One thread, and none that spins.
     env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "RADARSDF_ISA": isa()}
     callgrind = ["valgrind", "--tool=callgrind", "--instr-atstart=no", f"--callgrind-out-file={out}/counts"]
     child = [sys.executable, "-m", "bench.instructions", "--child", str(switch)]
@@ -80,7 +80,7 @@ def counted(out: Path) -> dict[str, Counter[str]]:
 
 
 def by_object(text: str) -> Counter[str]:
-    """Self costs in a file of callgrind."""
+    """Sum self costs in a callgrind file by object."""
     names: dict[str, str] = {}
     counts: Counter[str] = Counter()
     current, called = "", False
@@ -90,7 +90,7 @@ def by_object(text: str) -> Counter[str]:
         elif match := re.match(r"cob=(\(\d+\)) (.*)", line):
             names.setdefault(match[1], match[2])
         elif line.startswith("calls="):
-            called = True  # the next line has the cost of the called function
+            called = True  # the next line is the cost of the callee
         elif re.match(r"[+\-*\d]", line):
             counts[Path(current).name] += 0 if called else int(line.split()[1])
             called = False
@@ -98,12 +98,12 @@ def by_object(text: str) -> Counter[str]:
 
 
 def isa() -> str:
-    """The instruction set of the count: valgrind knows no AVX-512."""
+    """Instruction set to count with: valgrind does not support AVX-512."""
     return "baseline" if _core.instruction_set() == "baseline" else "avx2"
 
 
 def _child(library: Path) -> None:
-    """Runs all cases, each once before it is counted."""
+    """Run all cases, each once before it is counted."""
     switch = ctypes.CDLL(str(library))
     scans = street(_FEW, 20.0)
     quick = FitConfig.quick().override(num_threads=1)
@@ -139,7 +139,7 @@ def _child(library: Path) -> None:
 
 
 def _count_steps(training: Training, name: bytes, switch: ctypes.CDLL) -> None:
-    """Counts the steps after the second: the first ones draw the order of the rays and prepare what all use."""
+    """Count the steps after the second: the first ones shuffle the rays and prepare common data."""
     add, numbers = training.history.add, itertools.count(1)
 
     def add_and_switch(*arguments: Any) -> None:
@@ -187,7 +187,7 @@ def main() -> None:
 
 
 def faults(of_core: dict[str, int], expected: dict[str, int], many_by_few: float) -> list[str]:
-    """What is too much: instructions of cases compared with those expected, or of a step with many returns with one with few."""
+    """Describe excessive counts: cases against the expected counts, and a step with many returns against one with few."""
     by_case = {name: of_core[name] / count for name, count in expected.items()}
     found = [
         f"{name}: {ratio:.2f} times the instructions" for name, ratio in by_case.items() if ratio > _MOST

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Places of many kinds, each with another radar and another drive: what holds on all of them is no luck of one scene."""
+"""Scenes of many kinds, each with another radar and drive, so that results do not depend on one scene."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ __all__ = ["KINDS", "Kind"]
 
 FloatArray = NDArray[np.float64]
 
-_LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan has
+_LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan uses
 _THRESHOLD_DB = 64.0
-_REACH_DB = 6.0  # a wall is detected at the largest range, even at a flat angle
-_BEYOND = (-0.1, 1.3)  # part of the path, and of what lies before and behind it, beside which things stand
+_REACH_DB = 6.0  # a wall is detected at the maximum range, even at grazing incidence
+_BEYOND = (-0.1, 1.3)  # part of the path, extended at both ends, along which objects stand
 
 
 def _radar(
@@ -36,7 +36,7 @@ def _radar(
     far_noise: float = 0.0,
     false_returns: float = 1.0,
 ) -> RadarSensor:
-    """A radar of so many beams, azimuth and elevation `fov_deg`. 1 is the noise, near and far, and what is false, of usual ones."""
+    """Build a radar with `beams` beams and field of view `fov_deg`. A factor of 1 is typical noise, near and far, and clutter."""
     azimuth_rad, elevation_rad = np.deg2rad(fov_deg)
     return RadarSensor(
         azimuth_fov_rad=float(azimuth_rad),
@@ -59,26 +59,26 @@ def _radar(
 
 @dataclass(frozen=True)
 class Kind:
-    """What scenes of a kind have in common. A seed gives the numbers within the limits, and the places."""
+    """Properties common to scenes of a kind. A seed draws the numbers within the limits, and the places."""
 
     radar: RadarSensor
     """The radar."""
     frames: int
     """Number of scans."""
     length_m: tuple[float, float]
-    """Of the path, or of a lap's longer diameter."""
+    """Length of the path, or longer diameter of a lap."""
     things: tuple[tuple[str, tuple[int, int], tuple[float, float]], ...]
-    """Methods of `Site`, how many of each there are, and how far beside the path, m."""
+    """Methods of `Site`, how many of each there are, and their distances from the path, m."""
     drive: str = "ahead"
-    """`ahead` along a bent path, one `lap`, or some scans from each of three `places` that look at one facade."""
+    """`ahead` along a bent path, one `lap`, or some scans from each of three `places` that face one facade."""
     ground_m: float = 0.1
     """Amplitude of the ground; see `Terrain.random`."""
     ground: Material = materials.ASPHALT
-    """What the ground is made of."""
+    """Material of the ground."""
     slope: float = 0.0
     """Steepest slope of a hillside, rise over run."""
     enclosure: tuple[float, float, bool] | None = None
-    """Walls round everything: how far beside the path they stand, how high, m, and whether there is a roof."""
+    """Enclosing walls: distance from the path, height, m, and whether there is a roof."""
 
 
 _GARDEN = (("tree", (10, 25), (4.0, 25.0)), ("hedge", (4, 9), (5.0, 20.0)))
@@ -122,10 +122,10 @@ _KINDS = {
 
 
 class _Site(Site):
-    """Also has fences."""
+    """A site that can also have fences."""
 
     def fence(self, xy: FloatArray, yaw: float) -> bool:
-        """A fence along a path: posts 2 m apart, and two rails."""
+        """Add a fence along a path: posts 2 m apart, and two rails."""
         steps, height = int(self.rng.integers(3, 7)), self.rng.uniform(1.1, 1.8)
         along = np.array([np.cos(yaw), np.sin(yaw)])
         spots = [xy + 2.0 * (i - steps / 2) * along for i in range(steps + 1)]
@@ -162,7 +162,7 @@ def _path(kind: Kind, rng: np.random.Generator) -> Path:
 
 
 def _ground(kind: Kind, rng: np.random.Generator) -> Terrain:
-    """The ground. A hillside is a long wave across the path, steepest there."""
+    """Terrain of a kind. A hillside is a long wave across the path, steepest there."""
     terrain = Terrain.random(rng, kind.ground_m, kind.ground)
     wave = 2 * np.pi / 300.0
     return replace(
@@ -199,7 +199,7 @@ def _enclosed(kind: Kind, way: FloatArray, rng: np.random.Generator) -> list[Box
 
 
 def _facade(rng: np.random.Generator, length_m: float) -> list[Box]:
-    """A front along x with windows set back from it, balconies and a roof's edge; 15 m to the left of the path."""
+    """A front along x with recessed windows, balconies and a roof's edge, 15 m to the left of the path."""
     brick, glass, y = vary(rng, materials.BRICK), vary(rng, materials.GLASS), 15.0
     height, middle = rng.uniform(9, 14), length_m / 2
     boxes = [

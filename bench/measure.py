@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Time and memory of a block, and functions in new processes. Standard library only: the Python of a peer may be an old one."""
+"""Time and memory of a block, and functions in new processes. Standard library only: a peer's Python may be old."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-_M_MMAP_THRESHOLD = -3  # of malloc.h
+_M_MMAP_THRESHOLD = -3  # constant of malloc.h
 
 
 @dataclass
@@ -27,9 +27,9 @@ class Taken:
     wall_s: float = float("nan")
     """Elapsed time, s."""
     cpu_s: float = float("nan")
-    """Processor time of all threads of this process, s."""
+    """CPU time of all threads of this process, s."""
     grown_mb: float = float("nan")
-    """Peak resident memory less that before the block, MB; only of :func:`measured`."""
+    """Growth of the peak resident memory, MB; only of :func:`measured`."""
 
 
 @contextmanager
@@ -52,9 +52,9 @@ def measured() -> Iterator[Taken]:
 
 
 def memory_bytes(field: str) -> int:
-    """Resident memory of this process, bytes: now (`VmRSS`) or its peak (`VmHWM`). -1 on other systems than Linux.
+    """Resident memory of this process, bytes: now (`VmRSS`) or its peak (`VmHWM`). -1 on systems other than Linux.
 
-    ``ru_maxrss`` is not used: a child process inherits that of its parent.
+    ``ru_maxrss`` is not used: a child process inherits its parent's.
     """
     status = Path("/proc/self/status")
     if not status.exists():
@@ -64,7 +64,7 @@ def memory_bytes(field: str) -> int:
 
 
 def return_freed_memory() -> None:
-    """Make the C library return large freed blocks to the system: reused, they would hide a part of the peak.
+    """Make the C library return large freed blocks to the system, since reused ones would hide a part of the peak.
 
     An environment variable would come too late for a process that is forked.
     """
@@ -73,7 +73,7 @@ def return_freed_memory() -> None:
 
 
 def in_new_process(function: str, *arguments: Any) -> Any:
-    """Result of ``module:function`` in a process of its own. Arguments and result go through JSON.
+    """Result of ``module:function`` in a separate process. Arguments and result are passed as JSON.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def in_new_process(function: str, *arguments: Any) -> Any:
 
 
 def failure(done: subprocess.CompletedProcess[str]) -> str:
-    """Why a process failed, in one line."""
+    """Describe in one line why a process failed."""
     if done.returncode < 0:
         return f"killed by signal {-done.returncode}" + (" (out of memory?)" if done.returncode == -9 else "")
     lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The runner of all experiments: an experiment is a function that yields rows, and an :class:`Experiment` that lays them out.
+"""Runner of all experiments: an :class:`Experiment` lays out the rows that its function yields.
 
-Rows are printed as they come. They are written with everything needed to repeat them as JSON, and as tables in Markdown.
+Rows are printed as they come, and written as JSON with everything needed to repeat them, and as Markdown tables.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from bench.measure import ROOT
 from bench.settings import parsed
 
 Row = dict[str, Any]
-"""Numbers and words of one result. `why_not` says why a result is missing."""
+"""Numbers and words of one result. `why_not` is the reason of a missing result."""
 
 
 class Column(NamedTuple):
-    """How a number of the rows is shown."""
+    """Format of one number of the rows."""
 
     heading: str
     factor: float = 1
-    """To the unit of the heading."""
+    """Factor to the unit of the heading."""
     digits: int = 2
     best: str = ""
-    """"highest" or "lowest" is in bold."""
+    """Which value is bold: "highest", "lowest" or none."""
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,23 @@ class Experiment:
     title: str
     rows: Callable[[argparse.Namespace], Iterable[Row]]
     cases: Sequence[str] = ()
-    """The cases by default: scenes, files or sizes."""
+    """Default cases: scenes, files or sizes."""
     options: Sequence[str] = ()
-    """Names in `OPTIONS`, besides those that all experiments have."""
+    """Names in `OPTIONS`, in addition to those common to all experiments."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
-    """Of options."""
+    """Defaults of the options."""
     columns: Mapping[str, Column] = field(default_factory=dict)
-    """By key of the rows; those without a value are left out. Empty: the keys of the rows are the headings."""
+    """Columns by key of the rows; keys without a column are omitted. Empty: the keys of the rows are the headings."""
     tables: Sequence[str] = ()
-    """Keys; each combination of their values has a table of its own."""
+    """Keys; each combination of their values gets its own table."""
     lines: Sequence[str] = ("method",)
-    """Keys that name the lines of a table. Rows that agree in them are repetitions."""
+    """Keys that identify the lines of a table. Rows with equal values are repetitions."""
     across: str = ""
     """Key whose values are side by side in a line."""
     median: bool = False
-    """Show medians of repetitions in place of mean ± standard deviation."""
+    """Show medians of repetitions instead of mean ± standard deviation."""
     mean_line: bool = False
-    """Add the mean of all complete lines."""
+    """Append the mean of all complete lines."""
     plot: Callable[[list[Row], Path], None] | None = None
 
 
@@ -76,7 +76,7 @@ def _number(text: str) -> int:
 
 
 OPTIONS: dict[str, dict[str, Any]] = {
-    "seed": {"type": int, "default": 0, "help": "of simulated scenes"},
+    "seed": {"type": int, "default": 0, "help": "seed of simulated scenes"},
     "repetitions": {"type": int, "default": 1, "help": "fits with other seeds; some experiments also change the scene's"},
     "samples": {"type": _number, "default": 10_000_000, "help": "points on a mesh for its errors"},
     "frames": {"type": int, "help": "number of scans of each scene; default: all"},
@@ -97,8 +97,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "drift": {
         "type": float, "nargs": 2, "metavar": ("M", "DEG"), "default": (0.0, 0.0), "help": "random walk of the poses, a step"
     },
-    "refine": {"action": "store_true", "help": "refine the poses of both days"},
-    "against": {"type": Path, "metavar": "PATH", "help": "another version: a wheel, or a checkout that is built in place"},
+    "refine": {"action": "store_true", "help": "refine the poses of both drives"},
+    "against": {"type": Path, "metavar": "PATH", "help": "another version: a wheel, or a checkout built in place"},
     "seeds": {"type": int, "nargs": "*", "help": "seeds of simulated scenes"},
 }  # fmt: skip
 
@@ -106,14 +106,14 @@ OPTIONS: dict[str, dict[str, Any]] = {
 def main(
     module: str, experiments: Mapping[str, Experiment] | Experiment, words: list[str] | None = None
 ) -> None:
-    """Run the experiment that the command names, and write its rows and tables.
+    """Run the experiment named by the command line, and write its rows and tables.
 
     Parameters
     ----------
     module : str
-        ``python -m`` of it is the command.
+        The command is ``python -m MODULE``.
     experiments : Mapping or Experiment
-        By name, or the only one.
+        Experiments by name, or the only one.
     words : list of str, optional
         Words of the command line. Default: those of this process.
     """
@@ -155,14 +155,14 @@ def _add_options(parser: argparse.ArgumentParser, experiment: Experiment) -> Non
 
 
 def run(experiment: Experiment, options: argparse.Namespace, stem: Path, made: dict[str, Any]) -> None:
-    """Run an experiment. Its results are at `stem`, with the suffixes .json, .md and, if it has a plot, .png."""
+    """Run an experiment. Its results are at `stem` with the suffixes .json, .md and, if it has a plot, .png."""
     rows: list[Row] = []
     for row in experiment.rows(options):
         rows.append(row)
         names = {*experiment.tables, *experiment.lines, experiment.across, *experiment.columns, "why_not"}
         shown = [key for key in row if not experiment.columns or (key in names and row[key] is not None)]
         print(", ".join(f"{key} {_text(row[key])}" for key in shown), flush=True)
-        # After each row, so that an interrupted run of hours keeps its rows.
+        # Written after each row, so that an interrupted run of hours keeps its rows.
         write_json(stem.with_suffix(".json"), made | {"rows": rows})
     warning = ", quick run: the numbers are meaningless" if options.quick else ""
     origin = f"`{made['command']}`, commit {made['commit']}, {made['processor']}, {made['threads']} threads"
@@ -179,7 +179,7 @@ def _text(value: Any) -> str:
 
 
 def tables(experiment: Experiment, rows: Sequence[Row]) -> str:
-    """The tables of an experiment in Markdown, and below each the reasons why results are missing."""
+    """Format an experiment's tables in Markdown, each followed by the reasons of missing results."""
     parts = []
     for names, own in groups(rows, *experiment.tables).items():
         if heading := ", ".join(str(name) for name in names if name is not None):
@@ -228,7 +228,7 @@ def _table(experiment: Experiment, rows: Sequence[Row]) -> str:
 
 
 def _cell(values: list[float], digits: int, median: bool) -> str:
-    """Mean and standard deviation, such as `3.24 ± 0.04`, or the median."""
+    """Format mean and standard deviation, such as `3.24 ± 0.04`, or the median."""
     if not values:
         return "–"
     text = f"{np.median(values) if median else np.mean(values):,.{digits}f}"
@@ -238,7 +238,7 @@ def _cell(values: list[float], digits: int, median: bool) -> str:
 def _set_bold(
     texts: list[list[str]], values: list[tuple[Column, list[list[float]]]], *, by_line: bool
 ) -> None:
-    """Set the best in bold, and what prints the same: of each column, or of equal columns side by side in each line."""
+    """Set the best value and its ties in bold: in each column, or among equal columns side by side in each line."""
     for heading in dict.fromkeys(column.heading for column, _ in values):
         own = [i for i, (column, _) in enumerate(values) if column.heading == heading]
         best = values[own[0]][0].best
@@ -258,7 +258,7 @@ def _set_bold(
 
 
 def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows grouped by the values of `keys`, in the order of the first row of each group."""
+    """Group rows by the values of `keys`, in the order of each group's first row."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         found.setdefault(tuple(row.get(key) for key in keys), []).append(row)
@@ -266,7 +266,7 @@ def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table with aligned columns."""
+    """Format a Markdown table with aligned columns."""
     table = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = [
@@ -277,7 +277,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def quantile(values: Sequence[float], share: float) -> float:
-    """The value below which this share of all is, for a row."""
+    """Quantile of values as a number for a row."""
     return round(float(np.quantile(values, share)), 2)
 
 
@@ -330,7 +330,7 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 def figure(
     path: Path, rows: int = 1, columns: int = 1, size: tuple[float, float] = (5, 3.6)
 ) -> Iterator[Any]:
-    """Axes (rows, columns) of a plot, which is written to `path` at the end of the block."""
+    """Yield axes (rows, columns) of a plot that is written to `path` at the end of the block."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - tables need no matplotlib
 
     drawing = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")

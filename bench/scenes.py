@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The scenes of the experiments: simulated ones, and recorded ones from files and folders."""
+"""Scenes of the experiments: simulated ones, and recorded ones from files and folders."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from bench.kinds import KINDS
 from bench.settings import PRESETS, Changes, merged
 
 SEEN_BY_RADAR_M = 1.0
-"""A lidar sees in all directions. Lidar points farther than this from every return do not count as ground truth."""
+"""Radius of ground truth around the radar's returns: a lidar sees in all directions, and farther points are ignored."""
 
 VOXEL_M = {"default": 0.1, "quick": 0.2}
-"""Edge of the voxels in which meshes of maps of each kind are judged, m."""
+"""Edge of the voxels in which meshes of each kind of map are evaluated, m."""
 
 _MIN_RANGE_M = 2.5
 _MIN_RANGE_OCULII_M = 1.0
 _MAX_RANGE_FILE_M = 60.0
 _HOLDOUT_EVERY = 10
 _HOLDOUT_EVERY_SHORT = 5
-_SHORT_FRAMES = 50  # of fewer scans, every tenth would be too few for a test
+_SHORT_FRAMES = 50  # below this, every tenth scan would be too few for a test
 _QUICK_FRAMES = 4
 
 QUICK: Changes = {"training": {"sdf_iterations": 60, "intensity_iterations": 60}}
@@ -68,9 +68,9 @@ class Scene:
     min_range_m: float = _MIN_RANGE_M
     """Setting of `FitConfig`: nearer returns are dropped by the fit. `points` still holds them."""
     max_range_m: float | None = None
-    """Setting of `FitConfig`: farther returns are dropped by the fit. None: none are."""
+    """Setting of `FitConfig`: farther returns are dropped by the fit. None: no limit."""
     simulation: Simulation | None = None
-    """The truth about the same scans if the scene is simulated."""
+    """Ground truth of the same scans if the scene is simulated."""
     doppler_mps: list[NDArray[Any]] | None = None
     """F arrays (N_i,), m/s, of a recorded scene."""
     times_s: NDArray[np.float64] | None = None
@@ -87,17 +87,17 @@ class Scene:
 
     @property
     def ranges(self) -> dict[str, Any]:
-        """The settings of the returns that a fit uses."""
+        """Settings of the range limits of a fit."""
         return {"min_range_m": self.min_range_m, "max_range_m": self.max_range_m}
 
     def config(self, preset: str, *, quick: bool = False, **changes: Any) -> FitConfig:
-        """One of `PRESETS` with the ranges of the scene, `QUICK` settings if asked for, and other changes."""
+        """Preset of `PRESETS` with the ranges of the scene, `QUICK` settings if requested, and other changes."""
         return (
             PRESETS[preset].override(returns=self.ranges).override(**merged(QUICK if quick else {}, changes))
         )
 
     def fit(self, config: FitConfig) -> RadarMap:
-        """A map of all scans, with intensities if the scene has them."""
+        """Fit all scans, with intensities if the scene has them."""
         return radarsdf.fit(self.points, self.poses, self.intensities, config=config, progress=False)
 
     def rays(self) -> Rays:
@@ -125,7 +125,7 @@ class Scene:
         return self._select(np.arange(n))
 
     def repeated(self, repetition: int) -> Scene:
-        """The simulated scene of another seed, since a fit of another seed repeats most errors. A recorded one as it is."""
+        """The simulated scene with another seed, since fits with other seeds repeat most errors; a recorded one unchanged."""
         if self.simulation is None or repetition == 0:
             return self
         other = load_scene(self.name, frames=len(self), seed=self.simulation.seed + repetition)
@@ -166,7 +166,7 @@ class Scene:
 
 
 def chosen_scenes(options: argparse.Namespace) -> Iterator[Scene]:
-    """The scenes of a command line; four scans of each in a quick run."""
+    """Yield the scenes of a command line; four scans of each in a quick run."""
     for spec in options.cases:
         frames = getattr(options, "frames", None) or (_QUICK_FRAMES if options.quick else None)
         yield load_scene(spec, frames=frames, seed=options.seed, box=getattr(options, "box", None))
@@ -184,9 +184,9 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
         - an ``.npz`` file for :func:`radarsdf.io.npz.read_scans`. Only lidar points within 1 m of a return that is
           2.5 to 60 m from its sensor are ground truth;
         - a folder of scans with poses for :func:`radarsdf.io.read`, such as a recording of Viking Hill. All its lidar
-          points are ground truth; `box` selects a part.
+          points are ground truth; `box` selects a region.
     frames : int, optional
-        Number of scans. A simulated scene has them along its whole path; of a recorded scene they are the first ones.
+        Number of scans. A simulated scene has them along its whole path; a recorded scene is cut to the first ones.
     seed : int
         Seed of a simulated scene.
     box : (2, 3) or (6,) array_like, optional

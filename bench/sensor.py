@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Noise and false returns of a radar, measured against lidar: recorded drives compared with simulated ones.
+"""Noise and false returns of a radar, measured against lidar, on recorded and simulated drives.
 
 `python -m bench.sensor FILE.npz ...`.
 """
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 MIN_RANGE_M = 2.5
-# A lidar as on the recorded drives: 16 rings. Weak echoes are lost: the drives have half of their lidar points within
+# A lidar like those of the recorded drives: 16 rings. Weak echoes are lost: half of the drives' lidar points are within
 # 18 m, and a twentieth beyond 45 m.
 _RINGS_RAD = np.deg2rad(np.arange(-15.0, 15.1, 2.0))
 _COLUMN_RAD = np.deg2rad(0.3)
@@ -37,14 +37,14 @@ _LIDAR_SURE_M = (
 
 BANDS_M = ((MIN_RANGE_M, 10.0), (10.0, 20.0), (20.0, 30.0), (30.0, 45.0), (45.0, 60.0))
 AXES = ("beam", "azimuth", "elevation")
-_FEWEST = 50  # returns for a figure; of fewer there is none
-_CONE_RAD = np.deg2rad(1.5)  # the lidar covers a direction if it has points this near to it,
-_CONE_POINTS = 3  # at least so many in the same scan
-_GATE_M = 1.5  # returns farther from their plane say nothing of the noise
-_TOGETHER = 1000  # returns whose pieces are in memory at once
-_ALONG_NORMAL = 0.85  # a plane measures the axis whose share in its normal is at least this
-_FALSE_M = 1.0  # a return farther from every lidar point is called false
-_REPEAT_PER_M = 0.02  # returns of two scans agree if they are nearer than this share of the range
+_FEWEST = 50  # smallest number of returns for a figure
+_CONE_RAD = np.deg2rad(1.5)  # the lidar covers a direction if it has points this close to it,
+_CONE_POINTS = 3  # at least this many in the same scan
+_GATE_M = 1.5  # gate: returns farther from their plane carry no information on the noise
+_TOGETHER = 1000  # returns whose neighbourhoods are in memory at once
+_ALONG_NORMAL = 0.85  # a plane measures the axis with at least this share in its normal
+_FALSE_M = 1.0  # returns farther from every lidar point are false
+_REPEAT_PER_M = 0.02  # returns of two scans agree within this share of the range
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Drive:
         return range_m
 
     def in_world(self, vectors: FloatArray) -> FloatArray:
-        """One vector (N, 3) in the sensor frame for each return, turned into the world frame."""
+        """Rotate vectors (N, 3), one per return, from the sensor frame into the world frame."""
         turned: FloatArray = np.einsum("nij,nj->ni", self.poses[self.frame, :3, :3], vectors)
         return turned
 
@@ -75,7 +75,7 @@ class Drive:
 
 
 def recorded(path: Path) -> Drive:
-    """A drive from an .npz file with `lidar_frame` besides the arrays of `read_scans`; static returns only."""
+    """Load a drive from an .npz file with `lidar_frame` and the arrays of `read_scans`; static returns only."""
     with np.load(path) as arrays:
         used = arrays["static"] & (np.linalg.norm(arrays["points"], axis=1) >= MIN_RANGE_M)
         return Drive(
@@ -90,9 +90,9 @@ def recorded(path: Path) -> Drive:
 
 
 def with_lidar(simulation: Simulation, same_lidar: Drive | None = None) -> Drive:
-    """A simulated drive, with the points that a lidar of 16 rings finds on its surfaces.
+    """Build a simulated drive, with the points of a lidar of 16 rings on its surfaces.
 
-    They do not depend on the radar: they can be those of another drive through the same scene, with the same poses.
+    They do not depend on the radar, so they can be shared by drives through the same scene with the same poses.
     """
     points = np.concatenate(simulation.points).astype(np.float64)
     used = np.linalg.norm(points, axis=1) >= MIN_RANGE_M
@@ -133,9 +133,9 @@ def _lidar_scan(simulation: Simulation, frame: int) -> FloatArray:
 
 
 def figures(drive: Drive) -> dict[str, float]:
-    """The figures by name, each followed by its range band, such as `median distance m 10-20`.
+    """Figures by name, each followed by its range band, such as `median distance m 10-20`.
 
-    NaN where fewer than 50 returns tell it. Distances are those to the nearest lidar point. Deviations are those from
+    NaN for fewer than 50 returns. Distances are those to the nearest lidar point. Deviations are relative to
     planes through lidar points; see `plane_errors`.
     """
     range_m, world = drive.range_m(), drive.world_points()
@@ -177,7 +177,7 @@ def figures(drive: Drive) -> dict[str, float]:
 
 
 def is_covered(drive: Drive) -> BoolArray:
-    """Mask (N,) of the returns in whose direction the lidar has points in the same scan."""
+    """Mask (N,) of the returns in directions where the lidar has points in the same scan."""
     range_m = drive.range_m()
     covered = np.zeros(len(range_m), dtype=bool)
     for frame, T_world_sensor in enumerate(drive.poses):
@@ -192,11 +192,11 @@ def is_covered(drive: Drive) -> BoolArray:
 def plane_errors(
     drive: Drive, world: FloatArray, nearest: NDArray[np.int64]
 ) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Signed distances (N,), m, of returns to flat parts of the lidar's surface, and which axis of the sensor they measure (N,).
+    """Signed distances (N,), m, of returns to flat neighbourhoods of the lidar's surface, and the sensor axis they measure (N,).
 
-    A part is all lidar points within 0.4 m, or 2.5 % of the range if that is more, of the point `nearest` (N,) to the return.
-    It is flat if its thickness is below 6 cm and below 0.22 of its width. Axis 0: its normal is along the beam, 1: along the
-    azimuth, 2: along the elevation, -1: oblique, or no plane.
+    A neighbourhood is all lidar points within 0.4 m, or 2.5 % of the range if that is more, of the point `nearest` (N,) to the
+    return. It is flat if its thickness is below 6 cm and below 0.22 of its width. Axis 0: its normal is along the beam, 1: along
+    the azimuth, 2: along the elevation, -1: oblique, or no plane.
     """
     range_m = drive.range_m()
     beam = drive.points / range_m[:, None]
@@ -221,11 +221,11 @@ def plane_errors(
 def _pieces(
     points: FloatArray, tree: cKDTree, middle: FloatArray, radius_m: FloatArray
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
-    """Count (n,), mean (n, 3), least axis (n, 3) and ascending variances (n, 3) of the points in n balls, none empty."""
+    """Count (n,), mean (n, 3), smallest axis (n, 3) and ascending variances (n, 3) of the points in n balls, none empty."""
     own = tree.query_ball_point(middle, radius_m, return_sorted=False)
     count = np.array([len(rows) for rows in own])
     first = np.cumsum(count) - count
-    # From the middle, or UTM coordinates would cost digits.
+    # Relative to the mean, since UTM coordinates would lose precision.
     spread_m = points[np.concatenate(own).astype(np.int64)] - np.repeat(middle, count, axis=0)
     mean = np.add.reduceat(spread_m, first) / count[:, None]
     spread_m -= np.repeat(mean, count, axis=0)
@@ -261,7 +261,7 @@ def _repeats(drive: Drive, world: FloatArray) -> FloatArray:
 
 
 def _halves(intensities: FloatArray, rows: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """The stronger and the weaker half of some returns."""
+    """Masks of the stronger and the weaker half of some returns."""
     middle = _median(intensities[rows])
     return rows & (intensities > middle), rows & (intensities <= middle)
 
@@ -275,7 +275,7 @@ def _mean(values: FloatArray | BoolArray) -> float:
 
 
 def medians(found: Sequence[dict[str, float]]) -> dict[str, float]:
-    """The median of each figure over the drives that have it, NaN if none has."""
+    """Median of each figure over the drives that have it, NaN if none has."""
     values = {name: np.array([one[name] for one in found]) for name in found[0]}
     return {
         name: float(np.nanmedian(own)) if np.isfinite(own).any() else float("nan")
@@ -284,7 +284,7 @@ def medians(found: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each figure: of the recorded drives (median, least, most) and of the simulations (median), and their ratio."""
+    """Yield a row per figure: recorded drives (median, minimum, maximum), simulations (median), and their ratio."""
     drives = [figures(recorded(Path(path))) for path in options.cases]
     simulations = [figures(with_lidar(SCENES["astyx"](seed=seed))) for seed in options.seeds]
     simulated = medians(simulations)

@@ -11,13 +11,13 @@ from typing import Any
 from radarsdf import FitConfig
 
 Changes = dict[str, Any]
-"""Top-level settings of a `FitConfig`, and for each group a dict of its settings that change; goes through JSON."""
+"""Settings to change: top-level ones of a `FitConfig`, and a dict for each group; JSON-serialisable."""
 
 PRESETS = {"default": FitConfig(), "quick": FitConfig.quick(), "paper": FitConfig.paper()}
 
 
 def merged(*changes: Changes) -> Changes:
-    """All changes together; of the same setting, the last one counts."""
+    """Merge changes; the last value of a setting wins."""
     found: Changes = {}
     for part in changes:
         for name, value in part.items():
@@ -28,7 +28,7 @@ def merged(*changes: Changes) -> Changes:
 
 
 def parsed(words: Iterable[str]) -> Changes:
-    """Changes from words such as ``training.batch_size=8192``. Those of ``mesh.`` are arguments of a mesh.
+    """Parse changes from words such as ``training.batch_size=8192``. Those of ``mesh.`` are arguments of a mesh.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def parsed(words: Iterable[str]) -> Changes:
 
 
 def words_of(changes: Changes) -> str:
-    """Changes as words; those of :func:`parsed`."""
+    """Format changes as words; the inverse of :func:`parsed`."""
     words = []
     for name, value in changes.items():
         of_group = value if isinstance(value, dict) else {"": value}

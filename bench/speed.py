@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Fits by turns with VDBFusion and with another version of radarsdf: `python -m bench.speed --against PATH`, in two minutes.
+"""Fits alternating with VDBFusion and with another version of radarsdf: `python -m bench.speed --against PATH`, in two minutes.
 
-PATH is a wheel, or a checkout that is built in place. Ratios of one round are of runs one after the other, so that what else the
-machine does reaches both.
+PATH is a wheel, or a checkout built in place. Ratios within a round are of consecutive runs, so that other load on the
+machine affects both.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _OWN = Path(radarsdf.__file__).parents[1]
 
 
 class Version:
-    """A version of radarsdf in a process of its own, which is warm after the first run."""
+    """A version of radarsdf in its own process, warm after the first run."""
 
     def __init__(self, packages: Path, scans: Path) -> None:
         self._child = subprocess.Popen(
@@ -56,14 +56,14 @@ class Version:
         """Wall time of a fit, with its mesh if the case has one."""
         assert self._child.stdin and self._child.stdout  # noqa: PT018 - pipes
         print(json.dumps(case), file=self._child.stdin, flush=True)
-        return float(self._child.stdout.readline())  # of no line, whose reason is above, a ValueError
+        return float(self._child.stdout.readline())  # an empty line, explained above it, is a ValueError
 
     def close(self) -> None:
         self._child.communicate()
 
 
 def _child(path: Path) -> None:
-    """Answers each line of cases with its seconds."""
+    """Answer each line, a case, with its seconds."""
     with np.load(path) as file:
         poses, own = file["poses"], np.cumsum(file["counts"])[:-1]
         points, intensities = np.split(file["points"], own), np.split(file["intensities"], own)
@@ -80,7 +80,7 @@ def _child(path: Path) -> None:
 
 
 def speed(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene, number of threads, case and round. Round 0 warms up, and is left out."""
+    """Yield a row per scene, number of threads, case and round. Round 0 warms up, and is left out."""
     frames, rounds = (4, 1) if options.quick else (None, options.repetitions)
     with tempfile.TemporaryDirectory() as folder:
         packages = {"own": _OWN}
@@ -111,7 +111,7 @@ def speed(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def packages_of(path: Path, folder: Path) -> Path:
-    """The folder that holds the package of a checkout or of a wheel.
+    """Folder that holds the package of a checkout or of a wheel.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def packages_of(path: Path, folder: Path) -> Path:
         return folder
     found = path.resolve() / "python"
     if not list(found.glob("radarsdf/_core*")):
-        msg = f"{path} is neither a wheel nor a checkout that is built in place"
+        msg = f"{path} is neither a wheel nor a checkout built in place"
         raise ValueError(msg)
     return found
 

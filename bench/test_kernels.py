@@ -21,7 +21,7 @@ from .conftest import FEATURE_DIM, LEAF_M, NUM_LEVELS, surface_points
 
 
 class Differentiated:
-    """An interpolation `function` of the tensors `features`, which PyTorch differentiates."""
+    """An interpolation `function` of the tensors `features`, differentiated by PyTorch."""
 
     def __init__(self, features, function):
         self._features = [tensor.clone().requires_grad_() for tensor in features]
@@ -65,7 +65,7 @@ def embedding_bag(surface, batch, _fixture):
 
 
 class Roofline:
-    """The loops of roofline.cpp, with one of its two schemes for the gradient."""
+    """Loops of roofline.cpp, with one of its two schemes for the gradient."""
 
     def __init__(self, library, surface, batch, threads, scheme):
         self._library, self._scheme = library, scheme
@@ -112,7 +112,7 @@ FORWARD = {
     "embedding_bag": embedding_bag,
 }
 ROOFLINE = {"roofline": roofline_way(0, "copies")}
-# The best scheme depends on the number of threads, and on the number of rows for each point.
+# The best scheme depends on the numbers of threads and of rows per point.
 ROOFLINES = {
     "roofline, one thread": roofline_way(1, "copies"),
     "roofline, a copy for each thread": roofline_way(0, "copies"),
@@ -178,7 +178,7 @@ def test_fourier(benchmark, batch, way):
     out = benchmark(fused if way == "ours" else plain)
     angle = (points.double()[:, None, :] * frequencies.double()[:, None]).flatten(1)
     expected = torch.cat([torch.sin(angle), torch.cos(angle)], 1)
-    assert (out - expected).abs().max() < 3e-4  # of float32 angles up to 4000; ours is exact to 1e-6
+    assert (out - expected).abs().max() < 3e-4  # float32 angles reach 4000; ours is exact to 1e-6
 
 
 @pytest.fixture(scope="module", params=[1_000_000, 10_000_000], ids=["1e6", "1e7"])

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: MIT
 """Speed of marching cubes against other programs on the same float32 samples, on one thread unless the case says more.
 
-Groups: two fields; lattice and extraction of a shell; a real map by its cells. Each case checks the number of triangles or the area of its mesh, so that a wrong result cannot
-be the fastest. Each program has its usual outputs: VTK float32 points and int64 cells, scikit-image also normals and
-values, PyMCubes float64 and int64. Ours are float64 and int32.
+Groups: two fields; lattice and extraction of a shell; a real map by its cells. Each case checks the number of triangles or
+the area of its mesh, so that a wrong result cannot be the fastest. Each program has its usual outputs: VTK float32 points and
+int64 cells, scikit-image also normals and values, PyMCubes float64 and int64. Ours are float64 and int32.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ def gyroid_192():
     return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
 
 
-# The volume, the number of triangles, which rounding can change a little, and their area in cells.
+# Volume, number of triangles, which rounding can change slightly, and their area in cells.
 FIELDS = {
     "sphere256": (sphere_256, 392_252, 4 * np.pi * (0.8 * 255 / 2) ** 2),
     "gyroid192": (gyroid_192, 1_415_084, None),
@@ -111,7 +111,7 @@ def test_scikit_image(benchmark, field):
     benchmark.group = field_group(field)
     measure = pytest.importorskip("skimage.measure", reason="scikit-image is not installed")
     vertices, faces, *_ = benchmark(measure.marching_cubes, field[0], 0.0)
-    check_mesh(vertices, faces, field, rel=0.01)  # it treats ambiguous cells differently
+    check_mesh(vertices, faces, field, rel=0.01)  # ambiguous cells are resolved differently
 
 
 def test_pymcubes(benchmark, field):
@@ -123,7 +123,7 @@ def test_pymcubes(benchmark, field):
 
 @pytest.fixture(scope="module")
 def shell():
-    """Cells of random points within 2 cells of a sphere, several times each and in random order."""
+    """Cells of random points within 2 cells of a sphere, repeated and in random order."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(6_000_000, 3))
     points *= (200 + rng.uniform(-2, 2, size=(len(points), 1))) / np.linalg.norm(
@@ -152,17 +152,17 @@ def test_sparse_extraction(benchmark, shell, threads):
 
 @dataclass(frozen=True, eq=False)
 class MapLattice:
-    """The voxels of a fitted map and the signed distances at their corners, as for its mesh."""
+    """Voxels of a fitted map and the signed distances at their corners, as for its mesh."""
 
     cells: np.ndarray  # (M, 3) voxels
     values: np.ndarray  # signed distances at the corners, m, in the order of sparse_lattice
     volume: np.ndarray  # signed distances in the whole box, m; 1 outside the map
     lower: np.ndarray  # (3,) lattice coordinates of the lower corner of the box
 
-    @cache  # noqa: B019 - the fixture makes only one
+    @cache  # noqa: B019 - the fixture creates only one
     def crossed_edges(self, *, of_cells):
         """Number of edges of the map's voxels, or of the box, that the surface crosses. A mesh has a vertex on each."""
-        # The voxels that count, with one more on each side of the box.
+        # The voxels inside, with one more on each side of the box.
         in_use = np.full(np.add(self.volume.shape, 1), not of_cells)
         in_use[tuple((self.cells - self.lower + 1).T)] = True
         positive, count = self.volume > 0, 0
@@ -199,7 +199,7 @@ def map_group(lattice):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_map_by_cells(benchmark, map_lattice, threads):
-    """Lattice and extraction. As in all cases, the network's distances at the corners are computed before."""
+    """Lattice and extraction. As in all cases, the network's distances at the corners are precomputed."""
     benchmark.group = map_group(map_lattice)
 
     def run():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Time in which a fitted map answers: signed distances near its returns, and meshes."""
+"""Query times of a fitted map: signed distances near its returns, and meshes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COUNT = 1_000_000
 
 @pytest.fixture(scope="module")
 def drive(request):
-    """The drive of `hugin`, short where nothing is measured, and its map."""
+    """The drive of `hugin`, shortened if nothing is measured, and its map."""
     scans = radarsdf.simulate.hugin(frames=4 if request.config.getoption("benchmark_disable") else None)
     return scans, radarsdf.fit(scans.points, scans.poses, progress=False)
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: MIT
 """Time of a training step on one of two threads: the whole step, and its matrix products alone.
 
-There is a group for each stage of the schedule: geometry alone, geometry and intensity together, and intensity with
-frozen geometry. A round has `STEPS` steps in all cases of a group, so that times can be compared.
+There is a group per stage of the schedule: geometry alone, geometry and intensity together, and intensity with
+frozen geometry. All cases of a group run `STEPS` steps per round, so that times can be compared.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .conftest import surface_points
 STEPS = 100  # after this many steps, a training checks its parameters and keeps a copy
 STAGES = ("geometry", "joint", "intensity")
 CONFIG = FitConfig(num_threads=1, returns={"drop_ghosts": False})
-SHARE = 2  # a fit divides its batches among two threads
+SHARE = 2  # a fit splits its batches among two threads
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_whole(benchmark, stage, rays, leaf_keys):
         benchmark.pedantic(run, setup=setup, rounds=10, warmup_rounds=1)
         while len(losses) < 5:  # with --benchmark-disable there is one round
             run(*setup()[0])
-    # Each round continues the training of the one before; where it has converged, the last losses are noise.
+    # Each round continues the training of the previous one; after convergence, the last losses are noise.
     assert min(losses[1:]) < losses[0]
 
 

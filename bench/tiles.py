@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Maps in tiles: compared with one fit, and over the number of returns: `python -m bench.tiles seams|growth`, on Linux."""
+"""Maps in tiles compared with one fit, and their scaling with returns: `python -m bench.tiles seams|growth`, on Linux."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from bench.measure import in_new_process, timed
 from bench.runner import Experiment, Row, main
 from bench.scenes import load_scene
 
-# Edges of the tiles: small, so that there are many borders; the default on the long street.
+# Edges of the tiles: small, for many borders; the default on the long street.
 _TILE_M = {"hugin": 32.0, "oculii": 51.2, "street": None}
 _RETURNS = 10_000_000
 _WORKERS = 2
-_SIDE_M = 1e-3  # either side of a border at which answers are compared
-_NEAR_M = 1.0  # what counts as near a border
+_SIDE_M = 1e-3  # offset to either side of a border at which queries are compared
+_NEAR_M = 1.0  # distance of points near a border
 
 _Floats = NDArray[np.float64]
 
 
 def seams(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene: F-scores, steps across borders, distance from the surface of one fit, and open edges."""
+    """Yield a row per scene: F-scores, steps across borders, distance from the surface of one fit, and open edges."""
     for name in options.cases:
         scans, config = _scene(name, options.quick)
         with tempfile.TemporaryDirectory() as folder:
@@ -47,7 +47,7 @@ def _scene(name: str, quick: bool) -> tuple[Scans, FitConfig]:
     config = FitConfig.quick() if quick else FitConfig()
     if name == "street":
         count = 100_000 if quick else _RETURNS
-        made = street(count, num_hits=count)  # all of them: the truth must be denser than the mesh
+        made = street(count, num_hits=count)  # all of them: the ground truth must be denser than the mesh
         return Scans(made.points, made.poses, made.intensities, made.hits), config
     scene = load_scene(name)
     scans = Scans(scene.points, scene.poses, scene.intensities, scene.ground_truth)
@@ -90,15 +90,15 @@ def _two(values: _Floats) -> str:
 
 
 def _to_border(city: TiledMap, points: _Floats) -> _Floats:
-    """Distance (N,) to the next border between tiles, m."""
+    """Distance (N,) to the nearest border between tiles, m."""
     way_m = points[:, :2] - city.plan.grid.corner_m
     nearest: _Floats = np.abs(way_m - np.round(way_m / city.plan.tile_m) * city.plan.tile_m).min(axis=1)
     return nearest
 
 
 def _steps(city: TiledMap, one: RadarMap, vertices: _Floats) -> dict[str, tuple[tuple[float, float], ...]]:
-    """The 99 % quantile and the largest of the steps of answers: of the tiles and of the single fit across borders, and of
-    the tiles across planes in the middle of tiles.
+    """The 99 % quantile and the maximum of steps in queries: of tiles and of the single fit across borders, and of
+    tiles across planes in the middle of tiles.
     """
     found: dict[str, tuple[tuple[float, float], ...]] = {}
     sensor = city.config.lattice.position(city.tiles[0].origin_cells)
@@ -117,7 +117,7 @@ def _steps(city: TiledMap, one: RadarMap, vertices: _Floats) -> dict[str, tuple[
 
 
 def _sides(city: TiledMap, vertices: _Floats, shift_m: float) -> tuple[_Floats, _Floats]:
-    """Points (N, 3) of the surface moved onto borders that are shifted, and steps (N, 3) across, where both are known."""
+    """Points (N, 3) of the surface moved onto shifted borders, and steps (N, 3) across, where both are known."""
     rng = np.random.default_rng(0)
     way_m = vertices[:, :2] - city.plan.grid.corner_m - shift_m
     way_m -= np.round(way_m / city.plan.tile_m) * city.plan.tile_m
@@ -131,7 +131,7 @@ def _sides(city: TiledMap, vertices: _Floats, shift_m: float) -> tuple[_Floats, 
 
 
 def _open_edges(city: TiledMap, mesh: Any) -> tuple[float, float]:
-    """Share of the edges with one triangle: of those on borders, and of those on planes in the middle of tiles."""
+    """Share of the edges with one triangle: on borders, and on planes in the middle of tiles."""
     edges, counts = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
     shares = []
     for shift in (0.0, 0.5):
@@ -143,13 +143,13 @@ def _open_edges(city: TiledMap, mesh: Any) -> tuple[float, float]:
 
 
 def growth(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each number of returns of a street, each in a new process; workers are processes."""
+    """Yield a row per number of returns of a street, each in a new process; workers are processes."""
     for count in [100_000] if options.quick else options.returns:
         yield in_new_process("bench.tiles:growth_row", count)
 
 
 def growth_row(count: int) -> Row:
-    """Plan, fit and export a street without intensities. Memory is what the kernel says that a process held at most."""
+    """Plan, fit and export a street without intensities. Memory is the peak of a process according to the kernel."""
     scans = (Scan(points, pose) for pose, points, *_ in street_scans(count))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "city"

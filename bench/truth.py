@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How far points of a mesh are from the true surface: from simulated solids exactly, from lidar points by planes."""
+"""Distances of a mesh from the true surface: from simulated solids exactly, from lidar points by planes."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from bench.scenes import Scene
 FloatArray = NDArray[np.float64]
 
 REACH_M = 1.0
-"""Errors along the normal are looked for up to here."""
+"""Search distance of errors along the normal."""
 
-_STARTS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.0)  # of the reach
-_LIDAR_SIGMA_M = 0.03  # range accuracy of a VLP-16, by its data sheet; also that of other lidars of its time
-_PIECES_M = (0.2, 0.4)  # radii of pieces of the lidar's surface; the first that is flat counts
-_PIECE_RAD = 0.04  # and this share of the range: two of 16 rings are 0.035 of it apart
+_STARTS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.0)  # shares of the search distance
+_LIDAR_SIGMA_M = 0.03  # range accuracy of a VLP-16 by its data sheet; also that of other lidars of its time
+_PIECES_M = (0.2, 0.4)  # radii of neighbourhoods on the lidar's surface; the first flat one is used
+_PIECE_RAD = 0.04  # radius as a share of the range: two of 16 rings are 0.035 of it apart
 _PIECE_POINTS = 10
-_MOST_POINTS = 1000  # of a piece; more change nothing
+_MOST_POINTS = 1000  # largest neighbourhood; more points change nothing
 _THICKNESS_M = 0.06
-_THIN = 0.1  # variance across a flat piece, as a share of the lesser one along it
-_WIDE = 0.03  # the lesser variance along a piece, as a share of its radius squared. A single ring is a line
-_LEAST_COS = 0.5  # a surface whose normal is farther than 60 degrees from that of the mesh is another one
+_THIN = 0.1  # variance across a flat neighbourhood, as a share of the smaller one along it
+_WIDE = 0.03  # smaller variance along a neighbourhood, over its squared radius. A single ring is a line
+_LEAST_COS = 0.5  # surfaces with normals more than 60 degrees from that of the mesh are other ones
 _SLACK_M = 1e-6  # rounding of distances
 
 
 class Truth(NamedTuple):
-    """The true surface near N points."""
+    """True surface near N points."""
 
     distance_m: FloatArray  # (N,) to the nearest surface or lidar point in any direction
     error_m: (
@@ -42,7 +42,7 @@ class Truth(NamedTuple):
 
 
 def truth_of(scene: Scene, x: FloatArray, normals: FloatArray) -> Truth:
-    """The true surface near points `x` (N, 3) of a mesh, with unit normals (N, 3) towards free space; world frame, m.
+    """True surface near points `x` (N, 3) of a mesh, with unit normals (N, 3) towards free space; world frame, m.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def truth_of(scene: Scene, x: FloatArray, normals: FloatArray) -> Truth:
     if scene.simulation is not None:
         world = scene.simulation.scene
         distance_m, error_m = np.abs(world.signed_distance(x)), along_normals(world, x, normals)
-        # Beyond an edge, a ray misses the surface beside it and meets one that lies far behind.
+        # Beyond an edge, a ray misses the adjacent surface and hits one far behind.
         error_m[_LEAST_COS * np.abs(error_m) > distance_m + _SLACK_M] = np.nan
         return Truth(distance_m, error_m, np.zeros(len(x)))
     if scene.ground_truth is None or len(scene.ground_truth) == 0:
@@ -64,10 +64,10 @@ def truth_of(scene: Scene, x: FloatArray, normals: FloatArray) -> Truth:
 
 
 def along_normals(world: World, x: FloatArray, normals: FloatArray) -> FloatArray:
-    """Signed distances (N,), m, to the nearest surface that faces the same way, along the normals, both ways.
+    """Signed distances (N,), m, to the nearest surface of the same orientation, along the normals in both directions.
 
     Rays are cast against the normals, from the points and from places in front of them. A ray from inside a solid
-    would meet surfaces that are hidden in others, so only places in free space count. NaN without a surface within
+    would hit surfaces hidden in others, so only origins in free space are used. NaN without a surface within
     `REACH_M`.
     """
     error_m = np.full(len(x), np.nan)
@@ -85,10 +85,10 @@ def along_normals(world: World, x: FloatArray, normals: FloatArray) -> FloatArra
 def to_planes(
     lidar: FloatArray, nearest: NDArray[np.int64], x: FloatArray, normals: FloatArray, sensors: FloatArray
 ) -> FloatArray:
-    """Signed distances (N,), m, along the normals to the planes through pieces of the lidar's surface.
+    """Signed distances (N,), m, along the normals to planes through neighbourhoods on the lidar's surface.
 
-    A piece is the points round the lidar point `nearest` (N,) to each point. Far from the `sensors` (F, 3) rings lie
-    far apart, so there pieces may be larger. NaN where none is flat and wide, or it faces elsewhere, or its plane is
+    A neighbourhood surrounds the lidar point `nearest` (N,) to each point. Far from the `sensors` (F, 3), rings are far
+    apart, so neighbourhoods may be larger there. NaN if none is flat and wide, or it faces elsewhere, or its plane is
     farther than `REACH_M`.
     """
     centres, which = np.unique(nearest, return_inverse=True)

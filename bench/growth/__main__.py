@@ -20,7 +20,7 @@ EXPERIMENTS = {
         {"returns": [10**5, 10**6, 10**7]} | _THREADS, fits.SURFEL_COLUMNS, lines=("returns", "threads"),
     ),
     "poses": Experiment(
-        "Refinement of poses", fits.poses, (), ("threads",), _THREADS, fits.POSE_COLUMNS, lines=("scans", "threads"),
+        "Pose refinement", fits.poses, (), ("threads",), _THREADS, fits.POSE_COLUMNS, lines=("scans", "threads"),
     ),
 }  # fmt: skip
 

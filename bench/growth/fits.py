@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Time and memory of fits, of parts of them, and of the refinement of poses. Each row is measured in a new process, on Linux."""
+"""Time and memory of fits, of their stages, and of pose refinement. Each row is measured in a new process, on Linux."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from bench.measure import in_new_process, measured, memory_bytes, timed
 from bench.paper.poses import walked
 from bench.runner import Column, Row, figure, groups
 
-_OFF_M = 0.2  # distance to the surface of the points at which the sign of the SDF is checked
+_OFF_M = 0.2  # distance from the surface of the points at which the sign of the SDF is checked
 _LEAST_RIGHT = 0.6
 
 FIT_COLUMNS = {
     "wall_s": Column("time, s"),
-    "cpu_s": Column("processor, s"),
+    "cpu_s": Column("CPU, s"),
     "peak_mb": Column("peak, MB", digits=0),
     "before_mb": Column("before the fit, MB", digits=0),
     "prepare_s": Column("prepare, s"),
@@ -49,7 +49,7 @@ FIT_COLUMNS = {
 
 
 def fits(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each number of returns, length of the street and number of threads, without and with intensities."""
+    """Yield a row per number of returns, length of the street and number of threads, without and with intensities."""
     returns, sizes_m = ([10**4], [50.0]) if options.quick else (options.returns, options.sizes)
     for count, size_m, threads in itertools.product(returns, sizes_m, options.threads):
         for intensities in (False, True):
@@ -93,7 +93,7 @@ def map_errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
     hits, sensors = scans.hits.astype(np.float64), scans.hit_sensors.astype(np.float64)
     rays = hits - sensors
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # The points are moved along the normal: a ray can be almost parallel to the surface.
+    # Points are offset along the normal, since a ray can be almost parallel to the surface.
     normals = np.zeros_like(hits)
     on_ground = np.abs(hits[:, 2]) < 1e-2
     on_side = ~on_ground & (np.abs(np.abs(hits[:, 1]) - 25) < 1e-2)
@@ -120,7 +120,7 @@ def map_errors(radar_map: RadarMap, scans: Street) -> dict[str, float]:
 
 
 def draw_fits(rows: list[Row], path: Path) -> None:
-    """Draw seconds and peak memory over the number of returns."""
+    """Plot seconds and peak memory over the number of returns."""
     with figure(path, columns=2, size=(4.6, 3.8)) as (axes,):
         for ax, (key, label, factor) in zip(
             axes, (("wall_s", "time, s", 1), ("peak_mb", "memory, GB", 1e-3)), strict=True
@@ -133,10 +133,10 @@ def draw_fits(rows: list[Row], path: Path) -> None:
 
 
 SURFEL_COLUMNS = {
-    "ghosts_cpu_s": Column("ghosts: processor, s"),
+    "ghosts_cpu_s": Column("ghosts: CPU, s"),
     "ghosts_wall_s": Column("time, s"),
     "ghosts_grown_mb": Column("MB", digits=0),
-    "visibility_cpu_s": Column("visibility counts: processor, s"),
+    "visibility_cpu_s": Column("visibility counts: CPU, s"),
     "visibility_wall_s": Column("time, s "),
     "visibility_grown_mb": Column("MB ", digits=0),
     "ghosts": Column("ghosts", digits=0),
@@ -145,7 +145,7 @@ SURFEL_COLUMNS = {
 
 
 def surfels(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each number of returns: the ghost search and the visibility counts. The street grows with the returns."""
+    """Yield a row per number of returns: ghost search and visibility counts. The street grows with the returns."""
     for count, threads in itertools.product([10**5] if options.quick else options.returns, options.threads):
         yield {"returns": count, "threads": threads} | in_new_process(
             "bench.growth.fits:surfel_row", count, threads
@@ -158,7 +158,7 @@ def surfel_row(returns: int, threads: int) -> Row:
     Raises
     ------
     RuntimeError
-        If the number of ghosts, or of cells that were seen, is implausible.
+        If the number of ghosts or of observed cells is implausible.
     """
     scans = street(returns)
     rays = prepare(scans.points, scans.poses)
@@ -182,21 +182,21 @@ def surfel_row(returns: int, threads: int) -> Row:
     return row
 
 
-_APART_M = 500.0  # from a copy to the next: they have no returns in common
-_WALK = 0.02, 0.1  # m and degrees a step
+_APART_M = 500.0  # distance between copies, which have no returns in common
+_WALK = 0.02, 0.1  # m and degrees per step
 POSE_COLUMNS = {
     "returns": Column("returns", digits=0),
     "wall_s": Column("time, s"),
-    "cpu_s": Column("processor, s"),
-    "grown_mb": Column("grown by, MB", digits=0),
+    "cpu_s": Column("CPU, s"),
+    "grown_mb": Column("growth, MB", digits=0),
     "rounds": Column("rounds", digits=0),
-    "given_deg": Column("a step given, °", digits=3),
-    "found_deg": Column("a step refined, °", digits=3),
+    "given_deg": Column("step error before, °", digits=3),
+    "found_deg": Column("step error refined, °", digits=3),
 }
 
 
 def poses(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each number of scans: `refine_poses` of a drive, and of copies of it one after another."""
+    """Yield a row per number of scans: `refine_poses` of a drive, and of concatenated copies of it."""
     for count, threads in itertools.product((40,) if options.quick else (120, 1200, 9960), options.threads):
         yield {"scans": count, "threads": threads} | in_new_process(
             "bench.growth.fits:pose_row", count, threads
@@ -204,7 +204,7 @@ def poses(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def pose_row(scans: int, threads: int) -> Row:
-    """Time and growth of the peak memory of `refine_poses`, of poses that drift.
+    """Time and growth of the peak memory of `refine_poses` with drifting poses.
 
     Raises
     ------

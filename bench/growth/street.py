@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A simulated street of any length with any number of returns: fast to compute, and its true surface is known.
+"""A simulated street of any length with any number of returns: fast to compute, with a known true surface.
 
 There are walls 25 m to the left and right of a straight path and one at each end, and flat ground 2 m below the sensor.
-Rays that hit nothing within 100 m give clutter at 30 to 100 m, and a tenth of the returns within 70 m are ghosts. The
+Rays without a hit within 100 m give clutter at 30 to 100 m, and a tenth of the returns within 70 m are ghosts. The
 intensity in dB follows the radar equation: it falls with the fourth power of the range, and differs between stripes of
 the walls.
 """
@@ -30,7 +30,7 @@ class Street:
     """F scans along the street from one end to the other."""
 
     points: list[NDArray[np.float32]]
-    """F arrays (N_i, 3), sensor frame, m. Its axes are those of the world."""
+    """F arrays (N_i, 3), sensor frame, m, with axes parallel to those of the world."""
     poses: NDArray[np.float64]
     """(F, 4, 4) T_world_sensor."""
     intensities: list[NDArray[np.float32]]
@@ -44,9 +44,9 @@ class Street:
 
 
 def street(count: int, size_m: float | None = None, num_hits: int = _NUM_HITS) -> Street:
-    """A street with `count` returns, and the truth about some of them, approximately `num_hits`.
+    """Simulate a street with `count` returns, with the truth of about `num_hits` of them.
 
-    It is `size_m` long. The default is 200 m + 1 m for every 5,000 returns, which keeps their density almost constant.
+    Its length is `size_m`, by default 200 m + 1 m per 5,000 returns, which keeps their density almost constant.
     """
     poses, points, intensities, truths = [], [], [], []
     for pose, scan, intensity, *truth in street_scans(count, size_m):
@@ -61,7 +61,7 @@ def street(count: int, size_m: float | None = None, num_hits: int = _NUM_HITS) -
 
 
 def street_scans(count: int, size_m: float | None = None) -> Iterator[tuple[NDArray[Any], ...]]:
-    """The scans of :func:`street` one after another: pose, points, intensities, and the truth about the true returns."""
+    """Yield the scans of :func:`street`: pose, points, intensities, and the truth of the true returns."""
     size_m = 200 + count / 5000 if size_m is None else size_m
     rng = np.random.default_rng(0)
     frames = max(-(-count // _MAX_SCAN), round(size_m / _MAX_STEP_M), 2)

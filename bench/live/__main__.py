@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Maps that grow scan by scan: `python -m bench.live EXPERIMENT`."""
+"""Live maps: `python -m bench.live EXPERIMENT`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ EXPERIMENTS = {
     "tracking": Experiment("Odometry of scans of 2,000 returns", speed.tracking, _SCENES[:2], _OPTIONS),
     "accuracy": Experiment("Surface after each tenth of a drive", accuracy.accuracy, _SCENES, _OPTIONS),
     "intensities": Experiment("Intensities of held-out scans", accuracy.intensities, _SCENES[:2], _OPTIONS),
-    "loops": Experiment("A drifted drive, corrected", accuracy.loops, _SCENES, _OPTIONS),
-    "removal": Experiment("Scans removed and moved", removal.removal, _SCENES[:2], _OPTIONS),
+    "loops": Experiment("Correction of a drifting drive", accuracy.loops, _SCENES, _OPTIONS),
+    "removal": Experiment("Removed and moved scans", removal.removal, _SCENES[:2], _OPTIONS),
 }
 
 

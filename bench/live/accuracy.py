@@ -38,9 +38,9 @@ def _f_percent(mesh: Any, scene: Scene, options: argparse.Namespace) -> float:
 
 
 def accuracy(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene and tenth of its scans: F-scores of the growing map and of a fit.
+    """Yield a row per scene and tenth of its scans: F-scores of the growing map and of a fit.
 
-    `all` is without the rule that leaves improbable surface out: what is missing there is missing in the surface itself.
+    `all` is without the confidence threshold: what is missing there is missing in the surface itself.
     """
     for scene, config in _scenes(options):
         assert scene.intensities is not None
@@ -64,7 +64,7 @@ def accuracy(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def intensities(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene: MAE at the returns of every fifth scan, which is held out, where all maps answer."""
+    """Yield a row per scene: MAE at the returns of held-out scans, every fifth, where all maps have predictions."""
     for scene, config in _scenes(options):
         train, test = holdout(len(scene), _HELD_OUT_EVERY)
         known = scene._select(train)
@@ -94,7 +94,7 @@ def intensities(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def loops(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene: a drifted drive, corrected by `refine_poses` and `move_all`, and a map of true poses."""
+    """Yield a row per scene: a drifting drive, corrected by `refine_poses` and `move_all`, and a map with true poses."""
     for scene, config in _scenes(options):
         given = walked(scene.poses, 0.02, 0.1, options.seed)
 
@@ -108,7 +108,7 @@ def loops(options: argparse.Namespace) -> Iterator[Row]:
         before = _f_percent(live.mesh(), scene, options)
         refined = radarsdf.refine_poses(scene.points, given, config=config)
         with timed() as taken:
-            # Returns do not determine where the whole is: that is not judged.
+            # Returns do not determine the global pose, which is not evaluated.
             live.move_all(dict(zip(live.scan_ids, aligned(refined.poses, scene.poses), strict=True)))
         yield {
             "scene": scene.name,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans that are removed, or moved, in random order: bits and time."""
+"""Removal and correction of scans in random order: bits and time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SCANS = 1000
 
 
 def removal(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene and operation."""
+    """Yield a row per scene and operation."""
     count = 40 if options.quick else _SCANS
     for name in options.cases:
         yield from _rows(name, count, options)
@@ -73,7 +73,7 @@ def _times(items: Iterable[int], act: Callable[[int], Any]) -> list[float]:
 
 
 def state(live: LiveMap) -> list[bytes]:
-    """The bits of all sums."""
+    """Bytes of all sums."""
     keys = live._state.sums.block_keys()
     return [
         array.tobytes() for array in (*live._state.sums.sums_of(keys), *live._state.sums.visibility_of(keys))

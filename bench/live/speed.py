@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Time and memory of live maps and of odometry. Times are those of the processor unless named."""
+"""Time and memory of live maps and of odometry. Times are CPU times unless stated."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _MESH_EVERY = 10
 
 
 def denser(scans: Simulation, times: float) -> Simulation:
-    """The same drive, with a sensor of so many times as many beams."""
+    """The same drive by a sensor with `times` as many beams."""
     sensor = dataclasses.replace(scans.sensor, beams=round(times * scans.sensor.beams))
     return simulate(scans.scene, sensor, scans.poses, name=scans.name, seed=scans.seed)
 
 
 def rates(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene and method: time of a scan and of a mesh, also of VDBFusion where it is installed."""
+    """Yield a row per scene and method: time of a scan and of a mesh, also of VDBFusion if installed."""
     for name in options.cases:
         if name == DENSE:
             scans = denser(radarsdf.simulate.hugin(seed=options.seed, frames=12 if options.quick else 60), 12)
@@ -75,14 +75,14 @@ def _methods(threads: int) -> Iterator[tuple[str, Callable[..., Any], Callable[[
     yield "VDBFusion", integrate, lambda: volume.extract_triangle_mesh(fill_holes=False, min_weight=0.0)
 
 
-_PLACES, _FRAMES, _LAST = (1, 6), 100, 4  # so many scans of the last place come one by one
+_PLACES, _FRAMES, _LAST = (1, 6), 100, 4  # number of single scans at the last place
 _APART_M = 200.0
-# Of the sensor. Estimated, it would change while the map grows, and all with it.
+# Fixed: an estimated noise would change as the map grows, and all results with it.
 _NOISE = {"range_noise_m": 0.073, "azimuth_noise_rad": 0.0059, "elevation_noise_rad": 0.0093}
 
 
 def growth(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for maps of one place and of several, far apart: a mesh after one more scan should take as long on both."""
+    """Yield a row for maps of one and several distant places: a mesh after one more scan should take equally long."""
     frames = 12 if options.quick else _FRAMES
     drives = [radarsdf.simulate.hugin(seed=options.seed + k, frames=frames) for k in range(max(_PLACES))]
     for places in _PLACES:
@@ -107,12 +107,12 @@ def growth(options: argparse.Namespace) -> Iterator[Row]:
 
 
 _LAP, _ROWS = 500, 20
-_RANGE_NOISE = 0.002  # of a range, new each time
+_RANGE_NOISE = 0.002  # as a share of the range, drawn anew each time
 _MAX_BYTES = 150_000_000
 
 
 def circles(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each twentieth of very many scans of one place, driven in circles with new noise each time."""
+    """Yield a row per twentieth of very many scans of one place, driven in circles with new noise each time."""
     count = 400 if options.quick else int(options.cases[0])
     lap = radarsdf.simulate.oculii(seed=options.seed, frames=min(_LAP, count // 4))
     rng = np.random.default_rng(options.seed)
@@ -141,12 +141,12 @@ def circles(options: argparse.Namespace) -> Iterator[Row]:
             times = []
 
 
-_RETURNS = 2000  # of a scan
-_SCANS = 120  # of a drive
+_RETURNS = 2000  # per scan
+_SCANS = 120  # per drive
 
 
 def tracking(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene, without Doppler and with it: time in which `odometry` places a scan of 2,000 returns."""
+    """Yield a row per scene, without and with Doppler: time in which `odometry` tracks a scan of 2,000 returns."""
     for name in options.cases:
         scans = SCENES[name](seed=options.seed, frames=_SCANS)
         scans = denser(scans, _RETURNS / float(np.median([len(scan) for scan in scans.points])))

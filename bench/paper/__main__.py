@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The experiments of the paper, and ours of the same kind: `python -m bench.paper EXPERIMENT [SCENE ...]`."""
+"""Experiments of the paper, and ours of the same kind: `python -m bench.paper EXPERIMENT [SCENE ...]`."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ EXPERIMENTS = {
         mean_line=True,
     ),
     "poses": Experiment(
-        "Poses that are refined, and poses from the radar alone", poses.poses, tuple(SCENES),
+        "Refined poses, and poses from the radar alone", poses.poses, tuple(SCENES),
         (*_ALL, "samples", "repetitions"), {"repetitions": 10}, poses.COLUMNS, ("scene",), ("poses",),
     ),
 }  # fmt: skip

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Whether a map knows its errors: `uncertainty` against distances to the truth, `confidence` against true surface."""
+"""Calibration of a map: `uncertainty` against distances to the truth, `confidence` against true surface."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from bench.truth import truth_of
 Floats = NDArray[np.float64]
 
 TRUE_M = 0.5
-"""A point of the mesh this near to the truth has an error. Farther ones are false."""
+"""Points of the mesh within this distance of the truth have an error; others are false."""
 
 _MOST_SAMPLES = 40_000  # more change nothing: neighbours have the same error
-_NEAR_M = 0.3  # returns this near give the range of a point, and how many scans saw it
+_NEAR_M = 0.3  # radius of the returns that give a point's range and number of scans
 _RANGES_M = (0.0, 10.0, 20.0, 30.0, np.inf)
 _SCANS = (0, 1, 2, 4, 8, 16, 32, np.inf)
-_FEWEST = 50  # points for the figures of a band
+_FEWEST = 50  # smallest number of points in a band
 _NO_TRUTH = "the scene has no ground truth"
 
 COLUMNS = {
@@ -45,7 +45,7 @@ COLUMNS = {
     "mean_uncertainty_m": Column("mean predicted, cm", 100),
     "predicted_m": Column("predicted, cm", 100),
     "false_share": Column("false, %", 100, 1),
-    "aside_share": Column("aside, %", 100, 1),
+    "aside_share": Column("no truth along normal, %", 100, 1),
     "unobserved_share": Column("NaN, %", 100, 1),
     "confidence_worst_gap": Column("confidence, worst gap"),
     "confidence_auc": Column("confidence, AUC"),
@@ -56,7 +56,7 @@ COLUMNS = {
 
 
 def calibration(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each configuration, `--set` and repetition, followed by rows by decile, range, scans and confidence."""
+    """Yield a row per configuration, `--set` and repetition, then rows by decile, range, scans and confidence."""
     variants = [{}, *options.set]
     for scene, base, changes in itertools.product(list(chosen_scenes(options)), options.base, variants):
         for repetition in range(options.repetitions):
@@ -86,7 +86,7 @@ def calibration(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def _parts(found: Row) -> Iterator[Row]:
-    """Rows of a result by decile of the uncertainty, range, number of scans, and confidence."""
+    """Yield rows of a result by decile of the uncertainty, range, number of scans, and confidence."""
     for i, (predicted_m, rmse_m) in enumerate(
         zip(found["decile_predicted_m"], found["decile_rmse_m"], strict=True)
     ):
@@ -110,19 +110,19 @@ def _parts(found: Row) -> Iterator[Row]:
 def compared(
     scene: Scene, x: Floats, normals: Floats, uncertainty_m: Floats, confidence: Floats, leaf_size_m: float
 ) -> Row:
-    """Errors of a map at points (N, 3) of its mesh, and what it says of them.
+    """Errors of a map at points (N, 3) of its mesh, and their predictions.
 
-    Shares of all points: `false_share` is farther than `TRUE_M` from the truth, `aside_share` is not, but no surface is
-    met along the normal (beyond an edge, or the truth is not flat), `unobserved_share` is the share of NaN. The figures
+    Shares of all points: `false_share` is farther than `TRUE_M` from the truth; `aside_share` is not, but has no surface
+    along the normal (beyond an edge, or the truth is not flat); `unobserved_share` is NaN. Figures
     of the uncertainty are those of the other points. The standard error of the truth is added to the prediction in
-    quadrature. `core_m` is the deviation of the errors up to `TRUE_M` without a uniform background: points that by
-    chance are near another surface raise the root mean square, but not this. A map that calls them surface is wrong in
-    its confidence, not in its uncertainty. A confidence is right if a surface is within `leaf_size_m` of so many points.
+    quadrature. `core_m` is the deviation of the errors up to `TRUE_M` without a uniform background: points near another
+    surface by chance raise the root mean square, but not this. A map that reports surface there has a wrong
+    confidence, not a wrong uncertainty. A confidence is right if surface is within `leaf_size_m` for that share of points.
 
     Raises
     ------
     ValueError
-        If there are too few of them, or an answer of the map is out of range.
+        If there are too few of them, or a prediction of the map is out of range.
     """
     truth = truth_of(scene, x, normals)
     is_true = truth.distance_m <= TRUE_M
@@ -144,9 +144,9 @@ def compared(
 
 
 def seen_from(scene: Scene, x: Floats) -> tuple[Floats, Floats]:
-    """Median range, m, of the returns near each point (N,), and the number of scans that they are from (N,).
+    """Median range, m, of the returns near each point (N,), and the number of their scans (N,).
 
-    Without returns near a point, the range is that of the nearest one.
+    Without returns nearby, the range is that of the nearest one.
     """
     rays = scene.rays()
     tree = cKDTree(rays.points)
@@ -163,7 +163,7 @@ def seen_from(scene: Scene, x: Floats) -> tuple[Floats, Floats]:
 def _bands(
     values: Floats, edges: Sequence[float], error_m: Floats, predicted_m: Floats, is_true: NDArray[np.bool_]
 ) -> list[Row]:
-    """Figures of the points whose value is from one edge up to the next."""
+    """Figures of the points in each band of values."""
     found = []
     for low, high in itertools.pairwise(edges):
         own = (values >= low) & (values < high)
@@ -180,7 +180,7 @@ def _bands(
 
 
 def _core(error_m: Floats) -> float | None:
-    """Deviation of the Gaussian in a uniform background of errors (N,), m; None of few. NaN does not count."""
+    """Deviation of a Gaussian in a uniform background of errors (N,), m; None for few. NaN is ignored."""
     sigma_m = deviation(error_m[np.abs(error_m) <= TRUE_M], TRUE_M)
     return sigma_m if np.isfinite(sigma_m) else None
 
@@ -199,9 +199,9 @@ KINDS_PEERS = ("VDBFusion", "radarsdf, quick", "radarsdf")
 
 
 def kinds(options: argparse.Namespace) -> Iterator[Row]:
-    """For each scene, and repetition with another seed of it: F-scores of all methods, and the confidence of ours.
+    """Per scene and repetition with another seed, yield F-scores of all methods, and the confidence of ours.
 
-    The confidence is that of the whole surface, whatever a mesh keeps of it.
+    The confidence is that of the whole surface, whatever the mesh limits.
     """
     for scene, repetition in itertools.product(list(chosen_scenes(options)), range(options.repetitions)):
         own = scene.repeated(repetition)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Fit the coefficients of `Map.confidence` and of the truth that surface covers, and judge them with whole kinds left out.
+"""Fit the coefficients of `Map.confidence` and of the coverage of the truth, with cross-validation over kinds of scenes.
 
     python -m bench.paper.one_probability [FILE.npz …] [--presets quick default] [--seed 141] [--judge 391]
 
-Learnt are, for each vertex, the probability that it is true, and how much of the truth it covers that no better vertex
-does. FILE are recorded drives with ground truth; each is a kind of its own. Scenes of the seed `--judge` are judged by what
-is learnt without their kind.
+Two models predict, per vertex, the probability that it is true, and how much of the truth it covers that no better vertex
+does. FILE are recorded drives with ground truth; each is a kind of its own. Scenes of the seed `--judge` are evaluated with
+models fitted without their kind.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from bench.truth import truth_of
 FloatArray = NDArray[np.float64]
 
 EVERY = 6
-"""Of each scene all scans are learnt from, every sixth, and the beginning: what few scans tell must not be learnt from many."""
+"""Every scene contributes all scans, every sixth, and its beginning, so that sparse data do not rely on models of dense data."""
 
 _BEGINNING = 1 / 10
 _BEGINNING_OF_DRIVE = 1 / 3  # those with lidar are short
 
 _TRUTH_POINTS = 60_000
-_BEST = 0.98  # of the highest probability round a point of the truth: these vertices share it
-_LEARNT = 20_000  # vertices of a map
+_BEST = 0.98  # vertices above this share of the highest probability near a point share the point
+_LEARNT = 20_000  # vertices per map to fit
 _SAMPLES = 300_000
 _STEPS = 50
 _ACCURATE = 1e-9
@@ -51,7 +51,7 @@ _ACCURATE = 1e-9
 
 @dataclass(frozen=True)
 class Example:
-    """The whole surface of one map, beside the truth."""
+    """The whole surface of one map with its ground truth."""
 
     kind: str
     name: str
@@ -60,11 +60,11 @@ class Example:
     voxel_m: float
     surface: Surface
     columns: FloatArray  # (V, K) regressors
-    reach: FloatArray  # (V,) the most that a probability can be; 0 without returns
+    reach: FloatArray  # (V,) upper limit of a probability; 0 without returns
     areas_m2: FloatArray  # (V,)
     is_true: NDArray[np.bool_]  # (V,)
     near: NDArray[np.int64]  # (N,) vertices within a leaf cell's edge of points of the truth, point by point
-    points: NDArray[np.int64]  # (N,) ascending from 0 in steps of 1: the point that each of them is near to
+    points: NDArray[np.int64]  # (N,) index of that point, ascending from 0 in steps of 1
 
     @classmethod
     def of(cls, kind: str, scene: Scene, preset: str, part: str) -> Example:
@@ -94,14 +94,14 @@ class Example:
         )
 
     def predicted(self, numbers: FloatArray) -> FloatArray:
-        """(V,) by the numbers (K,) of a logistic regression; 0 where there are no returns."""
+        """(V,) logistic regression with coefficients (K,); 0 without returns."""
         known = self.reach > 0
         predicted = np.zeros(len(known))
         predicted[known] = expit(self.columns[known] @ numbers)
         return predicted
 
     def added(self, p: FloatArray) -> FloatArray:
-        """(V,) truth that each vertex covers best, over its area; in the mean 1 where p is 1. At most 2, over 2."""
+        """(V,) truth that each vertex covers best, over its area; mean 1 where p is 1. At most 2, over 2."""
         highest = np.zeros(self.points[-1] + 1)
         np.maximum.at(highest, self.points, p[self.near])
         best = p[self.near] >= _BEST * highest[self.points]
@@ -112,13 +112,13 @@ class Example:
         return found
 
     def f_score(self, kept: NDArray[np.bool_]) -> float:
-        """With nothing discarded, %."""
+        """F-score with nothing discarded, %."""
         mesh = self.surface.part(self.contents.origin, kept)
         return 100 * surface_metrics(mesh, self.truth, samples=_SAMPLES)["f_score_all"] if kept.any() else 0.0
 
 
 def learnt(examples: list[Example], targets: list[FloatArray]) -> FloatArray:
-    """The numbers of a logistic regression, in which each kind has the same weight."""
+    """Fit a logistic regression in which each kind has the same weight."""
     rng = np.random.default_rng(0)
     known = [np.flatnonzero(e.reach > 0) for e in examples]
     rows = [rng.choice(own, min(_LEARNT, len(own)), replace=False) for own in known]
@@ -134,18 +134,18 @@ def learnt(examples: list[Example], targets: list[FloatArray]) -> FloatArray:
 
 
 def models(examples: list[Example]) -> tuple[FloatArray, FloatArray]:
-    """The numbers of the confidence, and those of what surface covers."""
+    """Coefficients of the confidence, and of the coverage."""
     of_truth = learnt(examples, [e.is_true.astype(np.float64) for e in examples])
     return of_truth, learnt(examples, [e.added(confidence(e, of_truth)) for e in examples])
 
 
 def confidence(example: Example, numbers: FloatArray) -> FloatArray:
-    """(V,) as :func:`queries.probabilities`, by these numbers."""
+    """(V,) confidence as by :func:`queries.probabilities`, with these coefficients."""
     return np.minimum(example.predicted(numbers), example.reach)
 
 
 def judged(example: Example, others: list[Example]) -> list[str]:
-    """A row of the table: the mesh as it is, and by what is learnt on others."""
+    """Row of the table: the current mesh, and that of models fitted to the others."""
     of_truth, of_added = models(others)
     surface, p = example.surface, confidence(example, of_truth)
     hits = surface.evidence.hits.double().numpy()
@@ -178,7 +178,7 @@ def logistic_regression(columns: FloatArray, shares: FloatArray, weights: FloatA
 
 
 def examples_of(specs: list[str], seed: int, presets: list[str]) -> list[Example]:
-    """Of each scene, all scans, every sixth, and the beginning."""
+    """Build examples of all scans, every sixth, and the beginning of each scene."""
     found = []
     for spec in specs:
         scene, kind = load_scene(spec, seed=seed), Path(spec).stem
@@ -198,8 +198,8 @@ def main() -> None:
     )
     parser.add_argument("files", nargs="*", metavar="FILE", help="recorded drives with ground truth")
     parser.add_argument("--presets", nargs="+", choices=VOXEL_M, default=["quick"])
-    parser.add_argument("--seed", type=int, default=141, help="of the simulated scenes that are learnt from")
-    parser.add_argument("--judge", type=int, default=391, help="seed of those that are judged")
+    parser.add_argument("--seed", type=int, default=141, help="seed of the simulated scenes to fit")
+    parser.add_argument("--judge", type=int, default=391, help="seed of the scenes to evaluate")
     parser.add_argument(
         "--kinds", nargs="+", default=[*SCENES, *KINDS], help="simulated scenes; default: all"
     )
@@ -213,7 +213,7 @@ def main() -> None:
         judged(e, [other for other in examples if other.kind != e.kind])
         for e in examples_of(options.kinds, options.judge, options.presets) + drives
     ]
-    print(markdown(["map", "F-all now", "learnt", "threshold", "worst tenth now", "learnt"], body))
+    print(markdown(["map", "F-all now", "refitted", "threshold", "worst tenth now", "refitted"], body))
 
 
 if __name__ == "__main__":

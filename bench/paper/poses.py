@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What errors of poses cost, and what `refine_poses` and `odometry` make of them."""
+"""Effect of pose errors, and results of `refine_poses` and `odometry`."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from bench.scenes import Scene, chosen_scenes
 Poses = NDArray[np.float64]
 
 COLUMNS = {
-    "f_given": Column("F given, %"),
-    "f_found": Column("F found, %"),
+    "f_given": Column("F before, %"),
+    "f_found": Column("F after, %"),
     "f_true": Column("F true, %"),
     "mae_found": Column("intensity, dB"),
     "mae_true": Column("intensity true, dB"),
-    "given_cm": Column("given, cm"),
-    "found_cm": Column("found, cm"),
-    "given_deg": Column("given, °"),
-    "found_deg": Column("found, °"),
+    "given_cm": Column("before, cm"),
+    "found_cm": Column("after, cm"),
+    "given_deg": Column("before, °"),
+    "found_deg": Column("after, °"),
     "relative_percent": Column("relative, %"),
     "deg_per_m": Column("°/m"),
     "nees": Column("NEES / 3"),
@@ -49,7 +49,7 @@ _SOURCES = ("returns and Doppler", "returns, Doppler, gyroscope", "returns alone
 
 
 def poses(options: argparse.Namespace) -> Iterator[Row]:
-    """Rows for each scene, breakage of its poses and odometry; repetitions have other seeds of the scene or breakage."""
+    """Yield rows per scene, error model of its poses and odometry; repetitions have other seeds of the scene or errors."""
     for scene, repetition in itertools.product(list(chosen_scenes(options)), range(options.repetitions)):
         own, seed = scene.repeated(repetition), options.seed + repetition
         base = {"scene": scene.name, "seed": seed} | _map_errors(own, own.poses, "true", options)
@@ -71,7 +71,7 @@ def poses(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def _measured(scene: Scene) -> list[tuple[str, dict[str, Any]]]:
-    """What refinement gets besides returns, and how the rows are then named: nothing, and what was recorded."""
+    """Inputs of refinement in addition to returns, with the suffix of their rows: none, and recorded Doppler."""
     if scene.doppler_mps is None or scene.times_s is None:
         return [("", {})]
     return [("", {}), (", Doppler", {"doppler_mps": scene.doppler_mps, "times_s": scene.times_s})]
@@ -111,7 +111,7 @@ def _odometry_rows(scene: Scene, seed: int, options: argparse.Namespace) -> Iter
 
 
 def _trajectory_errors(poses: Poses, true: Poses, name: str, covariance: np.ndarray | None = None) -> Row:
-    # Straight drives leave the rotation about them open, if positions alone are brought together.
+    # With alignment by positions alone, straight drives leave the rotation about them open.
     metrics = trajectory_metrics(poses, true)
     turns = trajectory_metrics(poses, true, align="poses")
     row: Row = {
@@ -129,7 +129,7 @@ def _trajectory_errors(poses: Poses, true: Poses, name: str, covariance: np.ndar
 
 
 def _nees(poses: Poses, true: Poses, covariance: np.ndarray) -> float | None:
-    """Mean squared error of positions in its deviations, over 3, relative to the scan in the middle: 1 is honest."""
+    """Mean normalised squared error of positions over 3, relative to the middle scan: 1 is calibrated."""
     middle = len(poses) // 2
     others = np.arange(len(poses)) != middle
     if not np.linalg.det(covariance[others, :3, :3]).all():
@@ -159,16 +159,16 @@ def _map_errors(scene: Scene, poses: Poses, name: str, options: argparse.Namespa
     return row | {f"mae_{name}": errors_of(train.fit(config), test)["mae"]}
 
 
-_STEP_S = 0.1  # between two scans, for what is late
+_STEP_S = 0.1  # between two scans, for time offsets
 
 
 def walked(poses: Poses, sigma_m: float, sigma_deg: float, seed: int, yaw_deg: float = 0.0) -> Poses:
-    """A random walk, with a bias in yaw."""
+    """Add a random walk, with a bias in yaw."""
     return drifted(poses, sigma_m, np.radians(sigma_deg), seed, np.radians(yaw_deg))
 
 
 def jumped(poses: Poses, jump_m: float, jump_deg: float, seed: int) -> Poses:
-    """All poses after the middle are elsewhere, as when odometry begins anew."""
+    """Displace all poses after the middle, as when odometry restarts."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(0, 1, 3)
     jump = np.concatenate([jump_m * direction / np.linalg.norm(direction), [0, 0, np.radians(jump_deg)]])
@@ -181,12 +181,12 @@ def jumped(poses: Poses, jump_m: float, jump_deg: float, seed: int) -> Poses:
 
 
 def stale(poses: Poses) -> Poses:
-    """Every second pose is the one before, as of a slow source without interpolation."""
+    """Repeat every second pose, as from a slow source without interpolation."""
     return poses[np.arange(len(poses)) // 2 * 2]
 
 
 def late(poses: Poses, time_offset_s: float) -> Poses:
-    """The poses of a clock that is late, of scans ten times a second."""
+    """Shift the clock of the poses, at ten scans per second."""
     times = _STEP_S * np.arange(len(poses))
     asked = np.clip(times - time_offset_s, 0, times[-1])
     found = poses.copy()
@@ -206,4 +206,4 @@ BREAKAGES: dict[str, Callable[[Poses, int], Poses]] = {
     "every second pose stale": lambda poses, _: stale(poses),
     "0.05 s late": lambda poses, _: late(poses, 0.05),
 }
-"""What is done to true poses, by name; the second argument is a seed."""
+"""Error models applied to true poses, by name; the second argument is a seed."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Intensities and whole scans that a map predicts, compared with held-out ones."""
+"""Predicted intensities and scans, compared with held-out ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _NO_INTENSITIES = "the scene has no intensities"
 
 
 def intensity(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for the nearest-neighbour baseline, and for each configuration and seed."""
+    """Yield a row for the nearest-neighbour baseline, and per configuration and seed."""
     for scene in chosen_scenes(options):
         row: Row = {"scene": scene.name}
         if scene.intensities is None:
@@ -53,12 +53,12 @@ def intensity(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def errors_of(radar_map: RadarMap, test: Scene) -> Row:
-    """Errors of the intensities at the returns of held-out scans, where the map observed nothing, too: kNN answers there."""
+    """Errors of intensities at the returns of held-out scans, extrapolated where the map observed nothing, like kNN."""
     x, sensors, measured = test.world_returns()
     return {**intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)}
 
 
-# All inputs of the paper, also those that the default configuration does not use.
+# All inputs of the paper, including those that the default configuration omits.
 _FULL: Changes = {"networks": {"normals": True, "geometry_feature_dim": 15}}
 _VARIANTS: dict[str, Changes] = {
     "full": {},
@@ -69,7 +69,7 @@ _VARIANTS: dict[str, Changes] = {
 
 
 def ablation(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each configuration, seed, and input that is left out."""
+    """Yield a row per configuration, seed, and omitted input."""
     for scene, base, variant in itertools.product(list(chosen_scenes(options)), options.base, _VARIANTS):
         row: Row = {"scene": scene.name, "base": base, "variant": variant}
         if scene.intensities is None:
@@ -82,14 +82,14 @@ def ablation(options: argparse.Namespace) -> Iterator[Row]:
 
 
 _ANGLES_DEG = range(-90, 90, 15)
-_REFLECTOR_M = 0.6  # nearer returns belong to the reflector: edges of 0.3 to 0.4 m, and noise across the beam
+_REFLECTOR_M = 0.6  # radius of the reflector: edges of 0.3 to 0.4 m, and noise across the beam
 VIEW_COLUMNS = {"all": Column("all"), **{str(a): Column(f"{a} to {a + 15}°") for a in _ANGLES_DEG}}
 
 
 def views(options: argparse.Namespace) -> Iterator[Row]:
-    """MAE by the angle at which the corner reflector is seen, at it and elsewhere, with and without that input.
+    """MAE by viewing angle of the corner reflector, at it and elsewhere, with and without the viewing direction as input.
 
-    Errors are those against the measured intensities and, of a simulated scene, against those without noise.
+    Errors are relative to the measured intensities and, in a simulated scene, to the noiseless ones.
     """
     for scene in chosen_scenes(options):
         if scene.intensities is None:
@@ -130,7 +130,7 @@ def _mean(values: Floats) -> float | None:
 def reflector_of(scene: Scene) -> Floats:
     """Position (3,) of the reflector, world frame, m.
 
-    It is the centre of the circle that the sensor drove, at the height of the strongest returns there.
+    It is the centre of the sensor's circular path, at the height of the strongest returns there.
     """
     middle = scene.poses[:, :2, 3].mean(axis=0)
     x, y = (scene.poses[:, :2, 3] - middle).T
@@ -167,9 +167,9 @@ Returns = tuple[Floats, Floats]
 
 
 def novel_views(options: argparse.Namespace) -> Iterator[Row]:
-    """Held-out scans compared with what the map predicts from their poses, and with the nearest training scan, replayed.
+    """Compare held-out scans with views that the map predicts from their poses, and with the nearest training scan, replayed.
 
-    A view has as many returns as the sensor gives, or a multiple. Numbers are means over the held-out scans.
+    A view has as many returns as the sensor, or a multiple. Numbers are means over the held-out scans.
     """
     for scene, base in itertools.product(list(chosen_scenes(options)), options.base):
         train, test = scene.split()
@@ -193,7 +193,7 @@ def novel_views(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def returns_of(scene: Scene, frame: int) -> Returns:
-    """The returns of a scan within the ranges of its scene."""
+    """Returns of a scan within the ranges of its scene."""
     points = np.asarray(scene.points[frame], np.float64)
     kept = scene.is_used(frame)
     values = np.full(len(points), np.nan) if scene.intensities is None else scene.intensities[frame]
@@ -201,7 +201,7 @@ def returns_of(scene: Scene, frame: int) -> Returns:
 
 
 def replayed(train: Scene, T_world_sensor: Floats) -> Returns:
-    """The training scan taken nearest to a pose, seen from that pose."""
+    """The training scan nearest to a pose, transformed to that pose."""
     positions = train.poses[:, :3, 3]
     nearest = int(np.linalg.norm(positions - T_world_sensor[:3, 3], axis=1).argmin())
     points, values = returns_of(train, nearest)
@@ -219,7 +219,7 @@ def scan_errors(predicted: Returns, measured: Returns) -> Row:
 
     `chamfer_m`: mean of the two mean distances to the nearest return of the other scan. `explained`: share of the
     measured returns with a predicted one within 0.3 m. `confirmed`: the reverse. `intensity`: mean absolute error of
-    the nearest predicted return of each that is explained.
+    the nearest predicted return over the explained ones.
     """
     (points, values), (true, true_values) = predicted, measured
     if len(points) == 0:

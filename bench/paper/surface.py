@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Surfaces of this package and of its peers: errors, time, memory, and size."""
+"""Surfaces of this package and its peers: errors, time, memory, and size."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ COLUMNS = {
 def reconstructed(
     options: argparse.Namespace, peer: Peer, scene: Scene, held_out: Scene | None = None
 ) -> Reconstruction:
-    """The surface of a peer for a scene. With `held_out`, also its intensities at the returns of that scene."""
+    """Reconstruct a scene by a peer. With `held_out`, also predict its intensities at the returns of that scene."""
     return reconstruct(
         peer.with_changes(**QUICK) if options.quick else peer,
         scene.points,
@@ -57,7 +57,7 @@ def reconstructed(
 
 
 def measured(options: argparse.Namespace, peer: Peer, scene: Scene, held_out: Scene | None = None) -> Row:
-    """Time, memory and surface errors of a peer for a scene, or the reason why there are none.
+    """Time, memory and surface errors of a peer on a scene, or the reason why there are none.
 
     With `held_out`, also its intensity errors at the returns of that scene.
     """
@@ -83,27 +83,27 @@ def measured(options: argparse.Namespace, peer: Peer, scene: Scene, held_out: Sc
 
 
 def samples_of(options: argparse.Namespace, most: int = 10_000_000) -> int:
-    """Points on a mesh for its errors."""
+    """Number of sampled points on a mesh for its errors."""
     count: int = min(options.samples, most, 100_000 if options.quick else most)
     return count
 
 
 def _cropped(mesh: trimesh.Trimesh, ground_truth: Floats) -> trimesh.Trimesh:
-    """The triangles within the bounds of the ground truth: surfaces far outside would make the scene small in a picture."""
+    """Crop to the bounds of the ground truth: surfaces far outside would make the scene small in a picture."""
     middle = mesh.triangles_center
     inside = ((middle >= ground_truth.min(axis=0)) & (middle <= ground_truth.max(axis=0))).all(axis=1)
     return trimesh.Trimesh(mesh.vertices, mesh.faces[inside if inside.any() else slice(None)], process=False)
 
 
 def surface(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene and method."""
+    """Yield a row per scene and method."""
     for scene in chosen_scenes(options):
         for name in options.peers:
             yield measured(options, PEERS[name], scene)
 
 
 def sparse(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene, method and n, of which every n-th scan is used."""
+    """Yield a row per scene, method and n, with every n-th scan used."""
     for scene in chosen_scenes(options):
         for n in (1, 2) if options.quick else range(1, 11):
             for name in options.peers:
@@ -111,14 +111,14 @@ def sparse(options: argparse.Namespace) -> Iterator[Row]:
 
 
 NEAR_M = 0.2
-"""A point this near to the other surface counts, as for the F-score with nothing discarded."""
+"""Distance of correct points, as for the F-score with nothing discarded."""
 
 _EDGES_M = (2.5, 10.0, 20.0, 30.0, 60.0)
 RANGE_COLUMNS = {"precision": Column("precision, %", 100, 0), "completion": Column("completion, %", 100, 0)}
 
 
 def ranges(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene, method and distance from the sensor, with which noise grows."""
+    """Yield a row per scene, method and distance from the sensor, with which noise grows."""
     for scene, name in itertools.product(list(chosen_scenes(options)), options.peers):
         row: Row = {"scene": scene.name, "method": name}
         truth = scene.ground_truth
@@ -149,9 +149,9 @@ def ranges(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def sampled(mesh: trimesh.Trimesh, count: int, box: Floats | None) -> tuple[Floats, Floats]:
-    """Points drawn uniformly by area on a mesh, and the normals of its vertices interpolated there: (N, 3) each.
+    """Sample points uniformly by area on a mesh, with interpolated vertex normals: (N, 3) each.
 
-    Only those in the box remain. The normal of a single triangle is not used: its tilt would lengthen the errors.
+    Only those in the box remain. Normals of single triangles are not used: their tilt would lengthen the errors.
     """
     if len(mesh.faces) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -185,7 +185,7 @@ _MAPS: dict[str, tuple[str, Changes, bool]] = {
 
 
 def map_size(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene, number of scans and method."""
+    """Yield a row per scene, number of scans and method."""
     for scene, n in itertools.product(list(chosen_scenes(options)), _EVERY):
         part = scene.every_nth(n)
         row: Row = {"scene": part.name, "scans": f"{len(part)} scans"}
@@ -220,9 +220,9 @@ _OURS = ("radarsdf", "radarsdf, intensities")
 
 
 def curve(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene, repetition and method: budgets of ours, `--set`, and peers. They take turns.
+    """Yield a row per scene, repetition and method: our budgets, `--set`, and peers, alternating.
 
-    Each method gets the scans that are not held out. The intensities of the others are predicted afterwards.
+    Each method gets the training scans. Intensities of the held-out ones are predicted afterwards.
     """
     methods = [
         (kind, f"{kind}, × {factor}", PEERS[kind].with_changes(effort=_BUDGETS[factor]))
@@ -242,7 +242,7 @@ def curve(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def draw_curve(rows: list[Row], path: Path) -> None:
-    """Draw, for each scene, what the F-score lacks to 100 % and the error of the intensity over the time."""
+    """Plot, per scene, 100 % minus the F-score, and the error of the intensity, over time."""
     scenes = groups([row for row in rows if row.get("f_score_all") is not None], "scene")
     panels = (("f_score_all", "100 % − F-all, %"), ("mae", "MAE of the intensity"))
     with figure(path, rows=max(1, len(scenes)), columns=2, size=(5, 4)) as axes:
@@ -266,7 +266,7 @@ def _draw_kind(ax: Any, kind: str, rows: list[Row], key: str) -> None:
 
 
 def seeds(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each scene and seed: how far errors of the default configuration vary."""
+    """Yield a row per scene and seed: variation of the errors of the default configuration."""
     for scene, seed in itertools.product(list(chosen_scenes(options)), range(options.repetitions)):
         train, test = scene.split()
         radar_map = train.fit(scene.config("default", quick=options.quick, seed=seed))

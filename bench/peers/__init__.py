@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: MIT
 """Other methods of surface reconstruction, each run in its own process; see `interface`.
 
-This module imports nothing, because Pythons that are too old for radarsdf import it as well.
+This module imports nothing, since Pythons too old for radarsdf import it, too.
 """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One reconstruction in its own process: `python -m bench.peers.child METHOD OPTIONS SCANS RESULT`.
+"""One reconstruction in a separate process: `python -m bench.peers.child METHOD OPTIONS SCANS RESULT`.
 
 METHOD is a `module:function` of this package that returns a `Made` or its first fields. OPTIONS are its keywords as
-JSON. SCANS and RESULT are .npz files. In its own process, the peak memory is that of the method alone, a crash does not
-stop the others, and the Python can be another one. Besides NumPy, only the method's packages are needed.
+JSON. SCANS and RESULT are .npz files. In a separate process, the peak memory is that of the method alone, a crash does not
+stop the others, and the Python may differ. Besides NumPy, only the method's packages are needed.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ class Made(NamedTuple):
     faces: np.ndarray
     """(F, 3) rows of the vertices."""
     map_bytes: int | None = None
-    """Size of the map that the mesh was extracted from, if there is one."""
+    """Size of the map from which the mesh was extracted, if there is one."""
     report: dict[str, Any] | None = None
-    """Any numbers of the method, in types of JSON."""
+    """Further numbers of the method, in types of JSON."""
     intensity: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     """Predicts intensities (N,), sensor units, of points (N, 3) seen from positions (N, 3), world frame, m.
 
-    It is called once time and memory are measured.
+    It is called after time and memory are measured.
     """
 
 

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Install peers in environments of their own: `python -m bench.peers.install [PYTHON]` or `... install odometry`.
+"""Install peers in separate environments: `python -m bench.peers.install [PYTHON]` or `... install odometry`.
 
-The first is VDBFusion. Its wheels (0.1.6) need CPython 3.8 to 3.10 and NumPy below 2. PYTHON names the interpreter; the
-default is the first suitable one on the path or of pyenv. `odometry` is kiss-icp and small_gicp, for this interpreter. Open3D
-comes with the extra `peers` instead.
+The first form installs VDBFusion, whose wheels (0.1.6) need CPython 3.8 to 3.10 and NumPy below 2. PYTHON is the interpreter;
+the default is the first suitable one on the path or of pyenv. `odometry` is kiss-icp and small_gicp, for this interpreter.
+Open3D comes with the extra `peers` instead.
 """
 
 from __future__ import annotations

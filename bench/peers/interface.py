@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The peers, which are the methods to compare with, and `reconstruct`, which runs one of them.
+"""Peers, the methods to compare with, and `reconstruct`, which runs one of them.
 
-Each peer runs in a child process (see `child`), and nothing of it is imported here. If it cannot run, the result says
-why, and the peer stays in the tables.
+Each peer runs in a child process (see `child`), and nothing of it is imported here. If it cannot run, the result states
+the reason, and the peer stays in the tables.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from bench.measure import ROOT, failure
 from bench.settings import Changes, merged
 
 PYTHON = [sys.executable]
-"""The command that runs a peer, unless that needs another Python."""
+"""Command that runs a peer, unless it needs another Python."""
 VDBFUSION_ENVIRONMENT = ROOT / "build" / "peers" / "vdbfusion"
 ODOMETRY_ENVIRONMENT = ROOT / "build" / "peers" / "odometry"
 INSTALL = {
@@ -45,12 +45,12 @@ class Peer:
     options: dict[str, Any]
     """Keywords of the function, with the values of the paper."""
     needs: str = ""
-    """The package that it imports besides NumPy."""
+    """Package required in addition to NumPy."""
     intensities: bool = False
-    """Whether it uses the intensities."""
+    """Whether it uses intensities."""
 
     def with_changes(self, *, mesh: dict[str, Any] | None = None, **changes: Any) -> Peer:
-        """The same peer with other settings of `FitConfig` and other arguments of its mesh. Methods of other packages stay."""
+        """Return the peer with other settings of `FitConfig` and arguments of its mesh. Methods of other packages are unchanged."""
         if "changes" not in self.options:
             return self
         options = {
@@ -60,7 +60,7 @@ class Peer:
         return replace(self, options=self.options | options)
 
 
-# What the published mesh leaves out.
+# Limits of the published mesh.
 _MESHES: dict[str, dict[str, Any]] = {
     "paper": {"min_confidence": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 300}
 }
@@ -83,7 +83,7 @@ PEERS = {
         Peer("BPA", "open3d_meshes:ball_pivoting", {"radius_m": 0.1}, "open3d"),
         Peer("Poisson", "open3d_meshes:poisson", {"depth": 12}, "open3d"),
         Peer("VDBFusion", "vdbfusion_tsdf:vdbfusion", {"voxel_m": 0.2}, "vdbfusion"),
-        # 3QFP and the representation of SHINE-Mapping, computed by this package with the published learning rate.
+        # 3QFP and the representation of SHINE-Mapping, computed by this package at the published learning rate.
         _fit(
             "SHINE (octree)", "paper", **merged(_OCTREE, {"encoding": {"fourier_count": 0}}, _PUBLISHED_RATE)
         ),
@@ -95,23 +95,23 @@ PEERS = {
         _fit("radarsdf, intensities", "default", intensities=True),
     )
 }
-"""By name, in the order of Table I of the paper. The configurations of this package come last."""
+"""Peers by name, in the order of Table I of the paper, then the configurations of this package."""
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Result of a peer, or the reason why there is none."""
+    """Result of a peer, or the reason why it is missing."""
 
     mesh: trimesh.Trimesh | None
     why_not: str = ""
     seconds: float | None = None
-    """Wall time from returns in memory to triangles in memory, without imports and files."""
+    """Wall time from returns in memory to triangles in memory, without imports and file access."""
     peak_bytes: int | None = None
     """Peak resident memory of its process, with interpreter and libraries."""
     map_bytes: int | None = None
-    """Size of the map that the mesh was extracted from, if there is one."""
+    """Size of the map from which the mesh was extracted, if there is one."""
     report: dict[str, Any] = field(default_factory=dict)
-    """Any numbers of the method. For a fit: `RadarMap.report` and the time of the mesh."""
+    """Further numbers of the method. For a fit: `RadarMap.report` and the time of the mesh."""
     intensity: np.ndarray | None = None
     """(N,) predicted intensities at the queries, sensor units. None if the method predicts none."""
 
@@ -129,8 +129,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Run one of `PEERS` on scans.
 
-    Points are F arrays (N_i, 3), sensor frame, m; poses (F, 4, 4) T_world_sensor; intensities F arrays (N_i,), which only peers
-    with `Peer.intensities` get. Nearer and farther returns than the ranges are dropped, for all peers. Queries are points (N, 3)
+    Points are F arrays (N_i, 3), sensor frame, m; poses (F, 4, 4) T_world_sensor; intensities F arrays (N_i,), passed only to
+    peers with `Peer.intensities`. Returns outside the ranges are dropped for all peers. Queries are points (N, 3)
     and sensor positions (N, 3), world frame, m, for which intensities are predicted. After the timeout a peer has no result.
     """
     python, why_not = _interpreter(peer.needs)
@@ -140,7 +140,7 @@ def reconstruct(
     sensor_points = np.concatenate([np.asarray(p, np.float32).reshape(-1, 3) for p in points])
     range_m = np.linalg.norm(sensor_points, axis=1)
     kept = (range_m >= min_range_m) & (range_m <= (np.inf if max_range_m is None else max_range_m))
-    # A local origin, because peers that compute in float32 cannot resolve UTM coordinates.
+    # Local origin, since peers that compute in float32 cannot resolve UTM coordinates.
     origin = poses[0, :3, 3].copy()
     local_poses = poses.copy()
     local_poses[:, :3, 3] -= origin
@@ -154,7 +154,7 @@ def reconstruct(
         arrays |= {"query_points": queries[0] - origin, "query_sensors": queries[1] - origin}
     options = dict(peer.options)
     if "changes" in options:
-        # The ranges are cut already.
+        # Returns are already cropped to the ranges.
         options["changes"] = merged({"returns": {"min_range_m": 0.0}}, options["changes"])
     with tempfile.TemporaryDirectory() as folder:
         scans_path, result_path = Path(folder) / "scans.npz", Path(folder) / "result.npz"
@@ -186,7 +186,7 @@ def reconstruct(
 
 @cache
 def _interpreter(needs: str) -> tuple[list[str] | None, str]:
-    """The command of a Python that can import `needs`, or None and the reason."""
+    """Command of a Python that can import `needs`, or None and the reason."""
     candidates = [PYTHON]
     if needs == "vdbfusion":
         candidates += [[str(VDBFUSION_ENVIRONMENT / "bin" / "python")]]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Odometry compared with that of others on the same scans: `python -m bench.peers.odometry [FILE.npz ...]`.
+"""Odometry compared with that of peers on the same scans: `python -m bench.peers.odometry [FILE.npz ...]`.
 
-`kiss-icp` and `small_gicp` come from their wheels (`python -m bench.peers.install odometry`). Both are made for lidars, so that
-each has several edges of voxels; the best of each drive counts, which is chosen by the true poses: a favour.
+`kiss-icp` and `small_gicp` come from their wheels (`python -m bench.peers.install odometry`). Both are made for lidars, so
+each runs with several voxel sizes; the best one per drive, chosen by the true poses, is reported, in their favour.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _KINDS = ("hugin", "oculii", "wall", "astyx")
 
 @dataclass(frozen=True)
 class Drive:
-    """Scans with true poses, and what was measured of the motion."""
+    """Scans with true poses, and motion measurements."""
 
     name: str
     points: Sequence[NDArray[Any]]
@@ -43,11 +43,11 @@ class Drive:
     times_s: NDArray[np.float64]
     doppler_mps: Sequence[NDArray[Any]]
     rates: NDArray[np.float64] | None
-    """(F, 3) of a gyroscope, rad/s. None: there is none."""
+    """(F, 3) gyroscope rates, rad/s. None: there is no gyroscope."""
 
 
 def simulated(seeds: Iterable[int]) -> Iterator[Drive]:
-    """Of each kind and seed."""
+    """Yield a drive per kind and seed."""
     for kind in _KINDS:
         for seed in seeds:
             drive = SCENES[kind](seed=seed)
@@ -63,7 +63,7 @@ def simulated(seeds: Iterable[int]) -> Iterator[Drive]:
 
 
 def recorded(path: Path) -> Drive:
-    """An .npz with times and Doppler, and the poses of a lidar."""
+    """Load an .npz with times and Doppler, and the poses of a lidar."""
     scans = radarsdf.io.read_scans(path)
     assert scans.times_s is not None
     assert scans.doppler_mps is not None
@@ -71,7 +71,7 @@ def recorded(path: Path) -> Drive:
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
-    """A row for each drive: positions in % of the path, steps of 10 to 50 % of it in % of them, and degrees per metre."""
+    """Yield a row per drive: position errors in % of the path, errors of 10 to 50 % segments in % of them and degrees per metre."""
     for drive in itertools.chain(map(recorded, map(Path, options.cases)), simulated(options.seeds)):
         row: Row = {"drive": drive.name, "scans": len(drive.points)}
         for name, given in _OURS.items():
@@ -103,11 +103,11 @@ def _ours(drive: Drive, *, doppler: bool, gyroscope: bool) -> str:
     part = found.longest_segment()
     words = _words(_errors(found.poses[part], drive.poses[part]))
     count = part.stop - part.start
-    return words if count == len(drive.points) else f"{words} ({count} scans in one piece)"
+    return words if count == len(drive.points) else f"{words} ({count} scans in one segment)"
 
 
 def _peer(name: str, drive: Drive, voxel_m: float) -> tuple[float, float, float] | str:
-    """Its errors, or why there are none."""
+    """Errors of a peer, or the reason why there are none."""
     python = ODOMETRY_ENVIRONMENT / "bin" / "python"
     if not python.exists():
         return "not installed"
@@ -130,7 +130,7 @@ def _peer(name: str, drive: Drive, voxel_m: float) -> tuple[float, float, float]
 
 
 def _errors(poses: NDArray[np.float64], true: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Of all positions, % of the way; of motions along 10 to 50 % of it, % of them and degrees per metre."""
+    """Errors of all positions, % of the path; of motions along 10 to 50 % of it, % of them and degrees per metre."""
     metrics = trajectory_metrics(poses, true)
     ratio, rad_per_m = metrics["relative_ratio"], metrics["relative_rad_per_m"]
     assert ratio is not None

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Odometry of a peer in its own environment: `python -m bench.peers.odometry_child NAME VOXEL_M SCANS POSES`.
 
-SCANS is an .npz of `points` (N, 3), sensor frame, m, and `counts` (F,) of the returns of each scan; POSES will be a .npy of
+SCANS is an .npz of `points` (N, 3), sensor frame, m, and `counts` (F,), returns per scan; POSES is the .npy output of
 (F, 4, 4). Besides NumPy, only the peer's package is needed.
 """
 
@@ -14,9 +14,9 @@ import numpy as np
 
 
 def kiss_icp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> list[np.ndarray]:
-    """KISS-ICP: points to the points of a map of voxels, a threshold that adapts."""
+    """KISS-ICP: point-to-point ICP on a voxel map with an adaptive threshold."""
     from kiss_icp.config import KISSConfig  # noqa: PLC0415 - an optional peer
-    from kiss_icp.kiss_icp import KissICP  # noqa: PLC0415 - likewise
+    from kiss_icp.kiss_icp import KissICP  # noqa: PLC0415 - an optional peer
 
     config = KISSConfig()
     config.data.deskew = False  # returns have no times of their own
@@ -30,8 +30,8 @@ def kiss_icp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> lis
 
 
 def small_gicp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> list[np.ndarray]:
-    """GICP of each scan on a map of Gaussians in voxels, which begins where a steady motion leads."""
-    import small_gicp as peer  # noqa: PLC0415 - likewise
+    """GICP of each scan on a Gaussian voxel map, starting from constant velocity."""
+    import small_gicp as peer  # noqa: PLC0415 - an optional peer
 
     target, T, step, poses = peer.GaussianVoxelMap(voxel_m), np.eye(4), np.eye(4), []
     for number, scan in enumerate(scans):
@@ -47,7 +47,7 @@ def small_gicp(scans: list[np.ndarray], voxel_m: float, max_range_m: float) -> l
 
 
 PEERS = {"kiss-icp": kiss_icp, "small_gicp": small_gicp}
-"""By name."""
+"""Methods by name."""
 
 
 def main() -> None:

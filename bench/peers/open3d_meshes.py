@@ -21,7 +21,7 @@ def alpha_shapes(scans: ScanArrays, alpha_m: float) -> Mesh:
 
 
 def ball_pivoting(scans: ScanArrays, radius_m: float) -> Mesh:
-    """Triangles on whose corners a ball of `radius_m` comes to rest as it rolls over the points (Bernardini et al.)."""
+    """Triangles at whose corners a ball of `radius_m` rests as it rolls over the points (Bernardini et al.)."""
     cloud = _with_normals(scans)
     radii = o3d.utility.DoubleVector([radius_m])
     return _arrays(o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii))
@@ -35,7 +35,7 @@ def poisson(scans: ScanArrays, depth: int) -> Mesh:
 
 
 def _with_normals(scans: ScanArrays) -> o3d.geometry.PointCloud:
-    """Points with normals of the plane through their neighbours, which point towards the sensor."""
+    """Points with normals of planes through their neighbours, oriented towards the sensor."""
     world = scans.world()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(world))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))

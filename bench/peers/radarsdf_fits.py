@@ -18,7 +18,7 @@ from .child import Made, ScanArrays
 
 
 def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], mesh: dict[str, Any]) -> Made:
-    """Fit and mesh. `base` is one of `PRESETS`, `mesh` has arguments of the mesh; intensities are used where there are any."""
+    """Fit and mesh. `base` is one of `PRESETS`, `mesh` holds arguments of the mesh; intensities are used if there are any."""
     config = PRESETS[base].override(**changes)
     frames = [np.flatnonzero(scans.frame == i) for i in range(len(scans.poses))]
     radar_map = radarsdf.fit(
@@ -33,7 +33,7 @@ def radarsdf_fit(scans: ScanArrays, base: str, changes: dict[str, Any], mesh: di
     report = radar_map.report | {"mesh_s": taken.wall_s}
 
     def intensity(points: np.ndarray, sensors: np.ndarray) -> np.ndarray:
-        # Held-out returns may lie where the map observed nothing; the nearest neighbours answer there, too.
+        # Held-out returns may lie in unobserved space; the nearest-neighbour baseline predicts there, too.
         predicted: np.ndarray = radar_map.intensity(points, sensors, extrapolate=True)
         return predicted
 

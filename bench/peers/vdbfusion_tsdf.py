@@ -14,7 +14,7 @@ from .child import ScanArrays
 
 
 def vdbfusion(scans: ScanArrays, voxel_m: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """The mesh, and the bytes of the file of the grids of distances and weights."""
+    """Mesh, and size in bytes of the file of the grids of distances and weights."""
     volume = VDBVolume(voxel_m, 3 * voxel_m, space_carving=False)  # truncation as in its own examples
     world = scans.world()
     for frame, T_world_sensor in enumerate(scans.poses):

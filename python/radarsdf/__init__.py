@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.
 
-The public names are in ``__init__.pyi``. Each is imported when it is first used, so that ``import radarsdf`` alone imports
+The public names are listed in ``__init__.pyi``. Each is imported at its first use, so that ``import radarsdf`` alone imports
 neither PyTorch nor NumPy.
 """
 
@@ -25,7 +25,7 @@ def __getattr__(name: str) -> object:
 
         try:
             found: object = version("radarsdf")
-        except PackageNotFoundError:  # the sources on PYTHONPATH, not installed
+        except PackageNotFoundError:  # run from sources on PYTHONPATH, not installed
             found = import_module("radarsdf._core").__version__
     elif (module := _MODULES.get(name)) is None:
         msg = f"module {__name__!r} has no attribute {name!r}"
@@ -34,5 +34,5 @@ def __getattr__(name: str) -> object:
         return import_module(f".{name}", __name__)
     else:
         found = getattr(import_module(module, __name__), name)
-    globals()[name] = found  # the next use does not come here
+    globals()[name] = found  # cached for later accesses
     return found

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Checks of numbers and arrays from users. The errors name the argument."""
+"""Validation of numbers and arrays from users. Errors name the argument."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ _RIGID = f"rotation, translation within {MAX_POSITION_M:g} m, last row 0 0 0 1"
 
 
 def check(holds: object, message: str) -> None:
-    """Raises a ValueError with this message unless something `holds`."""
+    """Raise a ValueError with this message unless `holds`."""
     if not holds:
         raise ValueError(message)
 
 
 def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
-    """`values` as an array of `dtype`, of any shape, which is not copied if it is one already.
+    """Convert to an array of `dtype` and any shape, without a copy if it is one already.
 
-    Raises a TypeError for what are no real numbers, and a ValueError for masked values and integers too large for float64.
+    Raises a TypeError for anything but real numbers, and a ValueError for masked values and integers too large for float64.
     """
     refuse_masked(values, name)
     try:
         array = np.asarray(values)
-        if array.dtype.kind == "O":  # numbers of other types, or integers of many digits
+        if array.dtype.kind == "O":  # numbers of other types, or integers with many digits
             array = array.astype(np.float64)
     except OverflowError as error:
         msg = f"{name}: {error}"
@@ -56,19 +56,19 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
         raise TypeError(msg) from error
     if array.dtype.kind not in "biuf":
         raise _wrong_type(name, "real numbers", array.dtype)
-    with np.errstate(over="ignore"):  # a number that is too large becomes infinite; the callers refuse that
+    with np.errstate(over="ignore"):  # overflow becomes infinite, which callers refuse
         return array.astype(dtype, copy=False)
 
 
 def refuse_masked(values: Any, name: str) -> None:
-    """Refuse masked values: NumPy would take what is under the mask for a value."""
+    """Refuse masked values: NumPy would use the data under the mask."""
     parts = values if isinstance(values, (list, tuple)) else [values]
     masked = any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts)
     check(not masked, f"{name} has masked values: leave them out")
 
 
 def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    """`values` as (N, 3) finite positions, m, in C order."""
+    """Convert to finite positions (N, 3), m, in C order."""
     points: NDArray[np.float64] = np.ascontiguousarray(real_array(values, name))
     check(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
     within = (np.abs(points) <= MAX_POSITION_M).all()
@@ -77,7 +77,7 @@ def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def check_box(box: ArrayLike) -> NDArray[np.float64]:
-    """Lower and upper corner (2, 3), world, m."""
+    """Validate a lower and an upper corner (2, 3), world, m."""
     corners = real_array(box, "box")
     ordered = corners.shape == (2, 3) and (corners[0] < corners[1]).all()
     check(ordered, "box must be a lower and an upper corner, (2, 3), the lower corner first")
@@ -85,7 +85,7 @@ def check_box(box: ArrayLike) -> NDArray[np.float64]:
 
 
 def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
-    """Refuse no scans, and scans that are not arrays (N, 3)."""
+    """Refuse an empty sequence of scans, and scans that are not arrays (N, 3)."""
     check(scans, "points holds no scans")
     for i, scan in enumerate(scans):
         check_scan_shape(scan, i)
@@ -97,7 +97,7 @@ def check_scan_shape(scan: NDArray[Any], number: int) -> None:
 
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
-    """Refuse values that are not arrays (N,) for scans (N, 3)."""
+    """Refuse values that are not one array (N,) for each scan (N, 3)."""
     check(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
         check_values_of_scan(value, scan, name, i)
@@ -109,17 +109,17 @@ def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, num
 
 
 def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
-    """`poses` as (F, 4, 4) float64, of any numbers."""
+    """Convert to an array (F, 4, 4) float64 of any numbers."""
     T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
     shape = T_world_sensor.shape
     count = (shape or (0,))[0] if num_scans is None else num_scans
-    wanted = f"({count}, 4, 4), one T_world_sensor a scan"
+    wanted = f"({count}, 4, 4), one T_world_sensor per scan"
     check(shape == (count, 4, 4), f"poses must have shape {wanted}, not {shape}")
     return T_world_sensor
 
 
 def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
-    """`pose` as (4, 4) float64 T_a_b, m, which must be a rigid transform."""
+    """Convert to a rigid transform (4, 4) float64 T_a_b, m."""
     matrix: NDArray[np.float64] = real_array(pose, name)
     check(matrix.shape == (4, 4), f"{name} must have shape (4, 4), not {matrix.shape}")
     check(are_rigid(matrix[None]).all(), f"{name} is not a rigid transform ({_RIGID})")
@@ -127,7 +127,7 @@ def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
 
 
 def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
-    """`poses` as (F, 4, 4) float64 T_world_sensor, m: rigid transforms, as many as scans if their number is given."""
+    """Convert to rigid transforms (F, 4, 4) float64 T_world_sensor, m, one per scan if the number of scans is given."""
     T_world_sensor = pose_matrices(poses, num_scans)
     for i in np.flatnonzero(~are_rigid(T_world_sensor))[:1]:
         msg = f"pose {i} is not a rigid transform ({_RIGID})"
@@ -138,7 +138,7 @@ def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.fl
 def usable_poses(
     poses: ArrayLike, num_scans: int | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """:func:`check_poses`, but a minority of poses that are not rigid transforms is interpolated, and False in a mask (F,)."""
+    """:func:`check_poses`, except that a minority of non-rigid poses is interpolated, and False in the mask (F,)."""
     T_world_sensor = pose_matrices(poses, num_scans)
     rigid = are_rigid(T_world_sensor)
     if rigid.all() or 2 * np.count_nonzero(rigid) <= len(rigid):
@@ -156,7 +156,7 @@ def usable_poses(
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Mask (F,) of the matrices (F, 4, 4) that are rigid transforms."""
     rotation = poses[:, :3, :3]
-    with np.errstate(all="ignore"):  # those that are not finite are none
+    with np.errstate(all="ignore"):  # non-finite matrices are not rigid
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         rigid: NDArray[np.bool_] = (
             (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
@@ -168,38 +168,38 @@ def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:
-    """`value`, if it is of this kind."""
+    """Return `value` if it is an instance of `kind`, else raise a TypeError."""
     if not isinstance(value, kind):
         raise _wrong_type(name, f"a {kind.__name__}", value)
     return value
 
 
 def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
-    """`values`, if they can be taken one after another."""
+    """Return `values` if they are iterable, else raise a TypeError."""
     one_by_one = hasattr(values, "__iter__") or hasattr(values, "__getitem__")
     if not one_by_one or getattr(values, "ndim", 1) == 0:
-        raise _wrong_type(name, "a list of arrays, one a scan", values)
+        raise _wrong_type(name, "a list of arrays, one per scan", values)
     return values  # type: ignore[no-any-return]
 
 
 def path_of(value: Any, name: str) -> Path:
-    """`value` as a path."""
+    """Convert to a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise _wrong_type(name, "a path", value)
     return Path(value)
 
 
 def flag(value: Any, name: str) -> bool:
-    """`value` as a bool."""
+    """Convert to a bool."""
     if not isinstance(value, (bool, np.bool_)):
         raise _wrong_type(name, "True or False", value)
     return bool(value)
 
 
 def hides_bar(progress: bool | None) -> bool | None:
-    """tqdm's `disable`, where a bar is asked for (True), not wanted (False), or for a terminal alone (None).
+    """tqdm's `disable`, for a bar that is wanted (True), unwanted (False), or only wanted on a terminal (None).
 
-    A service, or a command after ``2>&-``, has no standard error: then there is never a bar.
+    A service, or a command after ``2>&-``, has no standard error and thus never a bar.
     """
     if sys.stderr is None or getattr(sys.stderr, "closed", False):
         return True
@@ -207,7 +207,7 @@ def hides_bar(progress: bool | None) -> bool | None:
 
 
 def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -> int:
-    """`value` as an int, `lowest` ≤ value ≤ `highest`."""
+    """Convert to an int, `lowest` ≤ value ≤ `highest`."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise _wrong_type(name, "a whole number", value)
     least = "positive" if lowest == 1 else f"at least {lowest}"
@@ -216,17 +216,17 @@ def whole_number(value: Any, name: str, lowest: int, highest: int = 2**63 - 1) -
 
 
 def positive(value: Any, name: str) -> float:
-    """`value` as a float, positive and finite."""
+    """Convert to a positive finite float."""
     return _scalar(value, name, "positive and finite", lambda x: 0 < x < np.inf)
 
 
 def not_negative(value: Any, name: str) -> float:
-    """`value` as a float, at least 0 and finite."""
+    """Convert to a finite float of at least 0."""
     return _scalar(value, name, "at least 0 and finite", lambda x: 0 <= x < np.inf)
 
 
 def number(value: Any, name: str) -> float:
-    """`value` as a float. Infinity is allowed, NaN is not."""
+    """Convert to a float. Infinity is allowed, NaN is not."""
     return _scalar(value, name, "a number", lambda x: not math.isnan(x))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Libraries that only some uses need, and what to install where one is missing."""
+"""Optional dependencies, and how to install missing ones."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ REQUIREMENTS = {
     "rosbags": "rosbags>=0.11",
     "viser": "viser>=1.1",
 }
-"""What pip is asked for, by module: the extras of `pyproject.toml`, whose names need a release in pip's index."""
+"""Requirements for pip by module: the extras of `pyproject.toml`, which need a release in pip's index."""
 
 
 def require(*modules: str, what: str) -> Any:
-    """Import libraries that may not be installed, and return the last one.
+    """Import optional libraries and return the last one.
 
-    `what` needs them, such as "the viewer needs". An ImportError names all that are missing, and the command to install.
+    `what` begins the message, such as "the viewer needs". The ImportError names all missing ones and the install command.
     """
     missing: list[str] = []
     for name in modules:

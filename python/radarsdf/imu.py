@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Measurements of an inertial measurement unit (IMU)."""
+"""Data of an inertial measurement unit (IMU)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Imu:
     Raises
     ------
     ValueError
-        If arrays are not finite, do not fit together, times do not ascend, or `R_sensor_imu` is no rotation.
+        If arrays are not finite, their shapes are inconsistent, times do not ascend, or `R_sensor_imu` is not a rotation.
     """
 
     times_s: FloatArray
@@ -29,12 +29,12 @@ class Imu:
     angular_velocity: FloatArray
     """(G, 3) rad/s."""
     specific_force: FloatArray | None = None
-    """(G, 3) m/s², as an accelerometer measures it: at rest it is 9.81 upwards. None: there is no accelerometer."""
+    """(G, 3) specific force, m/s²: at rest 9.81 upwards. None: there is no accelerometer."""
     R_sensor_imu: FloatArray | None = None
-    """(3, 3) rotation from the axes of the IMU to those of the radar. None: it is not known."""
+    """(3, 3) rotation from the axes of the IMU to those of the radar. None: unknown."""
 
     def __post_init__(self) -> None:
-        """Checks the arrays."""
+        """Validate the arrays."""
         count = np.shape(self.times_s)[:1] or ("G",)
         shapes = {"times_s": count, "angular_velocity": (*count, 3), "specific_force": (*count, 3)}
         for name, shape in shapes.items():
@@ -57,7 +57,7 @@ class Imu:
 
 
 def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
-    """`R_sensor_imu` as a rotation (3, 3); of a rigid transform (4, 4), its rotation."""
+    """Convert to a rotation (3, 3); of a rigid transform (4, 4), take its rotation."""
     matrix: FloatArray = real_array(R_sensor_imu, "R_sensor_imu")
     whole = np.eye(4)
     whole[:3, :3] = matrix[:3, :3] if matrix.shape in ((3, 3), (4, 4)) else 0.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Delays Ctrl-C while work must not be interrupted."""
+"""Deferral of Ctrl-C during critical work."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from types import FrameType
 
 @contextmanager
 def deferred_interrupts() -> Iterator[Callable[[], bool]]:
-    """Delay Ctrl-C in a ``with`` block, and yield a function that returns whether it was pressed.
+    """Defer Ctrl-C in a ``with`` block, and yield a function that returns whether it was pressed.
 
-    A second Ctrl-C interrupts at once. Nothing changes outside the main thread, which alone receives the signal, nor if the
+    A second Ctrl-C interrupts at once. Without effect outside the main thread, which alone receives the signal, or if the
     program has its own handler.
     """
     pressed = False

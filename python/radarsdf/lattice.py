@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The lattice of the world: where the cells of all maps lie, so that different maps share them."""
+"""The lattice of the world, shared by all maps, so that their cells coincide."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Walls and floors often have a coordinate that is zero or a round number. On a face between cells, noise puts the returns
-# of one wall on both sides of it. With this shift, no such plane is a face of cells of any size: a third of a block is a
-# third or two thirds of a cell of each level, since 1/3 is 0.0101... in binary. Measured: 0.1 to 0.8 points of F-score, and
-# 0.1 to 0.8 fewer outliers, than with planes on faces.
+# Walls and floors often have a coordinate of zero or a round number. On a face between cells, noise would scatter the
+# returns of one wall to both sides. With this shift, no such plane is a face of cells of any size: a third of a block is a
+# third or two thirds of a cell at each level, since 1/3 is 0.0101... in binary. Measured: 0.1 to 0.8 points of F-score more,
+# and 0.1 to 0.8 fewer outliers, than with planes on faces.
 _FIRST_CORNER = -1 / 3
 
 
 class WorldLattice(NamedTuple):
-    """Leaf cells, and blocks of them, which are numbered along the axes of the world."""
+    """Leaf cells, and blocks of them, indexed along the axes of the world."""
 
     cell_m: float  # edge of a leaf cell, m
     block_cells: int  # edge of a block, leaf cells: a multiple of the edge of the coarsest cell
@@ -28,15 +28,15 @@ class WorldLattice(NamedTuple):
         return self.block_cells * self.cell_m
 
     def position(self, cells: ArrayLike) -> NDArray[np.float64]:
-        """Positions (..., 3), world, m, of the lower corners of leaf cells of these numbers (..., 3)."""
+        """Positions (..., 3), world, m, of the lower corners of leaf cells with indices (..., 3)."""
         position: NDArray[np.float64] = (np.asarray(cells) + _FIRST_CORNER * self.block_cells) * self.cell_m
         return position
 
     def cells(self, position: ArrayLike) -> NDArray[np.float64]:
-        """The same the other way round: numbers (..., 3) of leaf cells, with fractions."""
+        """Inverse of :meth:`position`: indices (..., 3) of leaf cells, with fractions."""
         return np.asarray(position, np.float64) / self.cell_m - _FIRST_CORNER * self.block_cells
 
     def nearest_block(self, position: ArrayLike) -> NDArray[np.int64]:
-        """Numbers (..., 3) of the leaf cells at those corners of blocks that are nearest to positions (..., 3), world, m."""
+        """Indices (..., 3) of the leaf cells at the block corners nearest to positions (..., 3), world, m."""
         blocks = np.round(self.cells(position) / self.block_cells)
         return self.block_cells * blocks.astype(np.int64)

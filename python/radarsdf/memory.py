@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The memory that is left, and errors where meshes and views need more."""
+"""Available memory, and errors for meshes and views that need more."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from pathlib import Path
 
 # Bytes, measured.
 _PER_VOXEL = 220.0
-_PER_TRIANGLE = 320.0  # of a welded mesh and its normals: measured on hugin in tiles
-# Of a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
-_PER_CELL_TRACED = 300.0  # the surface that rays meet, made once for a map
+_PER_TRIANGLE = 320.0  # a welded mesh and its normals, measured on hugin in tiles
+# For a view of a map: peaks of maps of 1e5 to 2e5 leaf cells.
+_PER_CELL_TRACED = 300.0  # surface for ray casting, built once per map
 _PER_PATCH_SEEN = 100.0
 _PER_BEAM = 100.0
 
 
 def check_mesh(voxels: int, voxel_size: float, max_memory_bytes: int | None) -> None:
-    """Raises a MemoryError if so many voxels of `voxel_size`, m, need more memory than there is."""
+    """Raise a MemoryError if this many voxels of `voxel_size`, m, exceed the memory."""
     _check(f"voxels of {voxel_size} m", voxels * _PER_VOXEL, max_memory_bytes, "use larger ones")
 
 
 def check_triangles(count: int, max_memory_bytes: int | None) -> None:
-    """Raises a MemoryError if the mesh of a map in tiles has more triangles than memory holds."""
-    remedy = "take a part, by a box, or write 3D Tiles (radarsdf tiles mesh -o NAME.json)"
+    """Raise a MemoryError if the mesh of a tiled map has too many triangles for the memory."""
+    remedy = "limit it to a box, or write 3D Tiles (radarsdf tiles mesh -o NAME.json)"
     _check(f"a mesh of {count} triangles", count * _PER_TRIANGLE, max_memory_bytes, remedy)
 
 
 def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 0, beams: int = 0) -> None:
-    """Raises a MemoryError if views of a map need more memory than there is.
+    """Raise a MemoryError if views of a map exceed the memory.
 
-    `cells`: leaf cells of a map whose surface has yet to be made for views; `patches` of that surface; `beams` of one
+    `cells`: leaf cells of a map whose surface for views is not yet built; `patches` of that surface; `beams` of one
     view.
     """
     of_map = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN
     needed = of_map + beams * _PER_BEAM
-    remedy = "ask for fewer poses or returns, or make the map of a part of the scans"
+    remedy = "use fewer poses or returns, or fit a part of the scans"
     _check("these views", needed, max_memory_bytes, remedy)
 
 
@@ -46,14 +46,14 @@ def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, remedy:
 
 
 def limit_bytes(max_memory_bytes: int | None) -> int | None:
-    """`max_memory_bytes`, or what is available."""
+    """`max_memory_bytes`, or else the available memory."""
     return available_bytes() if max_memory_bytes is None else max_memory_bytes
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:
-    """Memory that this process can still get, bytes: the least of what system and control group have left.
+    """Memory that this process can still allocate, bytes: the minimum over the system and its control group.
 
-    None if it cannot be found out, as on systems other than Linux. `root` is the root of the file system, for tests.
+    None if it is unknown, as on systems other than Linux. `root` is the root of the file system, for tests.
     """
     try:
         lines = (root / "proc/meminfo").read_text().splitlines()
@@ -66,8 +66,8 @@ def available_bytes(root: Path = Path("/")) -> int | None:
         try:
             left = int((folder / "memory.max").read_text()) - int((folder / "memory.current").read_text())
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
-        except (OSError, ValueError):  # there is no such group, or its limit is "max"
+        except (OSError, ValueError):  # no such group, or its limit is "max"
             continue
-        left += int(stat.get("inactive_file", 0))  # cached files, which the system can drop
+        left += int(stat.get("inactive_file", 0))  # page cache, which the system can drop
         available = min(available, max(0, left))
     return available

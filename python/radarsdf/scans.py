@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans with poses: one after another from files of any size, or all in memory."""
+"""Scans with poses, streamed from files of any size or held in memory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from radarsdf.imu import Imu
 _LOG = logging.getLogger("radarsdf.io")
 _Value = TypeVar("_Value")
 
-_ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # of one array a scan
+_ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # one array per scan each
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """(N,) each, by name."""
@@ -37,10 +37,10 @@ class Scan:
     intensities: NDArray[Any] | None = None
     """(N,) sensor units. None if the sensor does not measure them."""
     doppler_mps: NDArray[Any] | None = None
-    """(N,) radial velocity as the sensor gives it, m/s; most give negative values for what comes nearer. NaN where it
+    """(N,) radial velocity as output by the sensor, m/s, by most with a negative sign for approaching returns. NaN where it
     was not measured."""
     time_s: float | None = None
-    """When the scan was taken, s, by the clock of the file."""
+    """Time of the scan, s, by the clock of the file."""
     sigma: NDArray[Any] | None = None
     """(N, 3) the sensor's own standard deviations of range, azimuth and elevation of each return: m, rad, rad."""
 
@@ -57,7 +57,7 @@ class Scan:
 
 
 def finite_returns(scan: Scan, notes: Notes) -> Scan:
-    """The returns of a scan whose coordinates and intensity are finite. The others are counted."""
+    """Keep the returns with finite coordinates and intensity, and count the others."""
     points, intensities = scan.points, scan.intensities
     finite = np.isfinite(points).all(axis=1)
     if intensities is not None:
@@ -72,7 +72,7 @@ def finite_returns(scan: Scan, notes: Notes) -> Scan:
 
 
 class Notes:
-    """Sentences on what was assumed or left out, each logged once as a warning of the logger ``radarsdf.io``."""
+    """Sentences on assumptions and omissions, each logged once as a warning of the logger ``radarsdf.io``."""
 
     def __init__(self, about: str = "the scans") -> None:
         self.about = about  # what is read, for messages
@@ -81,37 +81,37 @@ class Notes:
         self._first: dict[str, str] = {}
 
     def add(self, line: str) -> None:
-        """Keeps a sentence, and logs it if it is new."""
+        """Add a sentence, and log it if it is new."""
         if line not in self.lines:
             self.lines.append(line)
             _LOG.warning(line)
 
     def ending(self) -> str:
-        """All sentences, to end an error with."""
+        """All sentences, to append to an error."""
         return "".join(f"; {line}" for line in self.lines)
 
     def count(self, what: str, number: int = 1, example: str = "") -> None:
-        """Counts what was left out in this pass through the files, and keeps the first example."""
+        """Count omissions in this pass through the files, and keep the first example."""
         if number:
             self._first.setdefault(what, f"; the first: {example}" if example else "")
             self._counts[what] = self._counts.get(what, 0) + number
 
     def start_pass(self) -> None:
-        """Forgets the counts: the files are read again."""
+        """Reset the counts before the files are read again."""
         self._counts = {}
 
     def end_pass(self) -> None:
-        """Turns the counts into sentences."""
+        """Turn the counts into sentences."""
         for what, number in self._counts.items():
             self.add(f"{number} {what}{self._first[what]}")
 
 
 class Scans:
-    """F scans with poses, and lidar points as ground truth where there are any.
+    """F scans with poses, and optionally lidar points as ground truth.
 
-    Iterating gives one :class:`Scan` after another. Scans of :func:`radarsdf.io.read` are read from their files while they
-    are iterated, so that memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read all of them
-    and keep them. `poses`, `times_s` and ``len()`` read the files once, and keep no points.
+    Iteration yields one :class:`Scan` after another. Scans of :func:`radarsdf.io.read` are read from their files while they
+    are iterated, so memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read all of them
+    and cache them. `poses`, `times_s` and ``len()`` read the files once, and keep no points.
 
     Parameters
     ----------
@@ -126,9 +126,9 @@ class Scans:
     doppler_mps, sigmas : sequence of F arrays, optional
         As `Scan.doppler_mps` and `Scan.sigma`.
     times_s : (F,) ndarray, optional
-        When the scans were taken, s.
+        Times of the scans, s.
     imu : Imu, optional
-        What an IMU measured meanwhile.
+        IMU data of the recording.
     """
 
     def __init__(
@@ -162,10 +162,10 @@ class Scans:
         ground_truth: Callable[[], NDArray[Any] | None] = lambda: None,
         imu: Callable[[], Imu | None] = lambda: None,
     ) -> Scans:
-        """Scans that are read while they are iterated.
+        """Build scans that are read lazily during iteration.
 
-        `source` returns a new iterator over them, each with at least one return, and `notes` take what it assumes. The
-        ground truth and the IMU are read once, when they are asked for.
+        `source` returns a new iterator over them, each with at least one return, and `notes` receive its assumptions. The
+        ground truth and the IMU are read once, on first access.
         """
         scans = cls([], np.zeros((0, 4, 4)))
         scans._source, scans._notes = source, notes
@@ -174,7 +174,7 @@ class Scans:
         return scans
 
     def __iter__(self) -> Iterator[Scan]:
-        """One scan after another."""
+        """Iterate over the scans."""
         if self._arrays is None:
             return self._read()
         return (self._scan(i) for i in range(len(self.points)))
@@ -203,52 +203,52 @@ class Scans:
 
     @property
     def doppler_mps(self) -> list[NDArray[Any]] | None:
-        """F arrays (N_i,), m/s: see `Scan.doppler_mps`. None if there is none."""
+        """F arrays (N_i,), m/s, see `Scan.doppler_mps`; None if not measured."""
         return self._loaded()["doppler_mps"]
 
     @property
     def sigmas(self) -> list[NDArray[Any]] | None:
-        """F arrays (N_i, 3), m, rad, rad: see `Scan.sigma`. None if there are none."""
+        """F arrays (N_i, 3), m, rad, rad, see `Scan.sigma`; None if not available."""
         return self._loaded()["sigmas"]
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
-        """(F,) when the scans were taken, s. None if that is not known."""
+        """(F,) times of the scans, s; None if unknown."""
         self._read_once()
         return self._times_s
 
     @property
     def ground_truth(self) -> NDArray[Any] | None:
-        """(M, 3) lidar points, world frame, m. None if there are none."""
+        """(M, 3) lidar points, world frame, m; None if there are none."""
         return self._ground_truth()
 
     @property
     def imu(self) -> Imu | None:
-        """What an inertial measurement unit measured meanwhile. None if there is none."""
+        """IMU data of the recording; None if there are none."""
         return self._imu()
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on what was assumed, and after the files were read, on what was left out."""
+        """Sentences on assumptions and, after a complete pass, on omissions."""
         return list(self._notes.lines)
 
     def select(self, frames: NDArray[np.int64] | Sequence[int]) -> Scans:
-        """Selects scans by their numbers. All scans are read.
+        """Select scans by index. All scans are read.
 
         Parameters
         ----------
         frames : (K,) integer ndarray, or sequence of int
-            Numbers of scans, from 0, in the order of the result. Negative ones count from the end.
+            Indices of scans, in the order of the result. Negative ones count from the end.
 
         Returns
         -------
         Scans
-            K scans, with the ground truth and the IMU of these.
+            K scans, with the same ground truth and IMU.
 
         Raises
         ------
         IndexError
-            If there is no scan of such a number.
+            If an index is out of range.
         """
         scans = self.with_poses(self.poses[frames])
         scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
@@ -256,14 +256,14 @@ class Scans:
         return scans
 
     def with_poses(self, poses: NDArray[np.float64], *, other_world: bool = False) -> Scans:
-        """Replaces the poses. All scans are read.
+        """Replace the poses. All scans are read.
 
         Parameters
         ----------
         poses : (F, 4, 4) float64 ndarray
             T_world_sensor, m.
         other_world : bool
-            Whether the poses are in another world frame than the ground truth, which is then left out.
+            Whether the poses are in another world frame than the ground truth, which is then dropped.
 
         Returns
         -------
@@ -278,7 +278,7 @@ class Scans:
         return scans
 
     def with_ground_truth(self, points: Callable[[], NDArray[Any] | None]) -> Scans:
-        """The same scans with other lidar points, (M, 3), world frame, m, which `points` returns when they are asked for."""
+        """Replace the lidar points (M, 3), world frame, m, by those that `points` returns on first access."""
         scans = copy(self)
         scans._ground_truth = cache(points)
         return scans
@@ -290,7 +290,7 @@ class Scans:
         return Scan(np.asarray(points), self.poses[i], intensities, doppler_mps, time_s, sigma)
 
     def _read(self) -> Iterator[Scan]:
-        """Reads the files, and keeps what is small once they are read to the end."""
+        """Read the files, and keep poses and times of a complete pass."""
         assert self._source is not None
         poses: list[NDArray[np.float64]] = []
         times_s: list[float | None] = []
@@ -307,20 +307,20 @@ class Scans:
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
 
     def _read_once(self) -> None:
-        """Reads the files, if there are any and nobody did: poses and times are kept."""
+        """Read the poses and times unless they are known."""
         if self._poses is None and self._source is not None:
             for _ in self._read():
                 pass
 
     def _loaded(self) -> dict[str, list[NDArray[Any]] | None]:
-        """The arrays of all scans, which are read from their files at the first call."""
+        """Arrays of all scans, read from their files at the first call."""
         if self._arrays is None:
             self._arrays = _arrays_of(list(self._read()))
         return self._arrays
 
 
 def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
-    """Collects scans, with the arrays that all of them have."""
+    """Collect scans, with the arrays that all of them have."""
     times_s = _all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
@@ -331,22 +331,22 @@ def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
 
 
 def filled(points: Any, **given: Any) -> tuple[Any, ...]:
-    """The points, and the `given` arrays, named as in :class:`Scans`. If points are `Scans`, what is None is theirs."""
+    """Fill missing arrays from `points`, if these are `Scans`; arrays are named as in :class:`Scans`."""
     if not isinstance(points, Scans):
         return points, *given.values()
-    arrays = points.points  # first: it reads all there is, in one pass
+    arrays = points.points  # first, since it reads everything in one pass
     return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
 
 
 def chosen(
     arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64] | Sequence[int]
 ) -> list[NDArray[Any]] | None:
-    """The arrays with these `numbers`, (K,), in this order; None if there are none."""
+    """Arrays at these `numbers`, (K,), in this order; None for no arrays."""
     return None if arrays is None else [arrays[i] for i in numbers]
 
 
 def _arrays_of(scans: Sequence[Scan]) -> dict[str, Any]:
-    """By their names in :class:`Scans`: lists of one array a scan, or None where a scan has none."""
+    """Collect arrays by their names in :class:`Scans`: one per scan, or None where a scan has none."""
     return {
         "points": [scan.points for scan in scans],
         "intensities": _all_or_none([scan.intensities for scan in scans]),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Frozen dataclasses of settings, whose values pydantic checks."""
+"""Frozen dataclasses of settings, validated by pydantic."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _RULES = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attrib
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def settings(cls: _Class) -> _Class:
-    """A frozen dataclass of keyword arguments. A wrong value is a `pydantic.ValidationError`, which is a ValueError."""
+    """Make a frozen keyword-only dataclass. Wrong values raise a `pydantic.ValidationError`, which is a ValueError."""
     return cast(_Class, dataclass(frozen=True, kw_only=True, config=_RULES)(cls))
 
 
 def by_name(values: Any, what: str) -> dict[str, Any]:
-    """`values` as a dict of settings by name. Raises a ValueError if they are none."""
+    """Convert to a dict of settings by name. Raises a ValueError for anything but a mapping of names."""
     if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
         msg = f"{what} must be a mapping of names to values, not {values!r:.50}"
         raise ValueError(msg)
@@ -31,12 +31,12 @@ def by_name(values: Any, what: str) -> dict[str, Any]:
 
 
 def first_wrong(error: ValidationError) -> str:
-    """The first wrong value in one line, with the name of the setting."""
+    """Format the first wrong value as one line, with the name of the setting."""
     first = error.errors(include_url=False)[0]
     name = ".".join(part for part in first["loc"] if isinstance(part, str))
     if first["type"] == "unexpected_keyword_argument":
         return f"unknown setting {name:.50}"
-    if first["type"] == "value_error":  # of a check of ours: its message is complete
+    if first["type"] == "value_error":  # one of our own checks, with a complete message
         return first["msg"].removeprefix("Value error, ")
     must = re.sub(r"^\w+ should", "must", first["msg"])
     return f"{name} {must}, not {first['input']!r:.50}"

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A pool of Python threads, in whose place PyTorch's own threads are off.
+"""A pool of Python threads that replaces PyTorch's own threads.
 
 PyTorch splits every operation over OpenMP threads, which spin while they wait for each other. Next to another busy
-process, a fit of 1.8 s took 88 s: threads with work waited for the time slices of threads that only spun. Python threads
-sleep while they wait, synchronise once in an iteration, and are no slower on an idle machine: PyTorch and the compiled
-core release the interpreter's lock. For work of less than a millisecond, there is :attr:`ThreadPool.core_threads`.
+process, a fit of 1.8 s took 88 s: working threads waited for the time slices of threads that only spun. Python threads
+sleep while they wait, synchronise once per iteration, and are no slower on an idle machine, since PyTorch and the compiled
+core release the GIL. For work of less than a millisecond, there is :attr:`ThreadPool.core_threads`.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _TRANSCENDENTAL = ("cos", "erf", "exp", "log", "log10", "log1p", "log2", "pow", "sigmoid", "sin", "tanh")
-_AT_ONCE = 1024  # numbers: enough for vectors, too few for PyTorch to share them among threads
+_VECTOR_LENGTH = 1024  # elements: enough for vectors, too few for PyTorch to split among threads
 
 _wanted, _known = os.environ.get("RADARSDF_ISA"), _core.available_instruction_sets()
-if _wanted and _wanted not in _known:  # the core goes on with its own choice
+if _wanted and _wanted not in _known:  # the core keeps its own choice
     warnings.warn(
         f"RADARSDF_ISA={_wanted!s:.50} is none of {', '.join(_known)}: {_core.instruction_set()} is used",
         RuntimeWarning,
@@ -41,13 +41,13 @@ if _wanted and _wanted not in _known:  # the core goes on with its own choice
 
 
 class _State:
-    """PyTorch's settings of the process, and who has changed them."""
+    """PyTorch's process-wide settings, and who changed them."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.open_blocks = 0
-        self.usual_threads = 0  # PyTorch's number before the first block that is still open
-        self.here = threading.local()  # its `inside`: whether this thread is in a block
+        self.usual_threads = 0  # PyTorch's number before the first open block
+        self.here = threading.local()  # `inside`: whether this thread is in a block
 
 
 _state = _State()
@@ -60,7 +60,7 @@ def _use_one_thread() -> None:
 
 
 def _reset_after_fork() -> None:
-    """One thread for a forked child: it has only the one that forked, and OpenMP would wait for ever for the others."""
+    """Use one thread in a forked child, which has only the forking one: OpenMP would wait forever for the others."""
     _state.__init__()  # type: ignore[misc]
     torch.set_num_threads(1)
 
@@ -70,10 +70,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def start_vector_library() -> None:
-    """Call PyTorch's transcendental functions once in this process, by one thread alone.
+    """Call PyTorch's transcendental functions once in this process, from a single thread.
 
-    Their libraries look for the processor's instructions in the first call. Where several threads make it at once, some get
-    other last bits than later: the same fit would differ about once in fifty processes.
+    Their libraries detect the instruction set in the first call. If several threads make it at once, some get
+    other last bits than later: about one in fifty processes would give another fit.
     """
     global _vector_library_started  # noqa: PLW0603 - there is one PyTorch
     with _state.lock:
@@ -81,16 +81,16 @@ def start_vector_library() -> None:
             return
         with torch.no_grad():
             for dtype in (torch.float32, torch.float64):
-                numbers = torch.full((_AT_ONCE,), 0.5, dtype=dtype, device="cpu")
+                numbers = torch.full((_VECTOR_LENGTH,), 0.5, dtype=dtype, device="cpu")
                 for name in _TRANSCENDENTAL:
                     getattr(torch, name)(*[numbers] * (2 if name == "pow" else 1))
                 functional.binary_cross_entropy_with_logits(numbers, numbers)
-                torch.randn(_AT_ONCE, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
+                torch.randn(_VECTOR_LENGTH, generator=torch.Generator("cpu"), dtype=dtype, device="cpu")
         _vector_library_started = True
 
 
 def resolve_num_threads(num_threads: int) -> int:
-    """`num_threads`, or if it is 0 as many as PyTorch uses, or used before a block of :class:`ThreadPool`."""
+    """Return `num_threads`, or for 0 PyTorch's number, as it was before a block of :class:`ThreadPool`."""
     with _state.lock:
         return num_threads or (_state.usual_threads if _state.open_blocks else torch.get_num_threads())
 
@@ -98,8 +98,8 @@ def resolve_num_threads(num_threads: int) -> int:
 class ThreadPool:
     """A pool of `num_threads` threads for a ``with`` block. 0: as many as PyTorch uses."""
 
-    # PyTorch keeps its number of threads for each thread; a new thread starts with what any thread set last. So the outermost
-    # block of each thread sets 1, and restores the number from before the first block that is still open, because a thread
+    # PyTorch keeps its number of threads per thread; a new thread starts with what any thread set last. So the outermost
+    # block of each thread sets 1, and restores the number from before the first open block, because a thread
     # that first used PyTorch since then has read 1.
 
     def __init__(self, num_threads: int = 0) -> None:
@@ -120,10 +120,10 @@ class ThreadPool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.__dict__.pop("core_threads", None)  # whose threads end with it
+        self.__dict__.pop("core_threads", None)  # its threads end with it
         try:
             self._pool.shutdown(cancel_futures=True)
-        finally:  # also if a second Ctrl-C interrupts the wait for the threads
+        finally:  # even if a second Ctrl-C interrupts the wait for the threads
             with _state.lock:
                 _state.open_blocks -= 1
                 if self._is_outermost:
@@ -132,24 +132,24 @@ class ThreadPool:
 
     @cached_property
     def core_threads(self) -> _core.ThreadPool:
-        """As many threads of the core, for short work without Python: they look for work for a moment before they sleep.
+        """Equally many threads of the core, for short work without Python: they spin for a moment before they sleep.
 
-        On two threads, an iteration of a training took 4.1 ms with the pool, which was woken ten times, and takes 2.3.
+        On two threads, a training iteration took 4.1 ms with the pool, which was woken ten times, and takes 2.3 ms.
         """
         return _core.ThreadPool(self.num_threads)
 
     def map(self, function: Callable[[_Item], _Result], items: Sequence[_Item]) -> Iterator[_Result]:
-        """Like the built-in ``map``, with the items on different threads, where gradients are on.
+        """Like the built-in ``map``, with the items on different threads and gradients enabled.
 
-        With one thread or one item it runs in the calling thread, with the grad mode of that.
+        With one thread or one item it runs in the calling thread, with its grad mode.
         """
         if self.num_threads == 1 or len(items) <= 1:
             return map(function, items)
-        # If every item gets a thread, the calling thread computes the first one itself: to sleep and be woken
+        # If every item gets a thread, the calling thread computes the first one itself: sleeping and waking
         # would take a noticeable part of an iteration.
         own = 0 if len(items) > self.num_threads else 1
         futures = [self._pool.submit(function, item) for item in items[own:]]
-        futures.reverse()  # a result is let go once it is used
+        futures.reverse()  # a result is released once it is used
         with torch.enable_grad():  # as in the threads of the pool
             first = [function(item) for item in items[:own]]
         return itertools.chain(first, (futures.pop().result() for _ in range(len(futures))))

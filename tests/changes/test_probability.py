@@ -22,13 +22,13 @@ from radarsdf.changes.changes import (
     Changes,
     areas_of,
 )
-from radarsdf.changes.compare import _changed
+from radarsdf.changes.compare import _classify
 from radarsdf.changes.probability import (
     Errors,
     PlacedMap,
     PlaceEvidence,
     Side,
-    _passed,
+    _free_space_odds,
     odds_of_differences,
     posterior,
     share_of_changes,
@@ -62,7 +62,7 @@ def test_rays_that_pass_are_those_of_a_beta_binomial():
     def evidence(hits, passes, of):
         return quad(lambda p: p**hits * (1 - p) ** passes * of.pdf(p), 0, 1, limit=500)[0]
 
-    for i, found in enumerate(_passed(own, other)):
+    for i, found in enumerate(_free_space_odds(own, other)):
         hits, passes = other.hits[i] / 2, other.passes[i] / 2  # of scans: in two cells each
         same = evidence(hits, passes, beta(own.hits[i] / 2 + 0.5, own.passes[i] / 2 + 0.5))
         expected = np.log(evidence(hits, passes, beta(0.5, 0.5)) / same)
@@ -139,7 +139,7 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     of_side = side([distance_m], [0.01], normals=normals)
     odds = np.array([absent], float), np.array([shifted], float)
     for lost, sign in ((GONE, -1), (APPEARED, 1)):
-        found = _changed(of_side, *odds, 0.5, lost)
+        found = _classify(of_side, *odds, 0.5, lost)
         assert found.kind[0] == (lost if kind == GONE else kind)
         assert_allclose(found.moved_m[0], sign * distance_m if kind == MOVED else np.nan)
         probable = (
@@ -150,7 +150,7 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     unsure = dataclasses.replace(
         of_side, own=evidence([0.0], confidence=0.4), other=evidence([distance_m], normals)
     )
-    assert _changed(unsure, *odds, 0.5, GONE).kind[0] in (SAME, UNSEEN)
+    assert _classify(unsure, *odds, 0.5, GONE).kind[0] in (SAME, UNSEEN)
 
 
 def test_means_near_a_place_are_weighted():

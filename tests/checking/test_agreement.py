@@ -46,7 +46,7 @@ def expected(what):
     if words := re.fullmatch(r"the positions of the poses are multiplied by (?:1/)?([\d.]+)", what):
         factor = 1 / float(words[1]) if "1/" in what else float(words[1])
         return motions(with_part(POSES, 3, factor * POSES[:, :3, 3]))
-    if words := re.fullmatch(r"the sensor is turned by (-?\d+) degrees of (yaw|pitch) on .*", what):
+    if words := re.fullmatch(r"the sensor is rotated by (-?\d+) degrees in (yaw|pitch) against .*", what):
         turn = np.eye(4)
         turn[:3, :3] = Rotation.from_euler(
             "zy"[words[2] == "pitch"], float(words[1]), degrees=True

@@ -85,7 +85,7 @@ def test_a_drift_is_found_with_its_figures(drive):
     (found,) = check_drift(recording(drive, drifted(drive.poses, 0.05, 0.004, 1)), CONFIG)
     assert found.name == "poses_drift"
     assert found.severity == "warning"
-    assert "denser where returns that took no part lie" in found.evidence
+    assert "denser at held-out returns" in found.evidence
     assert "radarsdf poses" in found.fix
 
 

@@ -104,9 +104,9 @@ def test_a_clock_that_is_off_is_found_where_the_motion_changes():
             slice(1, None),
             scans.poses[:-1],
             None,
-            "With the poses of a time about 1 steps between scans later",
+            "With poses from about 1 steps between scans later",
         ),
-        (slice(-1), scans.poses[1:], 0.2 * np.arange(23), "With the poses of a time about 0.2 s earlier"),
+        (slice(-1), scans.poses[1:], 0.2 * np.arange(23), "With poses from about 0.2 s earlier"),
     ):
         (found,) = check_clock(checked_input(scans.points[rows], poses, times_s=times_s))
         assert (found.name, found.severity) == ("clock_offset", "error")

@@ -57,7 +57,7 @@ def test_intensity_outliers_are_counted_and_named(good):
         "intensity_outliers": 1,
     }
     assert f"of {len(whole)} intensities" in found["intensity_sentinel"].evidence
-    assert "are -9999, 65535, far from all others" in found["intensity_sentinel"].evidence
+    assert "are -9999, 65535, far from the others" in found["intensity_sentinel"].evidence
     assert "are 1e+09" in found["intensity_outliers"].evidence
 
 

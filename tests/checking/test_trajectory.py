@@ -86,7 +86,7 @@ def test_poses_that_are_no_transforms_are_told_apart():
     assert [(finding.name, finding.severity) for finding in found] == [
         ("poses_not_rigid", "warning"), ("poses_not_rigid", "error"), ("poses_transposed", "error"), ("mirrored", "error")
     ]  # fmt: skip
-    assert found[0].evidence.startswith("3 of 8 poses are no rigid transforms, the first is pose 2")
+    assert found[0].evidence.startswith("3 of 8 poses are not rigid transforms, the first is pose 2")
     assert found[3].evidence.startswith("4 of 8 poses are left-handed")
 
 
@@ -139,7 +139,7 @@ def test_what_a_fit_leaves_out_is_noted(good):
     poses[9] = np.nan
     found = check_cheaply([*padded, hole, hole[:0], *points[5:]], poses)
     assert names(found) == ["poses_not_rigid"]
-    assert found[0].evidence.startswith("1 of 30 poses are no rigid transforms, the first is pose 9")
+    assert found[0].evidence.startswith("1 of 30 poses are not rigid transforms, the first is pose 9")
     total = sum(map(len, padded)) + len(hole) + sum(map(len, points[5:]))
     zeros = sum(len(scan) for scan in padded) * 3 // 4
     notes = {finding.name: finding.evidence for finding in found if finding.severity == "note"}

@@ -53,7 +53,7 @@ def test_a_fit_reports_the_same_as_text_and_as_json(tmp_path, capsys):
     found = values(capsys, *words)
     used, returns, scans_used = map(int, re.match(r"(\d+) of (\d+) returns in (\d+) scans", printed).groups())
     assert (used, returns, scans_used) == (found["returns_used"], found["returns"], found["scans"])
-    assert f"{found['moving']} move by their Doppler" in printed
+    assert f"{found['moving']} move according to their Doppler" in printed
     assert 0.08 * returns < found["moving"] < 0.12 * returns
     assert f"{found['intensity_outliers']} intensities are outliers" in printed
     assert f"sdf loss {found['losses']['sdf']:.3g}" in printed

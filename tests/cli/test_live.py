@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli.live import Replay, _add_rates, _Shown, replay
+from radarsdf.cli.live import Replay, _add_rates, _PeriodicView, replay
 from radarsdf.cli.results import Results
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
@@ -84,15 +84,15 @@ def test_rates_are_those_of_the_seconds(capsys):
     _add_rates(Results(), Replay([0, 1, 2, 4], [], [0.01, 0.02, 0.03, 0.06], [3], []), 5)
     assert capsys.readouterr().out.splitlines() == [
         "4 of 5 scans in the map, 1 dropped, 0 lost",
-        "a scan took 25.0 ms (median), 59.1 ms (99 of 100), 60.0 ms (worst): 33 scans a second",
+        "a scan took 25.0 ms (median), 59.1 ms (99th percentile), 60.0 ms (worst): 33 scans per second",
     ]
-    with pytest.raises(ValueError, match="no scan came into the map"):
+    with pytest.raises(ValueError, match="no scan was integrated"):
         _add_rates(Results(), Replay(), 5)
 
 
 def test_the_page_shows_the_surface_from_time_to_time():
     page, done = Mock(), Replay(poses=[np.eye(4) + np.eye(4)[:, :1] * np.eye(4)[3]])
-    shown = _Shown(Mock(**{"mesh.return_value": "mesh"}), page)
+    shown = _PeriodicView(Mock(**{"mesh.return_value": "mesh"}), page)
     for due, times in ((True, 1), (False, 1), (True, 2)):
         shown._next_s = 0.0 if due else shown._next_s
         shown(done)

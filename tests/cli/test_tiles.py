@@ -74,7 +74,7 @@ def test_a_tile_that_failed_is_named_by_every_command(copied, scans_file, tmp_pa
     assert call("report", copied, scans_file, "-o", page, *VOXEL, "--quiet") == 0
     assert capsys.readouterr().err.startswith(f"warning: {copied} lacks 1 of 4 tiles")
     assert call("eval", copied, scans_file, "--holdout", 3, "--samples", 20000, *VOXEL) == 0
-    assert " held-out returns are outliers or in no tile" in capsys.readouterr().out
+    assert " held-out returns are skipped: outliers, or in no tile" in capsys.readouterr().out
 
 
 def test_the_city_is_the_map(city, whole, scans_file, tmp_path, capsys):
@@ -102,7 +102,7 @@ def test_folders_and_words_that_are_wrong(city, tmp_path, capsys):
         folder.mkdir()
     shutil.copy(city / "plan.json", planned)
     for words, named in (
-        (["info", nothing], f"{nothing} is no map"),
+        (["info", nothing], f"{nothing} is not a map"),
         (["mesh", planned, "-o", ply], "radarsdf tiles fit"),
         (["mesh", city, "-o", ply, "--voxel", 0.15], "0.1 or 0.2"),
         (["tiles", "status", tmp_path / "nowhere"], "nowhere"),

@@ -108,7 +108,7 @@ def test_what_somebody_wants_is_no_pose_of_the_sensor(tmp_path, topic):
     path = bag_of(tmp_path, lambda bag: tf(bag, {("base", "radar"): MOUNTING}), clouds, goals)
     scans = read(path)
     assert_allclose(scans.poses[0], MOUNTING, atol=1e-9)
-    assert any(note.startswith(f"poses of {topic} are passed over") for note in scans.notes)
+    assert any(note.startswith(f"poses of {topic} are ignored") for note in scans.notes)
     assert read(path, pose_topic=topic).poses[0, 0, 3] == 50.5  # what is asked for is read
     with pytest.raises(NoPoses, match="has no poses"):
         read(bag_of(tmp_path, clouds, goals, kind="ros1"))

@@ -170,7 +170,7 @@ def test_stamps_that_are_zero_or_stand_still(tmp_path, stamp_s):
         odometry(bag)
         for i, time_s in enumerate(TIMES_S):
             bag.write("/radar", bag.cloud2(stamp_s, columns(i), "base_link"), time_s)
-    why = "stand still" if stamp_s else "are zero"
+    why = "are constant" if stamp_s else "are zero"
     scans = read(tmp_path / "a.bag")
     assert scans.notes[0] == f"the header stamps of /radar {why}: the record time is used instead"
     check(scans)
@@ -228,7 +228,7 @@ def test_choices_that_are_not_clear(tmp_path):
         ("a.bag", {"topic": "/up"}, "/up"),
         ("a.bag", {"topic": "/odom"}, "/odom has messages nav_msgs/msg/Odometry"),
         ("a.bag", {"topic": "/left/points", "pose_topic": "/left/points"}, "topics with poses are /odom"),
-        ("b.bag", {}, "pose_topic which one counts, of /gps, /slam"),
+        ("b.bag", {}, "choose one with pose_topic, of /gps, /slam"),
     ):
         with pytest.raises(ValueError, match=names):
             read(tmp_path / path, **choices)

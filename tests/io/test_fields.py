@@ -99,7 +99,7 @@ def polar(text):
     names, *rows = [line.split() for line in text.splitlines()]
     columns = dict(zip(names, np.array(rows, np.float64).T, strict=True))
     notes = Notes()
-    return scan_of(Fields.of(names).judged(columns, notes), columns).points, notes.lines
+    return scan_of(Fields.of(names).with_unit(columns, notes), columns).points, notes.lines
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def polar(text):
 def test_units_in_names_become_metres_rad_and_metres_per_second(columns):
     rows = {name: np.full(2, value, np.float64) for name, value in columns.items()}
     notes = Notes()
-    scan = scan_of(Fields.of(list(rows)).judged(rows, notes), rows)
+    scan = scan_of(Fields.of(list(rows)).with_unit(rows, notes), rows)
     assert_allclose(scan.points, [[3, -4, 5]] * 2, rtol=1e-6)
     assert_allclose(scan.doppler_mps, [-10, -10], rtol=1e-6)
     assert (scan.intensities.tolist(), notes.lines) == ([7, 7], [])
@@ -123,19 +123,19 @@ LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("range azimuth elevation\n10 45 0", "degrees by their numbers"),
-        ("r az el\n10 45 0", "degrees by their numbers"),
+        ("range azimuth elevation\n10 45 0", "degrees by their values"),
+        ("r az el\n10 45 0", "degrees by their values"),
         ("r_m az_deg el_deg\n10 45 0", None),
-        ("range(mm) azimuth[deg] elevation\n10000 45 0", "degrees by their numbers"),
+        ("range(mm) azimuth[deg] elevation\n10000 45 0", "degrees by their values"),
         ("range azimuth_rad elevation_rad\n10 0.78539816339745 0", None),
-        ("range azimuth elevation\n10 0.78539816339745 0", "rad by their numbers"),
+        ("range azimuth elevation\n10 0.78539816339745 0", "rad by their values"),
         (
             "scalar_Range scalar_Azimuth_Angle scalar_Elevation_Angle\n10 0.78539816339745 0",
-            "rad by their numbers",
+            "rad by their values",
         ),
         (
             "range azimuth elevation\n10 0.78539816339745 0\n1 6.2 0.1",
-            "rad by their numbers",
+            "rad by their values",
         ),  # from 0 to a turn
     ],
 )

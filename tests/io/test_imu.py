@@ -64,7 +64,7 @@ def test_which_topic(tmp_path):
     path = a_bag(tmp_path, topics=("/camera/imu", "/imu"), force=False)
     scans = read(path, UNPOSED)
     assert scans.imu is None
-    assert any("say by imu_topic which, of /camera/imu, /imu" in note for note in scans.notes)
+    assert any("choose one with imu_topic, of /camera/imu, /imu" in note for note in scans.notes)
     chosen = read(path, UNPOSED, imu_topic="/imu").imu
     assert chosen.specific_force is None
     assert len(chosen) == 40

@@ -75,7 +75,7 @@ def test_without_a_scheduler_it_ends_and_keeps_what_was_done(drive, folder, tmp_
     arguments = {"tile_size": TILE_M, "halo": 6.4, "config": CONFIG, "progress": False}
     city = radarsdf.fit_tiles(drive, out, executor=CutOff(), **arguments)
     assert [tile.name for tile in city.tiles] == ["0_0"]
-    assert set(city.missing.values()) == {"the scheduler is gone: call again, what is done is kept"}
+    assert set(city.missing.values()) == {"the scheduler is gone: call again, finished tiles are kept"}
     written_ns = map_path(out, city.tiles[0]).stat().st_mtime_ns
     assert radarsdf.fit_tiles(drive, out, **arguments).missing == {}
     assert map_path(out, city.tiles[0]).stat().st_mtime_ns == written_ns

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from radarsdf.map.threshold import Threshold
-from radarsdf.view.framing import FOV_RAD, look_at_all
+from radarsdf.view.framing import FOV_RAD, framing_pose
 from radarsdf.view.glb import glb
 from radarsdf.view.surface import ShownSurface, first_hit, spread_evenly, thinned
 from scipy.spatial import cKDTree
@@ -80,7 +80,7 @@ def test_all_is_seen_and_the_frame_is_filled():
     rng = np.random.default_rng(3)
     points = rng.normal(size=(500, 3)) * [40, 6, 2] + [500, -300, 20]
     for aspect in (0.4, 1.0, 2.4):
-        position, look_at = look_at_all(points, np.array([-0.3, -0.6, 0.5]), aspect)
+        position, look_at = framing_pose(points, np.array([-0.3, -0.6, 0.5]), aspect)
         forward = (look_at - position) / np.linalg.norm(look_at - position)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)

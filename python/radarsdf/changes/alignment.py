@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Where the frame of one map lies in that of another, by their surfaces."""
+"""Registration of two maps by their surfaces."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from radarsdf.poses.verdict import Verdict
 from radarsdf.products import turned
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 
-# Standard deviations of how far frames are apart before maps are compared: translation, m, and rotation vector, rad.
-_APART = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
+# Prior standard deviations of the offset between the frames of two maps: translation, m, and rotation vector, rad.
+_PRIOR_SIGMAS = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.15])
 _ITERATIONS = 15
-_MOST_POINTS = 10_000  # of the later surface
-_PATCH_M = 4.0  # edge of a patch, whose errors are correlated
-_BY_CHANCE = 1e-3  # significance level
-# Standard error, in leaf cells, from which on an axis is not determined: fields reach two cells.
-_UNSURE_CELLS = 0.5
-_ALIKE_CELLS = 0.25  # surfaces that are nearer lie on each other
-_SEARCH_CELLS = 8.0  # edge of the cells of a search, in leaf cells
-_SEARCHED = 500  # points of a search
-_TRIED, _FOLLOWED = 8192, 200  # poses of a search, and the best of them
-_ERRORS = 3.0  # standard errors by which poses that agree about as well differ at most
+_MAX_POINTS = 10_000  # sampled on the later surface
+_PATCH_M = 4.0  # edge of a patch within which errors are correlated
+_SIGNIFICANCE = 1e-3  # significance level
+# Largest standard error of a determined axis, in leaf cells: fields reach two cells.
+_MAX_SIGMA_CELLS = 0.5
+_COINCIDENT_CELLS = 0.25  # surfaces within this distance coincide
+_SEARCH_CELLS = 8.0  # edge of the cells of the coarse search, in leaf cells
+_SAMPLES = 500  # points of a search
+_SEARCH_POSES, _BEST_POSES = 8192, 200  # poses of the coarse search, and the best of them, which are compared
+_TIE_SIGMAS = 3.0  # poses within these standard errors agree about equally well
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where one map lies in the frame of another."""
+    """Pose of one map in the frame of another."""
 
     T_before_after: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) m
-    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of an offset from the `centre`
+    covariance: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of offsets about the `centre`
     centre: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) world of the earlier map, m
-    improved: bool = False  # whether the surfaces show that the frames are apart
+    improved: bool = False  # whether the surfaces show an offset between the frames
     words: str = "The maps were taken as they are."  # the verdict in one sentence
 
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
@@ -58,57 +58,57 @@ class Alignment:
 
 
 def align(before: PlacedMap, after: PlacedMap) -> Alignment:
-    """Move the later map so that its surface lies on that of the earlier one, if that is more than chance explains.
+    """Register the later map to the surface of the earlier one, if the offset between them is significant.
 
-    The verdict is on the offset over its standard errors: surfaces that lie along it become no nearer, however far it is.
+    The test is on the offset over its standard errors: along a surface, it brings the surfaces no nearer, however large it is.
     """
     if min(len(before.faces), len(after.faces)) < CELLS_OF_SURFACE:
         return Alignment()
     surface = _Surface.of(after)
 
     def far(pose: Floats) -> Floats:
-        """(N,) logarithms of the distances between the surfaces, about equal where they lie on each other."""
-        near_m, _, distance_m = before.nearest(_placed(surface.points, pose))
+        """(N,) logarithms of the distances between the surfaces, about equal where the surfaces coincide."""
+        near_m, _, distance_m = before.nearest(_transformed(surface.points, pose))
         distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
-        found: Floats = np.log(np.hypot(distance_m, _ALIKE_CELLS * before.leaf_m))
+        found: Floats = np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
         return found
 
-    found = _determined(before, surface, np.eye(4))
-    searched = _determined(before, surface, _searched(before, surface))
+    found = _constrained_pose(before, surface, np.eye(4))
+    searched = _constrained_pose(before, surface, _coarse_pose(before, surface))
     if Verdict.by_groups(far(found[0]) - far(searched[0]), surface.patches).improved:
         found = searched
     pose, covariance, undetermined = found
     offset = surface.offset(pose)
     sigmas = np.sqrt(np.einsum("i,ij,j->", offset, np.linalg.inv(covariance), offset))
-    by_chance = np.sqrt(chi2.isf(_BY_CHANCE, len(offset)))
+    by_chance = np.sqrt(chi2.isf(_SIGNIFICANCE, len(offset)))
     if sigmas <= by_chance or far(pose).mean() >= far(np.eye(4)).mean():
-        words = "The frames were taken as they are: surfaces do not show that they are apart."
+        words = "The frames were taken as they are: surfaces do not show an offset between them."
         return Alignment(covariance=covariance, centre=surface.centre, words=words)
-    moved_m = np.sqrt(((_placed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
+    moved_m = np.sqrt(((_transformed(surface.points, pose) - surface.points) ** 2).sum(1).mean())
     words = (
         f"The later map was moved by {moved_m:.3f} m, {sigmas:.1f} standard errors; "
-        f"surfaces do not determine {undetermined} of 6 axes, along which it stays as given."
+        f"surfaces do not determine {undetermined} of 6 axes, along which its pose was kept."
     )
     return Alignment(pose, covariance, surface.centre + offset[:3], True, words)
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """Points of the later surface, in its given frame."""
+    """Points of the later surface, in its original frame."""
 
     points: Floats  # (N, 3) m
     normals: Floats  # (N, 3)
     sigma_m: Floats  # (N,) standard errors, m
-    patches: NDArray[np.int64]  # (N,) number of the patch of each
+    patches: NDArray[np.int64]  # (N,) index of each point's patch
     centre: Floats  # (3,) m
     radius_m: float  # root mean square distance of the points from the centre
 
     @classmethod
     def of(cls, placed: PlacedMap) -> _Surface:
-        """Points on triangles: vertices are in the lattice of cells, and would be aligned with that of the other map."""
+        """Sample points on triangles: vertices lie on the lattice of cells, and would align with that of the other map."""
         rng = np.random.default_rng(0)
         _, areas = across_triangles(placed.vertices, placed.faces)
-        chosen = rng.choice(len(areas), min(len(areas), _MOST_POINTS), p=areas / areas.sum())
+        chosen = rng.choice(len(areas), min(len(areas), _MAX_POINTS), p=areas / areas.sum())
         corners, shares = placed.faces[chosen], rng.dirichlet(np.ones(3), len(chosen))
         points, normals = (
             np.einsum("nk,nki->ni", shares, values[corners]) for values in (placed.vertices, placed.normals)
@@ -121,56 +121,56 @@ class _Surface:
         return cls(points, normals, sigma_m, patches, centre, radius_m)
 
     def offset(self, pose: Floats) -> Floats:
-        """(6,) by how far a pose (4, 4) moves the centre, m, and its rotation vector, rad."""
+        """(6,) translation of the centre, m, and rotation vector, rad, of a pose (4, 4)."""
         shift = np.einsum("ij,j->i", pose[:3, :3], self.centre) + pose[:3, 3] - self.centre
         return np.concatenate([shift, rotation_vector(pose[:3, :3])])
 
     def pose(self, offset: Floats) -> Floats:
-        """The inverse of :meth:`offset`."""
+        """Inverse of :meth:`offset`."""
         found: Floats = moved(np.eye(4)[None], offset[None])[0]
         found[:3, 3] += self.centre - np.einsum("ij,j->i", found[:3, :3], self.centre)
         return found
 
 
-def _searched(before: PlacedMap, surface: _Surface) -> Floats:
-    """The nearest of the poses at which points agree about as well with planes of the earlier surface as anywhere."""
+def _coarse_pose(before: PlacedMap, surface: _Surface) -> Floats:
+    """Search coarsely; of the poses that fit the earlier surface about equally well, return the one nearest to the identity."""
     planes = LocalPlanes(_SEARCH_CELLS * before.leaf_m)
     planes.add(np.ascontiguousarray(before.vertices - surface.centre))
-    points = np.ascontiguousarray((surface.points - surface.centre)[:: -(-len(surface.points) // _SEARCHED)])
-    # A quasi-random sequence leaves fewer holes than random numbers (Sobol 1967).
-    offsets = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(_TRIED) * _APART
-    poses = moved(np.tile(np.eye(4), (_TRIED, 1, 1)), offsets)
+    points = np.ascontiguousarray((surface.points - surface.centre)[:: -(-len(surface.points) // _SAMPLES)])
+    # A quasi-random sequence leaves smaller gaps than random numbers (Sobol 1967).
+    offsets = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(_SEARCH_POSES) * _PRIOR_SIGMAS
+    poses = moved(np.tile(np.eye(4), (_SEARCH_POSES, 1, 1)), offsets)
     width_m = 0.25 * _SEARCH_CELLS * before.leaf_m
     scores = planes.scores(points, poses, [width_m**2, *[(width_m / surface.radius_m) ** 2] * 2])
-    best = np.argsort(-scores.mean(axis=1))[:_FOLLOWED]
+    best = np.argsort(-scores.mean(axis=1))[:_BEST_POSES]
     losses = scores[best[0]] - scores[best]
-    alike = offsets[best[losses.mean(axis=1) <= _ERRORS * losses.std(axis=1) / np.sqrt(len(points))]]
-    return surface.pose(alike[((alike / _APART) ** 2).sum(axis=1).argmin()])
+    alike = offsets[best[losses.mean(axis=1) <= _TIE_SIGMAS * losses.std(axis=1) / np.sqrt(len(points))]]
+    return surface.pose(alike[((alike / _PRIOR_SIGMAS) ** 2).sum(axis=1).argmin()])
 
 
-def _determined(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, int]:
-    """The pose that fits the surfaces, its covariance, and how many axes they do not determine: there it stays as given."""
-    pose, covariance = _settled(before, surface, start)
+def _constrained_pose(before: PlacedMap, surface: _Surface, start: Floats) -> tuple[Floats, Floats, int]:
+    """The pose that fits the surfaces, its covariance, and the number of undetermined axes, along which the pose is kept."""
+    pose, covariance = _gauss_newton(before, surface, start)
     lever_m = np.repeat([1.0, surface.radius_m], 3)
     variances, axes = np.linalg.eigh(covariance * np.outer(lever_m, lever_m))
-    most = (_UNSURE_CELLS * before.leaf_m) ** 2
+    most = (_MAX_SIGMA_CELLS * before.leaf_m) ** 2
     unsure = axes[:, variances > most]
     offset = surface.offset(pose) * lever_m
     offset -= np.einsum("ik,jk,j->i", unsure, unsure, offset)
-    # Errors of normals would make larger ones errors of all surfaces.
+    # Larger variances would turn errors of the normals into errors of all surfaces.
     covariance = np.einsum("ik,k,jk->ij", axes, np.minimum(variances, most), axes)
     return surface.pose(offset / lever_m), covariance / np.outer(lever_m, lever_m), unsure.shape[1]
 
 
-def _settled(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats, Floats]:
-    """The pose by Gauss and Newton's method, and its covariance. Points are weighted by the probability that they did not change."""
-    # Errors of the normals of both maps are independent: products of normals of different maps show along which axes
-    # surfaces determine the pose (instrumental variables). Errors are correlated in a patch, so the scatter of its sums
+def _gauss_newton(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats, Floats]:
+    """Fit the pose by Gauss-Newton, with its covariance. Weights are probabilities that points did not change."""
+    # Errors of the normals of the two maps are independent, so products of normals from both show which axes the
+    # surfaces determine (instrumental variables). Errors are correlated within a patch, so the scatter of its sums
     # is the covariance of the equations (Hansen 1982).
-    prior = np.diag(_APART**-2.0)
+    prior = np.diag(_PRIOR_SIGMAS**-2.0)
     covariance = np.linalg.inv(prior)
     for _ in range(_ITERATIONS):
-        there, own = _placed(surface.points, pose), turned(surface.normals, pose[:3, :3])
+        there, own = _transformed(surface.points, pose), turned(surface.normals, pose[:3, :3])
         offset = surface.offset(pose)
         near_m, rows, distance_m = before.nearest(there)
         normals = before.normals[rows]
@@ -200,12 +200,12 @@ def _settled(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[Floats
     return pose, np.asarray(covariance, np.float64)
 
 
-def _placed(points: Floats, pose: Floats) -> Floats:
-    """Points (N, 3) moved by a pose (4, 4)."""
+def _transformed(points: Floats, pose: Floats) -> Floats:
+    """Transform points (N, 3) by a pose (4, 4)."""
     return turned(points, pose[:3, :3]) + pose[:3, 3]
 
 
 def _jacobian(from_centre: Floats, normals: Floats) -> Floats:
-    """(N, 6) derivatives of the places along their normals by a translation, and by a rotation about a centre."""
+    """(N, 6) derivatives of positions along their normals by a translation, and by a rotation about a centre."""
     turns = np.einsum("ni,nij->nj", normals, -skew(from_centre))
     return np.concatenate([normals, turns], axis=1)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What changed between two maps, as coloured surfaces."""
+"""Result of a comparison of two maps, as coloured surfaces."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ COLORS = {
 
 @dataclass(frozen=True)
 class ChangedSurface:
-    """The surface of one map, and how it differs in the other."""
+    """Surface of one map with its differences from the other."""
 
     vertices: Floats
     """(V, 3) world of the earlier map, m."""
     faces: NDArray[np.int32]
-    """(F, 3) rows of vertices. They face free space."""
+    """(F, 3) rows of vertices; triangles face free space."""
     kind: NDArray[np.int8]
-    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 of changed reflectance. Unseen: the other map does not know the place.
-    Repainted, on the later surface: only the reflectance changed."""
+    """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 changed reflectance. Unseen: not observed by the other map.
+    Changed reflectance, on the later surface only: the surface did not move."""
     probability: NDArray[np.float32]
-    """(V,) of that change; of the likeliest one where it is the same or unseen."""
+    """(V,) probability of that change; of the likeliest change where it is the same or unseen."""
     moved_m: NDArray[np.float32]
-    """(V,) how far the surface moved along its normal towards free space, m. NaN for other kinds."""
+    """(V,) displacement along the normal towards free space, m. NaN for other kinds."""
     intensity_change: NDArray[np.float32]
-    """(V,) later less earlier intensity from views that both drives had, sensor units, without the offset that all places have
-    in common. NaN without such views."""
+    """(V,) later minus earlier intensity from views common to both drives, sensor units, without the offset common to all
+    places. NaN without such views."""
 
     def of_faces(self) -> tuple[NDArray[np.int8], Floats]:
-        """Return kinds (F,) int8 of the faces, that of most vertices or of the first, and areas (F,), m²."""
+        """Return kinds (F,) int8 of the faces, by majority of the vertices or that of the first, and areas (F,), m²."""
         kinds = self.kind[self.faces]
         _, twice_m2 = across_triangles(self.vertices, self.faces)
         return np.where(kinds[:, 1] == kinds[:, 2], kinds[:, 1], kinds[:, 0]), 0.5 * twice_m2
@@ -69,15 +69,15 @@ class Region:
     area_m2: float
     """Area, m²."""
     probability: float
-    """Mean over its vertices."""
+    """Mean probability of its vertices."""
     moved_m: float | None
-    """How far it moved along its normal, mean, m. None of other changes."""
+    """Mean displacement along the normal, m. None for other changes."""
     intensity_change: float | None
-    """Later less earlier intensity, mean, sensor units. None of other changes."""
+    """Mean of later minus earlier intensity, sensor units. None for other changes."""
 
     @property
     def words(self) -> str:
-        """What happened, such as "moved by 0.21 m"."""
+        """Description of the change, such as "moved by 0.21 m"."""
         if self.moved_m is not None:
             return f"{self.kind} by {abs(self.moved_m):.2f} m"
         if self.intensity_change is not None:
@@ -88,17 +88,17 @@ class Region:
 
 @dataclass(frozen=True)
 class Changes:
-    """What :func:`radarsdf.compare` found."""
+    """Result of :func:`radarsdf.compare`."""
 
     before: ChangedSurface
-    """The earlier surface: what is gone, and what moved."""
+    """The earlier surface, with what disappeared or moved."""
     after: ChangedSurface
-    """The later surface: what appeared, what moved, and what changed its reflectance."""
+    """The later surface, with what appeared, moved or changed its reflectance."""
     T_before_after: Floats
-    """(4, 4) from the later map's world to that of the earlier one, m."""
+    """(4, 4) transform from the later map's world to that of the earlier one, m."""
     report: dict[str, Any]
-    """`alignment`: in words; `areas_m2` by kind; `compared_m2`, area of both surfaces that the other map knows; `reflectance`:
-    the common offset of intensities in words, or why they were not compared; `intensity_offset`, sensor units, or None."""
+    """`alignment`: verdict in words; `areas_m2` by kind; `compared_m2`, area of surface observed by both maps; `reflectance`:
+    common offset of intensities in words, or why they were not compared; `intensity_offset`, sensor units, or None."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
         """List the connected components of changes.
@@ -106,12 +106,12 @@ class Changes:
         Parameters
         ----------
         min_area_m2 : float
-            Smaller regions are left out, m².
+            Omit smaller regions, m².
 
         Returns
         -------
         list of Region
-            The largest first. Each is of the faces of one kind, on one of the two surfaces.
+            Largest first. Each consists of faces of one kind, on one of the two surfaces.
         """
         found = []
         for surface, kinds in (
@@ -139,13 +139,13 @@ class Changes:
         return sorted(found, key=lambda region: -region.area_m2)
 
     def mesh(self) -> trimesh.Trimesh:
-        """Combine the later surface with the faces of the earlier one that are gone or moved, in colours.
+        """Combine the later surface with the faces of the earlier one that are gone or moved, with colours.
 
         Returns
         -------
         trimesh.Trimesh
-            World of the earlier map, m. Green appeared, vermilion is gone, orange moved, purple changed its reflectance, grey is the
-            same, and light grey is unseen. ``vertex_attributes`` (V,) are `kind`, `probability`, `moved_m` and
+            World of the earlier map, m. Green: appeared, vermilion: gone, orange: moved, purple: changed reflectance, grey:
+            same, light grey: unseen. ``vertex_attributes`` (V,) are `kind`, `probability`, `moved_m` and
             `intensity_change` of :class:`ChangedSurface`.
         """
         import trimesh  # noqa: PLC0415 - slow to import
@@ -167,7 +167,7 @@ class Changes:
         return mesh
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the mesh of :meth:`mesh` to a file. An old one is replaced only once the new one is complete.
+        """Write the mesh of :meth:`mesh` to a file atomically.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class Changes:
 
 
 def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
-    """Areas for a report."""
+    """Areas of surfaces, for a report."""
     kinds, areas_m2 = (np.concatenate(of) for of in zip(*(s.of_faces() for s in surfaces), strict=True))
     return {
         "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},
@@ -196,7 +196,7 @@ def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
 
 
 def colors_of(kinds: NDArray[np.int8]) -> NDArray[np.uint8]:
-    """(V, 3) sRGB of kinds (V,)."""
+    """Colours (V, 3), sRGB, of kinds (V,)."""
     table = np.array([COLORS[kind] for kind in sorted(COLORS)], np.uint8)
     return table[np.asarray(kinds, np.int64) - min(COLORS)]
 

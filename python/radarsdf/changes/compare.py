@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Compares two maps of one place, or a map and new scans."""
+"""Comparison of two maps of one place, or of a map with new scans."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from radarsdf.map.mesh import renumbered
 from radarsdf.scans import Scans
 
 _PROBABLE = 0.5  # more likely than not
-_LEVEL = np.cos(np.pi / 4)  # least part of a level surface's normal that is upright
-# Of what both saw, more would have changed only between maps that do not fit together: 16 % and more where one was turned by
-# 20° or more, or shifted by 20 m, on yard, hall, forest, car_park and facade. A car that moved on open ground is less.
+_LEVEL = np.cos(np.pi / 4)  # smallest cosine between a level surface's normal and the vertical
+# Larger shares of changed surface mean that the maps do not fit together: 16 % and more where one was rotated by 20° or
+# more, or shifted by 20 m, on yard, hall, forest, car_park and facade. A car that moved on open ground is less.
 _MOST_CHANGED = 0.1
 _AGREEING_SIGMAS = 3.0
 
@@ -53,49 +53,49 @@ def compare(
 ) -> Changes:
     """Detect what appeared, disappeared, moved or changed its reflectance between two maps of one place.
 
-    Unseen is not gone. A surface is gone only where rays of the later drive passed the place, and it appeared only where
-    those of the earlier drive did. The probability of a change follows from the distance of the surfaces and its standard
-    error, from how many scans hit the place and passed it on both days, from the confidence of the surface that changed, and
-    from intensities of equal views. The share of what changed is estimated from all places together.
+    Unseen is not gone: a surface is gone only if rays of the later drive crossed its place, and it appeared only if rays
+    of the earlier drive did. The probability of a change follows from the distance between the surfaces and its standard
+    error, from the numbers of scans that hit and crossed the place in each drive, from the confidence of the changed
+    surface, and from intensities of equal views. The share of changes is estimated from all places together.
 
     Parameters
     ----------
     before : Map
         The earlier map, fitted with ``returns.free_space``, which is the default of :class:`FitConfig`.
     after : Map, iterable of F arrays, or Scans
-        The later map, fitted likewise; or new scans as :func:`fit` takes them, which are first fitted with
-        ``FitConfig.quick()``, and the ranges, errors of poses and leaf cells of `before`.
+        The later map, fitted in the same way; or new scans as :func:`fit` takes them, which are first fitted with
+        ``FitConfig.quick()`` and with the ranges, pose errors and leaf cells of `before`.
     poses : (F, 4, 4) array_like, optional
-        Of new scans: T_world_sensor, m.
+        For new scans: T_world_sensor, m.
     intensities : iterable of F arrays (N_i,), optional
-        Of new scans: sensor units.
+        For new scans: sensor units.
     align_frames : bool
-        Whether the later map may be moved as a whole. It is if its surface shows that the frames are apart, at a significance
-        level of 0.001; they may be some metres and some degrees apart. Along axes that surfaces do not determine, such as
-        along a single wall, the frame stays as given.
+        Whether to align the later map as a whole, if its surface shows an offset between the frames at a significance
+        level of 0.001; offsets may be some metres and some degrees. Along axes that the surfaces do not determine, such as
+        along a single wall, the frame is kept.
     box : (2, 3) array_like, optional
         Lower and upper corner, world of the earlier map, m: nothing outside is returned.
     progress : bool, optional
-        Whether to show the progress of a fit of new scans. Default: only in a terminal.
+        Whether to show the progress of a fit of new scans. Default: only on a terminal.
 
     Returns
     -------
     Changes
-        Surfaces of both maps, in the world of the earlier one, with the kind and the probability of their changes.
+        Surfaces of both maps, in the world of the earlier one, with kinds and probabilities of changes.
 
     Raises
     ------
     ValueError
         If a map has no free-space crossings (``returns.free_space``) or no surface, for wrong arguments, or if the maps do not
-        fit together: they saw no surface in common, or of the level or of the steep surfaces that they have in common, more
-        would have changed than agrees.
+        fit together: they have no surface in common, or more of their common level or steep surfaces would have changed
+        than agrees.
     TypeError
-        If `before` is no map.
+        If `before` is not a map.
 
     Notes
     -----
-    A thing that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
-    Intensities near what appeared, went or moved are left out.
+    An object that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
+    Intensities near surface that appeared, disappeared or moved are left out.
     """
     if not isinstance(before, Map):
         msg = f"before must be a map, not {type(before).__name__}"
@@ -103,7 +103,7 @@ def compare(
     corners = None if box is None else check_box(box)
     check_free_space(before, "before")
     if not isinstance(after, Map):
-        after = fit(after, poses, intensities, config=_quick(before.config), progress=progress)
+        after = fit(after, poses, intensities, config=_quick_config(before.config), progress=progress)
     elif poses is not None or intensities is not None:
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)
@@ -120,8 +120,8 @@ def compare(
     errors = Errors.of(sides)
     (absent, shifted), (absent_later, shifted_later) = map(errors.log_odds, sides)
     share = share_of_changes(np.concatenate([absent, absent_later]))
-    gone = _changed(sides[0], absent, shifted, share, GONE)
-    appeared = _changed(sides[1], absent_later, shifted_later, share, APPEARED)
+    gone = _classify(sides[0], absent, shifted, share, GONE)
+    appeared = _classify(sides[1], absent_later, shifted_later, share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
     report: dict[str, Any] = {
@@ -137,12 +137,12 @@ def compare(
             f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
         )
     if corners is not None:
-        gone, appeared = _inside(corners, gone), _inside(corners, appeared)
+        gone, appeared = _crop(corners, gone), _crop(corners, appeared)
     return Changes(gone, appeared, alignment.T_before_after, report | areas_of(gone, appeared))
 
 
-def _quick(config: FitConfig) -> FitConfig:
-    """Settings of the quick map of new scans."""
+def _quick_config(config: FitConfig) -> FitConfig:
+    """Settings of a quick map of new scans."""
     names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
     same = {name: getattr(config.returns, name) for name in names}
     return FitConfig.quick(
@@ -154,7 +154,7 @@ def _quick(config: FitConfig) -> FitConfig:
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
-    """The surface of one map, with the evidence of both."""
+    """Surface of one map with the evidence of both."""
     vertices = own_map.to_common(own_map.vertices)
     own = own_map.evidence(vertices)
     other = other_map.evidence(vertices, own.normals)
@@ -162,8 +162,8 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
-def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
-    """Kinds, probabilities and movements by log odds (V,). `lost`: the kind of surface missing from the other map."""
+def _classify(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
+    """Assign kinds, probabilities and displacements by log odds (V,). `lost`: kind of surface missing from the other map."""
     own, other = side.own, side.other
     gone = own.confidence * posterior(absent, share)
     elsewhere = own.confidence * posterior(shifted, share)
@@ -171,13 +171,13 @@ def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: in
     seen = np.isfinite(other.distance_m)
     behind = seen & (other.distance_m < 0)
     kinds = np.where(seen, SAME, UNSEEN).astype(np.int8)
-    # What lies deep behind the other surface is hidden by it.
+    # Places deep behind the other surface are hidden by it.
     kinds[behind & ~side.parallel & (elsewhere > _PROBABLE)] = UNSEEN
     kinds[~behind & (gone > _PROBABLE)] = lost
-    # A surface that is elsewhere is more than one that is not here. In front of the other one, rays must have passed, too.
+    # A displaced surface is a stronger claim than a missing one. In front of the other surface, rays must have crossed, too.
     kinds[(moved > _PROBABLE) & (behind | (seen & (gone > _PROBABLE)))] = MOVED
     probability = np.where(kinds == MOVED, np.maximum(moved, np.where(behind, 0, gone)), gone)
-    # Along the normal: the earlier surface moved to where the later one is.
+    # Displacement along the normal, from the earlier to the later surface.
     towards = -other.distance_m if lost == GONE else other.distance_m
     moved_m = np.where(kinds == MOVED, towards, np.nan).astype(np.float32)
     unknown = np.full(len(kinds), np.nan, np.float32)
@@ -187,7 +187,7 @@ def _changed(side: Side, absent: Floats, shifted: Floats, share: float, lost: in
 def _reflectance_changed(
     surface: ChangedSurface, differences: Differences, changed: Floats
 ) -> ChangedSurface:
-    """The later surface, with what changed its reflectance alone, away from places (C, 3) that `changed` otherwise."""
+    """Mark vertices of the later surface that changed only in reflectance, away from places (C, 3) that `changed` otherwise."""
     change, reflectance_changed = differences.probability(surface.vertices, surface.kind == SAME, changed)
     return replace(
         surface,
@@ -197,8 +197,8 @@ def _reflectance_changed(
     )
 
 
-def _inside(box: Floats, surface: ChangedSurface) -> ChangedSurface:
-    """The triangles in a box (2, 3), world of the earlier map, m."""
+def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
+    """Keep the triangles in a box (2, 3), world of the earlier map, m."""
     within = ((surface.vertices >= box[0]) & (surface.vertices <= box[1])).all(axis=1)
     used, faces = renumbered(len(within), surface.faces[within[surface.faces].all(axis=1)])
     of_vertices = {name: values[used] for name, values in vars(surface).items() if name != "faces"}
@@ -210,8 +210,8 @@ def _check_common(
 ) -> None:
     """Raise a ValueError if the maps do not fit together.
 
-    Maps in wrong frames agree about the ground and a level floor, so level and steep surfaces are judged separately;
-    and on both sides, since a place may be cleared.
+    Maps in wrong frames still agree about the ground and level floors, so level and steep surfaces are tested separately;
+    and on both sides, since a place may have been cleared.
     """
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
     if seen == 0:
@@ -227,7 +227,7 @@ def _check_common(
         if changed.sum() > _MOST_CHANGED * seen and (changed > agree).all():
             shares = " and ".join(f"{part:.0%}" for part in changed / (changed + agree))
             msg = (
-                f"the maps do not fit together: of the {name} surfaces that both saw, {shares} would have changed. "
+                f"the maps do not fit together: of the {name} surfaces that both observed, {shares} would have changed. "
                 f"Give maps of one place, in about one frame. {alignment.words}"
             )
             raise ValueError(msg)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How probable it is that a place changed, from the evidence of two maps.
+"""Probability that a place changed, from the evidence of two maps.
 
-Every probability here is Bayes' rule for two explanations, nothing changed or something did. The share of what
-changed is unknown, too. It is estimated from all places together (empirical Bayes, Efron 2010): so where nothing changed,
-chance alone makes few changes.
+Each probability follows from Bayes' rule for two hypotheses, no change or a change. The prior share of changes is
+estimated from all places together (empirical Bayes, Efron 2010), so that chance alone causes few changes where nothing
+changed.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
 
-# A field knows distances about so far from its surface: returns scatter into the next cells.
+# Reach of distances around the surface of a field: returns scatter into the next cells.
 _REACH_CELLS = 2.0
 PARALLEL = np.cos(np.pi / 4)
-"""Least cosine between normals of surfaces that are about parallel: one that moved still is."""
-_BLOCK_M = 32.0  # cells are looked up in blocks, so that few are in memory
-# Behind a surface: so far, the 27 cells hardly reach the side from which it is seen.
+"""Smallest cosine between normals of surfaces that are about parallel: a moved surface stays parallel."""
+_BLOCK_M = 32.0  # edge of blocks in which cells are looked up, to limit memory
+# Depth behind a surface at which the 27 cells hardly reach its visible side.
 _BEHIND_CELLS = 1.5
-_CELLS_ALONG_RAY = 3.0  # of the 27 near a place that one ray crosses, on average about
+_CELLS_ALONG_RAY = 3.0  # mean number of the 27 cells near a place that one ray crosses
 _LEAST_SHARE, _MOST_SHARE = 1e-6, 0.5
-_ROUNDS, _SETTLED = 50, 1e-4  # of the share
-# Returns of a scan in adjacent cells have causes in common: so many of them count once. Chosen on facade, hall and
+_MAX_ITERATIONS, _TOLERANCE = 50, 1e-4  # iterations and tolerance of the share
+# Returns of a scan in adjacent cells are correlated: this many count as one. Tuned on facade, hall and
 # forest of seed 31.
 _CELLS_PER_SCAN = 2.0
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-_MOST_DISTANCES = 5_000  # evenly spread, for both
+_MAX_DISTANCES = 5_000  # evenly spread, for both maps
 
 
 @dataclass(frozen=True)
@@ -52,26 +52,26 @@ class PlaceEvidence:
     normals: Floats  # (N, 3) of that surface, towards free space, in the common frame
     sigma_m: Floats  # (N,) standard error of the surface's position. NaN where there are no returns
     confidence: Floats  # (N,) probability of a surface there
-    hits: Floats  # (N,) scans with returns in the 27 leaf cells near the place, added up over the cells
-    # (N,) scans with rays through the 27 cells near a place behind the surface, likewise, a ray counted once. Rays that
+    hits: Floats  # (N,) scans with returns in the 27 leaf cells near the place, summed over the cells
+    # (N,) scans with rays through the 27 cells near a place behind the surface, also summed, one count per ray. Rays that
     # graze a surface pass in front of it, and are no evidence against it.
     passes: Floats
 
 
 @dataclass(frozen=True)
 class PlacedMap:
-    """A map, and where it lies in the common frame."""
+    """A map and its pose in the common frame."""
 
     radar_map: Map
     T_common_map: Floats  # (4, 4) from the map's world to the common frame, m
-    vertices: Floats  # (V, 3) of the mesh that the map keeps by default, in leaf cells; world of the map, m
+    vertices: Floats  # (V, 3) of the map's default mesh, in leaf cells; world of the map, m
     faces: NDArray[np.int32]  # (F, 3) rows of vertices
     normals: Floats  # (V, 3) of the mesh, towards free space
     sigma_m: Floats  # (V,) standard errors of the vertices, m
 
     @classmethod
     def of(cls, radar_map: Map) -> PlacedMap:
-        """A map whose world is the common frame."""
+        """Build from a map whose world is the common frame."""
         mesh = radar_map.mesh(radar_map.config.leaf_size_m, progress=False)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
         normals = np.asarray(mesh.vertex_normals, np.float64)
@@ -85,7 +85,7 @@ class PlacedMap:
 
     @property
     def reach_m(self) -> float:
-        """So far from its surface the map knows distances, m."""
+        """Distance from its surface up to which the map is defined, m."""
         return _REACH_CELLS * self.leaf_m
 
     @cached_property
@@ -93,21 +93,21 @@ class PlacedMap:
         return cKDTree(self.vertices)
 
     def nearest(self, x: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
-        """Distances of the vertices nearest to places (N, 3), world of the map, their rows, and distances from their planes."""
+        """Distances to the vertices nearest to places (N, 3), world of the map, their rows, and distances from their planes."""
         near_m, rows = self._tree.query(x)
         away = x - self.vertices[rows]
         return near_m, rows, np.einsum("ni,ni->n", away, self.normals[rows])
 
     def to_own(self, x: Floats) -> Floats:
-        """Places (N, 3) of the common frame in the world of the map."""
+        """Transform places (N, 3) from the common frame to the world of the map."""
         return turned(x - self.T_common_map[:3, 3], self.T_common_map[:3, :3].T)
 
     def to_common(self, x: Floats) -> Floats:
-        """Places (N, 3) of the map's world in the common frame."""
+        """Transform places (N, 3) from the map's world to the common frame."""
         return turned(x, self.T_common_map[:3, :3]) + self.T_common_map[:3, 3]
 
     def evidence(self, x: Floats, facing: Floats | None = None) -> PlaceEvidence:
-        """At places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
+        """Evidence at places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
         own = self.to_own(x)
         evidence, sigma_m, confidence = self.radar_map.surface_at(torch.from_numpy(np.ascontiguousarray(own)))
         distance_m, normals = self.radar_map.tangent_planes(own)
@@ -123,14 +123,14 @@ class PlacedMap:
         )
 
     def _passes(self, own: Floats) -> Floats:
-        """(N,) see :attr:`PlaceEvidence.passes`, of places (N, 3), world of the map, m."""
+        """(N,) :attr:`PlaceEvidence.passes` of places (N, 3), world of the map, m."""
         found = np.zeros(len(own))
         blocks = np.unique(np.floor(own / _BLOCK_M), axis=0, return_inverse=True)[1].ravel()
         edges = np.cumsum(np.bincount(blocks))[:-1]
         for rows in np.split(np.argsort(blocks, kind="stable"), edges) if len(own) else []:
             x, margin_m = own[rows], 2 * self.leaf_m
             cells = self.radar_map.cells_near(x.min(axis=0) - margin_m, x.max(axis=0) + margin_m)
-            # The core counts up to seven scans for a cell: larger counts carry no information.
+            # The core counts up to seven scans per cell: larger counts carry no information.
             near = 27 * uniform_filter(cells.passed.astype(np.float32), 3, mode="constant")
             places = np.floor((x - cells.corner) / self.leaf_m).astype(np.int64)
             found[rows] = np.rint(near[tuple(places.T)]) / _CELLS_ALONG_RAY
@@ -139,14 +139,14 @@ class PlacedMap:
 
 @dataclass(frozen=True)
 class Side:
-    """The surface of one map, with the evidence of both maps at its vertices."""
+    """Surface of one map with the evidence of both maps at its vertices."""
 
     vertices: Floats  # (V, 3) common frame, m
     faces: NDArray[np.int32]  # (F, 3) rows of vertices
     own: PlaceEvidence
     other: PlaceEvidence
     sigma_m: Floats  # (V,) standard error of the distance between both surfaces, m
-    reach_m: float  # see :attr:`PlacedMap.reach_m`, of the other map
+    reach_m: float  # :attr:`PlacedMap.reach_m` of the other map
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -162,17 +162,17 @@ class Side:
 
 @dataclass(frozen=True)
 class Errors:
-    """Distances between surfaces that did not change, over their standard error: Student's t, widened.
+    """Student-t model of normalised distances between unchanged surfaces.
 
-    At edges, in corners and at ghosts both maps are worse than their uncertainty, so some distances have large errors.
+    At edges, in corners and at ghosts, errors of both maps exceed their uncertainty, so the distribution is heavy-tailed.
     """
 
-    freedom: float  # degrees of freedom. Few: some distances are far larger than the others.
-    scale: float  # by how much they exceed the standard errors
+    freedom: float  # degrees of freedom: few mean heavy tails
+    scale: float  # ratio of the errors to the standard errors
 
     @classmethod
     def of(cls, sides: Sequence[Side]) -> Errors:
-        """The errors that make the distances most likely, if an unknown share of them is of other surfaces within reach."""
+        """Fit by maximum likelihood, with an unknown share of the distances to other surfaces within reach."""
         columns = [
             np.stack([s.other.distance_m, s.sigma_m, np.full(len(s.sigma_m), s.reach_m)])[:, s.observed]
             for s in sides
@@ -180,7 +180,7 @@ class Errors:
         known = np.concatenate(columns, axis=1)
         if known.size == 0:
             return cls(_FREEDOMS[-1], 1.0)
-        distance_m, sigma_m, reach_m = known[:, :: -(-known.shape[1] // _MOST_DISTANCES)]
+        distance_m, sigma_m, reach_m = known[:, :: -(-known.shape[1] // _MAX_DISTANCES)]
 
         def likelihood(errors: Errors) -> float:
             same, other = errors.log_density(distance_m, sigma_m), -np.log(2 * reach_m)
@@ -190,37 +190,37 @@ class Errors:
         return max((cls(freedom, scale) for freedom in _FREEDOMS for scale in _SCALES), key=likelihood)
 
     def log_density(self, distance_m: Floats, sigma_m: Floats) -> Floats:
-        """(N,) logarithm of the density of distances (N,) with standard errors (N,), 1/m."""
+        """(N,) log density of distances (N,) with standard errors (N,), 1/m."""
         found: Floats = student.logpdf(distance_m, self.freedom, scale=self.scale * sigma_m)
         return found
 
     def log_odds(self, side: Side) -> tuple[Floats, Floats]:
-        """Logarithms (V,) of how much more likely the evidence is if the surface is absent from the other map than if it is still
-        there; and if it is elsewhere along its normal, to either side, -inf where that was not observed."""
+        """Log odds (V,), given the evidence, that the surface is absent from the other map rather than unchanged; and that it is
+        displaced along its normal to either side, -inf where that was not observed."""
         observed, reach_m = side.observed, side.reach_m
         distance_m, sigma_m = side.other.distance_m[observed], side.sigma_m[observed]
         same = self.log_density(distance_m, sigma_m)
 
         def elsewhere(lower_m: float) -> Floats:
-            """Of a surface that lies anywhere from `lower_m` to `reach_m`."""
+            """Density of a surface that lies anywhere from `lower_m` to `reach_m`."""
             error = student(self.freedom, distance_m, self.scale * sigma_m)
-            # Far outside, the difference is nothing but rounding.
+            # Far in the tails, the difference is only rounding.
             inside = np.maximum(error.cdf(reach_m) - error.cdf(lower_m), 1e-12)
             found: Floats = np.log(inside / (reach_m - lower_m)) - same
             return found
 
-        absent = _passed(side.own, side.other)
+        absent = _free_space_odds(side.own, side.other)
         shifted = np.full(len(absent), -np.inf)
         shifted[observed] = elsewhere(-reach_m)
         absent[observed] += elsewhere(0.0)
         return absent, shifted
 
 
-def _passed(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
-    """(N,) logarithm of how much more likely rays of the other map are if the surface is no longer there.
+def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
+    """(N,) log likelihood ratio of the other map's rays: surface gone against unchanged.
 
-    Of all scans whose rays came to a place, some have returns there, and others passed behind it. If nothing changed, that
-    share is the one that the own map shows: few of a thin fence. If the surface is gone, it is another one (beta-binomial).
+    Of all scans whose rays reach a place, some have returns there, and others pass behind it. If nothing changed, the share
+    of hits is that of the own map, which is small for a thin fence. If it is gone, any share is possible (beta-binomial).
     """
     hits, passes = other.hits / _CELLS_PER_SCAN, other.passes / _CELLS_PER_SCAN
     hit, missed = own.hits / _CELLS_PER_SCAN + 0.5, own.passes / _CELLS_PER_SCAN + 0.5
@@ -232,24 +232,24 @@ def _passed(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
 
 
 def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:
-    """(N,) logarithm of how much more likely differences (N,) are by a change, of any size within reach, than by errors."""
+    """(N,) log likelihood ratio of differences (N,): a change of any size within reach against errors alone."""
     found: Floats = 0.5 * (differences / sigma) ** 2 + np.log(sigma * np.sqrt(2 * np.pi) / (2 * reach))
     return found
 
 
 def share_of_changes(log_odds: Floats) -> float:
-    """The share of places that changed that makes the evidence of all of them most likely."""
+    """Maximum-likelihood share of changed places, given the evidence of all of them."""
     share = 0.01
     if len(log_odds) == 0:
         return _LEAST_SHARE
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         before, share = share, float(np.clip(posterior(log_odds, share).mean(), _LEAST_SHARE, _MOST_SHARE))
-        if abs(share - before) < _SETTLED * share:
+        if abs(share - before) < _TOLERANCE * share:
             break
     return share
 
 
 def posterior(log_odds: Floats, share: float) -> Floats:
-    """(N,) probability of a change, if such a share of all places changed."""
+    """(N,) posterior probability of a change, for a prior `share` of changed places."""
     found: Floats = expit(log_odds + np.log(share / (1 - share)))
     return found

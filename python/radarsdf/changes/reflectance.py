@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Mean intensities on two days, at places and from views that both drives had."""
+"""Comparison of mean intensities between two drives, at places and from views that both have."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from radarsdf.changes.probability import Floats, PlacedMap, odds_of_differences,
 from radarsdf.products import turned
 from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
-_OTHER_UNITS = 1.7  # ratio of spreads: half decibels and decibels differ by 2
-_FEWEST_VIEWS = 100  # fewer do not determine the units
+_UNITS_RATIO = 1.7  # ratio of spreads that shows different units: half decibels and decibels differ by 2
+_MIN_VIEWS = 100  # needed to determine the units
 
 
 @dataclass(frozen=True)
 class _Means:
-    """Numbers at places, each with a variance."""
+    """Values at places, each with a variance."""
 
     points: Floats  # (K, 3) common frame, m
     values: Floats  # (K,) sensor units
-    variances: Floats  # (K,) by how many returns they are means of
+    variances: Floats  # (K,) from the number of returns per mean
 
     def select(self, chosen: NDArray[np.bool_]) -> _Means:
-        """Some (K,) of them."""
+        """Return the chosen ones (K,)."""
         return _Means(self.points[chosen], self.values[chosen], self.variances[chosen])
 
     def near(self, x: Floats, reach_m: float) -> tuple[Floats, Floats, Floats, Floats]:
-        """Of those within reach of places (V, 3): weighted mean (NaN without any), its standard error, χ² and degrees of freedom."""
+        """Weighted mean of values within reach of places (V, 3) (NaN without any), standard error, χ² and degrees of freedom."""
         near = cKDTree(x).sparse_distance_matrix(cKDTree(self.points), reach_m, output_type="coo_matrix")
 
         def total(values: Floats) -> Floats:
@@ -49,19 +49,19 @@ class _Means:
 
 @dataclass(frozen=True)
 class Differences:
-    """Differences of mean intensities between two days, each at one place from one view."""
+    """Differences of mean intensities between two drives, per place and view."""
 
-    between: _Means  # later less earlier, without `offset`
-    within: list[_Means]  # of each day, what its own map leaves of the intensities
-    offset: float  # by so much more all returns are stronger, sensor units
-    reach_m: float  # means that are so close to a place belong to it, m
-    width: float  # of the range of intensities, sensor units
+    between: _Means  # later minus earlier, without `offset`
+    within: list[_Means]  # per drive, residuals of the intensities from its own map
+    offset: float  # common increase of all returns, sensor units
+    reach_m: float  # radius of the neighbourhood of a place, m
+    width: float  # width of the range of intensities, sensor units
 
     @classmethod
     def of(cls, before: PlacedMap, after: PlacedMap) -> Differences | str:
-        """Of two maps; or why they cannot be compared.
+        """Build from two maps; or return the reason why they cannot be compared.
 
-        What both maps expect is subtracted from both days: so views may differ a little within what counts as one.
+        The predictions of both maps are subtracted from both drives, so views may differ a little within one view bin.
         """
         scales = [p.radar_map.intensity_scale for p in (before, after)]
         days = [p.radar_map.view_statistics() for p in (before, after)]
@@ -94,8 +94,8 @@ class Differences:
         if first.size == 0:
             return "Reflectance was not compared: the maps share no view."
         spreads = [np.subtract(*np.percentile(day[2] / day[0], [95, 5])) for day in (first, second)]
-        if first.shape[1] > _FEWEST_VIEWS and max(spreads) > _OTHER_UNITS * min(spreads):
-            return "Reflectance was not compared: intensities from the same views spread so differently that they are in other units."
+        if first.shape[1] > _MIN_VIEWS and max(spreads) > _UNITS_RATIO * min(spreads):
+            return "Reflectance was not compared: spreads of intensities from equal views imply other units."
         values = second[1] / second[0] - first[1] / first[0]
         offset = float(np.median(values))
         between = _Means(
@@ -112,11 +112,11 @@ class Differences:
         return cls(between, within, offset, PLACE_CELLS * leaf_m, width)
 
     def probability(self, x: Floats, same: NDArray[np.bool_], changed: Floats) -> tuple[Floats, Floats]:
-        """(V,) difference near places (V, 3), and the probability that only the reflectance changed, of places that are `same` (V,).
+        """(V,) difference near places (V, 3), and probability that only the reflectance changed, for places that are `same` (V,).
 
-        Views near places (C, 3) that `changed` otherwise do not count. Where views of one place differ by more than their
-        numbers of returns explain, on one day or in how far they changed, errors are as much larger (Birge's ratio): at edges,
-        near mirrors, in thickets. What changes its reflectance changes alike from all views.
+        Views near places (C, 3) that `changed` otherwise are ignored. If views of one place scatter more than their numbers
+        of returns explain, within a drive or in their differences, errors are scaled up (Birge's ratio): at edges, near
+        mirrors, in thickets. A change of reflectance is the same from all views.
         """
         between = self.between
         if len(changed):

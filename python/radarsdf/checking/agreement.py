@@ -17,20 +17,20 @@ from radarsdf.poses.rigid import between, turned_by
 
 FloatArray = NDArray[np.float64]
 
-_NEIGHBOURS = 4  # returns of the same scan whose mean distance is the spacing at a return
-MIN_RETURNS = _NEIGHBOURS + 2  # of a scan. A scan with fewer is not compared
-# Quotients below and above these count as much as these. A return in empty space must not count more than one beside
-# a surface, or a hypothesis would win that merely makes the fields of view overlap.
+_NEIGHBOURS = 4  # nearest returns of the same scan whose mean distance is the spacing at a return
+MIN_RETURNS = _NEIGHBOURS + 2  # scans with fewer are not compared
+# Limits of the quotients. A return in empty space must not count more than one next to
+# a surface, or hypotheses would win that merely make the fields of view overlap.
 _LEAST, _MOST = 0.1, 1.5
 LAGS = (1, 2, 4, 8)
-"""How far apart the scans of a pair are, and the same times a stride where the sensor is slow."""
-_MOTION = 0.05  # of the median range: a sensor that has moved less shows little of the error of its poses
+"""Lags between the scans of a pair; multiplied by a stride if the sensor is slow."""
+_MOTION = 0.05  # share of the median range: smaller motions hardly show errors of the poses
 
 
 class Agreement:
-    """Compares scans (N_i, 3), each with the nearest-neighbour tree of at most `returns` of its returns.
+    """Agreement of scans (N_i, 3), each compared with the k-d tree of at most `returns` returns of another one.
 
-    About `queries` returns of each scan are looked up in another one. They are sampled at equal steps: no random numbers.
+    About `queries` returns per scan are looked up. They are sampled at equal steps, not at random.
     """
 
     def __init__(self, scans: Sequence[NDArray[Any]], returns: int, queries: int) -> None:
@@ -38,9 +38,9 @@ class Agreement:
         self._trees: dict[int, tuple[cKDTree, FloatArray, FloatArray]] = {}
 
     def scores(self, pairs: NDArray[np.int64], T_j_i: FloatArray) -> FloatArray:
-        """Scores (H, P) of pairs (P, 2) of scans i and j under H hypotheses. The smaller, the better the scans agree.
+        """Scores (H, P) of pairs (P, 2) of scans i and j under H hypotheses; lower scores mean better agreement.
 
-        `T_j_i` (H, P, 4, 4): isometries, proper or not, from the frame of scan i to that of scan j.
+        `T_j_i` (H, P, 4, 4): isometries, proper or improper, from the frame of scan i to that of scan j.
         """
         back = inverse(T_j_i)
         found = np.zeros(T_j_i.shape[:2])
@@ -49,7 +49,7 @@ class Agreement:
         return found
 
     def spacing_m(self, i: int) -> float:
-        """Median distance between neighbouring returns of scan i, m. 0 if it has too few."""
+        """Median distance between neighbouring returns of scan i, m; 0 if it has too few."""
         return float(np.median(self._tree(i)[1])) if len(self._scans[i]) >= MIN_RETURNS else 0.0
 
     def _one_way(self, i: int, j: int, T_j_i: FloatArray) -> FloatArray:
@@ -57,9 +57,9 @@ class Agreement:
         queries = self._tree(i)[2]
         tree, spacing, _ = self._tree(j)
         moved = np.einsum("hab,nb->hna", T_j_i[:, :3, :3], queries) + T_j_i[:, None, :3, 3]
-        # Far from all returns, the quotient counts as _MOST anyway: the bound saves most of the search.
+        # Beyond this bound, the quotient is clipped to _MOST anyway; it saves most of the search.
         distances, nearest = tree.query(moved.reshape(-1, 3), distance_upper_bound=_MOST * spacing.max())
-        quotients = distances / np.append(spacing, 1.0)[nearest]  # the row is n where none was found
+        quotients = distances / np.append(spacing, 1.0)[nearest]  # the row is n if none was found
         logs = np.log(np.clip(quotients, _LEAST, _MOST)).reshape(moved.shape[:2])
         means: FloatArray = logs.mean(axis=1)
         return means
@@ -74,14 +74,14 @@ class Agreement:
             )
             tree = cKDTree(kept)
             spacing = tree.query(kept, _NEIGHBOURS + 1)[0][:, 1:].mean(axis=1)
-            least = 1e-9 * max(float(np.abs(kept).max()), 1.0)  # returns on one another
+            least = 1e-9 * max(float(np.abs(kept).max()), 1.0)  # coincident returns have no spacing
             self._trees[i] = tree, np.maximum(spacing, least), queries
         return self._trees[i]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """How much better hypotheses agree than the data as given, over P pairs of scans."""
+    """Gain in agreement of H hypotheses over the data as they are, over P pairs of scans."""
 
     gains: (
         FloatArray  # (H,) mean decrease of the score. exp(-gain) is the factor by which the distances shrink
@@ -90,10 +90,10 @@ class Comparison:
 
     @classmethod
     def of(cls, given: FloatArray, others: FloatArray) -> Comparison:
-        """Compares scores `given` (P,) or (H, P) with scores `others` (H, P)."""
+        """Compare scores `given` (P,) or (H, P) with scores `others` (H, P)."""
         better = given - others
         count = better.shape[1]
-        # A mean of few pairs that agree by chance must not look certain.
+        # The mean of a few pairs that agree by chance must not look certain.
         spread = better.std(axis=1, ddof=1) if count > 1 else np.full(len(better), np.inf)
         return cls(better.mean(axis=1), np.maximum(spread, 1e-3) / np.sqrt(count))
 
@@ -106,10 +106,10 @@ class Comparison:
 def choose_pairs(
     scans: Sequence[NDArray[Any]], positions: FloatArray, count: int, lags: Sequence[int] = LAGS
 ) -> NDArray[np.int64]:
-    """Pairs (P, 2) of scans, about `count`, spread over the drive, neighbours and farther apart.
+    """Choose about `count` pairs (P, 2) of scans, spread over the drive, at small and large lags.
 
-    Neighbours overlap most; but where scans are frequent, the sensor hardly moves between them, and any hypothesis
-    agrees. So in some pairs, the sensor moved a share of its range, by the poses. Scans with too few returns are left out.
+    Neighbours overlap most; but at high frame rates, the sensor hardly moves between them, and every hypothesis agrees.
+    So in some pairs, the sensor moved by a share of its range, according to the poses. Scans with too few returns are skipped.
     """
     usable = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in scans])
     if len(usable) < 2:
@@ -124,19 +124,19 @@ def choose_pairs(
 
 
 def pairs_apart(scans: NDArray[np.int64], lag: int, count: int) -> NDArray[np.int64]:
-    """Pairs (P, 2) of scans (K,), `lag` of them apart: about `count`, at equal steps."""
+    """Pairs (P, 2) of scans (K,) at a lag: about `count`, at equal steps."""
     last = len(scans) - lag
     firsts = np.unique(np.linspace(0, last - 1, min(last, count)).round().astype(int))
     return np.stack([scans[firsts], scans[firsts + lag]], 1)
 
 
 def relative(T_world_sensor: FloatArray, pairs: NDArray[np.int64]) -> FloatArray:
-    """(P, 4, 4) motions T_j_i of the pairs (P, 2) of poses (F, 4, 4), each from scan i to scan j."""
+    """(P, 4, 4) motions T_j_i of pairs (P, 2) of poses (F, 4, 4), from scan i to scan j."""
     return between(T_world_sensor[pairs[:, 1]], T_world_sensor[pairs[:, 0]])
 
 
 def inverse(T_a_b: FloatArray) -> FloatArray:
-    """Inverses (…, 4, 4) of isometries (…, 4, 4)."""
+    """Invert isometries (…, 4, 4)."""
     found = np.zeros_like(T_a_b)
     transposed = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
     found[..., :3, :3] = transposed
@@ -148,30 +148,30 @@ def inverse(T_a_b: FloatArray) -> FloatArray:
 _UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}
 # Of radar axes (x forward, y left, z up) in a camera frame (x right, y down, z forward).
 _CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-# Of a sensor on its vehicle, in yaw; in pitch up to 20.
+# Mounting angles of a sensor on its vehicle: in yaw; in pitch up to 20.
 _TURNS_DEG = {"yaw": ("z", range(5, 50, 5)), "pitch": ("y", range(5, 25, 5))}
-# A sensor that turns more between scans may have poses of degrees taken for radians.
+# For larger turns between scans, poses in degrees may have been taken for radians.
 _FAST_RAD = np.radians(3)
-_LOST_TURNS = 29  # whole turns tried
-STILL = 1  # number of the hypothesis under which the sensor does not move between scans: points in the world frame
+_LOST_TURNS = 29  # whole turns that are tried
+STILL = 1  # index of the hypothesis of a sensor that does not move between scans: points in the world frame
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One way to read the data."""
+    """A hypothetical interpretation of the data."""
 
-    finding: str  # its name, if this is right
-    what: str  # words that follow "the scans agree better if"
-    T_j_i: FloatArray  # (P, 4, 4) motions of the pairs of scans, between the frames of the points as given
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # the axis of the points as given that is up then
+    finding: str  # name of the finding if the hypothesis is right
+    what: str  # completes "the scans agree better if"
+    T_j_i: FloatArray  # (P, 4, 4) motions between the frames of the original points of scan pairs
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # vertical axis in the frame of the original points
 
 
 def hypotheses(
     T_world_sensor: FloatArray, pairs: NDArray[np.int64], *, all_axes: bool = True
 ) -> list[Hypothesis]:
-    """Hypotheses about rigid poses (F, 4, 4) for pairs (P, 2) of scans i and j. The more common a mistake, the earlier.
+    """Hypotheses about rigid poses (F, 4, 4) for pairs (P, 2) of scans i and j, the more common mistakes first.
 
-    `all_axes`: whether to try all 47 ways to swap and turn axes, of points and of positions, or only the most common eight.
+    `all_axes`: whether to try all 47 permutations and reflections of axes, of points and positions, or the eight most common.
     """
     poses, motions = T_world_sensor, relative(T_world_sensor, pairs)
 
@@ -191,11 +191,11 @@ def hypotheses(
         Hypothesis("points_in_world_frame", "the points are in the world frame already", still),
     ]
     rotations_by_90 = Rotation.create_group("O").as_matrix().round()
-    # All ways to swap axes or change their signs, without the identity.
+    # All permutations and reflections of axes but the identity.
     for matrix in sorted([*rotations_by_90, *-rotations_by_90], key=_surprise)[1:]:
         words, kind = _written(matrix), _kind(matrix)
         camera = kind == "camera_frame"
-        # z up or down, x and y in any order; and the frame of a camera
+        # z up or down, x and y in any order; and the camera frame
         if not (all_axes or camera or matrix[2, 2] == 1 or words == "x, -y, -z"):
             continue
         turned = _transform(matrix)
@@ -218,33 +218,33 @@ def hypotheses(
     for name, (axis, turns) in _TURNS_DEG.items():
         for degrees in (sign * turn for turn in turns for sign in (1, -1)):
             T_vehicle_sensor = _transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
-            what = f"the sensor is turned by {degrees} degrees of {name} on what the poses are of"
+            what = f"the sensor is rotated by {degrees} degrees in {name} against the frame of the poses"
             moved = T_vehicle_sensor.T @ motions @ T_vehicle_sensor
             found.append(Hypothesis("sensor_turned", what, moved))
     return found
 
 
 def _transform(matrix: FloatArray) -> FloatArray:
-    """(4, 4) of a matrix (3, 3)."""
+    """Embed a matrix (3, 3) as a transform (4, 4)."""
     found = np.eye(4)
     found[:3, :3] = matrix
     return found
 
 
 def _written(matrix: FloatArray) -> str:
-    """A signed permutation as a user would write it: x, -y, -z."""
+    """Format a signed permutation as a user would write it: x, -y, -z."""
     axes = np.argmax(np.abs(matrix), axis=1)
     return ", ".join("-" * int(row[axis] < 0) + "xyz"[axis] for row, axis in zip(matrix, axes, strict=True))
 
 
 def _surprise(matrix: FloatArray) -> tuple[bool, bool, float]:
-    """To sort matrices by: the identity, those where z stays up, as in more common mistakes, few signs before many."""
+    """Sort key of matrices: the identity first, then those that keep z up, a more common mistake, then few signs."""
     key = matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum())
     return not np.array_equal(matrix, np.eye(3)), *key
 
 
 def _kind(matrix: FloatArray) -> str:
-    """Name of the finding that the axes have to be mapped by this matrix."""
+    """Name of the finding for axes that must be mapped by this matrix."""
     if any(np.array_equal(matrix, m) for m in (_CAMERA_OF_RADAR, _CAMERA_OF_RADAR.T)):
         return "camera_frame"
     keeps_axes = np.array_equal(np.abs(matrix), np.eye(3))
@@ -252,15 +252,15 @@ def _kind(matrix: FloatArray) -> str:
 
 
 def _angles(poses: FloatArray) -> Iterator[tuple[str, Rotation]]:
-    """Rotations (F,) if their angles had been taken for another unit, and what that means in words."""
+    """Rotations (F,) as if their angles were in another unit, with a description."""
     rotations = Rotation.from_matrix(poses[:, :3, :3])
-    # Angles in rad, taken for degrees, are 57 times too small.
+    # Angles in rad taken for degrees are 57 times too small.
     vectors = np.degrees(rotations.as_rotvec())
     if np.linalg.norm(vectors, axis=1).max() < 2 * np.pi:
         yield "the angles of the poses are taken for rad, not degrees", Rotation.from_rotvec(vectors)
     if len(rotations) < 3 or np.median(turned_by(poses[:-1], poses[1:])) < _FAST_RAD:
         return
-    # Angles in degrees, taken for rad, have lost whole turns. Steps are small, so the turns between scans are known.
+    # Angles in degrees taken for rad lost whole turns. Steps are small, so the turns between scans are known.
     angles = np.radians(np.unwrap(rotations.as_euler("ZYX"), axis=0))
     for turns in range(-_LOST_TURNS, _LOST_TURNS + 1):
         lost = np.array([turns * np.radians(2 * np.pi), 0.0, 0.0])

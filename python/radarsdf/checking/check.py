@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The check of scans and poses before a fit: all findings, the worst first."""
+"""Check of scans and poses before a fit: all findings, worst first."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ def check(
 ) -> list[Finding]:
     """Find mistakes in scans and poses, and estimate the cost of a fit.
 
-    Most findings compare how well returns of different scans agree in the world frame: with the data as they are, and as if
-    one common mistake were corrected. Samples are taken at equal steps, so the same data give the same findings.
+    Most findings compare the agreement of returns of different scans in the world frame: with the data as they are, and
+    with one common mistake corrected. Samples are taken at equal steps, so the same data give the same findings.
 
     Parameters
     ----------
     points : sequence of F arrays, or Scans
-        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Of :class:`radarsdf.io.Scans`, all the
-        rest is used where it is not given here.
+        (N_i, 3) each: the returns of one scan, sensor frame, m, of any real dtype. Other attributes of
+        :class:`radarsdf.io.Scans` are used unless passed here.
     poses : array_like, optional
-        (F, 4, 4) T_world_sensor, m, one for each scan. Only `Scans` can do without.
+        (F, 4, 4) T_world_sensor, m, one per scan. Optional only with `Scans`.
     intensities : sequence of F arrays, optional
         (N_i,) each, sensor units.
     doppler_mps : sequence of F arrays, optional
@@ -47,17 +47,17 @@ def check(
     times_s : array_like, optional
         (F,) time of each scan, s.
     config : FitConfig, optional
-        Settings of the fit to come.
+        Settings of the planned fit.
 
     Returns
     -------
     list of Finding
-        The worst first. Without an error among them, the last is what a fit will cost.
+        Worst first. If there is no error, the last one is the cost of a fit.
 
     Raises
     ------
     TypeError, ValueError
-        If the arrays are not numbers, or their shapes do not fit together. Wrong numbers are findings.
+        If arrays are not numeric, or their shapes are inconsistent. Wrong values are findings.
 
     Examples
     --------
@@ -79,7 +79,7 @@ def check(
 def check_cheaply(
     points: Sequence[ArrayLike], poses: ArrayLike, intensities: Sequence[ArrayLike] | None = None
 ) -> list[Finding]:
-    """The findings of :func:`check` that take little time compared with a fit, on a smaller sample."""
+    """Findings of :func:`check` that take little time compared with a fit, on a smaller sample."""
     return _find(checked_input(points, poses, intensities), None, frames.CHEAP)
 
 
@@ -88,7 +88,7 @@ def _stops(findings: list[Finding]) -> bool:
 
 
 def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> list[Finding]:
-    """All findings, the worst first. `config` None: only the cheap ones."""
+    """All findings, worst first. `config` None: only the cheap ones."""
     found, recording, numbers = _usable(recording)
     if not _stops(found):
         for check_values in (
@@ -115,7 +115,7 @@ def _of_poses(
         found = list(frames.check_frames(recording, effort))
     if not _stops(found):
         found += trajectory.check_lengths(recording)
-    if not _stops(found):  # else the scans do not agree, whatever the clock
+    if not _stops(found):  # else the scans do not agree at any clock offset
         found += trajectory.check_jumps(recording, numbers, effort)
         found += check_doppler(recording)
         if config is not None and all(finding.severity == "note" for finding in found):
@@ -125,7 +125,7 @@ def _of_poses(
 
 
 def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
-    """Findings about rows, scans and poses that a fit leaves out, the recording without them, and its scans' numbers (F,)."""
+    """Findings about unusable rows, scans and poses, the recording without them, and the numbers (F,) of its scans."""
     found, numbers = [], np.arange(len(recording))
     left_out = [~measured(scan) for scan in recording.points]
     total, unmeasured = sum(map(len, left_out)), sum(int(mask.sum()) for mask in left_out)
@@ -135,7 +135,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
         found.append(Finding("returns_not_finite", "note", evidence))
     if unmeasured > infinite:
         count = f"{unmeasured - infinite} of {total} returns"
-        evidence = f"{count} are no measurements: 0 0 0, or one point many times in succession."
+        evidence = f"{count} are no measurements: 0 0 0, or consecutive copies of one point."
         found.append(Finding("padding", "note", evidence))
     if unmeasured:
         recording = _without(recording, left_out)
@@ -153,7 +153,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
 
 
 def _without(recording: Scans, left_out: list[NDArray[np.bool_]]) -> Scans:
-    """Without the rows of each scan in its mask (N_i,)."""
+    """Remove the rows in the mask (N_i,) of each scan."""
     points, intensities, doppler_mps = (
         None if arrays is None else [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]
         for arrays in (recording.points, recording.intensities, recording.doppler_mps)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Checks by Doppler: of its own consistency, of poses, axes and intensities."""
+"""Checks of Doppler velocities: their consistency, and their agreement with poses, axes and intensities."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, 
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
 from radarsdf.scans import Scans
 
-_STILL_MPS = 0.3  # slower, the direction of a velocity is noise
+_STILL_MPS = 0.3  # slower velocities have no reliable direction
 _MIN_SCANS = 4
 _MIN_SIGNIFICANCE = 4.0
 _MIN_YAW_RAD = np.radians(3)
@@ -23,9 +23,9 @@ _MANY_MOVE = 0.4
 
 
 def check_doppler(recording: Scans) -> Iterator[Finding]:
-    """Whether Doppler, intensities, poses and axes agree. The poses must be rigid transforms."""
+    """Check the agreement of Doppler, intensities, poses and axes. The poses must be rigid transforms."""
     if recording.intensities is not None and _are_speeds(recording, recording.intensities):
-        evidence = "In most scans the intensities agree with one velocity of the sensor, as Doppler does."
+        evidence = "In most scans the intensities fit one velocity of the sensor, as Doppler values do."
         yield Finding("intensity_is_doppler", "error", evidence)
     if recording.doppler_mps is None:
         return
@@ -35,13 +35,13 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
     if tried - without < max(_MIN_SCANS, tried // 2):
         if tried >= _MIN_SCANS:
             evidence = (
-                f"In {without} of {tried} scans no velocity of the sensor agrees with 40 % of the Doppler."
+                f"In {without} of {tried} scans no velocity of the sensor fits 40 % of the Doppler values."
             )
             yield Finding("doppler_without_velocity", "warning", evidence)
         return
     static = np.concatenate([velocity.static for velocity in velocities if velocity.found])
     moving = 1 - static.mean()
-    evidence = f"By their Doppler, {moving:.1%} of the returns move."
+    evidence = f"According to their Doppler, {moving:.1%} of the returns move."
     yield Finding("moving_share", "warning" if moving > _MANY_MOVE else "note", evidence)
     by_doppler = np.array([velocity.velocity_mps for velocity in velocities if velocity.found])
     yield from _compared_with_poses(recording, scans[good], by_doppler)
@@ -50,16 +50,16 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
 def _velocities(
     recording: Scans, values: list[NDArray[Any]]
 ) -> tuple[NDArray[np.int64], list[SensorVelocity]]:
-    """Some scans, and their velocities by `values`, which may be Doppler."""
+    """Velocities of some scans from `values`, which may be Doppler, and the scans."""
     scans = [i for i in some_scans(recording) if len(recording.points[i]) >= MIN_DOPPLER_RETURNS]
     found = sensor_velocities([recording.points[i] for i in scans], [values[i] for i in scans])
     return np.array(scans, np.int64), found
 
 
 def _are_speeds(recording: Scans, values: list[NDArray[Any]]) -> bool:
-    """Whether values (N_i,) of the scans are Doppler: most scans agree on a velocity, which is not zero in all."""
+    """Whether values (N_i,) of the scans are Doppler: most scans fit a velocity, which is not zero in all."""
     if min(float(np.min(value, initial=0)) for value in values) >= 0:
-        return False  # Doppler has both signs, or a minus where the sensor comes nearer
+        return False  # Doppler has both signs, or a negative one for approaching returns
     scans, velocities = _velocities(recording, values)
     found = [velocity.velocity_mps for velocity in velocities if velocity.found]
     if len(scans) < _MIN_SCANS or len(found) < 0.7 * len(scans):
@@ -70,7 +70,7 @@ def _are_speeds(recording: Scans, values: list[NDArray[Any]]) -> bool:
 def _compared_with_poses(
     recording: Scans, scans: NDArray[np.int64], by_doppler: FloatArray
 ) -> Iterator[Finding]:
-    """Compares the directions of velocities (K, 3) of scans (K,) by Doppler with those by poses: sign and yaw."""
+    """Compare the directions of velocities (K, 3) of scans (K,) from Doppler with those from poses: sign and yaw."""
     times = ascending_times_s(recording)
     knots = np.arange(len(recording), dtype=np.float64) if times is None else times
     if len(recording) < _MIN_SCANS:
@@ -83,24 +83,24 @@ def _compared_with_poses(
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (by_doppler[used], by_poses[used]))
     cosine = float(np.median(np.einsum("na,na->n", a, b)))
     if cosine < -0.8:
-        # Sensors differ in it, and what moves is found all the same: so this is no fault of the data.
+        # Sign conventions differ, and moving returns are found with either: so this is not a fault of the data.
         evidence = f"By its Doppler the sensor moves backwards where its poses move forwards (median cosine {cosine:.2f})."
         yield Finding("doppler_sign", "note", evidence)
         a = -a
-    # Yaw that turns one onto the other, in each scan.
+    # Yaw between the two, in each scan.
     yaws = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.einsum("na,na->n", a[:, :2], b[:, :2]))
     yaw = float(np.median(yaws))
     spread = 1.4826 * float(np.median(np.abs(yaws - yaw))) * np.sqrt(np.pi / 2 / len(yaws))
     if abs(yaw) > max(_MIN_YAW_RAD, _MIN_SIGNIFICANCE * spread):
         evidence = (
-            f"The poses move {np.degrees(yaw):+.1f} degrees to the left of the velocity by Doppler, in the median of "
+            f"The poses move {np.degrees(yaw):+.1f} degrees to the left of the Doppler velocity, in the median of "
             f"{len(yaws)} scans."
         )
         yield Finding("sensor_turned", "warning", evidence)
 
 
 def velocity_of_poses(T_world_sensor: FloatArray, times_s: FloatArray) -> FloatArray:
-    """(F, 3) velocities of the sensor in its own frame at the poses (F, 4, 4), m/s, from the steps before and after."""
+    """(F, 3) velocities of the sensor in its own frame at the poses (F, 4, 4), m/s, from central differences."""
     rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
     half = rotations[:-1] * Rotation.from_rotvec((rotations[:-1].inv() * rotations[1:]).as_rotvec() / 2)
     steps = np.diff(T_world_sensor[:, :3, 3], axis=0) / np.diff(times_s)[:, None]

@@ -29,23 +29,23 @@ from radarsdf.checking.recording import Finding, FloatArray, Severity, ascending
 from radarsdf.io.poses import Trajectory
 from radarsdf.scans import Scans
 
-# A hypothesis is noted if the scans agree better by this: of the mean logarithm of distances, and of its standard error. It
-# must agree better than standing still by as much, too: any pattern of the sensor's cells agrees with itself if it stands still.
+# Minimum gain of a note, as the mean logarithm of distances and in standard errors. The gain over standing still must
+# be as large: any pattern of the sensor's cells agrees with itself if the sensor stands still.
 _MIN_GAIN = 0.05
 _MIN_SIGNIFICANCE = 4.0
-# It is an error from these gains on, however small the standard error. docs/checks.md has the largest gains of wrong hypotheses
-# on good recordings, and the smallest of right ones on broken data.
+# Gains of an error, however small the standard error. docs/checks.md lists the largest gains of wrong hypotheses
+# on good recordings, and the smallest gains of right ones on broken data.
 _ERROR_GAIN = 0.12
-# To shrink positions, or to take points for points in the world, moves the cells of the sensor onto each other.
+# Shrunk positions, or points taken for world points, align the cells of the sensor with each other.
 _ERROR_GAINS = {"units": 0.2, "points_in_world_frame": 0.25, "sensor_turned": 0.08}
-# Points in the world frame agree as badly if the poses move them forwards as if backwards. Measured: at most 0.06; on good
+# World points agree equally badly if the poses move them forwards or backwards. Measured: at most 0.06; on good
 # recordings of a sensor with coarse cells, 0.15 and more.
 _FORWARDS_GAIN = 0.1
-_EQUAL = 0.8  # of the best gain: mistakes that agree about as well are indistinguishable. The most common one is named
+_EQUAL = 0.8  # share of the best gain: among nearly equal mistakes, the most common is reported
 _NOT_BEHIND = 2.5  # standard errors
-# Standard errors. Measured: below -2.3 in the sensor's frame, above -0.5 in the world's.
+# Standard errors. Measured: below -2.3 in the sensor frame, above -0.5 in the world frame.
 _FIELD_OF_VIEW_STAYS = -1.5
-# Skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it misleads.
+# Skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it is misleading.
 _UPSIDE_DOWN = -0.5
 _AFAR = 10.0  # distance of the returns from the origin, over their spread
 _MIN_PAIRS = 3
@@ -53,13 +53,13 @@ _MIN_PAIRS = 3
 
 @dataclass(frozen=True)
 class Effort:
-    """How much of the data a check uses."""
+    """Amounts of data that a check uses."""
 
-    pairs: int  # of scans
-    returns: int  # largest number of returns of a scan that others are compared with
-    queries: int  # returns of a scan that are compared with another one
-    all_axes: bool  # whether all ways to swap axes are tried
-    lags: tuple[int, ...] = LAGS  # how far apart the scans of a pair are
+    pairs: int  # number of pairs of scans
+    returns: int  # largest number of returns of a scan in the tree
+    queries: int  # returns of a scan looked up in another one
+    all_axes: bool  # whether to try all permutations of axes
+    lags: tuple[int, ...] = LAGS  # lags between the scans of a pair
 
 
 FULL = Effort(pairs=48, returns=1000, queries=80, all_axes=True)
@@ -67,7 +67,7 @@ CHEAP = Effort(pairs=20, returns=400, queries=40, all_axes=False, lags=(1, 2))
 
 
 def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
-    """The mistake in frames, axes or units without which the scans agree much better. Poses must be rigid transforms."""
+    """Find the mistake in frames, axes or units whose correction makes the scans agree best. Poses must be rigid."""
     poses = recording.poses
     pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
     if len(pairs) < _MIN_PAIRS:
@@ -93,18 +93,18 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
 
 
 def _severity(gain: float, finding: str) -> Severity:
-    """Of a finding, by how much better the scans agree without the mistake."""
+    """Severity of a finding by its gain in agreement."""
     return "error" if gain >= _ERROR_GAINS.get(finding, _ERROR_GAIN) else "note"
 
 
 def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
-    """Whether all positions are the same although the sensor moved: what the scans see then changes with time."""
+    """Check whether all positions are equal although the sensor moved, so that the scans change with time."""
     positions = recording.poses[:, :3, 3]
     usable = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in recording.points])
     if len(usable) < 2 or (positions != positions[0]).any():
         return
     agreement = Agreement(recording.points, effort.returns, effort.queries)
-    # Neighbours, and scans that are half of the recording apart.
+    # Neighbours, and scans half a recording apart.
     scores = []
     for lag in (1, max(1, len(usable) // 2)):
         pairs = pairs_apart(usable, lag, effort.pairs // 2)
@@ -117,14 +117,14 @@ def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     evidence = f"All {len(recording)} poses have the same position"
     if moved:
         evidence += (
-            f", but returns of scans far apart in time are {np.exp(change):.2f} times farther from each other than those of "
+            f", but returns of scans far apart in time are {np.exp(change):.2f} times farther apart than those of "
             f"neighbours ({change / error:.0f} standard errors)"
         )
     yield Finding("poses_stand_still", "error" if moved else "warning", f"{evidence}.")
 
 
 def check_clock(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
-    """Whether the scans agree better with the poses of an earlier or a later time, or of another row."""
+    """Check whether the scans agree better with poses of an earlier or a later time, or of another row."""
     poses, times = recording.poses, ascending_times_s(recording)
     unit = "steps between scans" if times is None else "s"
     times = np.arange(len(poses), dtype=np.float64) if times is None else times
@@ -134,7 +134,7 @@ def check_clock(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     shifts = step * np.array([-8.0, -4, -2, -1, -0.5, 0.5, 1, 2, 4, 8])
     shifts = shifts[np.abs(shifts) <= (times[-1] - times[0]) / 4]
     pairs = choose_pairs(recording.points, poses[:, :3, 3], effort.pairs, effort.lags)
-    # Beyond the first and the last pose nothing is known.
+    # Beyond the first and the last pose, interpolation is undefined.
     far = float(np.abs(shifts).max(initial=0))
     pairs = pairs[((times[pairs] - far >= times[0]) & (times[pairs] + far <= times[-1])).all(axis=1)]
     if len(pairs) < _MIN_PAIRS or not len(shifts):
@@ -148,7 +148,7 @@ def check_clock(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     gain, significance, shift = comparison.gains[best], comparison.significance[best], shifts[best]
     if gain >= _MIN_GAIN and significance >= _MIN_SIGNIFICANCE:
         evidence = (
-            f"With the poses of a time about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
+            f"With poses from about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
             f"different scans are {np.exp(gain):.2f} times closer to each other ({len(pairs)} pairs of scans, {significance:.0f} "
             "standard errors)."
         )
@@ -162,20 +162,20 @@ def _best(
     scores: FloatArray,
     in_world: bool,
 ) -> tuple[Hypothesis, float, float] | None:
-    """The hypothesis that is clearly better than the data as given, its gain and its significance.
+    """Return the hypothesis that is clearly better than the data as they are, its gain and its significance.
 
-    `in_world`: whether the points can be in the world frame.
+    `in_world`: whether the points may be in the world frame.
     """
     lags = pairs[:, 1] - pairs[:, 0]
     possible = np.ones(len(guesses), bool)
     possible[STILL] = in_world
-    # The skewness of the coordinates of the returns is positive upwards: walls are higher than the sensor is.
+    # The skewness of the heights is positive along the up axis: walls rise above the sensor.
     points = np.concatenate(some_points(recording))
     centred = points - np.median(points, axis=0)
     skewness = (centred**3).mean(axis=0) / np.maximum(centred.std(axis=0) ** 3, 1e-300)
     upright = np.array([guess.up for guess in guesses]) @ skewness > _UPSIDE_DOWN
-    # Neighbours first: scans far apart see different things, and agree best where a wrong motion makes their fields
-    # of view overlap. What is clearly worse than the data as given for neighbours is not tried on scans farther apart.
+    # Neighbours first: scans far apart observe different things, and agree best where a wrong motion makes their fields
+    # of view overlap. Hypotheses clearly worse for neighbours are not tried on scans farther apart.
     noted = None
     for lag in np.unique(lags):
         used = lags <= lag
@@ -193,12 +193,12 @@ def _best(
 def _best_of(
     guesses: list[Hypothesis], scores: FloatArray, possible: NDArray[np.bool_], upright: NDArray[np.bool_]
 ) -> tuple[Hypothesis, float, float] | None:
-    """:func:`_best` for pairs of scans that are about equally far apart."""
+    """:func:`_best` for pairs of scans at similar lags."""
     comparison = Comparison.of(scores[0], scores[1:])
     good = (comparison.gains >= _MIN_GAIN) & (comparison.significance >= _MIN_SIGNIFICANCE) & possible
-    # Returns come closer to each other, too, where the fields of view of two scans only cover more of each other. They do
-    # so most if the sensor stands still. What explains the scans better than the data as given explains them better than
-    # that. Measured: without this, 37 of 70 good recordings of 4 to 8 sparse scans had an error; with it, none of 258.
+    # Returns come closer to each other, too, if the fields of view of two scans merely overlap more, most of all if the
+    # sensor stands still. A hypothesis that explains the scans better than the data as they are also beats
+    # that one. Measured: without this, 37 of 70 good recordings of 4 to 8 sparse scans had an error; with it, none of 258.
     beats_still = Comparison.of(scores[1 + STILL], scores[1:]).gains >= _MIN_GAIN
     beats_still[STILL] = True
     good &= beats_still
@@ -209,9 +209,9 @@ def _best_of(
     behind = Comparison.of(scores[1:], scores[1 + top])
     near = good & (comparison.gains >= _EQUAL * comparison.gains[top])
     near &= (behind.significance < _NOT_BEHIND) | (np.arange(len(guesses)) == top)
-    # Scans that move on a plane agree as well upside down.
+    # Scans that move on a plane agree equally well upside down.
     near = near & upright if (near & upright).any() else near
-    # The most common kind of mistake among those that are about equal; of its variants, the one that agrees best.
+    # The most common of the mistakes with about equal gains; of its variants, the best one.
     kind = kinds[int(np.argmax(near))]
     of_kind = near & np.array([name == kind for name in kinds])
     chosen = int(np.argmax(np.where(of_kind, comparison.gains, -np.inf)))
@@ -219,16 +219,16 @@ def _best_of(
 
 
 def _looks_out_of_its_frame(recording: Scans, pairs: NDArray[np.int64]) -> bool:
-    """Whether the returns stay in one place of the frame that they came in, but not in the sensor's by the poses.
+    """Whether the returns stay in one place of their own frame, but not of the sensor frame according to the poses.
 
-    Where the sensor moves far between scans, they agree best as if it stood still: its field of view then is the same. But in
-    the world frame, the centre of the returns and the mean direction to them move.
+    If the sensor moves far between scans, they agree best as if it stood still, when its field of view is the same. But in
+    the world frame, the centroid of the returns and their mean direction move.
     """
     rows = np.unique(pairs)
     given = [np.asarray(recording.points[i], np.float64) for i in rows.tolist()]
     afar = [np.linalg.norm(np.median(scan, axis=0)) / max(scan.std(axis=0).max(), 1e-9) for scan in given]
     if np.median(afar) > _AFAR:
-        return False  # no sensor sees all its returns in one direction, such as those of UTM coordinates
+        return False  # no sensor has all returns in one direction, unlike UTM coordinates
     moved = [
         (scan - pose[:3, 3]) @ pose[:3, :3] for scan, pose in zip(given, recording.poses[rows], strict=True)
     ]

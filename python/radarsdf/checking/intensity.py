@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Checks of the intensities: whether they are measured at all, outliers, steps, an offset, clipping."""
+"""Checks of the intensities: missing measurements, outliers, quantisation, an offset, clipping."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from radarsdf.checking.recording import Finding, FloatArray, some_scans
 from radarsdf.returns.intensities import Plausible
 from radarsdf.scans import Scans
 
-_SOME, _MANY = 0.005, 0.05  # share of the returns at the highest value
-_ABOVE_NEXT = 5.0  # times the share at each of the next values
-_FEW_VALUES = 1000  # different ones. More have no steps that matter
-_RCS_OFFSET = 128  # of radar cross sections in dBsm, to put them into a byte
+_SOME, _MANY = 0.005, 0.05  # shares of returns at the highest value for a note and a warning
+_ABOVE_NEXT = 5.0  # ratio to the share at each of the next values
+_FEW_VALUES = 1000  # distinct values: with more, quantisation does not matter
+_RCS_OFFSET = 128  # added to radar cross sections in dBsm to store them in a byte
 _LEAST_RETURNS = 100
-_NAMED = 3  # values in a message
+_NAMED = 3  # largest number of values in a message
 
 
 def check_intensities(recording: Scans) -> Iterator[Finding]:
-    """Findings about the intensities."""
+    """Check the intensities."""
     if recording.intensities is None:
         return
-    whole = np.concatenate(recording.intensities)  # one value in any scan can stretch the scale of all
+    whole = np.concatenate(recording.intensities)  # one value in any scan can stretch the common scale
     finite = np.isfinite(whole)
     if not finite.all():
         evidence = f"{1 - finite.mean():.2%} of the intensities are not finite."
@@ -53,7 +53,7 @@ def check_intensities(recording: Scans) -> Iterator[Finding]:
 
 
 def _outliers(outliers: FloatArray, usual: FloatArray) -> Iterator[Finding]:
-    """Values that come again and again stand for no measurement; single ones are faults."""
+    """Report outliers: repeated values mark missing measurements, single ones are faults."""
     levels, counts = np.unique(outliers, return_counts=True)
     total = len(outliers) + len(usual)
     for name, chosen in (("intensity_sentinel", counts > 1), ("intensity_outliers", counts == 1)):
@@ -61,14 +61,14 @@ def _outliers(outliers: FloatArray, usual: FloatArray) -> Iterator[Finding]:
             most = levels[chosen][np.argsort(-counts[chosen], kind="stable")]
             named = ", ".join(f"{level:g}" for level in most[:_NAMED]) + ", …" * (len(most) > _NAMED)
             evidence = (
-                f"{counts[chosen].sum()} of {total} intensities are {named}, far from all others, which are {usual.min():g} to "
+                f"{counts[chosen].sum()} of {total} intensities are {named}, far from the others, which are {usual.min():g} to "
                 f"{usual.max():g}."
             )
             yield Finding(name, "warning", evidence)
 
 
 def _scale(values: FloatArray) -> Iterator[Finding]:
-    """Steps, an offset, and values that pile up at the end of the scale."""
+    """Report quantisation, an offset, and clipping at the end of the scale."""
     levels, counts = np.unique(values, return_counts=True)
     shares = counts / len(values)
     low, middle = np.percentile(values, [5, 50])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Geometry, noise and drift of a recording, and what a fit of it will cost."""
+"""Elevation, ground, noise and drift of a recording, and the cost of a fit."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from radarsdf.scans import Scans
 
 _FEW_RETURNS = 100
 _FLAT = 1e-5  # thickness of the plane of the returns over its extent: float32 rounds to 1e-7
-_CLOSE_M = 25.0  # farther returns are below the ground by their noise in elevation
+_CLOSE_M = 25.0  # noise in elevation puts farther returns below the ground
 _BIN_M = 0.25
-_DEPTH_M, _DEPTH_PER_M = 1.0, 0.1  # below the ground by this, and by this share of the range
-_SOME, _MANY = 0.01, 0.1  # share of the close returns. Six real drives have up to 0.063
+_DEPTH_M, _DEPTH_PER_M = 1.0, 0.1  # margins below the ground: a constant, and a share of the range
+_SOME, _MANY = 0.01, 0.1  # shares of the close returns. Six real drives have up to 0.063
 
-_SIGMAS = 3.0  # a return farther from its surfel is an outlier
+_SIGMAS = 3.0  # returns farther from their surfel are outliers
 _SIGNIFICANCE = 3.0  # standard errors
-_PARTS = 20  # of the surfels, neighbours together, of which each is left out once to find the standard error
+_PARTS = 20  # groups of neighbouring surfels for the jackknife standard error
 _MIN_SURFELS = 10 * _PARTS
 
-# So that a large recording takes no longer than a small one: so many windows of so many scans and returns, evenly spread.
+# Sizes of a sample of windows, scans and returns, evenly spread, so that a large recording takes no longer than a small one.
 _WINDOWS, _SCANS, _RETURNS = 3, 60, 60_000
 _LEAST_SCANS = 4
-# Of the deviation of a return, that returns must move by. Measured: true poses of slow sensors with cells of 0.5 m: up to 0.09; a
-# drift of 0.01 m and 0.05 degrees a step that is found: 0.27 and more.
+# Smallest displacement of returns, as a share of their standard deviation. Measured: true poses of slow sensors with cells
+# of 0.5 m: up to 0.09; a detected drift of 0.01 m and 0.05 degrees per step: 0.27 and more.
 _LEAST_MOVED = 0.15
 
 
 def check_elevation(recording: Scans) -> Iterator[Finding]:
-    """Whether the sensor measures no elevation: then all returns lie in one plane of its frame."""
+    """Check for a sensor without elevation, whose returns all lie in one plane of its frame."""
     points = np.concatenate(some_points(recording))
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) >= _FEW_RETURNS and spread[2] <= _FLAT * spread[0]:
@@ -49,9 +49,9 @@ def check_elevation(recording: Scans) -> Iterator[Finding]:
 
 
 def check_ground(recording: Scans) -> Iterator[Finding]:
-    """How many returns lie below the ground, as reflections in it do. The z axis of the world must be up.
+    """Check the share of returns below the ground, such as reflections in it. The z axis of the world must be up.
 
-    The ground is where most close returns below the sensor lie.
+    The ground is the most frequent height of close returns below the sensor.
     """
     scans, upwards = some_points(recording), recording.poses[some_scans(recording), 2, :3]
     distance = np.concatenate([np.linalg.norm(scan, axis=1) for scan in scans])
@@ -72,7 +72,7 @@ def check_ground(recording: Scans) -> Iterator[Finding]:
 
 
 def check_noise_and_cost(recording: Scans, config: FitConfig) -> Iterator[Finding]:
-    """The noise of the sensor and of the poses, and what a fit will cost, or why it would refuse."""
+    """Report the noise of the sensor and of the poses, and the cost of a fit, or why it would be refused."""
     try:
         rays = prepare(recording.points, recording.poses, recording.intensities, **config.preparation)
         check_extent(rays, config)
@@ -91,12 +91,12 @@ def check_noise_and_cost(recording: Scans, config: FitConfig) -> Iterator[Findin
 
 
 def _check_poses(rays: Rays, surfels: Surfels, noise: SensorNoise) -> Iterator[Finding]:
-    """Whether returns of different scans are farther from each other, across a surface, than those of one scan.
+    """Check for returns of different scans that are farther apart across a surface than those of one scan.
 
-    Two returns of one scan on the same surfel differ by the noise of the sensor alone; two of different scans by the errors
-    of their poses, too. So the ratio of the mean squared differences is 1 if the poses are right, whatever the noise, the
-    density and the roughness. Measured: 0.93 to 1.10 in 30 good recordings of six simulated kinds; 1.3 to 1.6 on five real
-    drives, where the errors of a scan's returns from one thing are correlated.
+    Two returns of one scan on the same surfel differ only by the noise of the sensor; two of different scans also by the
+    errors of their poses. So the ratio of the mean squared differences is 1 if the poses are right, whatever the noise,
+    density and roughness. Measured: 0.93 to 1.10 in 30 good recordings of six simulated kinds; 1.3 to 1.6 on five real
+    drives, where errors of a scan's returns from one object are correlated.
     """
     plane = surfels.flat_planes_at(rays.points)
     rows = np.flatnonzero(plane >= 0)
@@ -116,7 +116,7 @@ def _check_poses(rays: Rays, surfels: Surfels, noise: SensorNoise) -> Iterator[F
     both = np.flatnonzero((within[0] > 0) & (between[0] > 0))
     if len(both) < _MIN_SURFELS:
         return
-    # Each surfel counts as much in both: its mean is as certain as the fewer of its pairs make it.
+    # A surfel has the same weight in both, set by the smaller number of its pairs.
     weights = np.minimum(within[0], between[0])[both]
     means = np.stack([weights * part[1, both] / part[0, both] for part in (within, between)])
     part_of = np.arange(len(both)) * _PARTS // len(both)
@@ -133,7 +133,7 @@ def _check_poses(rays: Rays, surfels: Surfels, noise: SensorNoise) -> Iterator[F
         f"Across the surfaces that scans have in common, poses add about {added_m:.3f} m to the {own_m:.3f} m by which "
         f"returns of one scan differ ({len(both)} surfaces, {log_ratio / error:.0f} standard errors)."
     )
-    # From a ratio of 2 on, the poses add as much as the sensor has.
+    # At a ratio of 2, the poses add as much as the sensor itself.
     yield Finding("poses_disagree", "warning" if other > 2 * one else "note", evidence)
 
 
@@ -144,7 +144,7 @@ def _of_pairs(values: FloatArray, group: NDArray[np.int64], count: int) -> Float
 
 
 def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
-    """Whether held-out returns agree better once the poses are refined, in the clearest of some windows of scans."""
+    """Check whether held-out returns agree better with refined poses, in the clearest of some windows of scans."""
     count = len(recording)
     if count < _LEAST_SCANS:
         return
@@ -152,7 +152,7 @@ def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
     improved = []
     for begin in begins:
         part = recording.select(np.arange(begin, min(begin + _SCANS, count)))
-        # Every n-th return: those of a scan come in the order of its angles.
+        # Every n-th return, since returns of a scan are ordered by angle.
         every = max(1, -(-sum(map(len, part.points)) // _RETURNS))
         points = [np.asarray(scan[::every], np.float64) for scan in part.points]
         times_s, doppler_mps = ascending_times_s(part), None
@@ -170,8 +170,8 @@ def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
     if improved:
         best = max(improved, key=lambda report: float(report["gain"] / report["gain_error"]))
         evidence = (
-            f"With refined poses, returns of other scans are {np.expm1(best['gain']):.1%} denser where returns that took no part lie "
-            f"({best['gain'] / best['gain_error']:.0f} standard errors): a step is off by {best['sigma_m']:.3f} m and "
+            f"With refined poses, returns of other scans are {np.expm1(best['gain']):.1%} denser at held-out returns "
+            f"({best['gain'] / best['gain_error']:.0f} standard errors): steps have errors of {best['sigma_m']:.3f} m and "
             f"{np.degrees(best['sigma_rad']):.2f} degrees ({len(improved)} of {len(begins)} windows of the recording)."
         )
         yield Finding("poses_drift", "warning", evidence)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The input of a check, with shapes that fit together, and its findings."""
+"""Input of a check, with consistent shapes, and its findings."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from radarsdf.scans import Scans
 FloatArray = NDArray[np.float64]
 
 Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # from the worst to the mildest
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
 
-_SAMPLE = 40  # scans that show what returns of a sensor are like
+_SAMPLE = 40  # scans from which properties of the sensor are estimated
 
-_LEFT_OUT = "Nothing needs to be done: a fit leaves them out."
+_LEFT_OUT = "No action needed: a fit leaves them out."
 _FRAME = "Pass points of the sensor frame in metres, x forward, y left, z up, and T_world_sensor."
 _ANGLES = "Recompute the rotations of the poses from angles in rad or unit quaternions x y z w."
-_NO_VALUE = "Look up in the driver what they stand for. A fit leaves them out of the reflectance."
+_NO_VALUE = "Look up their meaning in the driver. A fit leaves them out of the reflectance."
 FIXES = {
     "returns_not_finite": _LEFT_OUT,
     "padding": _LEFT_OUT,
     "empty_scans": f"Pass the returns. {_LEFT_OUT}",
     "intensity_not_finite": "Fit without intensities, if there are hardly any. A fit leaves them out of the reflectance.",
-    "no_elevation": "Read the map from above only: heights of its surface are those of the sensor, not of what it sees.",
+    "no_elevation": "Read the map from above only: its heights are those of the sensor, not of the scene.",
     "positions_rounded": "Keep poses in float64, or subtract an origin before they become float32.",
     "poses_not_rigid": f"A fit leaves out their scans. {_ANGLES}",
     "poses_transposed": "Transpose each pose: poses.transpose(0, 2, 1).",
     "poses_inverted": "Invert each pose: np.linalg.inv(poses).",
-    "points_in_world_frame": "Move them back: (points - pose[:3, 3]) @ pose[:3, :3], or pass the points of the sensor frame.",
+    "points_in_world_frame": "Transform them back: (points - pose[:3, 3]) @ pose[:3, :3], or pass points of the sensor frame.",
     "camera_frame": _FRAME,
     "axes_swapped": _FRAME,
     "mirrored": f"{_FRAME} Frames are right-handed.",
@@ -51,48 +51,48 @@ FIXES = {
     "angles_in_degrees": _ANGLES,
     "quaternion_order": _ANGLES,
     "sensor_turned": "Pass poses of the sensor: poses @ T_vehicle_sensor, by its calibration.",
-    "poses_stand_still": "Pass the position of the sensor for each scan. If it stood still, the map shows what is seen from there.",
+    "poses_stand_still": "Pass the position of the sensor for each scan. If it stood still, the map shows the view from there.",
     "poses_disagree": "Use better poses, if there are any; state their errors as returns.pose_sigma_m, if not.",
     "poses_drift": "Refine them: radarsdf poses, radarsdf fit --refine, or radarsdf.refine_poses(points, poses).",
     "pose_jumps": "Use poses that were smoothed over the whole drive, or leave out the scans at the jumps.",
     "clock_offset": "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
-    "times": "Sort scans, poses and times together, and use the times of record if those of the messages were never set.",
-    "duplicate_scans": "Leave out the copies: they count as measurements that never were.",
+    "times": "Sort scans, poses and times together, and use the record times if the header stamps were never set.",
+    "duplicate_scans": "Leave out the copies: they would count as independent measurements.",
     "duplicate_poses": "Interpolate the poses at the times of the scans, unless the sensor stood still.",
-    "intensity_constant": "Pass another field, or fit without intensities: the sensor does not measure this one.",
+    "intensity_constant": "Pass another field, or fit without intensities: this one is not measured.",
     "intensity_constant_in_scans": "Look for a fault of the driver, or fit without intensities.",
     "intensity_sentinel": _NO_VALUE,
     "intensity_outliers": _NO_VALUE,
     "intensity_is_doppler": "Pass the field of the power or of the radar cross section as intensity.",
     "intensity_clipped": "Lower the gain of the sensor, or read a field that is not clipped.",
     "intensity_offset": "Subtract 128 for dBsm; a fit does not need it.",
-    "intensity_steps": "Nothing needs to be done.",
-    "doppler_without_velocity": "Pass the measured speed along the ray in m/s, not one with the sensor's motion taken out.",
-    "doppler_sign": "Change the sign of the Doppler, so that it is negative where the sensor comes nearer.",
+    "intensity_steps": "No action needed.",
+    "doppler_without_velocity": "Pass the measured radial velocity in m/s, without compensation of the sensor's motion.",
+    "doppler_sign": "Change the sign of the Doppler, so that it is negative for approaching returns.",
     "moving_share": "A fit leaves them out, unless returns.drop_moving is false.",
     "below_ground": "Leave them out if they are reflections in the ground.",
     "fit_refuses": "See the message.",
-    "noise": "Nothing needs to be done: a fit estimates it.",
-    "cost": "Lower effort if that is too much.",
+    "noise": "No action needed: a fit estimates it.",
+    "cost": "Lower effort if this is too expensive.",
 }
-"""What to do about each finding."""
+"""Remedy of each finding by name."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is worth knowing before a fit."""
+    """A fact about the data to consider before a fit."""
 
     name: str
-    """A short name in lower case that does not change between versions, such as ``poses_inverted``."""
+    """Short lower-case name that is stable across versions, such as ``poses_inverted``."""
     severity: Severity
     """``error``: a map of these data would be nonsense. ``warning``: it would suffer. ``note``: for information."""
     evidence: str
-    """One sentence with the numbers that show it."""
+    """Numerical evidence in one sentence."""
     fix: str = ""
-    """What to do, in a sentence or two. Default: that of the name."""
+    """Remedy in one or two sentences. Default: that of the name."""
 
     def __post_init__(self) -> None:
-        """Looks up what to do."""
+        """Look up the remedy."""
         object.__setattr__(self, "fix", self.fix or FIXES[self.name])
 
     def __str__(self) -> str:
@@ -106,7 +106,7 @@ def checked_input(
     doppler_mps: Sequence[ArrayLike] | None = None,
     times_s: ArrayLike | None = None,
 ) -> Scans:
-    """Scans whose shapes and types fit together: the values are what is checked.
+    """Check shapes and types and build scans; the values themselves remain to be checked.
 
     Raises a TypeError or a ValueError that names the argument.
     """
@@ -125,23 +125,23 @@ def checked_input(
 
 
 def ascending_times_s(scans: Scans) -> FloatArray | None:
-    """Times (F,), if each is later than the one before; else None."""
+    """Times (F,) if they are strictly ascending, else None."""
     times = scans.times_s
     return times if times is not None and (np.diff(times) > 0).all() else None
 
 
 def some_scans(scans: Scans) -> list[int]:
-    """Numbers of at most about `_SAMPLE` scans, at equal steps."""
+    """Indices of at most about `_SAMPLE` scans, at equal steps."""
     return list(range(0, len(scans), -(-len(scans) // _SAMPLE)))
 
 
 def some_points(scans: Scans) -> list[FloatArray]:
-    """The returns (N_i, 3) of these scans."""
+    """Returns (N_i, 3) of :func:`some_scans`."""
     return [np.asarray(scans.points[i], np.float64) for i in some_scans(scans)]
 
 
 def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
-    """`values` as an array of real numbers. float32 stays float32: only samples are computed with."""
+    """Convert to an array of real numbers. float32 is kept: only samples enter computations."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f":
         refuse_masked(values, name)
         return values

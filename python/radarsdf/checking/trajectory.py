@@ -19,27 +19,27 @@ from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.rigid import step_vectors, steps
 from radarsdf.scans import Scans
 
-# No radar that gives points sees most of them from farther away, and none has most of them at its own housing.
+# No imaging radar has most of its returns beyond the first two ranges, or within the third, at its own housing.
 _FAR_M, _VERY_FAR_M, _NEAR_M = 400.0, 1000.0, 0.2
-_COARSE_M = 0.01  # steps of positions. Smaller ones are less than the noise of any radar
+_COARSE_M = 0.01  # spacing of positions: finer rounding is below the noise of any radar
 _FAST_MPS = 100.0  # faster than cars and drones
-_JUMP = 3.0  # times the steps near it
-_LEAST_JUMP = 0.2  # in distances between returns of a scan: smaller ones are below what scans measure
-_NEAR = 3  # steps before and after
+_JUMP = 3.0  # ratio to the neighbouring steps
+_LEAST_JUMP = 0.2  # smallest jump, in spacings of a scan's returns: the resolution
+_NEAR = 3  # neighbouring steps on each side
 _JUMPS_TRIED = 12
-_MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs lie across a jump
-_CLOSES = 0.5  # of the difference to scans next to the jump
-_CAUGHT_UP = 1.5  # times the median step
+_MIN_GAIN, _MIN_SIGNIFICANCE = 0.1, 3.0  # as in frames.py; few pairs straddle a jump
+_CLOSES = 0.5  # share of the difference to scans next to the jump
+_CAUGHT_UP = 1.5  # ratio to the median step
 
 
 def check_rigid(recording: Scans) -> Iterator[Finding]:
-    """Whether the matrices are rigid transforms, and what they may be if not."""
+    """Check that the matrices are rigid transforms, and diagnose those that are not."""
     poses, usable = recording.poses, are_rigid(recording.poses)
     count, wrong, first = len(poses), int((~usable).sum()), int(np.argmin(usable))
     if wrong == 0:
         return
     name = "poses_not_rigid"
-    evidence = f"{wrong} of {count} poses are no rigid transforms, the first is pose {first}: {poses[first].round(3).tolist()}."
+    evidence = f"{wrong} of {count} poses are not rigid transforms, the first is pose {first}: {poses[first].round(3).tolist()}."
     if 2 * wrong >= count:
         if are_rigid(poses.transpose(0, 2, 1)).all():
             name, evidence = "poses_transposed", "The translations are in the last row of the poses."
@@ -50,7 +50,7 @@ def check_rigid(recording: Scans) -> Iterator[Finding]:
 
 
 def check_rounding(recording: Scans) -> Iterator[Finding]:
-    """Whether the positions were rounded to float32 far from the origin, as with UTM coordinates."""
+    """Check for positions rounded to float32 far from the origin, as with UTM coordinates."""
     positions = recording.poses[:, :3, 3]
     rounded = positions.astype(np.float32)
     step_m = float(np.spacing(np.abs(rounded).max()))
@@ -60,10 +60,10 @@ def check_rounding(recording: Scans) -> Iterator[Finding]:
 
 
 def check_lengths(recording: Scans) -> Iterator[Finding]:
-    """Whether ranges and speeds can be in metres. The poses must be finite."""
+    """Check whether ranges and speeds are plausible in metres. The poses must be finite."""
     range_m, times = median_range_m(some_points(recording)), ascending_times_s(recording)
     if range_m > _FAR_M or range_m < _NEAR_M:
-        # Points of a world frame far from its origin, such as UTM, have no ranges. Their distances to the sensor do.
+        # World points far from the origin, such as UTM, have no ranges; distances from the sensor replace them.
         error = range_m > _VERY_FAR_M or range_m < _NEAR_M / 10
         evidence = f"Half of the returns are {range_m:.4g} m or more from the sensor."
         yield Finding("units", "error" if error else "warning", evidence)
@@ -74,7 +74,7 @@ def check_lengths(recording: Scans) -> Iterator[Finding]:
 
 
 def check_times(recording: Scans) -> Iterator[Finding]:
-    """Whether the times can be those of the scans."""
+    """Check that the times are plausible for the scans."""
     times = recording.times_s
     if times is None or len(times) < 2 or ascending_times_s(recording) is not None:
         return
@@ -86,7 +86,7 @@ def check_times(recording: Scans) -> Iterator[Finding]:
 
 
 def check_duplicates(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[Finding]:
-    """Whether scans, or the poses of different scans, are the same. `numbers` (F,): of the scans, for the user."""
+    """Check for duplicate scans, or poses shared by different scans. `numbers` (F,): of the scans, for messages."""
     first_of: dict[tuple[object, ...], int] = {}
     repeated = []
     for i, scan in enumerate(recording.points):
@@ -107,7 +107,7 @@ def check_duplicates(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[F
     lengths = _steps_m(recording)
     if len(recording) < 3 or not same_pose.any() or same_pose.all():
         return
-    # A sensor that stands still has such poses too. One whose poses are held catches up with a leap.
+    # A stationary sensor has equal poses too. One whose poses are held catches up with a leap.
     after = lengths[1:][same_pose[:-1] & ~same_pose[1:]]
     plain = lengths[1:][~same_pose[:-1] & ~same_pose[1:]]
     usual = float(np.median(plain)) if len(plain) >= _NEAR else float(np.median(lengths[~same_pose])) / 2
@@ -118,15 +118,15 @@ def check_duplicates(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[F
 
 
 def check_jumps(recording: Scans, numbers: NDArray[np.int64], effort: Effort = FULL) -> Iterator[Finding]:
-    """Where the trajectory jumps: a step far longer than those near it, without which the scans agree better.
+    """Find jumps: steps far longer than their neighbours, without which the scans agree better.
 
-    A recording that pauses while the sensor moves has long steps too; then the scans agree with them.
+    A recording that pauses while the sensor moves has long steps too, but the scans agree with them.
     """
     count, times = len(recording), ascending_times_s(recording)
     if count < 2 * _NEAR:
         return
     durations = np.ones(count - 1) if times is None else np.diff(times)
-    # Turns count as translations of the returns at a typical range.
+    # Rotations count as the displacement of returns at a typical range.
     motions, moved = steps(recording.poses), step_vectors(recording.poses)
     lever_m = np.repeat([1.0, median_range_m(some_points(recording))], 3)
     vectors = moved * lever_m / durations[:, None]
@@ -162,10 +162,10 @@ def _agree_without(
     motions: FloatArray,
     durations: FloatArray,
 ) -> bool:
-    """Whether the scans near a step agree clearly better if it is replaced by the motion of the steps near it.
+    """Whether the scans near a step agree clearly better if it is replaced by the motion of the neighbouring steps.
 
-    If that repairs the poses, the scans then agree about as well as those next to the step do. Without that condition,
-    scans that see different things would agree better wherever the replaced motion makes their fields of view overlap.
+    If that repairs the poses, the scans then agree about as well as those next to the step. Without this condition,
+    scans that observe different things would agree better wherever the replaced motion makes their fields of view overlap.
     """
     poses = recording.poses
     near = [k for k in range(jump - _NEAR, jump + 1 + _NEAR) if 0 <= k < len(motions) and k not in suspects]
@@ -185,7 +185,7 @@ def _agree_without(
         return False
     regular = [(i, j) for i, j in pairs if not any(i <= k < j for k in suspects)] or pairs
     usual = float(agreement.scores(np.array(regular), relative(poses, np.array(regular))[None]).mean())
-    # Either all is displaced from here on, or one pose is, and the step after takes it back.
+    # Either all poses from here on are displaced, or only one is, and the next step reverts it.
     across = [(i, j) for i, j in pairs if i <= jump < j]
     for chosen in (across, *([pair for pair in pairs if k in pair] for k in (jump, jump + 1))):
         if len(chosen) < 2:

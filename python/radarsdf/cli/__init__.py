@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: MIT
 """The command line: ``radarsdf COMMAND``.
 
-`commands` lists them, `app` runs one and prints its error, `options` and `results` are what several of them share; the other
-modules are the commands. They import PyTorch, NumPy and trimesh only while a command runs, so help is immediate.
+`commands` lists them, `app` runs one and prints its error, `options` and `results` are shared; the other modules are the
+commands. They import PyTorch, NumPy and trimesh only when a command runs, so help is immediate.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments
-        The words after ``radarsdf``. None: those of this process.
+        The words after ``radarsdf``. None: those of ``sys.argv``.
 
     Returns
     -------
     int
-        The exit status: 0 if the command succeeded, 1 if it failed or a check found an error, 2 if the command line is
+        The exit status: 0 on success, 1 if the command failed or a check found an error, 2 if the command line is
         wrong, 130 if Ctrl-C stopped it.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Runs one command, and prints its error: the one place where errors are printed."""
+"""Run one command and print its error: the only module that prints errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
 
 
 def refuse_if(wrong: object, message: str) -> None:
-    """Raise a :class:`UsageError` of this message if something is wrong."""
+    """Raise a :class:`UsageError` with this message if `wrong`."""
     if wrong:
         raise UsageError(message)
 
@@ -29,8 +29,8 @@ def warn(text: str) -> None:
 
 
 def run(words: list[str]) -> int:
-    """Run the command of these words, print its error, and return the exit status."""
-    # A character that a terminal lacks must not cost the work before it.
+    """Run the command line, print its error, and return the exit status."""
+    # A character that the terminal cannot encode must not discard the results so far.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
     try:
@@ -38,12 +38,12 @@ def run(words: list[str]) -> int:
     except UsageError as error:
         warn(f"error: {error}")
         return 2
-    except SystemExit:  # of --help
+    except SystemExit:  # raised by --help
         return 0
     except KeyboardInterrupt as stop:  # 130, as in shells: 128 and the number of the signal
         warn(f"error: {str(stop) or 'interrupted'}")
         return 130
-    except BrokenPipeError:  # the reader has gone; nothing is left for Python to flush at the end
+    except BrokenPipeError:  # the reader is gone; nothing is left for Python to flush at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except _ERRORS as error:
@@ -59,7 +59,7 @@ def _run(words: list[str]) -> int:
 
         print("radarsdf", radarsdf.__version__)
         return 0
-    refuse_if(name not in commands, f"there is no command {name!r:.50}; radarsdf --help lists all")
+    refuse_if(name not in commands, f"unknown command {name!r:.50}; radarsdf --help lists all")
     command = name
     if name == "tiles":
         if not words or words[0] in ("-h", "--help"):
@@ -81,14 +81,14 @@ def _run(words: list[str]) -> int:
 
 
 def message_of(error: Exception) -> str:
-    """An error in one line: of pydantic's, the first wrong setting; of the system's, the file and what is wrong with it."""
-    if type(error).__name__ == "ValidationError":  # whose module is imported only with the settings
+    """Format an error as one line: of pydantic's, the first wrong setting; of the system's, the file and the reason."""
+    if type(error).__name__ == "ValidationError":  # imported only with the settings
         from radarsdf.settings import first_wrong
 
         return first_wrong(error)  # type: ignore[arg-type]
     if isinstance(error, OSError) and error.strerror is not None:
         return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
-    # NumPy's message names an array of no use to users; our own messages are kept.
+    # NumPy's message describes an internal array; our own messages are kept.
     if isinstance(error, MemoryError) and (not str(error) or str(error).startswith("Unable to allocate")):
         return "there is not enough memory"
     return " ".join(str(error).split()) or type(error).__name__

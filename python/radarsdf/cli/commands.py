@@ -1,33 +1,33 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The commands: the module of each, its arguments, and its help in one line."""
+"""Table of commands: module, arguments, and one line of help."""
 
 from __future__ import annotations
 
 COMMANDS = {
     "Start here": {
         "demo": ("fits", "", "Simulate a drive, fit a map to it, and compare the map with the truth."),
-        "check": ("scans", "SCANS [POSES]", "Report what is wrong with scans and poses, before a fit."),
+        "check": ("scans", "SCANS [POSES]", "Find mistakes in scans and poses before a fit."),
         "fit": ("fits", "SCANS [POSES] -o MAP", "Fit a map to scans."),
         "mesh": ("maps", "MAP -o MESH", "Extract the surface of a map as a triangle mesh."),
     },
     "Poses, recordings and large maps": {
-        "poses": ("scans", "SCANS [POSES] -o POSES", "Refine the poses of scans by their returns, or find them from the radar alone."),
-        "live": ("live", "SCANS [POSES]", "Replay a recording into a map that grows, and report how it keeps up."),
-        "tiles": ("tiles", "SCANS [POSES] -o FOLDER", "Fit a map that does not fit into memory, in tiles, here or on a cluster."),
+        "poses": ("scans", "SCANS [POSES] -o POSES", "Refine the poses of scans, or estimate them from the radar alone."),
+        "live": ("live", "SCANS [POSES]", "Replay a recording into a growing map, and report whether it keeps up."),
+        "tiles": ("tiles", "SCANS [POSES] -o FOLDER", "Fit a map larger than memory in tiles, locally or on a cluster."),
     },
     "Uses of a map": {
-        "view": ("pages", "MAP [SCANS [POSES]]", "Show a map in the browser, with a sensor that can be dragged."),
+        "view": ("pages", "MAP [SCANS [POSES]]", "Show a map in the browser, with a draggable sensor."),
         "report": ("pages", "MAP [SCANS [POSES]] -o PAGE", "Write a page about a map: pictures, errors, plots, settings."),
         "eval": ("maps", "MAP|MESH TRUTH [POSES]", "Print the errors of a mesh or a map."),
         "render": ("maps", "MAP --pose X Y Z -o VIEW", "Predict the scan that the radar would get from other poses."),
-        "compare": ("uses", "MAP LATER [POSES]", "Report what appeared, is gone, moved or changed its reflectance between two maps."),
+        "compare": ("uses", "MAP LATER [POSES]", "Report what appeared, disappeared, moved or changed its reflectance."),
         "grid": ("uses", "MAP -o GRID", "Write occupied, free and unknown space for planners: OctoMap, map_server, costmap."),
     },
     "Files and settings": {
         "convert": ("scans", "SCANS [POSES] -o FILE", "Write scans as one file or one point cloud, or a mesh in another format."),
-        "config": ("settings", "", "Print every setting of a fit with its meaning, as a file for --config."),
-        "info": ("info", "[MAP]", "Print versions and threads, for bug reports, and what a map holds."),
+        "config": ("settings", "", "Print every setting of a fit with its meaning, as a TOML file for --config."),
+        "info": ("info", "[MAP]", "Print versions and threads for bug reports, and the contents of a map."),
     },
 }  # fmt: skip
 """Module, arguments and help of each command, by heading of the overview."""
@@ -36,18 +36,18 @@ TILE_STEPS = {
     "run": (
         "tiles",
         "SCANS [POSES] -o FOLDER",
-        "Plan, fit and mesh in one go; the word run may be left out.",
+        "Plan, fit and mesh in one go; run is the default step.",
     ),
     "plan": ("tiles", "SCANS [POSES] -o FOLDER", "Read the scans once, and write the rays of each tile."),
-    "fit": ("tiles", "FOLDER", "Fit the tiles of a plan; those that are done are kept."),
+    "fit": ("tiles", "FOLDER", "Fit the tiles of a plan; finished ones are kept."),
     "mesh": ("tiles", "FOLDER", "Write the surface of all tiles as one mesh."),
-    "status": ("tiles", "FOLDER", "Name the tiles that are not done, and why: exit status 1."),
+    "status": ("tiles", "FOLDER", "List unfinished tiles with the reasons; exit status 1 if there are any."),
 }
-"""The same of the steps of ``radarsdf tiles``."""
+"""Module, arguments and help of each step of ``radarsdf tiles``."""
 
 
 def overview() -> str:
-    """The help of ``radarsdf`` without a command."""
+    """Format the help of ``radarsdf`` without a command."""
     lines = [
         "Usage: radarsdf COMMAND [OPTIONS]...",
         "",
@@ -63,7 +63,7 @@ def overview() -> str:
 
 
 def steps() -> str:
-    """The help of ``radarsdf tiles``."""
+    """Format the help of ``radarsdf tiles``."""
     rows = [f"  {step:<9}{text}" for step, (_, _, text) in TILE_STEPS.items()]
     return "\n".join(
         [

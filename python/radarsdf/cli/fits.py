@@ -27,15 +27,15 @@ from radarsdf.report.page import require_extras
 from radarsdf.report.subject import Subject
 from radarsdf.view import serving
 
-# Options of the demo that it passes on.
+# Options of the demo that are passed on to its commands.
 _SHARED = ("paper", "quick", "config", "set", "voxel", *LIMITS)
 
 
 def fit(given: Namespace, results: Results) -> None:
-    """Fit a map, or estimate what the fit takes."""
+    """Fit a map, or estimate the cost of the fit."""
     out, report = given.out, given.report
     not_exactly_one = (out is None) != given.dry_run
-    refuse_if(not_exactly_one, "-o MAP writes the map, --dry-run only estimates: give one of them")
+    refuse_if(not_exactly_one, "-o MAP writes the map, --dry-run only estimates: give exactly one of them")
     refuse_if(out and out.suffix != MAP_SUFFIX, f"{out}: a map is written as {MAP_SUFFIX}")
     refuse_if(given.dry_run and report, f"--dry-run makes no map: leave out --report {report}")
     if report is not None:
@@ -83,20 +83,20 @@ def fit(given: Namespace, results: Results) -> None:
 
 
 def _add_fit(results: Results, radar_map: RadarMap) -> None:
-    """Add the counts of returns, the losses and the estimated noise of a fit."""
+    """Add the numbers of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
     names = ("scans", "returns", "returns_used", "moving", "ghosts", "intensity_outliers", "leaf_cells")
     used, moving, ghosts = report["returns_used"], report["moving"], report["ghosts"]
     left_out = {
-        "move by their Doppler": moving,
+        "move according to their Doppler": moving,
         "are ghosts": ghosts,
         "are invalid or out of range": report["returns"] - used - moving - ghosts,
     }
-    line = f"{used} of {report['returns']} returns in {report['scans']} scans make the surface"
+    line = f"{used} of {report['returns']} returns in {report['scans']} scans form the surface"
     line += "".join(f", {count} {why}" for why, count in left_out.items() if count)
     results.add(line, **{name: report[name] for name in names})
     if outliers := report["intensity_outliers"]:
-        results.add(f"{outliers} intensities are outliers, and are left out of the reflectance")
+        results.add(f"{outliers} intensities are outliers, left out of the reflectance")
     noise, losses = report["noise"], report["losses"]
     seconds = sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s")
     loss = "".join(f", {stage} loss {value:.3g}" for stage, value in losses.items())
@@ -110,10 +110,10 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
 
 
 def demo(given: Namespace, results: Results) -> None:
-    """Simulate, then run the commands that fit, mesh and evaluate, which are printed."""
+    """Simulate scans, then fit, mesh and evaluate them by commands, which are printed."""
     frames, out, view = given.frames, given.out, given.view
     refuse_if(frames is not None and frames < 2, f"--frames must be at least 2, not {frames}")
-    if view is None:  # only where somebody can see it, and end it by Ctrl-C
+    if view is None:  # only if somebody can see it and stop it with Ctrl-C
         in_terminal = sys.stdout is not None and sys.stdout.isatty() and not results.json
         view = in_terminal and serving.has_display() and serving.has_viser()
     elif view:

@@ -15,7 +15,7 @@ from radarsdf.cli.results import Results
 
 
 def versions() -> dict[str, str]:
-    """Version, compiler, instruction set and threads of each part, in words."""
+    """Version, compiler, instruction set and threads of each component."""
     openmp = _core.openmp_version()
     return {
         "radarsdf": _core.__version__,
@@ -28,7 +28,7 @@ def versions() -> dict[str, str]:
 
 
 def info(given: Namespace, results: Results) -> None:
-    """Print one row for each part."""
+    """Print one row per component."""
     rows: dict[str, Any] = {name.replace(" ", "_"): value for name, value in versions().items()}
     if given.map is not None:
         from radarsdf.cli.inputs import load_map

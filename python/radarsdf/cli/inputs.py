@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the arguments of a command stand for: scans, a configuration, a map."""
+"""Inputs of a command: scans, a configuration, a map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def is_map(path: Path) -> bool:
 
 
 def load_map(path: Path) -> Map:
-    """Load a map, and warn of tiles that are missing."""
+    """Load a map, with a warning if tiles are missing."""
     radar_map = load(path)
     if tiles := lacking(radar_map):
         warn(f"warning: {path} lacks {tiles}: radarsdf tiles status {path} lists the reasons")
@@ -36,7 +36,7 @@ def load_map(path: Path) -> Map:
 
 
 def read_scans(given: Namespace, poses: StampedPoses | None = None) -> Scans:
-    """The scans, with `poses` in place of theirs. What was assumed or left out is logged on standard error."""
+    """Read the scans, with `poses` instead of theirs if passed. Assumptions and omissions are logged on standard error."""
     fields = [text.partition("=") for text in given.field or ()]
     for role, _, name in fields:
         refuse_if(not (role and name), f"--field takes ROLE=NAME, not {role!r:.50}")
@@ -58,17 +58,17 @@ def read_scans(given: Namespace, poses: StampedPoses | None = None) -> Scans:
 
 
 def scans_or_unposed(given: Namespace, *, find: bool = False) -> tuple[Scans, bool]:
-    """Read scans, and whether their poses are to be estimated: with `find`, or where there are none."""
+    """Read scans; also return whether their poses must be estimated: with `find`, or if there are none."""
     if not find:
         try:
             return read_scans(given), False
         except NoPoses:
-            warn(f"note: {given.scans} has no poses: they are found from the radar alone")
+            warn(f"note: {given.scans} has no poses: they are estimated from the radar alone")
     return read_scans(given, UNPOSED), True
 
 
 def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:
-    """The scans of a fit, and those that ``--holdout`` leaves out."""
+    """Split scans into those to fit and those that ``--holdout`` leaves out."""
     if every is None:
         return scans, None
     train, test = holdout(len(scans.points), every)
@@ -82,11 +82,11 @@ def inputs_of(given: Namespace) -> list[Path]:
 
 
 def mesh_limits(given: Namespace) -> dict[str, Any]:
-    """What the mesh leaves out, as arguments of ``Map.mesh``."""
+    """Limits of the mesh, as arguments of ``Map.mesh``."""
     return {name: getattr(given, name) for name in LIMITS}
 
 
 def check_address(given: Namespace) -> None:
-    """Raises an ImportError if viser is missing, and an OSError if the address cannot be listened on."""
+    """Raise an ImportError if viser is missing, an OSError if the address is unusable."""
     require_viser()
     free_port(given.host, given.port)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf live``: a recording as if its scans were arriving now."""
+"""``radarsdf live``: replay a recording as if its scans arrived now."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _SHOWN_EVERY_S = 0.5
 
 @dataclass
 class Replay:
-    """Results of a replay: rows of the scans that were integrated, with their poses and seconds, and of the others."""
+    """Results of a replay: indices of integrated scans with their poses and seconds, and of the others."""
 
     rows: list[int] = field(default_factory=list)
     poses: list[NDArray[np.float64]] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     dropped: list[int] = field(default_factory=list)  # the map was not ready
-    lost: list[int] = field(default_factory=list)  # without a pose, they could not be tracked
+    lost: list[int] = field(default_factory=list)  # tracking failed for these scans without poses
 
 
 def replay(
@@ -48,9 +48,9 @@ def replay(
     rate: float = 1.0,
     on_scan: Callable[[Replay], None] | None = None,
 ) -> Replay:
-    """Integrates scans at `rate` times the recorded speed; 0: as fast as possible.
+    """Integrate scans at `rate` times the recorded speed; 0: as fast as possible.
 
-    A scan waits until the next one arrives, and is then dropped. `on_scan` is called after each.
+    A scan waits until the next one arrives, and is then dropped. `on_scan` is called after each scan.
     """
     done, count = Replay(), len(scans.points)
     times_s = scans.times_s if scans.times_s is not None else 0.1 * np.arange(count)
@@ -87,7 +87,7 @@ def replay(
 
 
 def live(given: Namespace, results: Results) -> None:
-    """Replay the scans, report how the map kept up, and write it."""
+    """Replay the scans, report whether the map kept up, and write it."""
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
     out, trajectory = given.out, given.trajectory
     if trajectory is not None:
@@ -97,7 +97,7 @@ def live(given: Namespace, results: Results) -> None:
         check_address(given)
     scans, unposed = scans_or_unposed(given, find=given.find)
     if unposed and scans.times_s is None:
-        msg = f"{given.scans}: scans without poses need times: when each was taken"
+        msg = f"{given.scans}: scans without poses need times, one per scan"
         raise ValueError(msg)
     if trajectory is not None:
         check_pose_times(trajectory, scans.times_s)
@@ -106,8 +106,8 @@ def live(given: Namespace, results: Results) -> None:
         shown = None
         if given.view:
             page = stack.enter_context(GrowingView(host=given.host, port=given.port))
-            results.add(f"the map grows on {url_of(page.host, page.port)}; Ctrl-C ends it")
-            shown = _Shown(growing, page)
+            results.add(f"live map on {url_of(page.host, page.port)}; Ctrl-C ends it")
+            shown = _PeriodicView(growing, page)
         done = replay(growing, scans, with_poses=not unposed, rate=given.rate, on_scan=shown)
         _add_rates(results, done, len(scans))
         if out is not None:
@@ -124,8 +124,8 @@ def live(given: Namespace, results: Results) -> None:
             until_stopped(page)
 
 
-class _Shown:
-    """Called after each scan, shows the surface from time to time, from a thread."""
+class _PeriodicView:
+    """Callback after each scan that updates the page periodically, in its own thread."""
 
     def __init__(self, live_map: LiveMap, page: GrowingView) -> None:
         self._map, self._page = live_map, page
@@ -139,14 +139,14 @@ class _Shown:
             self._thread.start()
 
     def show(self, poses: list[NDArray[np.float64]]) -> None:
-        """Show the surface now, and the path of these poses."""
+        """Show the current surface and the trajectory of these poses."""
         with self._lock:
             self._page.show(self._map.mesh(), np.array(poses)[:, :3, 3])
 
 
 def _add_rates(results: Results, done: Replay, scans: int) -> None:
     if not done.rows:
-        msg = "no scan came into the map"
+        msg = "no scan was integrated into the map"
         raise ValueError(msg)
     in_map, dropped, lost = len(done.rows), len(done.dropped), len(done.lost)
     line = f"{in_map} of {scans} scans in the map, {dropped} dropped, {lost} lost"
@@ -154,8 +154,8 @@ def _add_rates(results: Results, done: Replay, scans: int) -> None:
     hertz = in_map / max(sum(done.seconds), 1e-9)
     p50, p99, worst = np.percentile(done.seconds, [50, 99, 100])
     results.add(
-        f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99 of 100), {1e3 * worst:.1f} ms (worst): "
-        f"{hertz:.0f} scans a second",
+        f"a scan took {1e3 * p50:.1f} ms (median), {1e3 * p99:.1f} ms (99th percentile), {1e3 * worst:.1f} ms (worst): "
+        f"{hertz:.0f} scans per second",
         p50_s=p50,
         p99_s=p99,
         worst_s=worst,

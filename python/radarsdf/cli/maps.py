@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf mesh``, ``eval`` and ``render``: what a map shows, and how good it is."""
+"""``radarsdf mesh``, ``eval`` and ``render``: outputs of a map, and its errors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _MAX_PICTURES = 20
 
 
 def mesh(given: Namespace, results: Results) -> None:
-    """Extract the mesh, write it, draw it."""
+    """Extract the mesh, write it, and draw a picture if asked for."""
     out, drawing = given.out, given.picture
     check_mesh_path(out)
     check_outputs([out, drawing], [given.map])
@@ -91,14 +91,14 @@ def evaluate(given: Namespace, results: Results) -> None:
 
 
 def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: Scans) -> None:
-    """Add the intensity errors on scans that a fit left out, and those of a kNN baseline on the scans that it used."""
+    """Add the intensity errors on held-out scans, and those of a kNN baseline fitted to the other scans."""
     if not radar_map.has_intensity or test.intensities is None:
         return
     every_ray, known = (rays_as_measured(scans, radar_map.config) for scans in (test, train))
     tested, known = (rays.select(rays.with_intensity) for rays in (every_ray, known))
     inside, found = predicted(radar_map, tested)
     left_out = len(every_ray) - len(inside)
-    line = f"{left_out} of {len(every_ray)} held-out returns are outliers or in no tile, and are not compared"
+    line = f"{left_out} of {len(every_ray)} held-out returns are skipped: outliers, or in no tile"
     results.add(line if left_out else None, not_compared=left_out)
     (x, sensors), measured = inside.in_world(), inside.intensities
     assert measured is not None
@@ -114,13 +114,13 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
 
 
 def _holds_scans(path: Path) -> bool:
-    """Whether the truth is scans, and not a file of points or a surface."""
+    """Whether the ground truth is scans rather than points or a surface."""
     has_poses = path.suffix.lower() == ".npz" and bool(arrays_of(path, ["poses"]))
     return path.is_dir() or is_bag(path) or has_poses
 
 
 def render(given: Namespace, results: Results) -> None:
-    """Predict the scans, and write them."""
+    """Predict scans and write them."""
     out, suffix = given.out, given.out.suffix.lower()
     refuse_if(suffix not in _VIEW_SUFFIXES, f"{out}: a view can be written as {', '.join(_VIEW_SUFFIXES)}")
     refuse_if(given.seed < 0, f"--seed must be at least 0, not {given.seed}")
@@ -135,10 +135,10 @@ def render(given: Namespace, results: Results) -> None:
         radar_map.render(T, returns=given.returns, noise=given.noise, seed=rng) for T in poses
     )
     if suffix == ".png":
-        views = list(views)  # a picture shows all of a view; of others, the returns are kept alone
+        views = list(views)  # a picture shows the whole view; other formats need only the returns
     scans = scans_of_views(view for view in views if len(view))
     if not len(scans):
-        msg = f"{given.map} has no surface that the sensor sees from there: nothing written"
+        msg = f"{given.map} has no surface visible from there: nothing written"
         raise ValueError(msg)
     if suffix == ".npz":
         write_scans(out, scans)
@@ -151,7 +151,7 @@ def render(given: Namespace, results: Results) -> None:
 
 
 def _poses(words: list[str]) -> NDArray[np.float64]:
-    """T_world_sensor (F, 4, 4) of one ``--pose``: numbers, or the name of a file."""
+    """T_world_sensor (F, 4, 4) from one ``--pose``: numbers, or the name of a file."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The arguments and options of the commands: tables, here and not next to the commands, so that help imports none of these."""
+"""Arguments and options of all commands, as tables apart from the commands, so that help imports none of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class UsageError(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """Parses the words after a command, or a step of ``radarsdf tiles`` such as ``tiles fit``."""
+    """Parser of the arguments of a command, or of a step such as ``tiles fit``."""
 
     def __init__(self, command: str, usage: str = "", text: str = "") -> None:
         super().__init__(f"radarsdf {command}", usage or None, text, allow_abbrev=False)
@@ -40,7 +40,7 @@ def _add(group: Any, command: str, name: str) -> None:
 
 
 class _Corners(argparse.Action):
-    """The lower and the upper corner of six numbers."""
+    """Stores six numbers as a lower and an upper corner."""
 
     def __call__(self, _parser: Any, namespace: Any, values: Any, _option: Any = None) -> None:
         setattr(namespace, self.dest, [values[:3], values[3:]])
@@ -83,7 +83,7 @@ LIMITS = (
     "min_confidence",
     "max_uncertainty",
     "min_component_triangles",
-)  # of "surface", arguments of Map.mesh
+)  # options of "surface" that are arguments of Map.mesh
 
 _Kind = dict[str, Any]
 _FLAG: _Kind = {"action": "store_true"}
@@ -100,98 +100,98 @@ _POINT: _Kind = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z")}
 _BOX: _Kind = {"type": float, "nargs": 6, "action": _Corners, "metavar": ("X0", "Y0", "Z0", "X1", "Y1", "Z1")}
 
 # fmt: off
-OPTIONS: dict[str, tuple[_Kind, str]] = {  # of all commands, or of one: "fit -o"
+OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option: "fit -o"
     "map": (_PATH, "the map: .safetensors of radarsdf fit, or the folder of radarsdf tiles"),
-    "info map": (_MAYBE, "also report what is in this map"),
+    "info map": (_MAYBE, "also report the contents of this map"),
     "what": (_PATH, "a mesh, or a map"),
-    "folder": (_PATH, "the folder that radarsdf tiles plan wrote"),
+    "folder": (_PATH, "the folder written by radarsdf tiles plan"),
 
     "scans": (_PATH, "the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"),
     "view scans": (_MAYBE, "scans to browse, as for radarsdf fit"),
     "report scans": (_MAYBE, "the scans of the map, as for radarsdf fit"),
-    "eval scans": (_PATH, ("the truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
+    "eval scans": (_PATH, ("the ground truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
                    "(.ply, .obj, .off, .stl, .glb), or scans as for radarsdf fit, with lidar points or with --holdout")),
     "compare scans": (_PATH, "the later map, or later scans, as for radarsdf fit"),
     "convert scans": (_PATH, "the scans, as for radarsdf fit; or a mesh: .ply, .obj, .off, .stl, .glb"),
-    "poses": (_MAYBE, "their poses, if they have none: TUM, KITTI, 4 x 4 matrices"),
-    "--extrinsic": (_FILE, "T_base_sensor, 4 x 4, if the poses are those of another frame"),
+    "poses": (_MAYBE, "file of poses, if the scans have none: TUM, KITTI, 4 x 4 matrices"),
+    "--extrinsic": (_FILE, "T_base_sensor, 4 x 4, if the poses are those of another frame than the sensor's"),
     "--topic": (_NAMES, "in a bag: the topic of the scans; may be repeated"),
     "--pose-topic": (_NAME, "in a bag: the topic of the poses"),
-    "--imu-topic": (_NAME, "in a bag: the topic of the IMU, for poses that are found"),
-    "--imu-rotation": (_FILE, "R_sensor_imu, 3 x 3; default: of the bag, or found"),
-    "--field": (_NAMES | {"metavar": "ROLE=NAME"}, "which field holds x, y, z, intensity or doppler; may be repeated"),
-    "--columns": (_NAME, "in files without a header: how many, or their names, such as x,y,z,intensity,doppler"),
+    "--imu-topic": (_NAME, "in a bag: the topic of the IMU, used to estimate poses"),
+    "--imu-rotation": (_FILE, "R_sensor_imu, 3 x 3; default: from the bag, or estimated"),
+    "--field": (_NAMES | {"metavar": "ROLE=NAME"}, "field for a role: x, y, z, intensity or doppler; may be repeated"),
+    "--columns": (_NAME, "in files without a header: number of columns, or their names, such as x,y,z,intensity,doppler"),
     "--max-gap": (_FLOAT | {"metavar": "S", "default": 0.5}, "longest gap between poses to interpolate; default: 0.5 s"),
-    "--world-frame": (_NAME, "in a bag with TF: the frame of the world"),
-    "--stamps": ({"choices": ("header", "record")}, "in a bag: whether a scan has the time of its header or record"),
+    "--world-frame": (_NAME, "in a bag with TF: the world frame"),
+    "--stamps": ({"choices": ("header", "record")}, "in a bag: clock of the scans"),
 
     "fit -o": (_FILE, "the map to write, .safetensors"),
-    "live -o": (_FILE, "the map to write in the end, .safetensors"),
+    "live -o": (_FILE, "the map to write at the end, .safetensors"),
     "mesh -o": (_OUT, "the mesh to write: .ply, .obj, .stl, .glb"),
     "poses -o": (_OUT, "the poses to write: .tum (with times), .kitti, .npy; or .npz: the scans with these poses"),
     "report -o": (_OUT, "the page to write, .html"),
-    "render -o": (_OUT, ".npz, scans as radarsdf fit takes them; .ply, points in the world frame; .png, a picture"),
-    "compare -o": (_FILE, "a mesh in colours to write, such as changes.ply"),
+    "render -o": (_OUT, ".npz, scans for radarsdf fit; .ply, points in the world frame; .png, a picture"),
+    "compare -o": (_FILE, "coloured mesh to write, such as changes.ply"),
     "grid -o": (_OUT | {"action": "append"}, ("a file to write, may be repeated: .npz with all arrays, .bt for OctoMap, "
                 ".yaml and .pgm for ROS's map_server")),
     "convert -o": (_OUT, (".npz: the scans with their poses; .ply, .pcd, .las, .laz, .npy, .csv: all returns in the world "
-                   "frame, with intensity, doppler, number and time of the scan; of a mesh, a mesh")),
+                   "frame, with intensity, doppler, index and time of the scan; or a mesh")),
     "demo -o": (_FILE | {"default": Path("radarsdf_demo")}, "the folder to write; default: radarsdf_demo"),
-    "tiles mesh -o": (_FILE, "one file, or a .json file for 3D Tiles; default: mesh.ply in the folder"),
+    "tiles mesh -o": (_FILE, "mesh to write; .json for 3D Tiles; default: mesh.ply in the folder"),
     "-o": (_OUT, "the folder to write"),
 
-    "--quiet": (_FLAG, "show no progress bar"),
-    "--json": (_FLAG, "print the results as one JSON object, lengths in m; all else goes to standard error"),
-    "--paper": (_FLAG, "use the published configuration: slower, for comparison"),
+    "--quiet": (_FLAG, "hide progress bars"),
+    "--json": (_FLAG, "print the results as one JSON object, lengths in m; everything else goes to standard error"),
+    "--paper": (_FLAG, "use the published settings: slower, for comparison"),
     "--quick": (_FLAG, "average distances instead of training: under a second, no free space; mesh with --voxel 0.2"),
-    "--config": (_FILE, "change the settings in this TOML file; radarsdf config prints all"),
+    "--config": (_FILE, "read settings from this TOML file; radarsdf config prints all of them"),
     "--set": (_NAMES | {"metavar": "NAME=VALUE"}, "change a setting, such as training.sdf_iterations=200; may be repeated"),
     "--voxel": (_FLOAT | {"default": 0.1}, "edge length of a voxel; default: 0.1 m"),
     "grid --voxel": (_FLOAT | {"default": 0.2}, "edge length of a voxel; default: 0.2 m"),
     "--min-confidence": (_FLOAT | {"metavar": "P"},
-                         "leave out surface below this, 0 to 1; default: that of the highest expected F-score"),
+                         "leave out surface below this, 0 to 1; default: maximises the expected F-score"),
     "--max-uncertainty": (_FLOAT, "leave out surface with a standard error above this"),
-    "--min-component": (_COUNT | {"dest": "min_component_triangles"}, "leave out components of fewer triangles; default: 30, and fewer in large voxels"),
+    "--min-component": (_COUNT | {"dest": "min_component_triangles"}, "leave out smaller components, in triangles; default: 30, fewer for large voxels"),
     "--host": ({"default": "127.0.0.1"}, ("address to listen on; default: 127.0.0.1, this machine alone; with 0.0.0.0, "
-               "everyone who can reach this machine sees the map")),
-    "--port": ({"type": int}, "port to listen on; default: 8080, or the next that is free"),
+               "anyone who can reach this machine sees the map")),
+    "--port": ({"type": int}, "port to listen on; default: 8080, or the next free one"),
     "--box": (_BOX, "use only the part between these two corners: lower, upper, world frame, m"),
-    "--holdout": (_COUNT, "compare intensities with the scans that radarsdf fit --holdout N left out"),
-    "fit --holdout": (_COUNT, "leave out the first scan and then every N-th scan, for radarsdf eval --holdout N"),
-    "--refine": (_FLAG, "refine the poses by the returns first; radarsdf poses writes refined poses"),
+    "--holdout": (_COUNT, "compare intensities with the scans left out by radarsdf fit --holdout N"),
+    "fit --holdout": (_COUNT, "leave out the first and then every N-th scan, for radarsdf eval --holdout N"),
+    "--refine": (_FLAG, "refine the poses first; radarsdf poses writes refined poses"),
     "--geometry-only": (_FLAG, "do not use the intensities"),
-    "--no-check": (_FLAG, "do not refuse scans in which radarsdf check would find an error"),
+    "--no-check": (_FLAG, "fit even if radarsdf check would find an error"),
 
-    "--scene": ({"choices": ("hugin", "oculii", "wall", "astyx"), "default": "hugin"}, "the radar and the place"),
+    "--scene": ({"choices": ("hugin", "oculii", "wall", "astyx"), "default": "hugin"}, "radar and scene"),
     "--frames": (_COUNT, "number of scans; default: depends on the scene"),
-    "demo --view": (_SWITCH, "show the map in the browser at the end; default: in a terminal of a machine with a screen"),
+    "demo --view": (_SWITCH, "show the map in the browser at the end; default: in a terminal with a display"),
     "--view": (_FLAG, "show the result in the browser, until Ctrl-C"),
     "--dry-run": (_FLAG, "only estimate memory and time"),
-    "--checkpoint": (_FILE, "save the state of the fit here from time to time, and continue from it"),
+    "--checkpoint": (_FILE, "save the state of the fit here periodically, and resume from it"),
     "--report": (_FILE, "also write a page, .html: pictures, errors, plots"),
-    "--viewpoint": (_POINT, "colour the mesh by the intensity seen from here, world frame, m"),
+    "--viewpoint": (_POINT, "colour the mesh by the intensity seen from this position, world frame, m"),
     "--picture": (_FILE, "also draw a picture, .png"),
-    "--find": (_FLAG, "do not use the poses of the scans: find them from returns and Doppler"),
-    "--trajectory": (_FILE, "also write where the scans were placed: .tum, .kitti or .npy"),
+    "--find": (_FLAG, "ignore the poses of the scans: estimate them from returns and Doppler"),
+    "--trajectory": (_FILE, "also write the trajectory of the scans: .tum, .kitti or .npy"),
     "--rate": ({"type": float, "default": 1.0},
-               "multiplies the recorded speed, which is 0.1 s a scan without times; 0: as fast as possible"),
-    "--open": (_SWITCH, "open the page in a browser here; default: if there is a screen"),
+               "factor on the recorded speed, or on 0.1 s per scan without times; 0: as fast as possible"),
+    "--open": (_SWITCH, "open the page in a local browser; default: if there is a display"),
     "--samples": (_COUNT | {"default": 10_000_000}, "points sampled on the mesh; default: 10000000"),
-    "--pose": ({"nargs": "+", "action": "append", "required": True, "metavar": "P"}, ("where the sensor is, world frame: "
+    "--pose": ({"nargs": "+", "action": "append", "required": True, "metavar": "P"}, ("pose of the sensor, world frame: "
                "x y z, m, or x y z qx qy qz qw, or a file of poses as for radarsdf fit; may be repeated")),
-    "--returns": (_FLOAT | {"metavar": "N"}, "number of returns in a scan; default: that of the map's sensor"),
+    "--returns": (_FLOAT | {"metavar": "N"}, "returns per scan; default: as the map's sensor"),
     "--noise": (_FLAG, "add the noise of the sensor"),
     "--seed": (_COUNT | {"default": 0}, "seed of the noise"),
-    "--align": (_SWITCH | {"default": True}, "move the later map if its surface is then nearer to the earlier one"),
-    "--min-area": (_FLOAT | {"metavar": "M2", "default": 0.1}, "smallest region that is listed; default: 0.1 m2"),
+    "--align": (_SWITCH | {"default": True}, "align the later map if this brings its surface nearer to the earlier one"),
+    "--min-area": (_FLOAT | {"metavar": "M2", "default": 0.1}, "smallest region to list; default: 0.1 m2"),
     "--heights": ({"type": float, "nargs": 2, "default": (0.3, 2.0), "metavar": ("LOW", "HIGH")},
                   "range of heights above the ground that the .yaml map covers, m; default: 0.3 2.0"),
     "--distances": (_FILE, "also write the Euclidean distance field of the grid, as .npz"),
-    "--costmap": (_FILE, "also write heights, slopes, steps and costs for wheels, as .npz"),
+    "--costmap": (_FILE, "also write heights, slopes, steps and traversal costs, as .npz"),
     "--tile-size": (_FLOAT, "edge of a tile; default: 512 leaf cells"),
-    "--halo": (_FLOAT, "margin around a tile that its fit sees"),
+    "--halo": (_FLOAT, "margin of returns around a tile that are fitted, too"),
     "--tile": (_NAMES, "only the tile of this name; may be repeated"),
     "--processes": (_COUNT, "worker processes; each fits one tile at a time"),
-    "--cluster": ({"metavar": "ADDRESS"}, "of dask.distributed's scheduler, such as tcp://host:8786"),
+    "--cluster": ({"metavar": "ADDRESS"}, "address of the dask.distributed scheduler, such as tcp://host:8786"),
 }
 # fmt: on

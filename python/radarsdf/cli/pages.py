@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf view`` and ``report``: a map as a page."""
+"""``radarsdf view`` and ``report``: a map as a web page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from radarsdf.view.viewer import Viewer
 
 
 def view(given: Namespace, results: Results) -> None:
-    """Serve the page until Ctrl-C, and print its address."""
+    """Serve the page until Ctrl-C, after printing its address."""
     check_address(given)
     radar_map = load_map(given.map)
     with Viewer(

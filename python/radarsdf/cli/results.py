@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What commands print, as lines and tables for people or one JSON object for programs."""
+"""Output of commands: lines and tables for people, or one JSON object for programs."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # a page of help, or of settings, needs no PyTorch
+if TYPE_CHECKING:  # pages of help or settings need no PyTorch
     from radarsdf.map.threshold import Threshold
     from radarsdf.view.serving import Page
 
 
 class Results:
-    """Prints what a command has found; with ``--json``, nothing before :meth:`end`."""
+    """Prints the results of a command; with ``--json``, nothing before :meth:`end`."""
 
     def __init__(self, quiet: bool = False, json: bool = False) -> None:
-        self.progress = False if quiet else None  # of the library's functions
+        self.progress = False if quiet else None  # argument of the library's functions
         self.json = json
         self._values: dict[str, Any] = {}
         self._ended = False
 
     def add(self, line: str | None = None, **values: Any) -> None:
-        """Print a line for people, and keep the same numbers for programs by name; lengths in m, times in s."""
+        """Print a line for people, and keep its values for programs by name; lengths in m, times in s."""
         if line is not None and not self.json:
             print(line, flush=True)
         self._values |= values
 
     def table(self, rows: Iterable[Sequence[str]]) -> None:
-        """Print rows for people."""
+        """Print aligned rows for people."""
         rows = list(rows)
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         for row in rows:
@@ -39,22 +39,22 @@ class Results:
             self.add("  ".join(cells).rstrip())
 
     def add_threshold(self, threshold: Threshold) -> None:
-        """Add the confidence from which on a mesh was kept, and what that costs."""
+        """Add the confidence threshold of a mesh and its expected effect."""
         self.add(str(threshold), **threshold.metadata)
 
     def add_file(self, what: str, path: Path, **values: Any) -> None:
-        """Add what was written to a file."""
+        """Add a line on a written file."""
         self.add(f"{what} written to {path}", out=path, **values)
 
     def end(self) -> None:
-        """Print the object, if it is for programs, once. A number that is not finite is null."""
+        """Print the JSON object, if there is one. Non-finite numbers become null."""
         if self.json and not self._ended:
             self._ended = True
             print(json.dumps(_plain(self._values), indent=2, allow_nan=False), flush=True)
 
 
 def _plain(value: Any) -> Any:
-    """The same in types that JSON has."""
+    """Convert a value to types of JSON."""
     if hasattr(value, "tolist"):  # an array or a number of NumPy
         value = value.tolist()
     if isinstance(value, dict):
@@ -67,7 +67,7 @@ def _plain(value: Any) -> Any:
 
 
 def until_stopped(page: Page) -> None:
-    """Serve a page until Ctrl-C, which is the way to end it and no failure."""
+    """Serve a page until Ctrl-C, which is the normal end and not a failure."""
     try:
         page.wait()
     except KeyboardInterrupt:

@@ -31,7 +31,7 @@ from radarsdf.scans import Scans
 
 
 def check(given: Namespace, results: Results) -> int:
-    """Print the findings, the worst first. The status is 1 if one is an error."""
+    """Print the findings, worst first, and return status 1 if one is an error."""
     findings = radarsdf.check(read_scans(given), config=load_config(given))
     for finding in findings:
         results.add(str(finding))
@@ -40,7 +40,7 @@ def check(given: Namespace, results: Results) -> int:
 
 
 def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None:
-    """Print the warnings of the cheap checks before a fit. Raises a ValueError if a map of the scans would be nonsense."""
+    """Print warnings of the cheap checks before a fit. Raises a ValueError if a map of the scans would be nonsense."""
     for finding in check_cheaply(scans.points, scans.poses, intensities):
         if finding.severity == "error":
             msg = f"{finding.name}: {finding.evidence} {finding.fix} --no-check fits the scans as they are"
@@ -50,7 +50,7 @@ def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None
 
 
 def poses(given: Namespace, results: Results) -> None:
-    """Refine the poses of the scans, or find them, and write them."""
+    """Refine or estimate the poses of the scans, and write them."""
     out, picture = given.out, given.picture
     refuse_if(given.find and given.poses, f"--find does not use poses: leave out {given.poses}")
 
@@ -67,7 +67,7 @@ def poses(given: Namespace, results: Results) -> None:
     if as_scans:
         write_scans(out, scans)
     elif posed.segments > 1 and out.suffix.lower() != ".tum":
-        msg = f"there are {posed.segments} segments, and {out} would not say which scans have poses: write .tum or .npz"
+        msg = f"there are {posed.segments} segments, but {out} cannot tell which scans have poses: write .tum or .npz"
         raise ValueError(msg)
     else:
         write_poses(out, scans.poses, scans.times_s)
@@ -90,7 +90,7 @@ def posed_scans(
 ) -> tuple[Scans, PosedScans]:
     """Read scans; estimate their poses with `find` or if there are none, or `refine` them.
 
-    Of a trajectory in several segments, the scans of the longest are returned. `times_for`: a file of poses to be written.
+    Of a trajectory in several segments, the scans of the longest one are returned. `times_for`: the file of poses to write.
     """
     scans, unposed = scans_or_unposed(given, find=find)
     if times_for is not None:
@@ -116,7 +116,7 @@ def posed_scans(
 
 
 def add_segments(results: Results, posed: PosedScans) -> None:
-    """Add which segment of a trajectory is used, and print what was not used to find it."""
+    """Report which segment of a trajectory is used, and what its estimate ignored."""
     for note in posed.notes:
         warn(f"note: {note}")
     if posed.segments > 1:
@@ -124,7 +124,7 @@ def add_segments(results: Results, posed: PosedScans) -> None:
 
 
 def convert(given: Namespace, results: Results) -> None:
-    """Read, and write in the format of the output's suffix."""
+    """Read the input and write it in the format of the output's suffix."""
     out, folder = given.out, given.scans.resolve()
     check_outputs([out], inputs_of(given))
     if given.poses is None and holds_mesh(given.scans):
@@ -137,7 +137,7 @@ def convert(given: Namespace, results: Results) -> None:
     if suffix != ".npz":
         check_cloud_path(out)
     if suffix in CLOUD_SUFFIXES and folder.is_dir() and folder in out.resolve().parents:
-        msg = f"{out} lies in the folder of the scans, and would be read as one of them: write it elsewhere"
+        msg = f"{out} lies in the folder of the scans, where it would be read as one of them: write it elsewhere"
         raise ValueError(msg)
     scans = read_scans(given)
     if suffix == ".npz":

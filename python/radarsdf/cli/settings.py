@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf config``, and the configuration of other commands."""
+"""``radarsdf config``, and the settings of other commands."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from radarsdf.config.toml import read_toml, to_toml
 
 
 def config(given: Namespace, results: Results) -> None:
-    """Print the configuration as TOML."""
+    """Print the settings as TOML."""
     results.add(to_toml(load_config(given)).rstrip("\n"))
 
 
 def load_config(given: Namespace) -> FitConfig:
-    """The configuration: a preset, then the changes of a file, then single ones."""
+    """Build the configuration: a preset, then the settings of a file, then single settings."""
     refuse_if(given.paper and given.quick, "--paper and --quick are two presets: leave out one of them")
     config = FitConfig.paper() if given.paper else FitConfig.quick() if given.quick else FitConfig()
     if given.config is not None:
@@ -31,7 +31,7 @@ def load_config(given: Namespace) -> FitConfig:
 
 
 def _setting_of(text: str) -> dict[str, Any]:
-    """One ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
+    """Parse one ``NAME=VALUE`` or ``GROUP.NAME=VALUE``. A value that is not a Python literal, such as octree, is a string."""
     path, equals, value = text.partition("=")
     refuse_if(not equals, f"--set takes NAME=VALUE, not {text!r:.50}")
     group, dot, name = path.partition(".")

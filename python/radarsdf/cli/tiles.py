@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf tiles``: large maps in tiles, here or on a cluster."""
+"""``radarsdf tiles``: large maps in tiles, locally or on a cluster."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from radarsdf.tiles.mesh import voxels_along
 from radarsdf.tiles.plan import Plan, failure_of, is_done
 from radarsdf.tiles.tiled_map import TiledMap
 
-_FIRST_SCANS = 100  # that are checked before the work
+_FIRST_SCANS = 100  # checked before the work
 
 
 def run(given: Namespace, results: Results) -> int:
     """Plan, fit and mesh in one go."""
-    voxels_along(load_config(given).leaf_size_m, given.voxel)  # or an error before the work
+    voxels_along(load_config(given).leaf_size_m, given.voxel)  # raises before the work
     plan(given, results)
     in_folder = Namespace(**vars(given) | {"folder": given.out, "tile": None, "out": None})
     missing = fit(in_folder, results)
@@ -38,11 +38,11 @@ def run(given: Namespace, results: Results) -> int:
 
 
 def plan(given: Namespace, results: Results) -> None:
-    """Read the scans once, and write to a file for each tile the rays that cross it."""
+    """Read the scans once, and write the rays that cross each tile to its file."""
     _check_where(given)
     config = load_config(given)
     scans = read_scans(given)
-    if not given.no_check:  # a city of wrong poses would take hours
+    if not given.no_check:  # with wrong poses, a city would waste hours
         first = list(itertools.islice(iter(scans), _FIRST_SCANS))
         if len(first) > 1:
             some = scans_in_memory(first)
@@ -91,13 +91,13 @@ def _check_where(given: Namespace) -> None:
 
 
 def _executor(given: Namespace) -> AbstractContextManager[Executor | None]:
-    """What runs the tasks. None: this process."""
+    """Executor of the tasks. None: this process."""
     _check_where(given)
     if given.cluster is not None:
         memory_bytes = max(tile.memory_bytes for tile in Plan.load(given.folder).tiles)
         return cluster_executor(given.cluster, memory_bytes)
     if given.processes is not None:
-        # Not forked: a forked child has only one of the threads of PyTorch and OpenMP.
+        # Not forked: a forked child lacks all threads of PyTorch and OpenMP but one.
         return ProcessPoolExecutor(given.processes, multiprocessing.get_context("spawn"))
     return nullcontext()
 
@@ -122,7 +122,7 @@ def mesh(given: Namespace, results: Results) -> None:
 
 
 def status(given: Namespace, results: Results) -> int:
-    """Name the tiles that are not done, and why."""
+    """List the unfinished tiles with the reasons."""
     plan = Plan.load(given.folder)
     tiles = [tile for tile in plan.tiles if given.tile is None or tile.name in given.tile]
     undone = [tile for tile in tiles if not is_done(given.folder, plan, tile)]

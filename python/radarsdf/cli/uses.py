@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf compare`` and ``grid``: changes between two maps, and space for planners."""
+"""``radarsdf compare`` and ``grid``: changes between two maps, and occupancy for planners."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from radarsdf.report.page import require_extras
 from radarsdf.view.pages import ChangesView
 from radarsdf.view.serving import url_of
 
-_LISTED = 10  # regions, the largest first
+_LISTED = 10  # regions, largest first
 
 
 def compare(given: Namespace, results: Results) -> None:
-    """Compare, write the surfaces, report what changed."""
+    """Compare two maps, write coloured surfaces, report changes."""
     out, report = given.out, given.report
     if out is not None:
         check_mesh_path(out)
@@ -65,12 +65,12 @@ def compare(given: Namespace, results: Results) -> None:
     if given.view:
         results.end()
         with ChangesView(changes, regions, edge_m, host=given.host, port=given.port) as page:
-            print(f"what changed is on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
+            print(f"changes on {url_of(page.host, page.port)}; Ctrl-C ends it", flush=True)
             until_stopped(page)
 
 
 def grid(given: Namespace, results: Results) -> None:
-    """Make the grid, write its files, draw it."""
+    """Build the grid, write its files, and draw a picture if asked for."""
     out, heights = given.out, given.heights
     flat = [path for path in out if path.suffix == ".yaml"]
     for path in out:

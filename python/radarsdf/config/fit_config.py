@@ -20,7 +20,7 @@ from radarsdf.config.groups import (
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
 
-# Edge of a block, leaf cells: a multiple of that of the cubes of visibility counts, and of the coarsest cells.
+# Edge of a block, leaf cells: a multiple of the edges of a visibility cube and of the coarsest cells.
 LATTICE_BLOCK_CELLS = 32
 _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS + 1 of them
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
@@ -89,16 +89,16 @@ class FitConfig:
     leaf_size_m: _Length = 0.2
     """Edge of a leaf cell, m (3QFPI: 0.2). It is the unit of all settings in `_cells`."""
     effort: Annotated[float, Field(gt=0, le=1000)] = 1.0
-    """Multiplies the iterations that follow from the size of the data. 0.5 takes about half the time."""
+    """Factor on the number of iterations, which follows from the size of the data. 0.5 takes about half the time."""
     seed: Annotated[int, Field(ge=0, le=_MAX_SEED)] = 0
     """Seed of all random numbers of the fit. The same seed and data give the same bits, see :func:`radarsdf.fit`."""
     num_threads: Annotated[int, Field(ge=0, le=MAX_THREADS)] = 0
-    """Threads of the fit. 0: as many as PyTorch uses."""
+    """Number of threads. 0: as many as PyTorch uses."""
     max_memory_bytes: Annotated[int, Field(ge=1, lt=2**63)] | None = None
-    """A fit or mesh that takes more is refused with a MemoryError, bytes. None: what the system has left."""
+    """Memory limit, bytes; a fit or mesh that needs more raises a MemoryError. None: what the system has available."""
     train: bool = True
-    """Whether a field is trained (stage 2). Otherwise the surface is the smoothed average of the rays (stage 1), intensities
-    are in closed form, and of the groups only `returns` (but for `onto_planes`) and `encoding.bridge_cells` count."""
+    """Whether to train a field (stage 2). If not, the surface is the smoothed average of the rays (stage 1), intensities
+    come from the closed-form model, and of the groups only `returns` (except `onto_planes`) and `encoding.bridge_cells` apply."""
     returns: Annotated[ReturnsConfig, BeforeValidator(_from_mapping(ReturnsConfig))] = ReturnsConfig()
     """Which returns are used, and how they are cleaned."""
     encoding: Annotated[EncodingConfig, BeforeValidator(_from_mapping(EncodingConfig))] = EncodingConfig()
@@ -126,17 +126,17 @@ class FitConfig:
         ) -> None: ...
 
     def metres(self, cells: float) -> float:
-        """A length in leaf cells, m."""
+        """Convert a length in leaf cells to m."""
         return float(f"{cells * self.leaf_size_m:.12g}")  # 1.5 · 0.2 gives 0.3, not 0.30000000000000004
 
     @property
     def sigma_m(self) -> float:
-        """`training.sigma_cells`, m."""
+        """`training.sigma_cells` in m."""
         return self.metres(self.training.sigma_cells)
 
     @property
     def lattice(self) -> WorldLattice:
-        """Where cells lie in the world, from leaf cells to the coarsest."""
+        """The lattice of all cells, from leaf cells to the coarsest."""
         return WorldLattice(self.leaf_size_m, LATTICE_BLOCK_CELLS)
 
     @property
@@ -147,18 +147,18 @@ class FitConfig:
 
     @property
     def trains_intensity(self) -> bool:
-        """Whether intensities, where there are any, train a network."""
+        """Whether a network is trained on intensities, if there are any."""
         return self.train and self.networks.reflectance != "closed-form"
 
     @property
     def closes_intensity(self) -> bool:
-        """Whether intensities, or what a network leaves of them, are in closed form."""
+        """Whether intensities, or the residuals of a network, are fitted in closed form."""
         return not self.train or self.networks.reflectance != "network"
 
     def moves_rows(self, with_intensity: bool) -> bool:
-        """Whether an iteration changes only the features that its samples use."""
-        # Normals are gradients of the features, which only autograd differentiates again, for all features at
-        # once.
+        """Whether an iteration updates only the features that its samples use."""
+        # Normals are gradients of the features: only autograd differentiates them again, and it updates all
+        # features at once.
         through_normals = with_intensity and self.networks.normals
         return self.training.optimiser == "soap" and not through_normals
 
@@ -166,13 +166,13 @@ class FitConfig:
     def quick(cls, **changes: Any) -> FitConfig:
         """Return the settings for stage 1 only: distances averaged over the rays and smoothed, not trained.
 
-        The fit takes a fraction of the time; the file of the map is larger. Intensities are in closed form. Mesh the map with
-        voxels of a leaf cell's size: smaller ones show no more detail.
+        The fit takes a fraction of the time; the map's file is larger. Intensities are fitted in closed form. Mesh the map with
+        voxels of the size of a leaf cell: smaller ones show no more detail.
 
         Parameters
         ----------
         **changes
-            Further settings, and errors, as for :meth:`override`. ``returns={"free_space": True}`` keeps what
+            Further settings, as for :meth:`override`, which also lists the errors. ``returns={"free_space": True}`` keeps what
             :func:`radarsdf.grid` and :func:`radarsdf.compare` need.
         """
         return cls().override(**QUICK).override(**changes)
@@ -186,7 +186,7 @@ class FitConfig:
         Parameters
         ----------
         **changes
-            Further settings, and errors, as for :meth:`override`.
+            Further settings, as for :meth:`override`, which also lists the errors.
         """
         return cls().override(**PAPER).override(**changes)
 
@@ -226,18 +226,18 @@ class FitConfig:
         Parameters
         ----------
         values : mapping
-            Settings by name; a mapping for each group. Those that are missing have their defaults.
+            Settings by name; a mapping for each group. Missing ones keep their defaults.
 
         Raises
         ------
         ValueError
-            If `values` is no mapping of names; for an unknown setting, or a value of the wrong type or out of range.
+            If `values` is not a mapping of names; for an unknown setting, or a value of the wrong type or out of range.
         """
         return cls().override(**by_name(values, "the settings"))
 
 
 def settings_of_results(config: FitConfig) -> dict[str, Any]:
-    """As :meth:`FitConfig.to_dict`, without what changes no result: two fits of the same scans that agree in these are one."""
+    """Return :meth:`FitConfig.to_dict` without the settings that affect no result: two fits that agree in these are equal."""
     settings = config.to_dict()
     for name in ("num_threads", "max_memory_bytes"):
         del settings[name]
@@ -245,7 +245,7 @@ def settings_of_results(config: FitConfig) -> dict[str, Any]:
 
 
 def flat_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings, or changes of some, by names such as training.learning_rate."""
+    """Flatten nested settings to names such as training.learning_rate."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         group = value if isinstance(value, dict) else {"": value}

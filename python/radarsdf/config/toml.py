@@ -23,7 +23,7 @@ _WIDTH = 100  # columns of a comment
 
 
 def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
-    """The settings in a TOML file, as :meth:`FitConfig.override` takes them.
+    """Read settings from a TOML file, as :meth:`FitConfig.override` takes them.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def to_toml(config: FitConfig) -> str:
-    """All settings, each below a comment that explains it.
+    """Format all settings as TOML, each below a comment that explains it.
 
     A setting that is None is written as a comment, because TOML has no null.
     """

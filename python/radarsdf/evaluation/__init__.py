@@ -3,7 +3,7 @@
 """Errors of a map: its surface against lidar points, its intensity against held-out radar scans, its uncertainty
 and confidence against both; of a trajectory against the true one.
 
-The functions take meshes and arrays, not maps, so they measure the results of other programs in the same way.
+The functions take meshes and arrays, not maps, so they apply equally to the results of other programs.
 """
 
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Whether a map knows its own errors: standard errors in metres, and confidences as probabilities."""
+"""Calibration of a map: standard errors in metres, and confidences as probabilities."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from scipy.stats import rankdata
 
 from radarsdf.checks import real_array
 
-CALIBRATION_PROTOCOL = "radarsdf-calibration-1"  # changes when the meaning of a number changes
+CALIBRATION_PROTOCOL = "radarsdf-calibration-1"  # changes with the meaning of a number
 
 _Floats = NDArray[np.float64]
 _ENCE_BINS = 20
 _DECILES = 10
-_LEAST_M = 1e-12  # ratios of squares do not overflow
-_LEAST_SHARE = 0.01  # of the points. A share of fewer is too uncertain
+_LEAST_M = 1e-12  # keeps ratios of squares from overflowing
+_LEAST_SHARE = 0.01  # smallest share of points in a bin
 
 
 def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
     Parameters
     ----------
     error_m : (N,) array_like
-        Signed errors, m: the distance from the true surface along the normal. NaN where it is not known.
+        Signed errors, m: the distance from the true surface along the normal. NaN where it is unknown.
     uncertainty_m : (N,) array_like
         Predicted standard error of each, m. NaN where nothing was observed.
 
@@ -44,7 +44,7 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
           `worst_decile_factor`: the largest ratio of the two, in either direction.
         - `z_rms`: root mean square of error / uncertainty. Perfect is 1.
         - `mean_error_m`, `rmse_m`, `mean_uncertainty_m`: bias, size of the errors, and sharpness.
-        - `num_points`, and `num_unknown` points with NaN in either array, which do not count.
+        - `num_points`, and `num_unknown` points with NaN in either array, which are ignored.
 
     Raises
     ------
@@ -56,8 +56,8 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
 
     Notes
     -----
-    Points of equal uncertainty share their mean squared error, so the order of the points does not matter. Errors of
-    neighbouring points of a surface are correlated, so numbers of one surface scatter more.
+    Points of equal uncertainty share their mean squared error, so the order of points does not matter. Errors of
+    neighbouring points of a surface are correlated, so results on a single surface scatter more.
 
     Examples
     --------
@@ -80,7 +80,7 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
     z = error / sigma
     predicted, measured = _by_uncertainty(error, sigma, _ENCE_BINS)
     decile_predicted, decile_measured = _by_uncertainty(error, sigma, _DECILES)
-    # An error of exactly zero everywhere would be wrong by an infinite factor, which JSON does not have.
+    # A zero error everywhere would be wrong by an infinite factor, which JSON cannot store.
     ratio = np.maximum(decile_measured, _LEAST_M * decile_predicted) / decile_predicted
     return {
         "protocol": CALIBRATION_PROTOCOL,
@@ -105,7 +105,7 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
     Parameters
     ----------
     confidence : (N,) array_like
-        Probability that there is a surface, in [0, 1]. Points with NaN, where nothing was observed, do not count.
+        Probability that there is a surface, in [0, 1]. Points with NaN, where nothing was observed, are ignored.
     is_true : (N,) array_like
         Whether there is one: bool, or 0 and 1.
 
@@ -116,7 +116,7 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
           ten bins of equal width. The last two are None in an empty bin.
         - `worst_gap`: largest ``|confidence - share|`` of a bin with at least 1 % of the points. `mean_gap`: mean over all
           bins, weighted by their points; others call it expected calibration error.
-        - `auc`: probability that a true point has a higher confidence than a false one; 0.5 says nothing. None if all
+        - `auc`: probability that a true point has a higher confidence than a false one; 0.5 is chance. None if all
           are true or all are false.
         - `true_share`: share of true points among all.
 
@@ -154,14 +154,14 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
         "bin_true_share": [float(v) if n else None for v, n in zip(share, count, strict=True)],
         "worst_gap": float(gap[count >= _LEAST_SHARE * len(p)].max()),
         "mean_gap": float(gap @ count / len(p)),
-        # By the ranks of Mann and Whitney, where equal values count as half.
+        # Mann-Whitney statistic by ranks, where ties count half.
         "auc": (ranks - num_true * (num_true + 1) / 2) / pairs if pairs else None,
         "true_share": float(truth.mean()),
     }
 
 
 def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[_Floats, _Floats]:
-    """Two arguments as arrays (N,)."""
+    """Convert two arguments to arrays (N,)."""
     first, second = real_array(a, name_a), real_array(b, name_b)
     if first.ndim != 1 or first.shape != second.shape:
         msg = f"{name_a} {first.shape} and {name_b} {second.shape} must both be (N,)"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Errors of intensities on held-out scans, and the nearest-neighbour baseline of the paper."""
+"""Errors of intensities on held-out scans, and the paper's nearest-neighbour baseline."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 from radarsdf.checks import positions, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 
-INTENSITY_PROTOCOL = "radarsdf-intensity-1"  # changes when the meaning of a number changes
+INTENSITY_PROTOCOL = "radarsdf-intensity-1"  # changes with the meaning of a number
 
 _Floats = NDArray[np.float64]
-_CHUNK = 1 << 21  # candidates at a time, of all queries together: about 130 MB
+_CHUNK = 1 << 21  # candidates of all queries processed at once: about 130 MB
 _DISTANCE_M, _ANGLE_RAD = 0.1, 0.1  # noise of the returns: smaller differences hardly change a weight
-_SETTINGS = ((4, 4), (8, 8), (16, 16), (16, 64), (16, 128), (16, 256))  # k of so many candidates
-_EVERY = 5  # training scans from one that is held out to the next, to choose between them
-_MAX_QUERIES = 20_000  # held-out returns that are predicted to choose, evenly spread
+_SETTINGS = ((4, 4), (8, 8), (16, 16), (16, 64), (16, 128), (16, 256))  # (k, candidates)
+_EVERY = 5  # spacing of the training scans held out to choose between them
+_MAX_QUERIES = 20_000  # held-out returns predicted for the choice, evenly spread
 
 
 def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
     """
     p, m = real_array(predicted, "predicted"), real_array(measured, "measured")
     if p.ndim != 1 or p.shape != m.shape or p.size == 0:
-        msg = f"predicted {p.shape} and measured {m.shape} must both be (N,), of at least one return"
+        msg = f"predicted {p.shape} and measured {m.shape} must both be (N,), with at least one return"
         raise ValueError(msg)
     error = np.abs(p - m)
     if not np.isfinite(error).all():
@@ -106,7 +106,7 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
 class KNNIntensity:
     """Intensity from the nearest returns seen from a similar direction: the paper's baseline.
 
-    The search takes the `candidates` returns that are nearest in space, and of these the `k` with the most similar
+    The search selects the `candidates` returns nearest in space, and of these the `k` with the most similar
     viewing direction. Their intensities are averaged with the weights 1 / ((distance + 0.1 m) · (angle + 0.1 rad)).
 
     Parameters
@@ -118,7 +118,7 @@ class KNNIntensity:
     intensities : (N,) array_like
         Sensor units.
     candidates, k : int
-        Sizes of the two selections, 1 ≤ k ≤ candidates; at most the number of returns is taken.
+        Sizes of the two selections, 1 ≤ k ≤ candidates, capped at the number of returns.
 
     Raises
     ------
@@ -127,7 +127,7 @@ class KNNIntensity:
 
     Notes
     -----
-    The paper gives neither `k`, `candidates` nor the weights, and none are right for all scenes: compare with :meth:`chosen`.
+    The paper specifies neither `k`, `candidates` nor the weights, and no choice suits all scenes: compare with :meth:`chosen`.
 
     Examples
     --------
@@ -174,22 +174,22 @@ class KNNIntensity:
         intensities: ArrayLike,
         scans: ArrayLike,
     ) -> KNNIntensity:
-        """Make the baseline with the `candidates` and `k` that are best for these training scans.
+        """Build the baseline with the best `candidates` and `k` for these training scans.
 
-        Every fifth training scan is held out once more, and predicted from the others. The least mean absolute error decides
-        between 4 of 4, 8 of 8, and 16 of 16, 64, 128 or 256 candidates. The result predicts from all training scans.
+        Every fifth training scan is held out and predicted from the others. The lowest mean absolute error selects
+        4 of 4, 8 of 8, or 16 of 16, 64, 128 or 256 candidates. The result uses all training scans.
 
         Parameters
         ----------
         points_world, sensor_positions, intensities
-            As for the class. Give the training scans only: a choice that sees the evaluation is not fair.
+            As for the class. Pass the training scans only: a choice based on the evaluation scans is not fair.
         scans : (N,) array_like of int
             Scan number of each return. Whole scans are held out, since returns of one scan share view and noise.
 
         Returns
         -------
         KNNIntensity
-            Of a single scan none can be held out: it has the defaults of the class.
+            With a single scan, which cannot be held out, it has the defaults of the class.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class KNNIntensity:
         Returns
         -------
         (M,) float64
-            Intensities, sensor units. They are defined everywhere: far from all returns, the nearest returns decide.
+            Intensities, sensor units, defined everywhere: far from all returns, those of the nearest returns.
 
         Raises
         ------
@@ -238,7 +238,7 @@ class KNNIntensity:
         """
         points, directions = _rays(x, sensor_positions)
         predicted = np.zeros(len(points))
-        ranks = np.arange(1, self.candidates + 1)  # with k=1 as a number, the result would lose a dimension
+        ranks = np.arange(1, self.candidates + 1)  # an int k=1 would drop a dimension
         step = max(1, _CHUNK // self.candidates)
         for start in range(0, len(points), step):
             part = slice(start, start + step)

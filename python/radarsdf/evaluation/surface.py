@@ -18,12 +18,12 @@ from radarsdf.threads import resolve_num_threads
 if TYPE_CHECKING:
     import trimesh
 
-PROTOCOL = "radarsdf-surface-1"  # changes when the meaning of a number changes
+PROTOCOL = "radarsdf-surface-1"  # changes with the meaning of a number
 
-# As in the paper: a nearer point counts as correct; mesh samples farther from the ground truth are left out of the
-# accuracy; and ground-truth points farther from the mesh count with this distance.
+# As in the paper: distance of a correct point; distance beyond which mesh samples are left out of the accuracy as
+# outliers; and cap on the distances of ground-truth points from the mesh.
 _THRESHOLD_M, _OUTLIER_M, _TRUNCATION_M = 0.2, 0.4, 2.0
-_CHUNK = 500_000  # samples at a time. Bounds the memory; the protocol's random numbers depend on it
+_CHUNK = 500_000  # samples at a time, to limit memory; the protocol's random numbers depend on it
 _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in float64 over an edge of 1 cm
 _Points = NDArray[np.float64]
 _Faces = NDArray[np.int64]
@@ -46,7 +46,7 @@ def surface_metrics(
     ground_truth : (M, 3) array_like
         Lidar points, world frame, m. Accuracy and completion use the same points.
     box : (2, 3) array_like, optional
-        Lower and upper corner, world frame, m. Mesh samples and ground truth outside it do not count. None takes
+        Lower and upper corner, world frame, m. Mesh samples and ground truth outside it are ignored. None uses
         everything, which is rarely fair: radar and lidar have different ranges.
     samples : int
         Points drawn uniformly by area on the triangles whose bounds touch the box. Those outside the box are then
@@ -60,10 +60,10 @@ def surface_metrics(
           `outlier_ratio`: share of the samples that were left out.
         - `completion_error_m`: mean distance from a ground-truth point to the nearest mesh sample, at most
           `truncation_m`, 2 m. `completion_ratio`: share below `threshold_m`.
-        - `f_score`: harmonic mean of `accuracy_ratio` and `completion_ratio`, as in the paper. It does not punish
+        - `f_score`: harmonic mean of `accuracy_ratio` and `completion_ratio`, as in the paper. It does not penalise
           surface in free space, whose samples are left out as outliers.
         - `precision`: share of *all* samples below `threshold_m`. `f_score_all`: harmonic mean of `precision` and
-          `completion_ratio`, which does punish it.
+          `completion_ratio`, which does penalise it.
         - `gamma_mean`, `gamma_variance`: of the angles, rad and rad², between the two triangles at each edge whose
           midpoint is in the box, `num_angles` in all. `gamma_shape`: mean² / variance, that of a Gamma distribution by
           the method of moments, as in all rows of the paper's table. None without an angle or variance.
@@ -90,7 +90,7 @@ def surface_metrics(
         msg = f"there are no ground-truth points{in_the_box}"
         raise ValueError(msg)
     vertices, faces = _triangles(mesh)
-    # From here on relative to the mean: differences of large coordinates would lose digits.
+    # From here on relative to the mean: differences of large coordinates would lose precision.
     origin = points.mean(axis=0)
     points, vertices = points - origin, vertices - origin
     if corners is not None:
@@ -102,7 +102,7 @@ def surface_metrics(
     total = kept = right = 0
     kept_sum = 0.0
     for block in _sample_blocks(vertices, faces, corners, samples):
-        # The search finds distances strictly below its bound, and a sample at the limit exactly is an inlier.
+        # The search finds distances strictly below its bound, and a sample exactly at the limit is an inlier.
         distance, _ = tree.query(
             block, distance_upper_bound=np.nextafter(_OUTLIER_M, np.inf), workers=workers
         )
@@ -219,14 +219,14 @@ def _in_box(points: _Points, corners: _Points | None) -> _Points:
 def _sample_blocks(
     vertices: _Points, faces: _Faces, corners: _Points | None, samples: int
 ) -> Iterator[_Points]:
-    """Samples uniform by area, in blocks of neighbouring triangles, so that searches stay in cache."""
+    """Sample uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
     rng = np.random.default_rng(0)
     if corners is not None and len(faces):
         x = vertices[faces]
         faces = faces[((x.max(axis=1) >= corners[0]) & (x.min(axis=1) <= corners[1])).all(axis=1)]
     if len(faces) == 0:
         return
-    # Along a Morton curve with ten bits for each axis.
+    # Sorted along a Morton curve with ten bits per axis.
     middle = vertices[faces].mean(axis=1)
     middle -= middle.min(axis=0)
     faces = faces[np.argsort(cell_keys(middle, max(float(middle.max()), 1e-9) / 1023), kind="stable")]
@@ -234,7 +234,7 @@ def _sample_blocks(
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if area.sum() == 0:
         return
-    # Samples on each triangle, distributed as if they were drawn one by one.
+    # Samples per triangle, distributed as if they were drawn one by one.
     last = np.cumsum(rng.multinomial(samples, area / area.sum()))
     for start in range(0, samples, _CHUNK):
         index = np.searchsorted(last, np.arange(start, min(start + _CHUNK, samples)), side="right")
@@ -246,7 +246,7 @@ def _sample_blocks(
 
 
 def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -> None:
-    """Update `shortest` (M,), the distance of each point to all samples so far, with the samples of `block`."""
+    """Update `shortest` (M,), the distances of points to all samples so far, with the samples of `block`."""
     low, high = block.min(axis=0), block.max(axis=0)
     gap = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
     candidates = np.flatnonzero(gap < shortest)
@@ -260,20 +260,20 @@ def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -
 
 
 def _angles(vertices: _Points, faces: _Faces, corners: _Points | None) -> _Points:
-    """Angles (E,) between both triangles of each edge that has two: 0 in a plane, π where one is folded onto the other."""
+    """Angles (E,) between the triangles of each edge with two: 0 in a plane, π where one is folded onto the other."""
     from trimesh.graph import face_adjacency  # noqa: PLC0415 - slow to import
 
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
-    has_area = np.linalg.norm(normals, axis=1) > 0  # without it, a triangle has no direction
+    has_area = np.linalg.norm(normals, axis=1) > 0  # a degenerate triangle has no direction
     faces, normals = faces[has_area], normals[has_area]
     pairs, edges = face_adjacency(faces, return_edges=True)  # type: ignore[no-untyped-call]
     if corners is not None:
         middle = vertices[edges].mean(axis=1)
         inside = ((middle >= corners[0]) & (middle <= corners[1])).all(axis=1)
         pairs, edges = pairs[inside], edges[inside]
-    # Two triangles of the same orientation run along their common edge in opposite directions. Otherwise one normal is
-    # turned round.
+    # Two triangles of the same orientation traverse their common edge in opposite directions. Otherwise one normal is
+    # flipped.
     forward = [
         ((faces[own] == edges[:, :1]) & (np.roll(faces[own], -1, axis=1) == edges[:, 1:])).any(axis=1)
         for own in pairs.T

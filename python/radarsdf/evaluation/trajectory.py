@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Errors of a trajectory against the true one, as evo and KITTI define them."""
+"""Errors of a trajectory against the true one, by the definitions of evo and KITTI."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from radarsdf.poses.rigid import Floats, aligned, between, nearest_rotation, pla
 
 Alignment = Literal["positions", "poses", "none"]
 
-_SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # of the length, where it is shorter than KITTI's
+_SHARES = np.array([0.1, 0.2, 0.3, 0.4, 0.5])  # segment lengths of short trajectories
 _KITTI_M = np.arange(100.0, 900.0, 100.0)
 
 
@@ -29,26 +29,26 @@ def trajectory_metrics(
     poses, true_poses : (F, 4, 4) array_like
         T_world_sensor, m, of the same scans. Their worlds may differ.
     align : {"positions", "poses", "none"}
-        What one rigid motion of the whole brings together first: all positions (Umeyama 1991, as ``evo_ape --align``),
-        mean position and mean rotation, or nothing. Positions on a straight line leave the rotation about it open;
+        Rigid alignment of the whole: of all positions (Umeyama 1991, as ``evo_ape --align``), of
+        mean position and mean rotation, or none. Positions on a straight line leave the rotation about it open;
         "poses" does not.
 
     Returns
     -------
     dict of str to float
         ``absolute_m`` and ``absolute_rad``, root mean square over the scans; ``step_m`` and ``step_rad``, root mean square
-        of the motion from each scan to the next; ``relative_ratio`` and ``relative_rad_per_m``, mean error over length of the
-        segments that begin at each scan: those of KITTI, 100 to 800 m, or of a trajectory of less than 800 m 10, 20, 30, 40
+        of the motion between consecutive scans; ``relative_ratio`` and ``relative_rad_per_m``, mean error over length of the
+        segments that begin at each scan: those of KITTI, 100 to 800 m, or of a trajectory shorter than 800 m, 10, 20, 30, 40
         and 50 % of its length; ``length_m`` of the true trajectory.
 
     Raises
     ------
     ValueError
-        If poses are no rigid transforms, or are not as many; if `align` is none of these.
+        If poses are not rigid transforms, their numbers differ, or `align` is none of these.
 
     Notes
     -----
-    Checked against evo 1.38: ``evo_ape --align`` and ``evo_rpe --delta 1 --delta_unit f``, of positions and of angles.
+    Verified against evo 1.38: ``evo_ape --align`` and ``evo_rpe --delta 1 --delta_unit f``, of positions and of angles.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def trajectory_metrics(
     distance_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(true_steps[:, :3, 3], axis=1))])
     ratio, rad_per_m = _relative(found, true, distance_m)
     return {
-        "protocol": "radarsdf-trajectory-1",  # changes when the meaning of a number changes
+        "protocol": "radarsdf-trajectory-1",  # changes with the meaning of a number
         "align": align,
         "num_poses": len(true),
         "length_m": float(distance_m[-1]),
@@ -89,7 +89,7 @@ def trajectory_metrics(
 
 
 def _with_positions(poses: Floats, true: Floats) -> Floats:
-    """The poses (F, 4, 4) after the rigid motion that brings positions together."""
+    """Align the poses (F, 4, 4) by the rigid motion that fits the positions."""
     from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
     whole = np.eye(4)
     whole[:3, :3] = nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle))

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Bags of ROS 1 and ROS 2 as streams of messages, without ROS: those that hold scans, poses and inertial measurements.
+"""Message streams of ROS 1 and ROS 2 bags, without ROS: scans, poses and inertial measurements.
 
-Types of messages are those of rosbags and the definitions below, never those of a bag: rosbags builds Python code from them,
-and old ROS 2 bags have none.
+Message types are those of rosbags and the definitions below, never those in a bag: rosbags generates Python code from
+definitions, and old ROS 2 bags have none.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _DEFINITIONS = {
 }
 _POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
-# A list of returns as an ARS548 sends it: big-endian, always with space for 800 returns. Azimuth is positive to the left.
+# A list of returns as sent by an ARS548: big-endian, always with space for 800 returns. Azimuth is positive to the left.
 _ARS548_RETURN = np.dtype(
     [("azimuth_rad", ">f4"), ("azimuth_std", ">f4"), ("invalid", "u1"), ("elevation_rad", ">f4"), ("elevation_std", ">f4"),
      ("range", ">f4"), ("range_std", ">f4"), ("range_rate", ">f4"), ("range_rate_std", ">f4"), ("rcs", "i1"),
@@ -66,11 +66,11 @@ _ARS548_RETURN = np.dtype(
 )  # fmt: skip
 _ARS548_VALUES = [name for name in _ARS548_RETURN.names or () if name not in ("invalid", "others")]
 _PACKET_BYTES, _RETURNS_AT, _COUNT_AT, _MAX_RETURNS = 35336, 101, 35309, 800
-_NOT_MEASURED = -1.0  # in place of a variance, by the definition of sensor_msgs/Imu
+_NOT_MEASURED = -1.0  # a variance of sensor_msgs/Imu that marks a missing measurement
 
 
 class Topic(NamedTuple):
-    """A topic of bags."""
+    """A topic and its number of messages in all bags."""
 
     name: str
     message_type: str
@@ -82,7 +82,7 @@ class Pose(NamedTuple):
 
     stamp_s: float
     parent: str
-    child: str  # empty where the message does not name it
+    child: str  # empty if the message does not name it
     values: tuple[float, ...]  # x, y, z, m; qx, qy, qz, qw
 
 
@@ -93,7 +93,7 @@ class Message(NamedTuple):
     topic: str
     message_type: str
     recorded_s: float
-    number: int  # of its topic, from 0
+    number: int  # index within its topic
     stamp_s: float
     frame: str
     content: Any  # columns of a cloud, a list of poses, or rates, rad/s, and forces, m/s², of an IMU
@@ -111,7 +111,7 @@ def _types(cdr: bool) -> Any:
 
 
 def _stamp(message: Any) -> tuple[float, str]:
-    """Time, s, and frame; of messages without a header, 0 and none."""
+    """Time, s, and frame of a message; 0 and empty without a header."""
     if not hasattr(message, "header"):
         return 0.0, ""
     stamp = message.header.stamp
@@ -120,14 +120,14 @@ def _stamp(message: Any) -> tuple[float, str]:
 
 def _point_cloud2(message: Any) -> Columns:
     height, width, step, data = message.height, message.width, message.point_step, message.data
-    row_step = message.row_step if height > 1 else step * width  # of one row, some drivers leave it 0
+    row_step = message.row_step if height > 1 else step * width  # some drivers leave that of a single row 0
     fits = step * width <= row_step and row_step * height <= len(data)
     check(fits, f"{height} x {width} points of {step} bytes do not fit into its {len(data)} bytes")
     columns: Columns = {}
     for field in message.fields:
         kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")
-        check(field.offset + int(kind[1:]) <= step, f"its field {field.name} is beyond its points")
-        if field.count > 1 or not field.name or field.name in columns:  # 0 is what some drivers write for 1
+        check(field.offset + int(kind[1:]) <= step, f"its field {field.name} exceeds the size of a point")
+        if field.count > 1 or not field.name or field.name in columns:  # some drivers write 0 for 1
             continue
         dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
         column = np.zeros(0, dtype)
@@ -156,7 +156,7 @@ def _column(rows: list[Any], attribute: str) -> NDArray[np.float32]:
 
 
 def _ars548_packets(message: Any) -> Columns:
-    """What an ARS548 sent, among which lists of returns are found by their length. NaN: the radar calls it invalid."""
+    """Decode ARS548 packets, among which lists of returns are recognised by their length. Invalid values become NaN."""
     lists = [np.zeros(0, _ARS548_RETURN)]
     for packet in message.packets:
         data = packet.data.tobytes()
@@ -169,7 +169,7 @@ def _ars548_packets(message: Any) -> Columns:
 
 
 def _ars548_list(message: Any) -> Columns:
-    """The returns of an ARS548 as its drivers publish them: Autoware's with a flag a value, ars548_messages with bits."""
+    """Returns of an ARS548 as its drivers publish them: Autoware's with one flag per value, ars548_messages with bits."""
     returns = message.detections[: getattr(message, "num_detections", None)]
     flags = np.array([row.invalid for row in returns], np.uint8)
     if flags.ndim == 1:
@@ -180,7 +180,7 @@ def _ars548_list(message: Any) -> Columns:
 
 
 def _ars548(returns: Columns, invalid: NDArray[np.bool_]) -> Columns:
-    """Columns without what the radar calls `invalid` (8, N): of distance, azimuth, elevation and rate, before each deviation."""
+    """Columns with NaN where `invalid` (8, N) is set: flags of range, azimuth, elevation and rate, each before its deviation."""
     columns = {name: returns[name] for name in ("rcs", "range_std", "azimuth_std", "elevation_std")}
     for i, name in enumerate(("range", "azimuth_rad", "elevation_rad", "range_rate")):
         columns[name] = np.where(invalid[2 * i], np.nan, returns[name])
@@ -193,7 +193,7 @@ def _pose(message: Any, position: Any, rotation: Any) -> Pose:
 
 
 def _pose_stamped(message: Any) -> list[Pose]:
-    """Also of messages with a covariance, within which is the pose."""
+    """Pose of a stamped message, with or without a covariance."""
     pose = getattr(message.pose, "pose", message.pose)
     return [_pose(message, pose.position, pose.orientation)]
 
@@ -243,7 +243,7 @@ CLOUD_TYPES, POSE_TYPES, TRANSFORM_TYPES = tuple(_CLOUDS), tuple(_POSES), tuple(
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path is a bag by its name, or a folder that is a ROS 2 bag, whose files were not renamed."""
+    """Whether a path is a bag by its suffix, or a folder with the metadata of a ROS 2 bag whose files were not renamed."""
     if path.suffix.lower() in BAG_SUFFIXES or not (path / _METADATA).is_file():
         return path.suffix.lower() in BAG_SUFFIXES
     listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
@@ -252,12 +252,12 @@ def is_bag(path: Path) -> bool:
 
 
 def bags_in(folder: Path) -> list[Path]:
-    """The bags in a folder, by name."""
+    """Bags in a folder, sorted by name."""
     return sorted(path for path in folder.iterdir() if is_bag(path) and not path.name.startswith("."))
 
 
 def topics_of(paths: list[Path]) -> dict[str, Topic]:
-    """The topics of bags, by name."""
+    """Topics of bags, by name."""
     topics: dict[str, Topic] = {}
     for path in paths:
         with _opened(path) as reader:
@@ -271,12 +271,12 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
 
 
 def topics_with(types: Collection[str], topics: dict[str, Topic]) -> dict[str, Topic]:
-    """The topics that have messages of these types."""
+    """Topics that have messages of these types."""
     return {n: topic for n, topic in topics.items() if topic.message_type in types and topic.num_messages}
 
 
 def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator[Message, None, None]:
-    """The messages of some topics, in the order of their recording; damaged ones are left out, and noted in the end."""
+    """Yield the messages of some topics in the order of recording; damaged ones are left out, and noted at the end."""
     numbers: Counter[str] = Counter()
     damaged: dict[str, list[str]] = {}
     with ExitStack() as stack:
@@ -299,12 +299,12 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
 
 
 def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes) -> bool:
-    """Whether record times stand for the header stamps of `what`: as wanted, or where these are zero or stand still."""
+    """Whether record times replace the header stamps of `what`: if requested, or if the stamps are zero or constant."""
     if wanted is not None:
         return wanted == "record"
     if stamps.any() and (len(stamps) == 1 or (stamps != stamps[0]).any()):
         return False
-    why = "stand still" if stamps.any() else "are zero"
+    why = "are constant" if stamps.any() else "are zero"
     notes.add(f"the header stamps of {what} {why}: the record time is used instead")
     return True
 
@@ -312,14 +312,14 @@ def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes:
 def _stream(
     path: Path, names: set[str]
 ) -> Generator[tuple[float, Path, Any, bytes | memoryview], None, None]:
-    """Record time, s, bag, connection of rosbags, and bytes of each message."""
+    """Yield record time, s, bag, connection of rosbags, and bytes of each message."""
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic in names]
-        if not connections:  # of none, rosbags would give all messages
+        if not connections:  # rosbags would return all messages
             return
         try:
             for connection, recorded_ns, raw in reader.messages(connections=connections):
-                # A database of SQLite may hold values of any type.
+                # An SQLite database may hold values of any type.
                 known = isinstance(recorded_ns, int) and isinstance(raw, (bytes, memoryview))
                 check(known, "a message has no time or no bytes")
                 yield 1e-9 * recorded_ns, path, connection, raw
@@ -329,7 +329,7 @@ def _stream(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """A reader of rosbags."""
+    """Open a bag with rosbags."""
     check_regular_file(path if path.is_file() or not (path / _METADATA).is_file() else path / _METADATA)
     require("rosbags", what=f"{path}: bags are read by")
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra
@@ -339,7 +339,7 @@ def _opened(path: Path) -> Iterator[Any]:
         reader.open()
     except PermissionError:
         raise
-    except Exception as error:  # damaged bags raise exceptions of many kinds, OSError among them
+    except Exception as error:  # damaged bags raise exceptions of many kinds, including OSError
         raise _damaged(path, error) from error
     try:
         yield reader

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Which poses of a bag are those of the scans: of odometry, stamped poses, a path, or the tree of transforms (TF)."""
+"""Poses of the scans in a bag: from odometry, stamped poses, a path, or the tree of transforms (TF)."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ from radarsdf.io.poses import (
 from radarsdf.io.recordings import FindPoses, Request
 from radarsdf.scans import Notes
 
-# In the names of topics with poses that somebody wants or assumes: no sensor was there.
-_WANTED_POSE = re.compile(
+# Names of topics with desired or assumed poses, not measured ones.
+_DESIRED_POSE = re.compile(
     r"goal|set_?point|way_?point|initial_?pose|desired|(^|[/_.-])(plans?|planned|planner|target|cmd)(?![a-z])",
     re.IGNORECASE,
 )
-_SAME = 1e-9  # a transform that changes by no more is constant, though it is published again and again
+_CONSTANT = 1e-9  # largest change of a constant transform that is published repeatedly
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass
 class Track:
-    """The poses of one frame in another, as they were recorded."""
+    """Recorded poses of one frame in another."""
 
     parent: str
     child: str = ""  # empty where the messages do not name it
@@ -65,7 +65,7 @@ class Track:
     @cached_property
     def constant(self) -> bool:
         """Whether all poses are the same."""
-        return self.static or bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _SAME).all())
+        return self.static or bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
 
     @cached_property
     def matrix(self) -> FloatArray:
@@ -74,7 +74,7 @@ class Track:
         return matrix
 
     def trajectory(self, name: str, request: Request) -> Trajectory:
-        """The poses by time. Damaged ones are left out, and noted."""
+        """Trajectory of the poses. Damaged ones are left out and noted."""
         count = len(self.numbers) // 9
         if damaged := count - len(self.table):
             request.notes.add(
@@ -85,22 +85,22 @@ class Track:
 
 
 class TransformTree:
-    """Frames, each with the transform from its parent."""
+    """A tree of frames, each with the transform from its parent."""
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
-        self.tracks = dict(tracks)  # by child
+        self.tracks = dict(tracks)  # keyed by child frame
 
     def chain(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on up to the root. Raises a ValueError if they run in a circle."""
+        """Return the frame and its ancestors up to the root. Raises a ValueError on a cycle."""
         chain = [frame]
         while chain[-1] in self.tracks:
             parent = self.tracks[chain[-1]].parent
-            check(parent not in chain, f"the transforms run in a circle: {' -> '.join([*chain, parent])}")
+            check(parent not in chain, f"the transforms form a cycle: {' -> '.join([*chain, parent])}")
             chain.append(parent)
         return chain
 
     def rigid_top(self, frame: str) -> tuple[str, FloatArray]:
-        """The highest frame that does not move against this one, and T_top_frame (4, 4)."""
+        """Return the highest frame rigidly attached to this one, and T_top_frame (4, 4)."""
         T_top_frame = np.eye(4)
         for top in self.chain(frame):
             track = self.tracks.get(top)
@@ -110,12 +110,12 @@ class TransformTree:
         return top, T_top_frame
 
     def fixed(self, base: str, sensor: str) -> FloatArray | None:
-        """T_base_sensor (4, 4) where the two frames do not move against each other; None: they do, or nothing is known."""
+        """T_base_sensor (4, 4) if the two frames are rigidly attached; None if they are not, or are unknown."""
         (top, T_top_base), (other, T_top_sensor) = self.rigid_top(base), self.rigid_top(sensor)
         return np.linalg.inv(T_top_base) @ T_top_sensor if top == other else None
 
     def attach(self, poses: StampedPoses, base: str, request: Request) -> FindPoses:
-        """Lets `base`, and all below the highest frame that does not move against it, have these poses."""
+        """Assign poses to `base` and to all frames below the highest one rigidly attached to it."""
         top, T_top_base = self.rigid_top(base)
         T_pose_base = np.eye(4) if request.extrinsic is None else request.extrinsic
         above = (poses, T_pose_base @ np.linalg.inv(T_top_base))
@@ -128,7 +128,7 @@ class TransformTree:
         return find
 
     def finder(self, world: str, request: Request) -> Callable[[str], TransformChain | None]:
-        """Poses of the frames below the world."""
+        """Return a function from a frame below the world to its poses."""
 
         @cache
         def find(frame: str) -> TransformChain | None:
@@ -140,7 +140,7 @@ class TransformTree:
     def _links(
         self, frame: str, world: str, request: Request
     ) -> tuple[StampedPoses | FloatArray, ...] | None:
-        """The transforms from the world down to a frame; None if there are none, or one of them has a single pose."""
+        """Transforms from the world down to a frame; None if there are none, or one of them has a single pose."""
         links: list[StampedPoses | FloatArray] = []
         try:
             chain = self.chain(frame)
@@ -154,14 +154,14 @@ class TransformTree:
 
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
-    """The transforms of all frames in bags."""
+    """Read the transforms of all frames in bags."""
     return _tracks_and_tree(paths, set(), set(topics_with(TRANSFORM_TYPES, topics_of(paths))), request)[1]
 
 
 def poses_in_bags(paths: list[Path], request: Request, frames: list[str], preferred: str | None) -> FindPoses:
-    """Poses of each frame of scans, by time; `frames` are those of the first scans, the most frequent first.
+    """Return a function from frame to poses by time; `frames` are those of the first scans, the most frequent first.
 
-    Of several sources, the topic `preferred` is taken, or else :func:`_choose` decides.
+    Of several sources, the topic `preferred` is used, or else the one that :func:`_choose` returns.
     """
     notes, wanted = request.notes, request.pose_topic
     topics = topics_of(paths)
@@ -171,13 +171,13 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     listed = ", ".join(sorted(fitting | transforms)) or "none"
     known = wanted is None or wants_tf or wanted in fitting
     check(known, f"{paths[0]} has no poses in {wanted}: topics with poses are {listed}")
-    names = {n for n in fitting if not _WANTED_POSE.search(n)} if wanted is None else fitting & {wanted}
+    names = {n for n in fitting if not _DESIRED_POSE.search(n)} if wanted is None else fitting & {wanted}
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
     name = wanted if wanted is not None else _choose(tracks, tree, sensor, preferred)
     if wants_tf or name is None:
         try:
-            find = _of_tree(tree, sensor, request)
+            find = _tree_poses(tree, sensor, request)
         except ValueError:
             if wants_tf or not tracks:
                 raise
@@ -185,17 +185,17 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
             listed = ", ".join(sorted(tracks))
             check(
                 one,
-                f"{notes.about} has several topics with poses: say by pose_topic which one counts, of {listed}",
+                f"{notes.about} has several topics with poses: choose one with pose_topic, of {listed}",
             )
             (name,) = tracks
         else:
             for other in sorted(fitting):
-                notes.add(f"poses of {other} are passed over; pose_topic chooses them")
+                notes.add(f"poses of {other} are ignored; pose_topic selects them")
             return find
     check(name in tracks, f"{paths[0]}: {name} holds no poses")
     trajectory = tracks[name].trajectory(name, request)
     for other in sorted(fitting - {name}):
-        notes.add(f"poses of {other} are passed over; pose_topic chooses them")
+        notes.add(f"poses of {other} are ignored; pose_topic selects them")
     notes.add(f"poses: {len(trajectory.times_s)} of {name}")
     base = sensor if request.extrinsic is not None else _base(tracks[name].child, name, tree, sensor, notes)
     return tree.attach(trajectory, base, request)
@@ -204,11 +204,11 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
 def _tracks_and_tree(
     paths: list[Path], pose_topics: set[str], transform_topics: set[str], request: Request
 ) -> tuple[dict[str, Track], TransformTree]:
-    """The poses of each of `pose_topics` that has some, and the transforms, in one pass through the bags."""
+    """Read the poses of `pose_topics` and the transforms in one pass through the bags. Topics with a single pose are left out."""
     by_topic: dict[str, Track] = {}
     parents: dict[str, dict[str, Track]] = {}
     for message in read_messages(paths, pose_topics | transform_topics, request.notes):
-        if message.message_type == PATH:  # each message holds the whole path so far: the last one counts
+        if message.message_type == PATH:  # each message holds the whole path so far: the last one is used
             by_topic.pop(message.topic, None)
         static = "static" in message.topic  # /tf_static: transforms that hold for all times
         for pose in message.content:
@@ -232,7 +232,7 @@ def _tracks_and_tree(
 
 
 def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferred: str | None) -> str | None:
-    """The preferred topic, or the only one whose child frame does not move against that of the scans; else None."""
+    """Return the preferred topic, or the only one whose child frame is rigidly attached to that of the scans; else None."""
     if preferred in tracks:
         return preferred
     known = sensor in tree.tracks
@@ -242,7 +242,7 @@ def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferre
 
 
 def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes) -> str:
-    """The frame whose poses a topic has: where it names none, the one that moves with the sensor."""
+    """Frame of the poses of a topic; if it names none, the one that moves with the sensor."""
     base = child or tree.rigid_top(sensor)[0]
     if tree.fixed(base, sensor) is None or (not child and base == sensor):
         notes.add(
@@ -255,8 +255,8 @@ def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes)
     return base
 
 
-def _of_tree(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
-    """Poses of the frames below the world. Raises a ValueError where TF has none of the sensor."""
+def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
+    """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about = request.notes.about
     moving = {frame for frame, track in tree.tracks.items() if not track.constant}
     if not moving:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans, poses and inertial measurements from bags: which topics, which clock, and all messages in bounded memory."""
+"""Scans, poses and inertial measurements from bags: choice of topics and clocks, and streaming in bounded memory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from radarsdf.io.poses import UNPOSED, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
 from radarsdf.scans import Scans
 
-# Topics of radars in data sets, and of the poses there. They are preferred to others.
+# Topics of the radars in data sets, and of their poses. They take precedence over others.
 KNOWN_TOPICS = {
     "/hugin_raf_1/radar_data": "/icp_odom",  # Viking Hill
     "/radar_enhanced_pcl": None,  # NTU4DRadLM and others with an Oculii Eagle
@@ -45,11 +45,11 @@ KNOWN_TOPICS = {
     "/ti_mmwave/radar_scan_pcl": None,
 }
 _RADAR = re.compile(r"radar|ars_?\d{3}|srr_?\d{3}|oculii|mmwave", re.IGNORECASE)
-_PEEKED_SCANS = 10  # whose stamps and fields are looked at
+_PEEKED_SCANS = 10  # whose stamps and fields are inspected first
 
 
 def read_bags(paths: list[Path], request: Request) -> Scans:
-    """Scans of one drive in one or several bags; see :func:`radarsdf.io.read`."""
+    """Read scans of one drive from one or several bags; see :func:`radarsdf.io.read`."""
     others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
     check(paths and all(map(is_bag, paths)), f"{others} is not a bag: only bags can be read together")
     topics = topics_of(paths)
@@ -72,13 +72,13 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
-        find = _given(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
+        find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     recorded = by_recording[scan_topics[0].name]
     imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
 
-def _given(
+def _user_poses(
     poses: Poses,
     paths: list[Path],
     topics: list[Topic],
@@ -86,7 +86,7 @@ def _given(
     raw_scans: Callable[[], Iterator[RawScan]],
     request: Request,
 ) -> FindPoses:
-    """Poses that the user gives: in the order of the scans, or by time, of the frame that most of the first scans have."""
+    """Poses passed by the user: in the order of the scans, or by time, of the most frequent frame among the first scans."""
     if isinstance(poses, np.ndarray):
         count = topics[0].num_messages if len(topics) == 1 else sum(1 for _ in raw_scans())
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
@@ -97,7 +97,7 @@ def _given(
 
 
 def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
-    """The topics of the scans: the wanted ones, or the only one that can be meant. The others are noted."""
+    """Topics of the scans: those requested, or the only candidate. The others are noted."""
     about = request.notes.about
     fitting = topics_with(CLOUD_TYPES, topics)
     for name in request.topic:
@@ -113,10 +113,10 @@ def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
             break
     else:
         listed = _listed(fitting.values())
-        msg = f"{about} has several topics with points: say by topic which is the radar's, one or several of {listed}"
+        msg = f"{about} has several topics with points: choose one or several with topic, of {listed}"
         raise ValueError(msg)
     unread = [t for t in topics.values() if t.name not in fitting and _RADAR.search(t.message_type)]
-    what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that"
+    what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that one"
     check(not unread or _is_radar(chosen[0]), f"{about}: {what}")
     if others := {*fitting.values(), *unread} - set(chosen):
         request.notes.add(f"scans: those of {_listed(chosen)}; not read: {_listed(others)}")
@@ -132,7 +132,7 @@ def _is_radar(topic: Topic) -> bool:
 
 
 def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
-    """The first messages of a topic."""
+    """Read the first messages of a topic."""
     with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
         peeked = list(itertools.islice(messages, _PEEKED_SCANS))
     check(peeked, f"{paths[0]}: {topic.name} has no messages that can be read{request.notes.ending()}")
@@ -147,13 +147,13 @@ def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request
 
 
 def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
-    """The topic of the IMU: the wanted one, or the only one. None: there is none, or none is named of several."""
+    """Topic of the IMU: the one requested, or the only one. None if there is none, or if it is ambiguous."""
     fitting = sorted(topics_with([IMU], topics))
     listed = ", ".join(fitting)
     wanted, about = request.imu_topic, request.notes.about
     check(wanted in (None, *fitting), f"{about} has no inertial measurements in {wanted}: there are {listed}")
     if wanted is None and len(fitting) > 1:
-        request.notes.add(f"of several IMUs, none is used: say by imu_topic which, of {listed}")
+        request.notes.add(f"of several IMUs, none is used: choose one with imu_topic, of {listed}")
         return None
     return wanted or next(iter(fitting), None)
 
@@ -161,10 +161,10 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
 def _read_imu(
     paths: list[Path], topic: str | None, sensor_frame: str, recorded: bool, request: Request
 ) -> Imu | None:
-    """What the topic holds; None if it has no gyroscope.
+    """Read the inertial measurements of a topic; None if it has no gyroscope.
 
-    Where scans have the times when they were `recorded`, each measurement has its stamp plus the median time from stamp to
-    record, because messages of an IMU are recorded several at a time.
+    If scans are stamped with record times (`recorded`), each measurement is shifted by the median delay from stamp to
+    record, because IMU messages are recorded in batches.
     """
     if topic is None:
         return None

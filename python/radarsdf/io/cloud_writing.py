@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""All returns of all scans as one point cloud in the world frame, and the parts of PLY files."""
+"""Write all returns of all scans as one point cloud in the world frame; also the parts of PLY files."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from radarsdf.io.clouds import LAS_INTENSITY
 from radarsdf.io.files import check_fits_float32, whole_file
 from radarsdf.scans import Columns, Scan, Scans
 
-_CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # as many digits as give the same number back
+_CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # enough digits for a round trip
 _LAS_SCALE_M = 1e-4
 _LAS_FORMAT = 6  # the first of LAS 1.4, with a time
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 
 def check_cloud_path(path: str | PathLike[str]) -> None:
-    """Raises a ValueError unless `path` ends like a format that :func:`write_cloud` writes."""
+    """Raise a ValueError unless `path` has a suffix that :func:`write_cloud` supports."""
     known = path_of(path, "path").suffix.lower() in CLOUD_OUT_SUFFIXES
     check(known, f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}")
 
 
 def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
-    """Writes all returns of scans as one point cloud, whole or not at all.
+    """Write all returns of scans as one point cloud, atomically.
 
-    The cloud has x, y, z in the world frame, m; intensity in sensor units, doppler in m/s and time, s, where all scans have
-    them; and scan, the number of the scan.
-    Coordinates are float64. LAS and LAZ round them to 0.1 mm, and have the other columns as extra dimensions. PCD holds
-    float32, since most programs read no other.
+    The cloud has x, y, z in the world frame, m; intensity in sensor units, doppler in m/s and time, s, if all scans have
+    them; and scan, the index of the scan.
+    Coordinates are float64. LAS and LAZ round them to 0.1 mm, and store the other columns as extra dimensions. PCD holds
+    float32, since most programs read nothing else.
 
     Parameters
     ----------
     path : path-like
-        It ends in .ply, .pcd, .las, .laz, .npy or .csv. NumPy's file holds one record a return.
+        A file that ends in .ply, .pcd, .las, .laz, .npy or .csv. An .npy file holds one record per return.
     scans : Scans
-        They are read once.
+        Scans, read once.
 
     Returns
     -------
@@ -53,11 +53,11 @@ def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
     Raises
     ------
     ValueError
-        For another suffix, if `path` is no regular file, the scans cannot be read, or float32 has too few digits.
+        For another suffix, if `path` is no regular file, the scans cannot be read, or float32 is too coarse.
     OSError
         If a file cannot be read or written.
     ImportError
-        If the format takes a library that is not installed; the message says which.
+        If the format needs a library that is not installed; the message names it.
     """
     check_cloud_path(path)
     suffix = Path(path).suffix.lower()
@@ -128,7 +128,7 @@ def _las(file: BinaryIO, rows: NDArray[Any], *, compressed: bool) -> None:
 
 
 def records(columns: Columns) -> NDArray[Any]:
-    """(N,) one record for each row of the columns, of which there is at least one."""
+    """(N,) one record per row of the columns, of which there must be at least one."""
     dtype = np.dtype([(name, array.dtype.newbyteorder("<")) for name, array in columns.items()])
     rows = np.zeros(len(next(iter(columns.values()))), dtype)
     for name, array in columns.items():
@@ -137,14 +137,14 @@ def records(columns: Columns) -> NDArray[Any]:
 
 
 def face_records(faces: NDArray[np.integer[Any]]) -> NDArray[Any]:
-    """(T,) one record for each triangle (T, 3), as in a binary PLY file."""
+    """(T,) one record per triangle (T, 3), as in a binary PLY file."""
     rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
     rows["count"], rows["rows"] = 3, faces
     return rows
 
 
 def ply_header(dtype: np.dtype[Any], count: int, num_faces: int | None = None) -> bytes:
-    """The header of a binary PLY file of `count` such records, and of triangles if it is a mesh."""
+    """Header of a binary PLY file of `count` such records, and of triangles if it is a mesh."""
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += ["comment radarsdf: world frame, m", f"element vertex {count}"]
     lines += [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]

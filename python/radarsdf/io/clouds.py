@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files of one point cloud each: PCD, PLY, KITTI's .bin, NumPy, text, LAS and LAZ. All of them become named columns."""
+"""Readers of point cloud files: PCD, PLY, KITTI's .bin, NumPy, text, LAS and LAZ. All return named columns."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from radarsdf.io.text import read_table
 from radarsdf.scans import Columns, Notes
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
-LAS_INTENSITY = "radar_intensity"  # an extra dimension: LAS's own are whole numbers from 0 to 65535
-_PANIC = "PanicException"  # of lazrs, which is written in Rust; it is no Exception
-_MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth
-_VLRS_AT, _VLR_BYTES = 100, 54  # place of the number of records in a LAS header, and the least size of one
-_LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format; extra bytes have one each
-_VARIABLE = 2**32 - 1  # in place of the number of points in each chunk
-_MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a header of PCD has eleven lines
+LAS_INTENSITY = "radar_intensity"  # an extra dimension, since LAS's own is an integer from 0 to 65535
+_PANIC = "PanicException"  # raised by lazrs, which is written in Rust; not a subclass of Exception
+_MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth of their size
+_VLRS_AT, _VLR_BYTES = 100, 54  # offset of the number of records in a LAS header, and the smallest record
+_LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # layers of a chunk by point format, plus extra bytes
+_VARIABLE = 2**32 - 1  # marks chunks of varying size, in place of the number of points per chunk
+_MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a PCD header has eleven lines
 _PLY_HEADER_BYTES = 1 << 16
-_KITTI_WIDTH, _JUDGED_FILES = 4, 20  # of .bin files
-_MAX_POSITION_M, _FEW = 1e7, 0.02  # of the numbers may be damaged
-_LESS, _ENOUGH_ROWS = 0.8, 30  # of the variance within four columns is left by another number of them
+_KITTI_WIDTH, _INSPECTED_FILES = 4, 20  # columns, and number of .bin files that are inspected
+_MAX_POSITION_M, _DAMAGED = 1e7, 0.02  # limit of coordinates, and share of numbers that may be damaged
+_VARIANCE_RATIO, _MIN_ROWS = 0.8, 30  # limit of the variance left by another width
 
 GivenColumns: TypeAlias = int | Sequence[str] | None
 
 
 def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
-    """The columns of a file of points, (N,) each, by name."""
+    """Read the columns of a point cloud file, (N,) each, by name."""
     check_regular_file(path)
     suffix = path.suffix.lower()
-    check(suffix in READERS, f"{path} is no file of points: those end in {', '.join(CLOUD_SUFFIXES)}")
+    check(suffix in READERS, f"{path} is not a point cloud file: those end in {', '.join(CLOUD_SUFFIXES)}")
     try:
         return READERS[suffix](path, columns)
     except (ImportError, MemoryError):
         raise
-    except BaseException as error:  # libraries raise many kinds for damaged files, OSError among them
+    except BaseException as error:  # damaged files raise many kinds, including OSError
         if isinstance(error, OSError) and error.filename is not None:
             raise
         if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
@@ -59,7 +59,7 @@ def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
 
 
 def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
-    """Reads points, such as the ground truth of a lidar, from a file of any format that :func:`read` reads.
+    """Read points, such as ground truth from a lidar, from a file of any format that :func:`read` supports.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     Returns
     -------
     (M, 3) float64 ndarray
-        Frame of the file, m, in which the ``VIEWPOINT`` of a PCD file places the points. Points that are not finite are
+        Frame of the file, m; for a PCD file, the frame to which its ``VIEWPOINT`` transforms. Non-finite points are
         left out.
 
     Raises
@@ -79,12 +79,12 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     OSError
         If it cannot be read.
     ImportError
-        If it takes a library that is not installed; the message says which.
+        If it needs a library that is not installed; the message names it.
     """
     file = path_of(path, "path")
     columns = read_columns(file)
     with reading(path, "a file of points"):
-        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler"))).judged(columns, Notes())
+        fields = Fields.of(list(columns), dict.fromkeys(("intensity", "doppler"))).with_unit(columns, Notes())
         points = fields.scan(columns, np.eye(4), None, Notes()).points.astype(np.float64)
         check(len(points), "it holds no points")
     if file.suffix.lower() == ".pcd":
@@ -93,7 +93,7 @@ def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
     return points
 
 
-# Files .bin: float32, x, y, z, intensity, as KITTI has them, or as many columns as a user says.
+# .bin files: float32 x, y, z, intensity as in KITTI, or the columns that the user names.
 
 
 def _bin(path: Path, columns: GivenColumns) -> Columns:
@@ -102,27 +102,27 @@ def _bin(path: Path, columns: GivenColumns) -> Columns:
     width = columns if isinstance(columns, int) else len(columns or range(_KITTI_WIDTH))
     numbers = np.fromfile(path, "<f4")
     whole = path.stat().st_size % (4 * width) == 0
-    check(whole, f"its size is no whole number of points of {width} float32 each: give columns (--columns)")
+    check(whole, f"its size is not a multiple of {width} float32 per point: give columns (--columns)")
     return dict(zip(names_of(width, columns), numbers.reshape(-1, width).T, strict=True))
 
 
 def check_kitti(paths: Sequence[Path]) -> None:
-    """Raises a ValueError if ``.bin`` files of a recording do not look like points of four float32."""
-    paths = [path for path in paths if path.stat().st_size][:_JUDGED_FILES]
+    """Raise a ValueError if ``.bin`` files of a recording do not look like points of four float32."""
+    paths = [path for path in paths if path.stat().st_size][:_INSPECTED_FILES]
     fitting = [path for path in paths if path.stat().st_size % (4 * _KITTI_WIDTH) == 0]
     remedy = "give columns (--columns), how many float32 a point has, or their names"
-    check(2 * len(fitting) >= len(paths), f"most .bin files are no points of four float32 each: {remedy}")
+    check(2 * len(fitting) >= len(paths), f"most .bin files are not points of four float32 each: {remedy}")
     numbers = np.concatenate([np.zeros(0, "<f4"), *(np.fromfile(path, "<f4") for path in fitting)])
     positions = numbers.reshape(-1, _KITTI_WIDTH)[:, :3]
     far = np.abs(positions[np.isfinite(positions)]) > _MAX_POSITION_M
-    check(far.sum() <= _FEW * far.size, f"float32 numbers in the .bin files are no positions in m: {remedy}")
-    # Numbers of one column are alike. Logarithms, so that no column has all of the variance.
+    check(far.sum() <= _DAMAGED * far.size, f"numbers in the .bin files are not positions in m: {remedy}")
+    # Numbers within a column are similar. Logarithms keep a single column from dominating the variance.
     numbers = np.nan_to_num(np.sign(numbers) * np.log1p(np.abs(numbers)))
     within = _variance(numbers, _KITTI_WIDTH)
     for width in range(3, min(21, len(numbers) // 2 + 1)):
-        other, few = _variance(numbers, width), len(numbers) < _ENOUGH_ROWS * width
+        other, few = _variance(numbers, width), len(numbers) < _MIN_ROWS * width
         check(
-            other >= _LESS * within or (few and other),
+            other >= _VARIANCE_RATIO * within or (few and other),
             f"the numbers of the .bin files look like {width} columns, not four: {remedy}",
         )
 
@@ -136,14 +136,14 @@ def _npy(path: Path, columns: GivenColumns) -> Columns:
     if array.dtype.names is not None and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names}
     rows = array.ndim == 2 and array.dtype.kind in "iuf"
-    check(rows, f"it holds an array {array.shape} of {array.dtype}, not one row of numbers a point")
+    check(rows, f"it holds an array {array.shape} of {array.dtype}, not one row of numbers per point")
     return dict(zip(names_of(array.shape[1], columns), np.array(array).T, strict=True))
 
 
 def _text(path: Path, columns: GivenColumns) -> Columns:
     table = read_table(path)
     width = table.values.shape[1]
-    # CloudCompare writes names of columns after a comment sign.
+    # CloudCompare writes the column names after a comment sign.
     named = [head for head in table.heads if len(head) == width and not any(map(str.isdecimal, head))]
     names = named[-1] if named else names_of(width or 3, columns)
     values = table.values if len(table.values) else np.zeros((0, len(names)))
@@ -156,7 +156,7 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
 
 
 def _pcd(path: Path, _: GivenColumns) -> Columns:
-    """The fields with one number a point: of ascii, binary or binary_compressed files to version 0.7."""
+    """Read the scalar fields of ascii, binary or binary_compressed files up to version 0.7."""
     with path.open("rb") as file:
         header = _pcd_header(file)
         body = file.read()
@@ -190,20 +190,20 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
 
 
 def read_viewpoint(path: Path) -> NDArray[np.float64]:
-    """T_world_sensor (4, 4) of the ``VIEWPOINT`` of a PCD file, tx ty tz qw qx qy qz; the identity without one."""
+    """T_world_sensor (4, 4) of a PCD file's ``VIEWPOINT`` (tx ty tz qw qx qy qz); the identity if it has none."""
     with path.open("rb") as file:
         numbers = np.array(_pcd_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
     finite = numbers.shape == (7,) and np.isfinite(numbers).all()
     check(finite, f"{path}: its VIEWPOINT is not seven finite numbers")
     T_world_sensor = np.eye(4)
     T_world_sensor[:3, 3] = numbers[:3]
-    if numbers[3:].any():  # some programs write zeros where nothing is known
+    if numbers[3:].any():  # some programs write zeros for an unknown rotation
         T_world_sensor[:3, :3] = Rotation.from_quat(numbers[[4, 5, 6, 3]]).as_matrix()
     return T_world_sensor
 
 
 def _pcd_header(file: BinaryIO) -> dict[str, list[str]]:
-    """The lines of a header by their first words. Comments are in any encoding."""
+    """Lines of a header by their first word. Comments may be in any encoding."""
     header: dict[str, list[str]] = {}
     for _ in range(_MAX_HEADER_LINES):
         line = file.readline(_MAX_LINE).lstrip()
@@ -216,23 +216,23 @@ def _pcd_header(file: BinaryIO) -> dict[str, list[str]]:
 
 
 def ply_bytes(path: Path) -> io.BytesIO:
-    """A PLY file for trimesh, without the comments of its header, which may be in any encoding."""
+    """Load a PLY file for trimesh, without the comments of its header, which may be in any encoding."""
     head, end, body = path.read_bytes().partition(b"end_header")
     return io.BytesIO(re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]*[\r\n]+", b"", head) + end + body)
 
 
 def has_faces(path: Path) -> bool:
-    """Whether a PLY file is a mesh, by its header."""
+    """Whether the header of a PLY file declares faces."""
     with path.open("rb") as file:
         header = file.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
     return re.search(rb"element\s+face\s+0*[1-9]", header) is not None
 
 
 def _ply(path: Path, _: GivenColumns) -> Columns:
-    """The columns of the vertices."""
+    """Read the columns of the vertices."""
     import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
-    # Without materials: a PLY file may name an image, which is then not looked for.
+    # Without materials: a PLY file may name an image, which must not be opened.
     loaded: Any = trimesh.load(ply_bytes(path), file_type="ply", process=False, skip_materials=True)
     vertex = loaded.metadata.get("_ply_raw", {}).get("vertex")
     if vertex is None or not vertex["length"]:
@@ -241,29 +241,29 @@ def _ply(path: Path, _: GivenColumns) -> Columns:
     names = data.keys() if isinstance(data, dict) else data.dtype.names
     columns = {str(name): np.asarray(data[name]).reshape(-1) for name in names}
     whole = all(len(column) == vertex["length"] for column in columns.values())
-    check(whole, f"its header says {vertex['length']} points, which it does not hold")
+    check(whole, f"its header claims {vertex['length']} points, but it holds fewer")
     return columns
 
 
 def _las(path: Path, _: GivenColumns) -> Columns:
-    """Columns by their names; those that :func:`write_cloud` wrote have the names as there."""
+    """Read columns by name; files of :func:`write_cloud` give back its names."""
     laspy = require("laspy", what=f"{path}: LAS and LAZ files are read by")
     size = path.stat().st_size
     with path.open("rb") as raw:
         raw.seek(_VLRS_AT)
         records = int.from_bytes(raw.read(4), "little")
-    # laspy would count to four billion.
-    check(records * _VLR_BYTES <= size, f"its header says {records} records, for which the file is too small")
-    # Of its two readers of LAZ, the parallel one allocates by sizes that nobody can check.
+    # laspy would loop up to four billion times.
+    check(records * _VLR_BYTES <= size, f"its header claims {records} records: the file is too small")
+    # Of laspy's two LAZ readers, the parallel one allocates by sizes that cannot be checked beforehand.
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
         header = file.header
         largest = size * (_MAX_COMPRESSION if header.are_points_compressed else 1)
         fits = header.point_count * header.point_format.size <= largest
-        check(fits, f"its header says {header.point_count} points, for which the file is too small")
+        check(fits, f"its header claims {header.point_count} points: the file is too small")
         if header.are_points_compressed:
             check(_has_chunks(path, header), "its chunks of points are damaged, or it is too small for them")
         cloud = file.read_points(header.point_count)
-    # Scaled and shifted, in double precision: the integers in the file are no metres.
+    # Scaled and offset, in double precision: the integers in the file are not metres.
     columns = {axis: np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"}
     names = {"intensity": "intensity", "gps_time": "time"}
     names |= {name: str(name) for name in header.point_format.extra_dimension_names}
@@ -273,28 +273,28 @@ def _las(path: Path, _: GivenColumns) -> Columns:
 
 
 def _has_chunks(path: Path, header: Any) -> bool:
-    """Whether a LAZ file can hold the chunks that it claims: lazrs allocates for them, and may end the process."""
+    """Whether a LAZ file is large enough for its chunks: lazrs allocates for them, and may abort the process."""
     import lazrs  # noqa: PLC0415 - an extra
 
     point, size, at = header.point_format, path.stat().st_size, header.offset_to_point_data
     record = bytes(header.vlrs.get("LasZipVlr")[0].record_data)
     usual = bytes(lazrs.LazVlr.new_for_compression(point.id, point.num_extra_bytes).record_data())
-    # Compressor, then type, size and version of each part of a point.
+    # Compressor, then type, size and version of each item of a point.
     parts, usual_parts = (np.frombuffer(data[34:], "<u2").reshape(-1, 3)[:, :2] for data in (record, usual))
     possible = record[:2] == usual[:2] and np.array_equal(parts, usual_parts)
     layers = _LAZ_LAYERS.get(point.id, 0) + point.num_extra_bytes
     with path.open("rb") as file:
-        for place in (at, size - 8):  # of the place of the chunk table: before the points or at the end
+        for place in (at, size - 8):  # offset of the chunk table: before the points or at the end
             file.seek(place)
             table_at = int.from_bytes(file.read(8), "little", signed=True)
             if table_at > at:
                 file.seek(min(table_at, size))
-                chunks = int.from_bytes(file.read(8)[4:], "little")  # each begins with a point as it is
+                chunks = int.from_bytes(file.read(8)[4:], "little")  # each begins with an uncompressed point
                 possible &= table_at + 8 <= size and chunks * point.size <= size
                 possible &= chunks <= max(header.point_count, 1)
                 break
         chunk_size, left, at = int.from_bytes(record[12:16], "little"), header.point_count, at + 8
-        # In a chunk, the first point, the number of points, and the sizes of its layers are before these.
+        # A chunk begins with the first point, the number of points, and the sizes of its layers.
         while possible and left > 0 and point.id in _LAZ_LAYERS:
             file.seek(at + point.size)
             count, *sizes = np.frombuffer(file.read(4 * (1 + layers)), "<u4").tolist() or [0]

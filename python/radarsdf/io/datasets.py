@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Published data sets, found by the shape of their folders; `DATASETS` lists them.
+"""Published data sets, recognised by the layout of their folders; `DATASETS` lists them.
 
-Each reader states where the scans, the poses and the pose of the radar on its platform are. What a user passes to
-:func:`radarsdf.io.read` comes first. `T_a_b` transforms points of frame b to frame a.
+Each reader states where the scans, the poses and the pose of the radar on its platform are. Arguments of
+:func:`radarsdf.io.read` take precedence. `T_a_b` transforms points of frame b to frame a.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ class Dataset(NamedTuple):
     """A published data set."""
 
     name: str
-    fits: Callable[[Path], bool]  # whether a folder has its shape
+    fits: Callable[[Path], bool]  # whether a folder has its layout
     read: Callable[[Path, Request], Scans]
 
 
 def find(folder: Path) -> Dataset | None:
-    """The data set whose shape a folder has; None if it has none."""
+    """Return the data set with the layout of a folder, or None."""
     return next((dataset for dataset in DATASETS if dataset.fits(folder)), None)
 
 
 def _msc_rad4r(folder: Path, request: Request) -> Scans:
-    """PCD files, and ``timestamp_radar.txt`` with lines of a number, seconds and nanoseconds. It has no poses."""
+    """Read PCD files, and ``timestamp_radar.txt`` with lines of a number, seconds and nanoseconds. It has no poses."""
     return read_files(sorted((folder / "3_RADAR/PCD").glob("*.pcd"), key=natural), folder, request)
 
 
 def _coloradar(folder: Path, request: Request) -> Scans:
-    """The single-chip radar: rows of x, y, z, intensity and Doppler; poses of the platform in ``groundtruth``."""
+    """Read the single-chip radar: rows of x, y, z, intensity and Doppler; poses of the platform in ``groundtruth``."""
     if request.poses is None:
         truth = folder / "groundtruth"
         with reading(truth, "a folder with a time for each pose"):
@@ -72,7 +72,7 @@ def _delft_radar(folder: Path) -> Path:
 
 
 def _view_of_delft(folder: Path, request: Request) -> Scans:
-    """View-of-Delft, whole or one of its radar folders: a calibration and a pose for each frame."""
+    """Read View-of-Delft, complete or only its radar folder: a calibration and a pose for each frame."""
     radar = _delft_radar(folder)
     lidar = radar.parents[1] / "lidar/training"
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
@@ -89,7 +89,7 @@ def _view_of_delft(folder: Path, request: Request) -> Scans:
 def _delft_pose(
     frame: str, radar: Path, lidar: Path, extrinsic: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """T_map_radar (4, 4) of a frame. ``mapToCamera`` is T_map_camera, whatever its name says."""
+    """T_map_radar (4, 4) of a frame. ``mapToCamera`` is T_map_camera, despite its name."""
     path = lidar / "pose" / f"{frame}.json"
     with reading(path, "a pose mapToCamera of View-of-Delft", TypeError, IndexError, RecursionError):
         records = [json.loads(line) for line in read_text(path).splitlines() if line.strip()]
@@ -110,7 +110,7 @@ def _delft_pose(
 #     utm50r_T_xt32.txt                           time x y z qx qy qz qw, from full_trajs/<date>/<sequence>
 #     lidar.pcd or lidar.ply                      optional: ground truth
 
-_SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl")  # the first that is there is read
+_SNAIL_RADARS = ("eagleg7/enhanced", "eagleg7/pcl")  # the first that exists is read
 
 # The published calibration. The axes of the body point forward, left and up; its origin is that of the lidar. Source:
 # matlab/Body_T_Xt32.m and Body_T_Oculii.m ("refined") of github.com/snail-radar/dataset_tools, 2f82c2c.
@@ -126,7 +126,7 @@ def _snail_points(folder: Path) -> Path | None:
 
 
 def _snail_radar(folder: Path, request: Request) -> Scans:
-    """A sequence, such as ``data3``."""
+    """Read a sequence, such as ``data3``."""
     points = _snail_points(folder)
     assert points is not None
     if request.poses is None:
@@ -138,7 +138,7 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
     return read_files(sorted(points.glob("*.pcd"), key=natural), folder, request, partial(lidar_map, folder))
 
 
-# The first that fits a folder reads it.
+# The first one that fits a folder is used.
 DATASETS = (
     Dataset("SNAIL-Radar", lambda f: _snail_points(f) is not None, _snail_radar),
     Dataset(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the fields of a radar's point cloud mean: a table of names, and the returns of a scan by it."""
+"""Roles of the fields of a radar's point cloud: the names that sensors use, and the returns of a scan."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from radarsdf.scans import Notes, Scan, finite_returns
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
 SIGMA = ("sigma_range", "sigma_azimuth", "sigma_elevation")
-# Names that sensors, drivers and data sets give to a role, in lower case and without what separates words. The first name
-# that a cloud has counts. Files of ours come first.
+# Names that sensors, drivers and data sets use for a role, in lower case and without separators. The first one found
+# in a cloud is used. Our own names come first.
 _ALIASES: dict[str, tuple[str, ...]] = {
     "x": ("x",),
     "y": ("y",),
@@ -37,7 +37,7 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
     "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
 }  # fmt: skip
-# Names of columns without names, by their number.
+# Names of unnamed columns, by the number of columns.
 _COLUMNS: dict[int, tuple[str, ...]] = {
     3: ("x", "y", "z"),
     4: ("x", "y", "z", "intensity"),  # KITTI
@@ -57,21 +57,21 @@ def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
 
 @dataclass(frozen=True)
 class Fields:
-    """Which field of a cloud plays which role. Positions are x, y and z, or else range, azimuth and elevation."""
+    """The field of a cloud for each role. Positions are x, y and z, or else range, azimuth and elevation."""
 
-    names: dict[str, str]  # by role
-    in_degrees: bool = False  # angles whose names have no unit
+    names: dict[str, str]  # field name by role
+    in_degrees: bool = False  # unit of angles whose names have none
 
     @classmethod
     def of(cls, names: list[str], overrides: Mapping[str, Any] | None = None) -> Fields:
-        """The roles of fields by their names.
+        """Find the roles of fields by their names.
 
-        `overrides` are fields by role; None leaves a role out.
+        `overrides` maps roles to fields; None leaves a role out.
         """
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
-        # AzimuthAngle, azimuth_angle and Azimuth Angle are one name.
-        squeezed = {_squeezed(name): lower[name] for name in reversed(lower)}
+        # AzimuthAngle, azimuth_angle and Azimuth Angle are the same name.
+        squeezed = {_squeeze(name): lower[name] for name in reversed(lower)}
         found: dict[str, str] = {}
         for role, aliases in _ALIASES.items():
             name = next((squeezed[alias] for alias in aliases if alias in squeezed), None)
@@ -93,11 +93,11 @@ class Fields:
 
     @property
     def polar(self) -> bool:
-        """Whether positions are of range and angles."""
+        """Whether positions are given by range and angles."""
         return not set(_XYZ) <= set(self.names)
 
-    def judged(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
-        """These fields with the unit of their angles: of their names, or else by the numbers in a cloud."""
+    def with_unit(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
+        """Return these fields with the unit of their angles, from their names or else from the values in a cloud."""
         names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
         if all(plain_name(name)[1] for name in names):
             return self
@@ -105,19 +105,19 @@ class Fields:
         in_degrees = are_degrees(azimuth, elevation)
         unit = "degrees" if in_degrees else "rad"
         notes.add(
-            f"{' and '.join(names)} are taken as {unit} by their numbers: azimuth_deg or azimuth_rad would decide"
+            f"{' and '.join(names)} are taken as {unit} by their values: azimuth_deg or azimuth_rad would be explicit"
         )
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes) -> None:
-        """Notes intensities in linear units, and which fields are not used."""
+        """Note intensities in linear units, and unused fields."""
         if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
             notes.add(
-                f"{self.names['intensity']} is taken as intensity as it is: 10 log10 of it, dB, gives a better map"
+                f"{self.names['intensity']} is used as intensity unchanged: in dB, 10 log10, it gives a better map"
             )
         if unused := [name for name in names if name and name not in self.names.values()]:
             listed = ", ".join(unused)
-            notes.add(f"fields that are not used: {listed}; fields={{role: name}} or --field chooses others")
+            notes.add(f"unused fields: {listed}; fields={{role: name}} or --field selects others")
 
     def scan(
         self,
@@ -126,10 +126,10 @@ class Fields:
         time_s: float | None,
         notes: Notes,
     ) -> Scan:
-        """The finite returns in the columns, (N,) each."""
+        """Build a scan of the finite returns in the columns, (N,) each."""
         for name in self.names.values():
             check(columns[name].dtype.kind in "biuf", f"the field {name} holds no numbers")
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is dropped
+        with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are dropped
             intensities, doppler_mps = (
                 np.ascontiguousarray(self._values(columns, role), np.float32) if role in self.names else None
                 for role in ("intensity", "doppler")
@@ -138,7 +138,7 @@ class Fields:
         return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma), notes)
 
     def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
-        """A column in m, rad or m/s, where its name has another unit, or angles are in degrees."""
+        """A column converted to m, rad or m/s by the unit in its name, or from degrees."""
         unit = plain_name(self.names[role])[1]
         if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
             unit = "deg"
@@ -146,7 +146,7 @@ class Fields:
         return values * np.float64(SCALES[unit]) if unit in SCALES else values
 
     def points(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """(N, 3) sensor frame, m: float64 if the file has it or else float32."""
+        """(N, 3) sensor frame, m: float64 if the file has it, else float32."""
         if not self.polar:
             parts = [self._values(columns, axis) for axis in _XYZ]
             dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
@@ -160,15 +160,15 @@ class Fields:
         if not set(SIGMA) <= set(self.names):
             return None
         sigma = np.stack([self._values(columns, role) for role in SIGMA], axis=1).astype(np.float32)
-        if _squeezed(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
+        if _squeeze(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
             sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
         return sigma
 
 
 def plain_name(name: str) -> tuple[str, str]:
-    """A name in lower case as radars give it, and its unit: without the prefix of CloudCompare."""
+    """Name in lower case, without CloudCompare's prefix, and its unit."""
     return without_unit(name.lower().removeprefix("scalar_"))
 
 
-def _squeezed(name: str) -> str:
+def _squeeze(name: str) -> str:
     return re.sub(r"[\W_]+", "", name.lower())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files that are written whole or not at all, locks of folders, and the origin of files in a local frame."""
+"""Atomic writes of files, locks of folders, and the limit of float32 coordinates."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import check, path_of
 
-_MAX_NAME_BYTES = 255  # of nearly all file systems
-_MAX_STEM = 50  # characters of at most four bytes: the temporary name must not be longer than the limit
+_MAX_NAME_BYTES = 255  # limit of nearly all file systems
+_MAX_STEM = 50  # characters of at most four bytes: keeps the temporary name within the limit
 _MAX_FLOAT32_M = 16_384.0  # further from the origin, float32 resolves less than 1 mm
-_LOCK_FLAGS = ("O_CREAT", "O_RDWR", "O_BINARY", "O_NOFOLLOW", "O_NONBLOCK")  # as far as the system has them
+_LOCK_FLAGS = ("O_CREAT", "O_RDWR", "O_BINARY", "O_NOFOLLOW", "O_NONBLOCK")  # flags that the system supports
 _LOCKED = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 
 def check_regular_file(path: str | PathLike[str]) -> None:
-    """Raises unless `path` can be opened and is no pipe or device: reading those could block or never end."""
+    """Raise unless `path` can be opened and is no pipe or device: reading those could block or never end."""
     check(Path(path).is_dir() or stat.S_ISREG(Path(path).stat().st_mode), f"{path} is not a regular file")
     with open(path, "rb"):  # noqa: PTH123 - raises the error that names the path, for a folder too
         pass
@@ -38,7 +38,7 @@ def check_regular_file(path: str | PathLike[str]) -> None:
 
 @contextmanager
 def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> Iterator[None]:
-    """Turns a ValueError, or one of these errors, in its block into a ValueError that names the file: it is not `what`."""
+    """Turn a ValueError, or one of `errors`, raised in the block into a ValueError that `path` is not `what`."""
     kinds: tuple[type[Exception], ...] = (ValueError, *errors)
     try:
         yield
@@ -50,9 +50,9 @@ def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> I
 def check_outputs(
     outputs: Iterable[str | PathLike[str] | None], inputs: Iterable[str | PathLike[str] | None] = ()
 ) -> None:
-    """Raises unless each output can be written, and is neither an input nor another output.
+    """Raise unless each output can be written, and is neither an input nor another output.
 
-    To be called before the work. Paths that are None are ignored; links are followed.
+    Call it before the work. Paths that are None are ignored; links are followed.
     """
     taken = {os.path.realpath(path): path for path in inputs if path is not None}
     for path in outputs:
@@ -68,17 +68,17 @@ def check_outputs(
 
 
 def write_whole(path: str | PathLike[str], data: bytes) -> None:
-    """Writes a file whole or not at all; see :func:`whole_file`."""
+    """Write a file atomically; see :func:`whole_file`."""
     with whole_file(path) as file:
         file.write(data)
 
 
 @contextmanager
 def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
-    """A file open for writing that replaces the one at `path` only once it is on the disk.
+    """Open a file for writing that replaces the one at `path` only once it is on the disk.
 
-    If the block raises, the old file is as before. A link is followed, and the old file's permissions stay. A killed
-    process may leave a hidden file `.NAME.` and 16 hexadecimal digits in the same folder.
+    If the block raises, the old file is unchanged. Links are followed, and the old file's permissions are kept. A killed
+    process may leave a hidden file named `.NAME.` and 16 hexadecimal digits in the same folder.
     """
     target = Path(os.path.realpath(path_of(path, "path")))
     mode = _mode_to_keep(target, path)
@@ -92,16 +92,16 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
             temporary.chmod(mode)
         temporary.replace(target)
     except BaseException as error:
-        with suppress(OSError):  # its folder may be gone, or the disk; the first error says so
+        with suppress(OSError):  # its folder or the disk may be gone, as the first error says
             temporary.unlink()
-        # A full disk names no file. An error without a number is not the system's, one with another file is the block's.
+        # A full disk names no file. Errors without a number are not the system's; those with another file are the block's.
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 
 def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
-    """Permissions of the file that would be replaced; None if there is none."""
+    """Permissions of the file to be replaced; None if there is none."""
     if not target.exists():
         return None
     mode = target.stat().st_mode
@@ -112,11 +112,11 @@ def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
 
 
 def _open_temporary(target: Path) -> tuple[int, Path]:
-    """A new file in the folder of `target`: only within a file system does a rename replace at once."""
+    """Create a file in the folder of `target`: a rename is atomic only within a file system."""
     if len(os.fsencode(target.name)) > _MAX_NAME_BYTES:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
     temporary = target.with_name(f".{target.name[:_MAX_STEM]}.{secrets.token_hex(8)}")
-    # Not tempfile: only the owner may read its files, and the rename would keep that.
+    # Not tempfile: its files are readable by the owner only, and the rename would keep that.
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
         return os.open(temporary, flags, 0o666), temporary
@@ -127,10 +127,10 @@ def _open_temporary(target: Path) -> tuple[int, Path]:
 
 
 def take_lock(path: Path, use: str) -> int:
-    """The descriptor of a file that nobody else has locked; closing it, or the end of the process, unlocks it.
+    """Lock a file and return its descriptor; closing it, or the end of the process, unlocks it.
 
-    The file stays, since another process may be about to lock it. `use` says what its folder is locked for, as a
-    participle. Raises a BlockingIOError that names the holder if it is locked, an OSError if it cannot be written.
+    The file stays, since another process may be about to lock it. `use` is a participle that says what the folder is locked
+    for. Raises a BlockingIOError that names the holder if the file is locked, an OSError if it cannot be written.
     """
     descriptor = os.open(path, sum(getattr(os, flag, 0) for flag in _LOCK_FLAGS), 0o666)
     try:
@@ -142,8 +142,8 @@ def take_lock(path: Path, use: str) -> int:
             holder = text if text and text.isprintable() else "another process"  # empty for a moment
             msg = f"{path.parent} is being {use} by {holder}: wait until that is done, or give another folder"
             raise BlockingIOError(msg) from error
-        # Not all file systems of clusters have locks.
-        words = f"{path.parent} cannot be locked ({error.strerror}): let nobody else use it meanwhile"
+        # Some file systems of clusters have no locks.
+        words = f"{path.parent} cannot be locked ({error.strerror}): make sure that no other process uses it meanwhile"
         warnings.warn(words, RuntimeWarning, stacklevel=3)
     os.ftruncate(descriptor, 0)
     os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
@@ -154,7 +154,7 @@ def _lock(descriptor: int) -> None:
     if sys.platform == "win32":
         import msvcrt  # noqa: PLC0415
 
-        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # beyond the text: nobody could read what is locked
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)  # beyond the text, since nobody can read what is locked
         msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
         os.lseek(descriptor, 0, os.SEEK_SET)
     else:
@@ -164,9 +164,9 @@ def _lock(descriptor: int) -> None:
 
 
 def check_fits_float32(path: str | PathLike[str], points: NDArray[np.float64]) -> None:
-    """Raises a ValueError if float32 would round points (N, 3), m, by more than a millimetre."""
+    """Raise a ValueError if float32 would round points (N, 3), m, by more than a millimetre."""
     near = np.abs(points).max(initial=0.0) <= _MAX_FLOAT32_M
     check(
         near,
-        f"{path}: its format holds float32, too few digits {_MAX_FLOAT32_M:g} m from the origin: write .ply",
+        f"{path}: its float32 coordinates are too coarse {_MAX_FLOAT32_M:g} m from the origin: write .ply",
     )

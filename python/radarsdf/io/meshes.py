@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Meshes in files, in double precision where the format has it, and ground truth from files of any kind."""
+"""Read and write meshes, in double precision if the format has it; read ground truth of any kind."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
-_TRUTH_ARRAYS = ("lidar_points", "points")  # of which the first that a file has counts
-_SAMPLES = 1_000_000  # on a surface: a triangle of a building may be 20 m long
+_TRUTH_ARRAYS = ("lidar_points", "points")  # the first of these that a file has is used
+_SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 
 def holds_mesh(path: str | PathLike[str]) -> bool:
-    """Whether a file is a mesh, by its ending; of PLY, which may be a cloud too, by its header."""
+    """Whether a file is a mesh, by its suffix; for PLY, which may be a cloud too, by its header."""
     file = Path(path)
     suffix = file.suffix.lower()
     if suffix == ".ply":
@@ -38,28 +38,28 @@ def holds_mesh(path: str | PathLike[str]) -> bool:
 
 
 def check_mesh_path(path: str | PathLike[str]) -> None:
-    """Raises a ValueError unless `path` ends like a format that :func:`write_mesh` writes."""
+    """Raise a ValueError unless `path` has a suffix that :func:`write_mesh` supports."""
     known = path_of(path, "path").suffix.lower() in MESH_SUFFIXES
     check(known, f"{path}: files of meshes end in {', '.join(MESH_SUFFIXES)}")
 
 
 def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
-    """Writes a mesh whole or not at all.
+    """Write a mesh atomically.
 
-    PLY, OBJ and OFF keep float64 coordinates. STL and GLB hold float32. GLB has its y axis up, as glTF demands, by a rotation
-    of its root.
+    PLY, OBJ and OFF keep float64 coordinates; STL and GLB hold float32. In GLB, a rotation of the root turns the y axis
+    up, as glTF demands.
 
     Parameters
     ----------
     path : path-like
-        It ends in .ply, .obj, .off, .stl or .glb.
+        A file that ends in .ply, .obj, .off, .stl or .glb.
     mesh : trimesh.Trimesh
-        World frame, m. PLY keeps its vertex attributes of one number a vertex, such as confidence, and its colours.
+        World frame, m. PLY keeps scalar vertex attributes, such as confidence, and colours.
 
     Raises
     ------
     ValueError
-        For another suffix, if `path` is no regular file, or if float32 has too few digits: further than 16 km from the
+        For another suffix, if `path` is no regular file, or if float32 is too coarse: farther than 16 km from the
         origin.
     OSError
         If it cannot be written.
@@ -83,17 +83,17 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
 
 
 def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
-    """Reads a triangle mesh.
+    """Read a triangle mesh.
 
     Parameters
     ----------
     path : path-like
-        It ends in .ply, .obj, .off, .stl or .glb. GLB, whose y axis is up, is turned to z up.
+        A file that ends in .ply, .obj, .off, .stl or .glb. GLB, whose y axis is up, is rotated to z up.
 
     Returns
     -------
     trimesh.Trimesh
-        The mesh with all its vertices: none are merged. A scene of several parts is one mesh.
+        The mesh with all its vertices, unmerged. A scene of several parts becomes one mesh.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     except Exception as error:  # damaged files raise exceptions of many kinds
         msg = f"{path} cannot be read as a mesh: {error}"
         raise ValueError(msg) from error
-    check(whole, f"{path}: a triangle has a corner that is none of its vertices")
+    check(whole, f"{path}: a triangle refers to a vertex that does not exist")
     if file.suffix.lower() == ".glb":
         mesh.apply_transform(_T_GLTF_WORLD.T)
     read: trimesh.Trimesh = mesh
@@ -126,16 +126,16 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
 
 
 def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
-    """Points (M, 3) float64, world frame, m: of a cloud, of an ``.npz`` file, or drawn evenly on a mesh.
+    """Read points (M, 3) float64, world frame, m, from a cloud or an ``.npz`` file, or sample a mesh uniformly.
 
-    The same file gives the same points. Raises as :func:`radarsdf.io.read_points`.
+    The same file gives the same points. Raises the errors of :func:`radarsdf.io.read_points`.
     """
     file = Path(path)
     suffix = file.suffix.lower()
     if holds_mesh(file):
         mesh = read_mesh(file)
         check(mesh.area > 0, f"{path} has no surface")
-        # By area, in the order of the triangles: a triangle has points wherever it is large.
+        # By area, in the order of the triangles, so that each large triangle gets points.
         samples: Any = mesh.sample(_SAMPLES, return_index=True, seed=0)
         return np.asarray(samples[0], np.float64)
     if suffix == ".npz":
@@ -147,7 +147,7 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:
-    """Binary, little-endian, vertices in double precision."""
+    """Encode as binary little-endian PLY with vertices in double precision."""
     columns: Columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True))
     for name, values in mesh.vertex_attributes.items():
         if np.shape(values) == (len(mesh.vertices),):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans in ``.npz`` files, and arrays in those of any kind."""
+"""Scans in ``.npz`` files, and arrays in ``.npy`` and ``.npz`` files of any kind."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from radarsdf.imu import Imu
 from radarsdf.io.files import check_regular_file, reading, whole_file
 from radarsdf.scans import Scans
 
-# Measurements are mostly noise and compress by a factor of 2 to 5. Some kilobytes could unpack to gigabytes.
+# Measurements are mostly noise and compress by a factor of 2 to 5. A file of kilobytes could unpack to gigabytes.
 _MAX_COMPRESSION = 100
-_ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are unpacked at any compression
+_ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are accepted at any compression
 
-_IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu
+_IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu's fields
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "points": ("N", 3), "frame": ("N",), "poses": ("F", 4, 4), "intensity": ("N",), "static": ("N",), "doppler": ("N",),
     "times": ("F",), "sigma": ("N", 3), "lidar_points": ("M", 3),
@@ -30,7 +30,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
-    """Reads scans with poses from an ``.npz`` file.
+    """Read scans with poses from an ``.npz`` file.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         - ``static`` (N,) bool, optional: only returns with True are used;
         - ``lidar_points`` (M, 3), optional: ground truth, world frame, m;
         - ``doppler`` (N,), optional: m/s;
-        - ``times`` (F,), optional: when each scan was taken, s;
-        - ``sigma`` (N, 3), optional: the sensor's own deviations of range, azimuth and elevation, m, rad, rad;
+        - ``times`` (F,), optional: time of each scan, s;
+        - ``sigma`` (N, 3), optional: the sensor's own standard deviations of range, azimuth and elevation, m, rad, rad;
         - ``imu_times`` (G,), ``angular_velocity`` (G, 3), ``specific_force`` (G, 3), ``R_sensor_imu`` (3, 3), all optional: of
           :class:`radarsdf.io.Imu`.
 
@@ -57,7 +57,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     Raises
     ------
     ValueError
-        If the file has another format, or its arrays do not fit together.
+        If the file has another format, or its arrays are inconsistent.
     OSError
         If the file cannot be read.
     """
@@ -73,7 +73,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     order = np.flatnonzero(arrays["static"]) if "static" in arrays else np.arange(len(frame))
     order = order[np.argsort(frame[order], kind="stable")]
     frames, first = np.unique(frame[order], return_index=True)
-    rows = np.split(order, first)[1:]  # the part before the first scan is empty
+    rows = np.split(order, first)[1:]  # np.split's first part, before the first scan, is empty
 
     def by_scan(name: str) -> list[NDArray[Any]] | None:
         return [arrays[name][r] for r in rows] if name in arrays else None
@@ -91,7 +91,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
 
 
 def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raises a ValueError unless the arrays fit together."""
+    """Raise a ValueError unless the arrays are consistent."""
     known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
     for name, array in arrays.items():
         kinds = "biuf" if name == "static" else "iuf"
@@ -101,23 +101,23 @@ def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
         check(array.shape == expected, f"{name} must have shape {expected}, not {array.shape}")
     frame, num_poses = arrays["frame"], len(arrays["poses"])
     rows = (frame == np.floor(frame)) & (frame >= 0) & (frame < num_poses)
-    check(rows.all(), f"frame must hold row numbers of the {num_poses} poses")
+    check(rows.all(), f"frame must hold row indices of the {num_poses} poses")
 
 
 def write_scans(path: str | PathLike[str], scans: Scans) -> None:
-    """Writes scans as the ``.npz`` file that :func:`read_scans` reads, whole or not at all.
+    """Write scans as an ``.npz`` file for :func:`read_scans`, atomically.
 
     Parameters
     ----------
     path : path-like
-        The file. ``.npz`` is appended where it is missing.
+        The file. ``.npz`` is appended if it is missing.
     scans : Scans
         At least one scan. Attributes that are None are omitted.
 
     Raises
     ------
     TypeError
-        If `scans` are no :class:`Scans`.
+        If `scans` is not a :class:`Scans`.
     ValueError
         If `path` is no regular file.
     OSError
@@ -142,7 +142,7 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
 
 
 def array_in(path: Path) -> NDArray[Any]:
-    """The array of an ``.npy`` file, as a memory map: a header that claims more than the file holds is refused."""
+    """Map the array of an ``.npy`` file into memory; a header that claims more than the file holds is refused."""
     check_regular_file(path)
     with reading(path, "a whole .npy file", EOFError):
         array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -150,10 +150,10 @@ def array_in(path: Path) -> NDArray[Any]:
 
 
 def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of an ``.npz`` file that have these names, in this order. Raises as :func:`read_scans`."""
+    """Read those of the named arrays that an ``.npz`` file has, in this order. Raises the errors of :func:`read_scans`."""
     check_regular_file(path)
     arrays = {}
-    # Damaged files raise exceptions of many kinds, OSError among them.
+    # Damaged files raise exceptions of many kinds, including OSError.
     with reading(path, "a whole .npz file", Exception), zipfile.ZipFile(path) as file:
         held = set(file.namelist())
         members = {name: file.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in held}
@@ -167,7 +167,7 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
 
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[Any, ...]]) -> None:
-    """Raises a ValueError unless the wanted arrays are there, each of its type and shape. A length of None is any."""
+    """Raise a ValueError unless the wanted arrays exist with their type and shape. A length of None matches any."""
     for name, (dtype, *shape) in wanted.items():
         array = arrays.get(name, np.zeros(0, "O"))
         fits = array.dtype == dtype and array.ndim == len(shape)
@@ -178,7 +178,7 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[
 def write_arrays(
     path: str | PathLike[str], arrays: Mapping[str, ArrayLike], *, compressed: bool = False
 ) -> None:
-    """Writes the ``.npz`` that :func:`arrays_of` reads, whole or not at all."""
+    """Write an ``.npz`` file for :func:`arrays_of`, atomically."""
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
     with whole_file(path) as file:
         save(file, **arrays)

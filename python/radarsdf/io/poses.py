@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses by time and in files: tables with named columns, TUM, KITTI, and 4 x 4 matrices; the pose of each scan."""
+"""Poses by time and in files: tables with named columns, TUM, KITTI, and 4 x 4 matrices; matching to scans."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from radarsdf.io.npz import array_in
 from radarsdf.io.text import SCALES, in_seconds, read_numbers, read_table, without_unit
 from radarsdf.scans import Columns, Notes
 
-MAX_GAP_S = 0.5  # between two poses over which poses are interpolated, by default
+MAX_GAP_S = 0.5  # longest gap to interpolate across, by default
 
-# Names of files of poses that are found next to scans.
+# Files of poses that are looked for next to scans.
 POSE_FILES = ("poses.txt", "poses.tum", "poses.csv", "poses.npy", "trajectory.txt", "traj.txt", "gt_odom.txt")
-POSE_SUFFIXES = (".tum", ".kitti", ".npy")  # that write_poses writes
-FIND_POSES = "radarsdf poses finds them from the radar alone"  # ends what is said of scans without poses
+POSE_SUFFIXES = (".tum", ".kitti", ".npy")  # formats of write_poses
+FIND_POSES = "radarsdf poses estimates them from the radar alone"  # ends messages on scans without poses
 
-_MAX_NORM_ERROR = 1e-2  # of a quaternion. Three digits are enough; columns of another meaning are refused
-_ROUNDED_S = 1e-3
+_MAX_NORM_ERROR = 1e-2  # tolerance for unit quaternions: three digits suffice, other columns are refused
+_ROUNDING_S = 1e-3
 
 _POSITION = "(?:t|p|pos|position|trans|translation|loc|location|pose)"
 _QUATERNION = "(?:q|quat|quaternion|orientation|rot|rotation)"
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 _TIMES = ("header stamp", "stamp", "timestamp", "time", "t")
-# What words, whole, mean as the name of a column.
+# Patterns of whole column names, and the role of a match.
 _ROLES = (
     (rf"(?:{_QUATERNION} .* |(?:.* )?{_QUATERNION} ?)([xyzw])", "q{}"),
     (rf"(?:{_POSITION} .* |(?:.* )?{_POSITION} ?|)([xyz])", "{}"),
@@ -63,7 +63,7 @@ class Trajectory:
         return Slerp(self.times_s, self.rotations)
 
     def poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses T_world_base (N, 4, 4) at times (N,), s, between the first and the last pose: linear, and by slerp."""
+        """Interpolate poses T_world_base (N, 4, 4) at times (N,), s, within the trajectory: linearly, and by slerp."""
         poses = np.tile(np.eye(4), (len(times_s), 1, 1))
         poses[:, :3, :3] = self._slerp(times_s).as_matrix()
         for axis in range(3):
@@ -71,16 +71,16 @@ class Trajectory:
         return poses
 
     def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
-        """Pose T_world_base (4, 4) at one time, s; None outside of them, and in longer gaps.
+        """Interpolate the pose T_world_base (4, 4) at one time, s; None outside the trajectory and in longer gaps.
 
-        A millisecond beyond the first or the last pose, or next to one in a longer gap, is at that pose: times in files are
+        A time up to a millisecond beyond the ends, or beyond the edge of a longer gap, gets the pose there: times in files are
         rounded.
         """
         after = int(np.clip(np.searchsorted(self.times_s, time_s), 1, len(self.times_s) - 1))
         first_s, last_s = self.times_s[after - 1 : after + 1]
         if not first_s <= time_s <= last_s or last_s - first_s > max_gap_s:
             nearest_s = min(first_s, last_s, key=lambda known_s: abs(known_s - time_s))
-            if not abs(time_s - nearest_s) <= _ROUNDED_S:
+            if not abs(time_s - nearest_s) <= _ROUNDING_S:
                 return None
             time_s = nearest_s
         pose: NDArray[np.float64] = self.poses(np.array([time_s]))[0]
@@ -89,12 +89,12 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class TransformChain:
-    """A product of transforms, each of which is constant or moves: T_world_a · T_a_b · … of a tree of frames."""
+    """A product T_world_a · T_a_b · … of transforms in a tree of frames, each constant or moving."""
 
     links: tuple[Any, ...]  # matrices (4, 4), or poses by time
 
     def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
-        """T_world_base (4, 4) at a time, s; None if a link has none near enough."""
+        """T_world_base (4, 4) at a time, s; None if a moving link has no pose near enough."""
         pose = np.eye(4)
         for link in self.links:
             part = link if isinstance(link, np.ndarray) else link.pose_at(time_s, max_gap_s)
@@ -104,33 +104,33 @@ class TransformChain:
         return pose
 
     def span(self) -> str:
-        """First and last time of its moving links, for messages."""
+        """First and last time of the moving links, for messages."""
         return ", ".join(link.span() for link in self.links if not isinstance(link, np.ndarray))
 
 
 StampedPoses: TypeAlias = Trajectory | TransformChain
 
 Poses: TypeAlias = StampedPoses | NDArray[np.float64]
-"""By time, or (F, 4, 4) in the order of the scans."""
+"""Poses by time, or (F, 4, 4) in the order of the scans."""
 
 UNPOSED: StampedPoses = TransformChain(())
-"""In place of poses, reads scans that have none, such as for :func:`radarsdf.odometry`: each pose is the identity."""
+"""Passed as `poses`, reads scans without poses, such as for :func:`radarsdf.odometry`: each pose is the identity."""
 
 
 class NoPoses(ValueError):
-    """Scans have no poses, and none are given."""
+    """Scans have no poses, and none were passed."""
 
 
 def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Mask (P,) of the rows (P, 7) x y z qx qy qz qw that are finite and have a unit quaternion."""
-    with np.errstate(over="ignore", invalid="ignore"):  # of damaged numbers
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers may overflow
         unit = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= _MAX_NORM_ERROR
     mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
     return mask
 
 
 def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, 4, 4) of rows (P, 7) x y z qx qy qz qw; NaN where a row is no pose."""
+    """Convert rows (P, 7) x y z qx qy qz qw to matrices (P, 4, 4); NaN for rows that are not poses."""
     good = are_poses(table)
     poses = np.full((len(table), 4, 4), np.nan)
     poses[good] = np.eye(4)
@@ -141,9 +141,9 @@ def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = None) -> Trajectory:
-    """The trajectory in rows (P, 8) of time, position and quaternion, in any order.
+    """Build a trajectory from rows (P, 8) of time, position and quaternion, in any order.
 
-    Of several poses at one time, the first counts. `notes` take what was left out.
+    Of several poses at one time, the first is used. Omissions are added to `notes`.
     """
     good = are_poses(table[:, 1:]) & np.isfinite(table[:, 0])
     missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
@@ -151,7 +151,7 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    what = "are left out, not finite, not unit quaternions or of a repeated time"
+    what = "are left out: not finite, no unit quaternion, or a repeated time"
     left_out = (
         ""
         if kept.all()
@@ -166,7 +166,7 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
 
 
 def poses_of(poses: Any, notes: Notes) -> Poses:
-    """Poses as a user gives them: an array (F, 4, 4), poses by time, or a file for :func:`read_poses`."""
+    """Convert the user's argument to poses: an array (F, 4, 4), poses by time, or a file for :func:`read_poses`."""
     if isinstance(poses, (str, PathLike)):
         return read_poses(Path(poses), notes)
     if isinstance(poses, (Trajectory, TransformChain)):
@@ -177,16 +177,16 @@ def poses_of(poses: Any, notes: Notes) -> Poses:
 
 
 def read_poses(path: Path, notes: Notes) -> Poses:
-    """Poses by time, or (F, 4, 4) in the order of the scans, of a file of one of these kinds.
+    """Read poses by time, or (F, 4, 4) in the order of the scans, from a file of one of these kinds.
 
-    - A table whose first line, or a comment above it, names its columns in any order: a time, x, y and z, qx, qy, qz and
-      qw, as in files of EuRoC, evo and ``rostopic echo -p``. Without a time it is in order.
+    - A table whose first line, or a comment above it, names its columns in any order: time, x, y, z, qx, qy, qz and
+      qw, as in files of EuRoC, evo and ``rostopic echo -p``. Without times, rows are in the order of the scans.
     - TUM: ``time x y z qx qy qz qw``, s and m.
-    - KITTI: lines of twelve numbers, the first three rows of a matrix. With a ``Tr`` in ``calib.txt`` next to it,
+    - KITTI: lines of twelve numbers, the first three rows of a matrix. If ``calib.txt`` next to it has a ``Tr``,
       T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
 
-    Times may be in ms, µs or ns since 1970, or in the unit of their name.
+    Times may be in ms, µs or ns since 1970, or in the unit of their column's name.
     """
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
@@ -199,7 +199,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
         columns = _pose_columns(names, values)
         if columns:
-            return _of_columns(columns, path, notes)
+            return _from_columns(columns, path, notes)
     if width == 12:
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
@@ -220,7 +220,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
 
 
 def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
-    """Columns by role, times in s; none if the names are no pose's."""
+    """Columns by role, times in s; empty if the names are not those of a pose."""
     found: Columns = {}
     for name, column in zip(names, table.T, strict=True):
         bare, unit = without_unit(name)
@@ -237,8 +237,8 @@ def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
     return found if set(_TUM[1:]) <= set(found) else {}
 
 
-def _of_columns(columns: Columns, path: Path, notes: Notes) -> Poses:
-    """Poses of named columns: by time, or in their order."""
+def _from_columns(columns: Columns, path: Path, notes: Notes) -> Poses:
+    """Build poses from named columns: by time if there is one, else in their order."""
     poses = np.column_stack([columns[role] for role in _TUM[1:]])
     if "time" not in columns:
         return rigid_or_nan(pose_matrices_of(poses), str(path), notes)
@@ -249,11 +249,11 @@ def _of_columns(columns: Columns, path: Path, notes: Notes) -> Poses:
 
 
 def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.float64]:
-    """Poses (F, 4, 4) in the order of scans. Damaged ones are NaN, and named: their scans have none."""
+    """Check poses (F, 4, 4) in the order of the scans. Damaged ones become NaN and are noted: their scans have none."""
     with reading(name, "poses (F, 4, 4)", TypeError):
         matrices = pose_matrices(poses)
         bad = ~are_rigid(matrices)
-        if 2 * bad.sum() > len(bad):  # of another meaning
+        if 2 * bad.sum() > len(bad):  # the numbers are not poses at all
             check_poses(matrices)
     if bad.any():
         notes.add(
@@ -264,7 +264,7 @@ def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.flo
 
 
 def read_transform(path: Path) -> NDArray[np.float64] | None:
-    """Rigid transform (4, 4) of a text file, if there is one."""
+    """Read a rigid transform (4, 4) from a text file; None if there is no file."""
     if not path.is_file():
         return None
     with reading(path, "a rigid transform"):
@@ -272,7 +272,7 @@ def read_transform(path: Path) -> NDArray[np.float64] | None:
 
 
 def read_calibration(path: Path) -> NDArray[np.float64] | None:
-    """``Tr``, or ``Tr_velo_to_cam``, of a KITTI calibration, as T_camera_sensor (4, 4); None if the file has neither."""
+    """Read ``Tr`` or ``Tr_velo_to_cam`` of a KITTI calibration as T_camera_sensor (4, 4); None if it has neither."""
     check_regular_file(path)
     with reading(path, "a KITTI calibration"):
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -287,35 +287,35 @@ def read_calibration(path: Path) -> NDArray[np.float64] | None:
 
 
 def check_pose_suffix(path: str | PathLike[str]) -> None:
-    """Raises a ValueError for a name that :func:`write_poses` would refuse."""
+    """Raise a ValueError for a suffix that :func:`write_poses` does not support."""
     known = path_of(path, "path").suffix.lower() in POSE_SUFFIXES
-    check(known, f"{path} is no file of poses that can be written: those end in {', '.join(POSE_SUFFIXES)}")
+    check(known, f"{path} is not a supported file of poses: those end in {', '.join(POSE_SUFFIXES)}")
 
 
 def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
-    """Raises a ValueError if :func:`write_poses` would refuse to write without times."""
+    """Raise a ValueError if the format of the file needs times and there are none."""
     if times_s is None and path_of(path, "path").suffix.lower() == ".tum":
         msg = f"{path} needs times, s, and there are none: .kitti and .npy do without"
         raise ValueError(msg)
 
 
 def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike | None = None) -> None:
-    """Writes a trajectory, whole or not at all.
+    """Write a trajectory atomically.
 
     Parameters
     ----------
     path : path-like
-        The suffix says the format: ``.tum``, lines of ``time x y z qx qy qz qw``; ``.kitti``, lines of twelve numbers, the
+        The suffix selects the format: ``.tum``, lines of ``time x y z qx qy qz qw``; ``.kitti``, lines of twelve numbers, the
         first three rows of each matrix; ``.npy``, the array (F, 4, 4). evo reads the first two.
     poses : (F, 4, 4) array_like
         T_world_sensor, m.
     times_s : (F,) array_like, optional
-        s. ``.tum`` needs them; the others have no place for them.
+        Times, s. ``.tum`` needs them; the other formats do not store them.
 
     Raises
     ------
     ValueError
-        If the suffix is none of these, poses are no rigid transforms, or times are missing, not finite or not as many.
+        For another suffix, if poses are not rigid transforms, or times are missing, not finite or not one per pose.
     OSError
         If the file cannot be written.
 
@@ -340,7 +340,7 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike 
     else:
         times_s = real_array(times_s, "times_s")
         fits = times_s.shape == (len(matrices),) and np.isfinite(times_s).all()
-        check(fits, f"times_s must be {len(matrices)} finite numbers, one a pose, not {times_s.shape}")
+        check(fits, f"times_s must be {len(matrices)} finite numbers, one per pose, not {times_s.shape}")
         quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
         np.savetxt(text, np.column_stack([times_s, matrices[:, :3, 3], quaternions]), "%.9f")
     write_whole(path, text.getvalue())

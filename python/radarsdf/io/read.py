@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One function that reads scans from files, folders and bags of any kind."""
+"""Read scans from files, folders and bags of any supported kind."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def read(
     max_gap_s: float = MAX_GAP_S,
     ground_truth: str | PathLike[str] | ArrayLike | None = None,
 ) -> Scans:
-    """Reads scans with poses from a file, a folder or bags.
+    """Read scans with poses from a file, a folder or bags.
 
-    What was assumed and what was left out is logged by the logger ``radarsdf.io``, and kept in ``notes`` of the scans.
-    Returns with a coordinate or an intensity that is not finite, files that cannot be read, and scans whose poses are not
-    finite are left out, and counted.
+    Assumptions and omissions are logged by the logger ``radarsdf.io``, and kept in the ``notes`` of the scans.
+    Returns with a non-finite coordinate or intensity, unreadable files, and scans with non-finite poses are
+    skipped and counted.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def read(
 
         - our ``.npz`` (see :func:`read_scans`);
         - a folder with a file per scan: PCD, PLY, ``.bin`` of KITTI, ``.npy``, CSV or other text, LAS or LAZ, in natural
-          order or that of the times in their names, and with ``lidar.pcd`` or ``lidar.ply`` as ground truth; or one such
+          order or in that of the times in their names, with ``lidar.pcd`` or ``lidar.ply`` as ground truth; or one such
           file;
         - a folder of a published data set, recognised by its layout;
         - a ROS 1 bag, a ROS 2 bag (a folder, ``.mcap`` or ``.db3``), a folder of bags, or a sequence of bags of one drive.
@@ -77,17 +77,17 @@ def read(
     topic : str or sequence of str, optional
         In a bag, the topics of the scans, merged by time. By default the radar's, if there is one.
     pose_topic : str, optional
-        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one whose child frame does
-        not move against that of the scans, or else TF, or else the only one.
+        In a bag, the topic of the poses (Odometry, PoseStamped, Path or TF). By default the only one whose child frame is
+        rigidly attached to that of the scans, else TF, else the only one.
     imu_topic : str, optional
         In a bag, the topic of the IMU, for `Scans.imu`. By default the only one.
     R_sensor_imu : (3, 3) array_like, optional
         Rotation from the axes of the IMU to those of the radar. By default that of the file, or of the static transforms of
         a bag.
     world_frame : str, optional
-        With poses of TF, the world frame. By default the root of its tree.
+        World frame of poses from TF. By default the root of its tree.
     stamps : {"header", "record"}, optional
-        In a bag, the time of a scan. By default that of its header, unless its stamps are zero or stand still.
+        In a bag, the clock of the scans. By default the header stamps, unless they are zero or constant.
     fields : mapping, optional
         Field of the file by role, where names are unknown or misleading: ``{"intensity": "Power"}``. None leaves a role
         out. Roles are x, y, z, range, azimuth, elevation, intensity, doppler, sigma_range, sigma_azimuth and
@@ -96,20 +96,20 @@ def read(
         Of files without column names: how many a point has, or their names. By default ``.bin`` files are those of KITTI:
         float32 x, y, z, intensity.
     max_gap_s : float
-        Longest time between two poses over which poses are interpolated, s. Other scans are left out, and counted.
+        Longest gap between two poses to interpolate across, s. Scans in longer gaps are skipped and counted.
     ground_truth : path-like or (M, 3) array_like, optional
         Lidar points, world frame, m, in place of those that come with the scans.
 
     Returns
     -------
     Scans
-        Scans that are read while they are iterated, in memory bounded by one scan. Points keep the precision of the file;
+        Scans, read lazily while iterated, with memory bounded by one scan. Points keep the precision of the file;
         intensities, Doppler and standard deviations are float32.
 
     Raises
     ------
     NoPoses
-        If scans have no poses: a ValueError.
+        If the scans have no poses. It is a ValueError.
     ValueError
         If files are damaged or do not fit together, something is missing, or a choice is ambiguous.
     OSError
@@ -159,7 +159,7 @@ def read(
 
 
 def _read(path: Path, request: Request) -> Scans:
-    """By what the path is: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
+    """Dispatch on the kind of path: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
     if is_bag(path):
         return read_bags([path], request)
     if path.is_dir():
@@ -188,7 +188,7 @@ def _read(path: Path, request: Request) -> Scans:
 
 
 def _npz(path: Path, request: Request) -> Scans:
-    """The scans of our own file, with its poses or those that are given."""
+    """Read our own file, with its poses or those passed by the user."""
     notes = request.notes
     others = None if request.poses is UNPOSED else request.poses
     what = "contains its own poses T_world_sensor: extrinsic applies only to poses passed as an argument"

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""From the files of a recording to scans with poses.
+"""Build scans with poses from the files of a recording.
 
-Each format gives an iterator of :class:`RawScan`; :func:`posed` finds the pose of each, reads its columns, and decides what
-they mean. What cannot be used is counted in the notes, and never ends the reading. Folders have a file a scan.
+Each format yields :class:`RawScan`; :func:`posed` finds the pose of each, reads its columns, and assigns their
+roles. Unusable data are counted in the notes, and never abort the reading. Folders hold one scan per file.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from radarsdf.io.text import in_seconds, read_numbers, unit_since_1970
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
 BASE_T_RADAR = "base_T_radar.txt"
-"""A file next to scans: 4 x 4, the pose of the radar in the frame that has the poses."""
+"""A file next to scans: 4 x 4, the pose of the radar in the frame of the poses."""
 
-# With a time, s, for each scan, one a line; of three columns, the last two are seconds and nanoseconds.
+# One time per line and scan, s; of three columns, the last two are seconds and nanoseconds.
 TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.txt")
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, "calib.txt", BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
@@ -48,18 +48,18 @@ _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
 _TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
 Truth = Callable[[], NDArray[np.float64] | None]
-"""Reads ground truth, (M, 3), world frame, m, when it is asked for; None if there is none."""
+"""Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
 
 FindPoses = Callable[[str], Poses | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """How a user wants scans to be read; see :func:`radarsdf.io.read`."""
+    """Arguments of :func:`radarsdf.io.read`."""
 
     poses: Any = None
     extrinsic: NDArray[np.float64] | None = None
-    topic: tuple[str, ...] = ()  # none: the only one that can be meant
+    topic: tuple[str, ...] = ()  # empty: the only candidate
     pose_topic: str | None = None
     imu_topic: str | None = None
     R_sensor_imu: NDArray[np.float64] | None = None
@@ -73,20 +73,20 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class RawScan:
-    """A scan of a file, whose points are not yet read."""
+    """A scan of a file whose points are not yet read."""
 
     read: Callable[[], Columns]
     time_s: float | None
-    name: str  # for messages
-    frame: str = ""  # of a bag
-    topic: str = ""  # of a bag
-    number: int | None = None  # of its pose, in the order of the scans. None: the number of scans before it
+    name: str  # shown in messages
+    frame: str = ""  # header frame; only in bags
+    topic: str = ""  # topic name; only in bags
+    number: int | None = None  # index of its pose. None: the number of scans before it
 
 
 def posed(
     raw_scans: Callable[[], Iterable[RawScan]], find_poses: FindPoses, request: Request
 ) -> Callable[[], Iterator[Scan]]:
-    """The source of :meth:`Scans.of_source`: scans with poses and at least one return, in the order of the files."""
+    """Source for :meth:`Scans.of_source`: scans with poses and at least one return, in the order of the files."""
     notes = request.notes
 
     def source() -> Iterator[Scan]:
@@ -99,7 +99,7 @@ def posed(
                 continue
             if isinstance(known, np.ndarray):
                 own = known[number if raw.number is None else raw.number :][:1]
-                if not np.isfinite(own).all() or not len(own):  # it was named when the poses were read
+                if not np.isfinite(own).all() or not len(own):  # reported when the poses were read
                     continue
                 T_world_sensor = own[0]
             else:
@@ -112,7 +112,7 @@ def posed(
             num_posed += 1
             if scan := _scan(raw, T_world_sensor, layouts, request):
                 yield scan
-        what = f"no scan has a pose: {unposed}, gaps up to {request.max_gap_s} s: of one clock?"
+        what = f"no scan has a pose: {unposed}, gaps up to {request.max_gap_s} s: do both use one clock?"
         check(num_posed or not unposed, f"{notes.about}: {what}")
 
     return source
@@ -124,7 +124,7 @@ def _scan(
     layouts: dict[tuple[str, ...], Fields],
     request: Request,
 ) -> Scan | None:
-    """The scan with its pose; None, and counted, if it is damaged or has no returns. Adds to what `layouts` mean."""
+    """Read a scan and attach its pose; None, and counted, if it is damaged or empty. Extends `layouts`."""
     notes = request.notes
     try:
         columns = raw.read()
@@ -142,10 +142,10 @@ def _scan(
 
 
 def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields], request: Request) -> Fields:
-    """What the columns mean: as in an earlier scan of the topic with the same ones, or else by their names."""
+    """Roles of the columns: those of an earlier scan of the topic with the same columns, or by name."""
     layout, notes = (topic, *columns), request.notes
     if layout not in layouts:
-        fields = Fields.of(list(columns), request.fields).judged(columns, notes)
+        fields = Fields.of(list(columns), request.fields).with_unit(columns, notes)
         if not request.fields and topic not in {known for known, *_ in layouts}:
             fields.note_use(columns, notes)
         layouts[layout] = fields
@@ -159,14 +159,14 @@ def scan_poses(
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
 ) -> tuple[Poses, Sequence[float] | None]:
-    """The poses T_world_sensor of `count` scans, and their times, s, as far as they are then known."""
+    """Return the poses T_world_sensor of `count` scans, and their times, s, if known."""
     about = request.notes.about
     if isinstance(poses, np.ndarray):
         what = "give as many, or poses with time stamps for scans with time stamps"
         check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
     elif times_s is None:
         if not isinstance(poses, Trajectory) or len(poses.times_s) != count:
-            msg = f"{about}: the {count} scans have no time stamps, and the poses ({poses.span()}) are not as many"
+            msg = f"{about}: the {count} scans have no time stamps, and the number of poses ({poses.span()}) differs"
             raise ValueError(msg)
         request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()
@@ -179,14 +179,14 @@ def scan_poses(
 
 
 def read_folder(folder: Path, request: Request) -> Scans:
-    """The scans of the files in a folder; see :func:`radarsdf.io.read`."""
+    """Read the scans of a folder; see :func:`radarsdf.io.read`."""
     return read_files(cloud_files(folder), folder, request, partial(lidar_map, folder))
 
 
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
-    """The scans of files with the poses of the request, or those that are found in or near the folder.
+    """Read scans from files, with the poses of the request or those found in or near the folder.
 
-    The files hold one scan each.
+    Each file holds one scan.
     """
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
@@ -218,7 +218,7 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
 
 
 def cloud_files(folder: Path) -> list[Path]:
-    """The scans of a folder, or of a folder of `SCAN_FOLDERS` in it, in natural order: of the suffix with most files."""
+    """Files of scans in a folder or its subfolder of `SCAN_FOLDERS`, in natural order: those of the most frequent suffix."""
     for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
         kinds: dict[str, list[Path]] = {}
         for path in inner.iterdir() if inner.is_dir() else ():
@@ -232,13 +232,13 @@ def cloud_files(folder: Path) -> list[Path]:
 
 
 def natural(path: Path) -> tuple[Any, ...]:
-    """Sorts names as people do: scan_9 before scan_10."""
+    """Sort key for natural order: scan_9 before scan_10."""
     parts = re.split(r"(\d+)", path.name)
     return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
 
 
 def lidar_map(folder: Path) -> NDArray[np.float64] | None:
-    """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``. None if there is neither."""
+    """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``; None if there is neither."""
     found = (folder / f"{_TRUTH_STEM}{suffix}" for suffix in (".pcd", ".ply"))
     return next((read_points(path) for path in found if path.is_file()), None)
 
@@ -246,10 +246,10 @@ def lidar_map(folder: Path) -> NDArray[np.float64] | None:
 def _in_order_of_time(
     files: list[Path], poses: Poses, notes: Notes
 ) -> tuple[list[Path], Sequence[float] | None, Poses]:
-    """Scans in the order of their times, these times, s, None if there are none, and the poses.
+    """Sort scans by time; return files, times, s, or None if there are none, and poses.
 
-    Poses without times belong to the files by number: in the order of the times in their names, or, where a file has the
-    times line by line, in the order of these lines.
+    Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
+    file of times.
     """
     times = [time for path in files if (time := _time_in(path.stem)) is not None]
     listed = None
@@ -271,7 +271,7 @@ def _in_order_of_time(
 
 
 def _time_in(stem: str) -> float | None:
-    """The time, s, that a name ends in: with a point s; in 12, 15 or 18 digits or more ms, µs or ns. Others are numbers."""
+    """Time, s, at the end of a name: in s with a point; in ms, µs or ns with at least 12, 15 or 18 digits; else None."""
     if parts := _SECONDS_AND_NANOSECONDS.search(stem):
         return int(parts[1]) + 1e-9 * int(parts[2])
     found = _TIME.search(stem)

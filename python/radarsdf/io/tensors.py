@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Safetensors files whose arrays are read as they are asked for."""
+"""Safetensors files whose arrays are read on demand."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from torch import Tensor
 
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """A safetensors file."""
+    """Encode tensors as a safetensors file."""
     return save({name: tensor.contiguous() for name, tensor in tensors.items()}, dict(metadata))
 
 
 class TensorFile:
-    """An open safetensors file, as ``safetensors.safe_open`` opens it."""
+    """An open safetensors file that reads arrays on demand."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -28,12 +28,12 @@ class TensorFile:
         self.metadata: dict[str, str] = file.metadata() or {}
 
     def array(self, name: str) -> Any:
-        """An array of this name: a view of the file."""
+        """Return an array as a view of the file."""
         return self._file.get_tensor(name)
 
 
 @contextmanager
 def open_tensors(path: str | PathLike[str], framework: str = "pt") -> Iterator[TensorFile]:
-    """A safetensors file with arrays of this `framework`."""
+    """Open a safetensors file with arrays of this `framework`."""
     with safe_open(path, framework=framework) as file:
         yield TensorFile(file)

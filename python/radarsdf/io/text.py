@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Tables of numbers in text files, in which no line is lost silently, and the units of their columns."""
+"""Tables of numbers in text files, without silent loss of lines, and the units of their columns."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ _COMMENT = re.compile("(#|//|%).*")
 SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "mrad": 1e-3,
           **dict.fromkeys(("km/h", "kmh", "kph"), 1 / 3.6),
           **dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180)}  # fmt: skip
-"""Units in names of columns, in m, s, m/s or rad."""
+"""Factors from the units in column names to m, s, m/s or rad."""
 
 _UNIT = re.compile(
     r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|kph|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
 )
 _SINCE_1970 = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
-_LIMITS = (1e11, 1e14, 1e17)  # of the absolute times since 1970, from one of these units to the next
-_BEYOND = 1.05  # angles that exceed a limit by rounding
+_LIMITS = (1e11, 1e14, 1e17)  # bounds of absolute times since 1970 in one of these units and the next
+_SLACK = 1.05  # tolerance for angles that exceed a limit by rounding
 
 
 class Table(NamedTuple):
-    """The R rows of numbers of a text file."""
+    """Table of R rows of numbers in a text file."""
 
     heads: list[
         list[str]
-    ]  # the words of the lines above the rows, comments too: one of them may name the columns
-    values: NDArray[np.float64]  # (R, W), NaN for a word that is no number, and in a row of another width
+    ]  # words of the lines above the rows, including comments: one of them may name the columns
+    values: NDArray[np.float64]  # (R, W), NaN for words that are not numbers, and for rows of another width
 
 
 def read_table(path: Path) -> Table:
-    """Reads a text file with a row of numbers a line, separated by commas, semicolons, tabs or spaces.
+    """Read a text file with one row of numbers per line, separated by commas, semicolons, tabs or spaces.
 
-    Comments begin with ``#``, ``//`` or ``%``; decimal commas are read where semicolons separate the numbers. The first
-    line with a number is the first row. Raises a ValueError if most rows have words that are no numbers.
+    Comments begin with ``#``, ``//`` or ``%``; decimal commas are read if semicolons separate the numbers. The first
+    line with a number is the first row. Raises a ValueError if most rows have words that are not numbers.
     """
     heads: list[list[str]] = []
     rows: list[str] = []
     for line in read_text(path).splitlines():
         bare = _COMMENT.sub("", line).strip()
         if not rows and line.strip():
-            words = _words_of((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
+            words = _split_words((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
             if not bare or not any(map(_is_number, words)):
                 heads.append(words)
                 continue
@@ -63,7 +63,7 @@ def read_table(path: Path) -> Table:
 
 
 def _values(rows: list[str]) -> NDArray[np.float64]:
-    """(R, W) the numbers of the rows, by NumPy at once or else, where some are damaged, row by row."""
+    """Parse rows to numbers (R, W): by NumPy at once or, if some are damaged, row by row."""
     separator = next((sign for sign in (";", ",", "\t") if sign in rows[0]), None)
     if separator == ";":
         rows = [row.replace(",", ".") for row in rows]
@@ -80,22 +80,22 @@ def _values(rows: list[str]) -> NDArray[np.float64]:
     of_words = ~known.any(axis=0)  # a column of labels is no damage
     damaged = ~known[:, ~of_words].all(axis=1)
     most = of_words.all() or 2 * damaged.sum() > len(words)
-    check(not most, f"a line is no row of {width} numbers: {rows[int(np.argmax(damaged))]!r:.50}")
+    check(not most, f"a line is not a row of {width} numbers: {rows[int(np.argmax(damaged))]!r:.50}")
     return table
 
 
 def read_numbers(path: Path, columns: int | None = None) -> NDArray[np.float64]:
-    """(R, columns) finite numbers of a text file; None: as many as it has."""
+    """Read a table of finite numbers (R, columns) from a text file; None: any number of columns."""
     with reading(path, f"a table of {columns or 'any number of'} columns of finite numbers"):
         values = read_table(path).values
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        check(len(bad) == 0, f"row {bad[:1]} has others, or not as many as other rows")
+        check(len(bad) == 0, f"row {bad[:1]} has other values, or another number of columns")
         check(columns in (None, values.shape[1]), f"it has {values.shape[1]}")
     return values
 
 
 def read_text(path: Path) -> str:
-    """The text of a file in UTF-8. What does not decode, such as a comment in Latin-1, becomes replacement characters."""
+    """Read text in UTF-8. Undecodable bytes, such as a comment in Latin-1, become replacement characters."""
     return path.read_bytes().decode("utf-8-sig", errors="replace")
 
 
@@ -107,8 +107,8 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _words_of(line: str) -> list[str]:
-    """The words of a line, separated by commas, semicolons, tabs or else white space."""
+def _split_words(line: str) -> list[str]:
+    """Split a line at commas, semicolons, tabs or else white space."""
     separator = next((sign for sign in (";", ",", "\t") if sign in line), None)
     if separator == ";":
         line = line.replace(",", ".")
@@ -118,7 +118,7 @@ def _words_of(line: str) -> list[str]:
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """The name of a column in lower case without its unit, and the unit: of ``azimuth_deg``, ``x [m]``, ``time(ns)``."""
+    """Split a column name such as ``azimuth_deg``, ``x [m]`` or ``time(ns)`` into the bare name in lower case and the unit."""
     name = name.strip().lower()
     found = _UNIT.search(name)
     if found is None or not found.start():
@@ -127,12 +127,12 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def unit_since_1970(time: float) -> tuple[str, float]:
-    """The unit of a time since 1970 and its length, s."""
+    """Unit of a time since 1970 by its magnitude, and its length, s."""
     return _SINCE_1970[bisect(_LIMITS, abs(time))]
 
 
 def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
-    """Times (N,) of the file `name`, s. They may be in ms, µs or ns since 1970, which is noted."""
+    """Convert times (N,) of the file `name` to s. They may be in ms, µs or ns since 1970, which is noted."""
     check(np.isfinite(times).all(), f"{name} holds a time that is not finite")
     unit, scale = unit_since_1970(float(np.median(times)) if len(times) else 0.0)
     if unit != "s":
@@ -141,11 +141,11 @@ def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[n
 
 
 def are_degrees(azimuth: NDArray[Any], elevation: NDArray[Any]) -> bool:
-    """Whether angles (N,) are in degrees, because they exceed what rad can be."""
+    """Whether angles (N,) must be in degrees because they exceed the range of radians."""
     finite = np.isfinite(azimuth) & np.isfinite(elevation)
     if not finite.any():
         return False
     azimuth, elevation = azimuth[finite], elevation[finite]
     largest, highest = (np.quantile(np.abs(angles), 0.99) / np.pi for angles in (azimuth, elevation))
     # Azimuths in rad are from -pi to pi, or from 0 to 2 pi.
-    return bool(highest > _BEYOND / 2 or largest > (_BEYOND if azimuth.min() < 0 else 2 * _BEYOND))
+    return bool(highest > _SLACK / 2 or largest > (_SLACK if azimuth.min() < 0 else 2 * _SLACK))

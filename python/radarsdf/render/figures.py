@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Figures by matplotlib, an extra: views, grids and trajectories. They need no display and leave its settings alone."""
+"""Figures by matplotlib, an extra: views, grids and trajectories. They need no display and do not change its settings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from radarsdf.map.view import View
 
 _UNKNOWN = "#d0d0d0"
 _TRAJECTORY_COLORS = ("#d95f02", "#1b6ca8", "#2a7f3f", "#8e44ad")
-_MAX_RETURNS = 60_000  # that a picture of trajectories shows
+_MAX_RETURNS = 60_000  # largest number in a picture of trajectories
 
 
 def new_figure(**options: Any) -> Any:
-    """A matplotlib figure that needs no display; `options` are those of ``matplotlib.figure.Figure``."""
+    """Create a matplotlib figure that needs no display; `options` are those of ``matplotlib.figure.Figure``."""
     require("matplotlib", what="pictures need")
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - an extra
-    from matplotlib.figure import Figure  # noqa: PLC0415 - likewise
+    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     figure = Figure(**options)
     FigureCanvasAgg(figure)
@@ -34,7 +34,7 @@ def new_figure(**options: Any) -> Any:
 
 
 def png_of(figure: Any, **options: Any) -> bytes:
-    """A figure as PNG; `options` are those of ``Figure.savefig``."""
+    """Encode a figure as PNG; `options` are those of ``Figure.savefig``."""
     file = io.BytesIO()
     figure.savefig(file, format="png", **options)
     return file.getvalue()
@@ -55,8 +55,8 @@ def save_view_picture(
     views : sequence of View
         At least one.
     measured : sequence of arrays, optional
-        For each view, the returns measured from there: (N, 3) sensor frame, m, or (N, 4) with their intensity. None
-        where nothing was measured.
+        For each view, the returns measured there: (N, 3) sensor frame, m, or (N, 4) with their intensity. None
+        if nothing was measured.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def save_view_picture(
             azimuth_deg, elevation_deg, view.beam_ranges_m, cmap="viridis_r", shading="nearest"
         )
         axes[-1].set(title="first surface", xlabel="azimuth, °", ylabel="elevation, °")
-        axes[-1].invert_xaxis()  # as the sensor sees it: left is left
+        axes[-1].invert_xaxis()  # as seen by the sensor: left is left
         figure.colorbar(image, ax=axes[-1], label="range, m")
     write_whole(path, png_of(figure, dpi=100))
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Pictures of a mesh by casting rays: they need no display and no OpenGL."""
+"""Ray-cast pictures of a mesh, which need no display and no OpenGL."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _Floats = NDArray[np.float64]
 
-_PIXELS_AT_ONCE = 1 << 20  # bounds the memory
+_PIXELS_AT_ONCE = 1 << 20  # limit of memory
 _CREASE = np.cos(np.deg2rad(40.0))  # edges with a larger angle are drawn sharp, others are shaded smoothly
 _SUPERSAMPLING = 2  # subpixels per pixel and axis, which are averaged for smooth edges
 
@@ -46,7 +46,7 @@ def render(
     width, height : int
         Size of the picture in pixels.
     viewpoint : (3,) array_like, optional
-        Position of the viewer, world frame, m. The view is aimed at the mesh and zoomed to fill the picture. None:
+        Position of the viewer, world frame, m. The view is centred on the mesh and zoomed to fill the picture. None:
         obliquely from above one of its longer sides. Triangles that reach behind the viewer are not drawn.
 
     Returns
@@ -90,7 +90,7 @@ def render(
     image = np.full((rows, columns, 3), 255.0, np.float32)
     depth = np.full((rows, columns), np.inf)
     for part in np.array_split(np.arange(rows), -(-rows * columns // _PIXELS_AT_ONCE)):
-        rays = u[None, :, None] * right - v[part][:, None, None] * up + forward  # of depth 1
+        rays = u[None, :, None] * right - v[part][:, None, None] * up + forward  # depth 1
         length = np.linalg.norm(rays, axis=2)
         directions = np.asarray(rays / length[..., None], np.float32).reshape(-1, 3)
         range_m, face = tracer.first_hits(eye.tolist(), directions, np.inf, False, threads)
@@ -177,20 +177,20 @@ def save_picture(
 def eye_around(points: _Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) -> _Floats:
     """Position (3,) from which all points (N, 3), m, with z up, are visible, `rise_deg` above the horizon.
 
-    It faces the southern one of their two longer sides, turned by `turn_deg`, anticlockwise as seen from above.
+    It faces the southern one of their two longer sides, rotated by `turn_deg`, anticlockwise as seen from above.
     """
     center, radius = middle_of(points)
     spread = points[:, :2] - points[:, :2].mean(axis=0)
     along = np.linalg.eigh(spread.T @ spread)[1][:, 1]
     across = np.array([along[1], -along[0]])
-    across *= -1.0 if across[1] > 0 else 1.0  # of the two sides, the southern one
+    across *= -1.0 if across[1] > 0 else 1.0  # face the southern side
     turn, rise = np.deg2rad([turn_deg, rise_deg])
     flat = np.cos(turn) * across + np.sin(turn) * np.array([-across[1], across[0]])
     return np.asarray(center + 2.6 * radius * np.array([*(np.cos(rise) * flat), np.sin(rise)]))
 
 
 def middle_of(points: _Floats) -> tuple[_Floats, float]:
-    """Centre (3,) of the bounding box of points (N, 3), and half its diagonal, without a few stray points."""
+    """Centre (3,) of the bounding box of points (N, 3), and half its diagonal, ignoring a few stray points."""
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     return 0.5 * (low + high), max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
@@ -217,14 +217,14 @@ def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tu
 def _zoom(seen: _Floats, rows: int, columns: int) -> tuple[_Floats, float] | None:
     """Middle (2,) of the picture, and pixels per unit, both at depth 1, for points (N, 3) along the axes of the eye.
 
-    None: all of them are more than 56° from its axis. The zoom ignores such points.
+    None if all of them are more than 56° off its axis. The zoom ignores such points.
     """
     screen = np.stack([seen[:, 0], -seen[:, 1]]) / seen[:, 2]
     screen = screen[:, np.hypot(*screen) <= 1.5]
     if screen.shape[1] == 0:
         return None
     low, high = np.percentile(screen, [2, 98], axis=1)
-    reach = 0.2 * (high - low)  # all of a compact scene, yet a few stray triangles must not make it small
+    reach = 0.2 * (high - low)  # keeps a compact scene whole, but ignores a few stray triangles
     low, high = np.maximum(low - reach, screen.min(axis=1)), np.minimum(high + reach, screen.max(axis=1))
     focal = 0.93 * float(np.min(np.array([columns, rows]) / np.maximum(high - low, 1e-9)))
     return 0.5 * (low + high), focal
@@ -235,7 +235,7 @@ def _barycentric(points: _Floats, corners: _Floats) -> _Floats:
     a, b, c = (corners[:, i] - points for i in range(3))
     across = np.cross(b - a, c - a)
     weight = np.stack([np.einsum("nj,nj->n", across, np.cross(*two)) for two in ((b, c), (c, a), (a, b))], 1)
-    # Rounding can put a point outside, and triangles can have no area.
+    # Rounding can put a point outside, and triangles can be degenerate.
     weight = np.maximum(weight, 0.0) + 1e-300
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
@@ -254,7 +254,7 @@ def _corner_normals(vertices: _Floats, faces: NDArray[np.int32]) -> _Floats:
 
 
 def _contours(depth: _Floats, step: int) -> NDArray[np.float32]:
-    """Brightness factors (rows, columns) of eye-dome lighting: a pixel is darker if those `step` pixels away are nearer."""
+    """Brightness factors (rows, columns) of eye-dome lighting: pixels with nearer ones `step` pixels away are darker."""
     far = np.log(depth).astype(np.float32)
     padded = np.pad(far, step, constant_values=np.inf)
     hidden = np.zeros_like(far)

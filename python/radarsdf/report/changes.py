@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The report of what changed between two maps."""
+"""The report on changes between two maps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write_changes_report(
     edge_m: float,
     regions: Sequence[Region],
 ) -> int:
-    """Write a self-contained HTML page about what changed, whole or not at all, and return its size, bytes.
+    """Write a self-contained HTML page about changes atomically, and return its size, bytes.
 
     `names`: of the earlier and the later map. `edge_m`: vertex spacing of their surfaces. `regions`: the changes to
     list, largest first. Raises an ImportError if matplotlib or viser is missing, an OSError if the file cannot be written.

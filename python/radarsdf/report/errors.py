@@ -20,9 +20,9 @@ from radarsdf.tiles.tiled_map import predicted
 _Floats = NDArray[np.float64]
 
 _SAMPLES = 1_000_000
-_MATCH_M = 0.4  # a vertex farther from the truth is an outlier, not a surface with an error
+_MATCH_M = 0.4  # a vertex farther from the truth is an outlier rather than an inaccurate surface
 _MIN_MATCHES = 100
-_MAX_RETURNS = 100_000  # evenly spread; more would change no plot
+_MAX_RETURNS = 100_000  # evenly spread; more would not change a plot
 
 
 def error_values(subject: Subject) -> dict[str, Any] | None:

@@ -22,12 +22,12 @@ _NBSP = "\N{NO-BREAK SPACE}"
 
 
 def require_extras() -> None:
-    """Raise an ImportError that names what to install if matplotlib or viser is missing."""
+    """Raise an ImportError with the install command if matplotlib or viser is missing."""
     require("matplotlib", "viser", what="a report needs")
 
 
 def write_page(path: str | PathLike[str], template: str, **values: Any) -> int:
-    """Write a filled template, whole or not at all. Returns the size of the file, bytes."""
+    """Fill a template and write the page atomically. Returns the size of the file, bytes."""
     made = time.strftime("%Y-%m-%d %H:%M")
     data = _environment().get_template(template).render(made=made, **values).encode()
     write_whole(path, data)
@@ -35,23 +35,23 @@ def write_page(path: str | PathLike[str], template: str, **values: Any) -> int:
 
 
 def fixed(value: float, digits: int, unit: str = "") -> str:
-    """A number with so many decimals and its unit."""
+    """Format a number with a fixed number of decimals and its unit."""
     return f"{value:,.{digits}f}" + (unit if unit in ("", "°") else _NBSP + unit)
 
 
 def percent(share: float) -> str:
-    """A share from 0 to 1 as a percentage."""
+    """Format a share from 0 to 1 as a percentage."""
     return fixed(100 * share, 1, "%")
 
 
 def data_uri(image: bytes) -> str:
-    """The data URI of a PNG or JPEG file."""
+    """Encode a PNG or JPEG file as a data URI."""
     kind = "png" if image.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
 
 
 def css_color(rgb: Sequence[int]) -> str:
-    """An sRGB colour, 0 to 255, as CSS."""
+    """Format an sRGB colour, 0 to 255, as CSS."""
     return "rgb({} {} {})".format(*rgb)
 
 

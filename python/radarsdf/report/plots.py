@@ -18,7 +18,7 @@ _FIRST, _SECOND = "#0072b2", "#d55e00"  # distinguishable by colour-blind reader
 
 
 def _subplots() -> tuple[Any, Any]:
-    """A figure and its axes. It is small, so that text stays legible on a phone."""
+    """Create a figure with axes, small enough for text to stay legible on a phone."""
     figure = new_figure(figsize=(4.4, 3.3), dpi=180, layout="constrained", facecolor="white")
     return figure, figure.subplots()
 
@@ -32,7 +32,7 @@ def _png(figure: Any) -> bytes:
 
 
 def reliability(predicted_m: Sequence[float], measured_m: Sequence[float]) -> bytes:
-    """RMS error over predicted uncertainty, in bins."""
+    """Plot RMS error over predicted uncertainty, in bins."""
     figure, ax = _subplots()
     most = 1.1 * max(*predicted_m, *measured_m)
     ax.plot([0, most], [0, most], color="gray", linestyle="--", linewidth=1, label="ideal")
@@ -43,7 +43,7 @@ def reliability(predicted_m: Sequence[float], measured_m: Sequence[float]) -> by
 
 
 def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
-    """Density of predicted over measured intensities (N,), with the diagonal."""
+    """Plot the density of predicted over measured intensities (N,), with the diagonal."""
     from matplotlib.colors import LogNorm  # noqa: PLC0415 - an extra
 
     figure, ax = _subplots()
@@ -59,7 +59,7 @@ def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
 
 
 def trajectory(before: _Floats | None, after: _Floats) -> bytes:
-    """Positions (N, 3) from above. `before`: input positions of the same scans."""
+    """Plot positions (N, 3) from above. `before`: input positions of the same scans."""
     figure, above = _subplots()
     paths = [("after", after, _FIRST, 1.5)]
     if before is not None:

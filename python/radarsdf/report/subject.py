@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a report is about."""
+"""Subject of a report: a map and the data it is compared with."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.surface import thinned
 
-MAX_VERTICES = 160_000  # of the mesh in the 3D scene and the pictures; a larger one is thinned for them
+MAX_VERTICES = 160_000  # limit of the mesh in the 3D scene and the pictures, which is thinned above it
 
 
 @dataclass(frozen=True)
@@ -27,26 +27,24 @@ class Subject:
 
     radar_map: Map
     name: str  # title of the page
-    scans: Scans | None = None  # that the map was fitted to, or is compared with
-    held_out: Scans | None = None  # that the fit left out, if known
-    findings: Sequence[Finding] | None = None  # of `radarsdf.check` on all scans; None: they were not checked
-    voxel_size_m: float = 0.1  # of the mesh that is evaluated
-    box: ArrayLike | None = None  # (2, 3) corners of the part of the world to report on, m; None: all
+    scans: Scans | None = None  # those fitted, or those to compare with
+    held_out: Scans | None = None  # those that the fit left out, if known
+    findings: Sequence[Finding] | None = None  # result of `radarsdf.check` on all scans; None: not checked
+    voxel_size_m: float = 0.1  # voxels of the evaluated mesh
+    box: ArrayLike | None = None  # (2, 3) corners of the reported part of the world, m; None: all
     progress: bool | None = None
-    limits: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # what the mesh leaves out: arguments of `Map.mesh`
+    limits: Mapping[str, Any] = field(default_factory=dict)  # limits of the mesh: arguments of `Map.mesh`
 
     @property
     def viewpoint(self) -> NDArray[np.float64]:
-        """(3,) sensor position for predicted intensities: of the middle scan, or the map's origin; world, m."""
+        """(3,) sensor position for predicted intensities: that of the middle scan, or the map's origin; world, m."""
         if self.scans is None:
             return self.radar_map.origin
         return np.asarray(self.scans.poses[len(self.scans) // 2, :3, 3], np.float64)
 
     @cached_property
     def mesh(self) -> Any:
-        """The mesh that is evaluated, with intensities if the map has any."""
+        """The evaluated mesh, with intensities if the map has any."""
         viewpoint = self.viewpoint if self.radar_map.has_intensity else None
         return self.radar_map.mesh(
             self.voxel_size_m, box=self.box, viewpoint=viewpoint, progress=self.progress, **self.limits
@@ -54,12 +52,12 @@ class Subject:
 
     @cached_property
     def shown(self) -> tuple[Any, float]:
-        """The mesh that is drawn, and its vertex spacing, m."""
+        """The drawn mesh, and its vertex spacing, m."""
         return thinned(self.mesh, MAX_VERTICES, self.voxel_size_m)
 
     @cached_property
     def ground_truth(self) -> NDArray[np.float64] | None:
-        """(M, 3) ground-truth points in the box, world, m. None if there are none."""
+        """(M, 3) ground-truth points in the box, world, m; None if there are none."""
         if self.scans is None or self.scans.ground_truth is None:
             return None
         truth = np.asarray(self.scans.ground_truth, np.float64)
@@ -70,5 +68,5 @@ class Subject:
 
     @cached_property
     def truth_tree(self) -> Any:
-        """k-d tree of the ground-truth points, of which there must be some."""
+        """k-d tree of the ground-truth points, which must exist."""
         return cKDTree(self.ground_truth)

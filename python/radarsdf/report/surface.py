@@ -16,25 +16,25 @@ from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
 from radarsdf.report.page import css_color
 from radarsdf.report.subject import Subject
-from radarsdf.view.framing import Look, look_at_all
+from radarsdf.view.framing import CameraPose, framing_pose
 from radarsdf.view.glb import glb
-from radarsdf.view.serving import begin_at, free_port, start_server, stop_server
+from radarsdf.view.serving import free_port, set_initial_camera, start_server, stop_server
 
 _Floats = NDArray[np.float64]
 _Colors = NDArray[np.uint8]
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
-_SCENE_ASPECT = 8 / 5  # of its frame on any screen, see the style in page.html
-_STEPS_PER_M = 1024  # vertices are rounded to it: fewer digits save a sixth of the file
+_SCENE_ASPECT = 8 / 5  # aspect ratio of its frame on any screen, see the style in page.html
+_STEPS_PER_M = 1024  # vertices are rounded to multiples of 1 m / 1024: fewer digits save a sixth of the file
 _SENSOR_COLOR = (0, 114, 178)
-# The icon is the only address of another machine in viser's page, though only as the name of an XML namespace.
+# The icon holds the only address of another machine in viser's page, though only as the name of an XML namespace.
 _ICON = re.compile(r'<link\s+rel="icon".*?/>', re.DOTALL)
 _FIRST_SIDE = (25.0, 36.0)
 SIDES = {
     "One long side": _FIRST_SIDE,
     "Steeply from above": (0.0, 70.0),  # not straight down: walls would be lines
 }
-"""Name, turn and rise of each view, degrees."""
+"""Azimuth and elevation of each view by name, degrees."""
 
 
 def surface_values(subject: Subject) -> dict[str, Any] | None:
@@ -64,7 +64,7 @@ def surface_values(subject: Subject) -> dict[str, Any] | None:
 def colored(
     values: NDArray[Any] | None, count: int, label: str, limits: tuple[float, float] | None = None
 ) -> tuple[_Colors, dict[str, Any] | None]:
-    """Colours (V, 3) of vertex values (V,), and their legend. NaN is grey, and so is everything without values.
+    """Map vertex values (V,) to colours (V, 3), with a legend. NaN is grey, as is everything without values.
 
     `limits` None: the 2nd and the 98th percentile.
     """
@@ -77,12 +77,12 @@ def colored(
 
 
 def views(mesh: Any, colors: _Colors) -> dict[str, bytes]:
-    """Pictures of a mesh by the names of :data:`SIDES`."""
+    """Render a mesh from each of :data:`SIDES`, by name."""
     return {name: picture(mesh, colors, *side) for name, side in SIDES.items()}
 
 
 def picture(mesh: Any, colors: _Colors, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
-    """JPEG picture of a mesh with vertex colours (V, 3), seen from :func:`eye_around`."""
+    """Render a mesh with vertex colours (V, 3), seen from :func:`eye_around`, as JPEG."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
     eye = eye_around(np.asarray(mesh.vertices, np.float64), turn_deg, rise_deg)
@@ -93,15 +93,15 @@ def picture(mesh: Any, colors: _Colors, turn_deg: float = 25.0, rise_deg: float 
 
 
 def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Floats | None = None) -> str:
-    """Self-contained HTML page that shows a mesh in 3D, made by viser.
+    """Export a self-contained HTML page that shows a mesh in 3D, made by viser.
 
-    `vertices` (V, 3) and `sensors` (F, 3), which are drawn as points, are in m near the origin, since the page computes in
+    `vertices` (V, 3) and `sensors` (F, 3), drawn as points, are in m near the origin, since the page computes in
     float32. viser exports the scene of a server, which listens on this machine for less than a second. The addresses of
-    other machines in its program are not used; the report's content security policy forbids fetching them.
+    other machines in its program are never used; the report's content security policy forbids fetching them.
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
     to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
-    look: Look = look_at_all(everything, to_eye, _SCENE_ASPECT)
+    pose: CameraPose = framing_pose(everything, to_eye, _SCENE_ASPECT)
     host = "127.0.0.1"
     server: Any = start_server(host, free_port(host, 0))
     try:
@@ -112,11 +112,11 @@ def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Flo
                 "/sensor",
                 sensors.astype(np.float32),
                 _SENSOR_COLOR,
-                point_size=0.008 * float(np.linalg.norm(look.position - look.look_at)),
+                point_size=0.008 * float(np.linalg.norm(pose.position - pose.look_at)),
                 point_shape="circle",
                 precision="float32",
             )
-        begin_at(server, look)
+        set_initial_camera(server, pose)
         document: str = server.get_scene_serializer().as_html()
     finally:
         stop_server(server)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The report of a map."""
+"""The report on a map."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _DURATIONS = {
 
 
 def write_report(path: str | PathLike[str], subject: Subject) -> int:
-    """Write a self-contained HTML page about a map, whole or not at all, and return its size, bytes.
+    """Write a self-contained HTML page about a map atomically, and return its size, bytes.
 
     Raises an ImportError if matplotlib or viser is missing, and otherwise as :meth:`Map.mesh` and ``open``.
     """
@@ -65,7 +65,7 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
 
 
 def pose_values(poses: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Values of the section about refined or found poses. `poses`: their part of a map's report, None if taken as given."""
+    """Values of the section on estimated poses. `poses`: their part of a map's report, None for poses used as passed."""
     if poses is None:
         return None
     after = np.array(poses["after"])

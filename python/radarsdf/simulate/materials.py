@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Radar properties of surfaces: strength of the echo, its dependence on the angle, and its fading."""
+"""Radar properties of surfaces: strength of the echo, its angular dependence, and its fading."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 FloatArray = NDArray[np.float64]
 
-# A texture is three plane waves (rad/m). None of them is along an axis, so that every face of a box shows it.
+# A texture is three plane waves (rad/m), none of them along an axis, so that every face of a box shows it.
 _TEXTURE_WAVES = np.array([[1.7, 0.9, 1.3], [-0.8, 2.1, -1.1], [0.5, -1.2, 2.6]])
 
 
@@ -34,7 +34,7 @@ class Material:
     reflectivity_db: float  # echo at normal incidence, relative to the other materials [dB]
     specular: Annotated[float, Field(ge=0, le=1)] = 0.5  # share of the specular lobe at normal incidence
     lobe_width_rad: Annotated[float, Field(gt=0)] = 0.25  # w, standard deviation of the specular lobe [rad]
-    looks: Annotated[float, Field(gt=0)] = 3.0  # independent scatterers in one return: few mean strong fading
+    looks: Annotated[float, Field(gt=0)] = 3.0  # independent scatterers per return: few mean strong fading
     texture_db: Annotated[float, Field(ge=0)] = 0.0  # amplitude of slow changes over the surface [dB], >= 0
     # Loss of a wave mirrored by the surface [dB], >= 0; inf: no ghosts.
     mirror_loss_db: Annotated[float, Field(ge=0, allow_inf_nan=True)] = np.inf
@@ -55,8 +55,8 @@ CONCRETE = Material("concrete", 3.0, specular=0.8, lobe_width_rad=0.3, texture_d
 BRICK = Material("brick", 1.0, specular=0.6, lobe_width_rad=0.4, texture_db=3.0, mirror_loss_db=18.0)
 GLASS = Material("glass", 0.0, specular=0.97, lobe_width_rad=0.12, looks=4.0, mirror_loss_db=5.0)
 METAL = Material("metal", 9.0, specular=0.9, lobe_width_rad=0.25, looks=2.0, mirror_loss_db=6.0)
-# Plates of a corner reflector. They cause no ghosts: `CornerReflector.retro_db` has the waves that they mirror to
-# each other.
+# Plates of a corner reflector. They cause no ghosts: `CornerReflector.retro_db` models the waves reflected between
+# them.
 REFLECTOR = Material("reflector plate", -6.0, specular=0.5, looks=8.0)
 STEEL_POLE = Material("steel pole", 6.0, specular=0.6, lobe_width_rad=0.5)
 TREE = Material("tree", -2.0, specular=0.2, lobe_width_rad=0.6, looks=2.0, texture_db=2.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a radar, a gyroscope and an IMU measure of the motion of a simulated drive, and poses that drift."""
+"""Measurements of a radar, a gyroscope and an IMU on a simulated drive, and drifting poses."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ FloatArray = NDArray[np.float64]
 
 _MOTION_STREAM, _IMU_STREAM = 2**31 + 1, 2**31 + 2  # no scan has these numbers
 _DOPPLER_SIGMA_MPS = 0.1
-_MOVING_SHARE, _MOVING_SIGMA_MPS = 0.1, 5.0  # of the returns, at places where nothing was seen to move
-_GYROSCOPE_SIGMA_RAD_S = 0.005  # of each component of each measurement
+_MOVING_SHARE, _MOVING_SIGMA_MPS = 0.1, 5.0  # share and speed of moving returns
+_GYROSCOPE_SIGMA_RAD_S = 0.005  # per component
 _GYROSCOPE_BIAS_RAD_S = (0.002, -0.003, 0.0035)
 _ACCELEROMETER_SIGMA_MPS2 = 0.05
 _ACCELEROMETER_BIAS_MPS2 = (0.03, -0.02, 0.04)
@@ -32,12 +32,12 @@ _GRAVITY_MPS2 = np.array([0.0, 0.0, -9.81])
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
-    """What a radar and a gyroscope measure during F scans."""
+    """Measurements of a radar and a gyroscope during F scans."""
 
     times_s: FloatArray
     """(F,) times of the scans, s."""
     doppler_mps: list[NDArray[np.float32]]
-    """F arrays (N_i,): speed along the ray, m/s, positive away from the sensor."""
+    """F arrays (N_i,): radial velocity, m/s, positive away from the sensor."""
     angular_velocity: FloatArray
     """(F, 3) rad/s, frame of the sensor, at the times of the scans."""
 
@@ -50,21 +50,21 @@ def measured_motion(
     gyroscope_bias_rad_s: tuple[float, float, float] = _GYROSCOPE_BIAS_RAD_S,
     seed: int = 0,
 ) -> MeasuredMotion:
-    """Measure the motion along the smooth curve that joins the poses of a simulation.
+    """Measure the motion along the smooth curve through the poses of a simulation.
 
-    Doppler has a standard deviation of 0.1 m/s, and a tenth of the returns move by themselves, with a standard deviation of
-    5 m/s. Each component of the gyroscope has one of 0.005 rad/s.
+    Doppler has a standard deviation of 0.1 m/s, and a tenth of the returns move on their own, with a standard deviation of
+    5 m/s. Each component of the gyroscope has a standard deviation of 0.005 rad/s.
 
     Parameters
     ----------
     simulation : Simulation
         F scans, at least two.
     rate_hz : float
-        Scans in a second.
+        Scan rate, Hz.
     interval_mps : float, optional
-        Width of the interval, centred on 0, into which speeds are folded, m/s. Default: none are.
+        Width of the ambiguity interval, centred on 0, into which speeds are folded, m/s. Default: no folding.
     gyroscope_bias_rad_s : three floats
-        Added to all rates, rad/s.
+        Bias of the rates, rad/s.
     seed : int
         Seed of all random numbers.
 
@@ -116,7 +116,7 @@ def measured_imu(
     gyroscope_bias_rad_s: tuple[float, float, float] = _GYROSCOPE_BIAS_RAD_S,
     seed: int = 0,
 ) -> Imu:
-    """Measure a motion by an IMU along the smooth curve that joins poses.
+    """Measure a motion by an IMU along the smooth curve through poses.
 
     Each component has a standard deviation of 0.005 rad/s and 0.05 m/s². The accelerometer has a bias of 0.02 to 0.04 m/s².
 
@@ -125,15 +125,15 @@ def measured_imu(
     poses : (F, 4, 4) array_like
         T_world_sensor, m, at least two, such as those of a simulation. z is up.
     times_s : (F,) array_like
-        When the sensor was there, s, ascending.
+        Times of the poses, s, ascending.
     rate_hz : float
-        Measurements in a second.
+        Measurement rate, Hz.
     R_sensor_imu : (3, 3) array_like, optional
-        Rotation from the axes of the IMU to those of the sensor. Default: they are the same.
+        Rotation from the axes of the IMU to those of the sensor. Default: the identity.
     lever_m : three floats
         Position of the sensor in the axes of the IMU, m.
     gyroscope_bias_rad_s : three floats
-        Added to all rates, rad/s.
+        Bias of the rates, rad/s.
     seed : int
         Seed of all random numbers.
 
@@ -145,7 +145,7 @@ def measured_imu(
     Raises
     ------
     ValueError
-        If there are fewer than two poses, or times are not as many or do not ascend.
+        If there are fewer than two poses, or times differ in number or do not ascend.
 
     Examples
     --------
@@ -159,7 +159,7 @@ def measured_imu(
     R_imu = np.eye(3) if R_sensor_imu is None else checked_rotation(R_sensor_imu)
     count = int(np.floor((at_s[-1] - at_s[0]) * positive(rate_hz, "rate_hz") + 1e-6)) + 1
     times = at_s[0] + np.arange(count) / rate_hz
-    # SciPy's rates are in the frame of the turned body, here turned on into that of the IMU.
+    # SciPy's rates are in the frame of the rotating body, here rotated to that of the IMU.
     rates, changes = (np.einsum("ji,gj->gi", R_imu, turning(times, order)) for order in (1, 2))
     R_world_imu = np.einsum("gij,jk->gik", turning(times).as_matrix(), R_imu)
     lever = np.asarray(lever_m, np.float64)
@@ -173,7 +173,7 @@ def measured_imu(
 
 
 def _splines(poses: FloatArray, times_s: FloatArray) -> tuple[CubicSpline, RotationSpline]:
-    """Positions and rotations by time. Both raise a ValueError unless there are two poses, and ascending times."""
+    """Splines of positions and rotations by time. Both raise a ValueError unless there are two poses, and ascending times."""
     return CubicSpline(times_s, poses[:, :3, 3]), RotationSpline(
         times_s, Rotation.from_matrix(poses[:, :3, :3])
     )
@@ -182,18 +182,18 @@ def _splines(poses: FloatArray, times_s: FloatArray) -> tuple[CubicSpline, Rotat
 def drifted(
     poses: FloatArray, sigma_m: float, sigma_rad: float, seed: int = 0, yaw_rad: float = 0.0
 ) -> FloatArray:
-    """Add errors to each step from scan to scan, which add up along the trajectory.
+    """Add errors to the steps between scans, which accumulate along the trajectory.
 
     Parameters
     ----------
     poses : (F, 4, 4) ndarray
-        T_world_sensor, m. The first one stays.
+        T_world_sensor, m. The first one is kept.
     sigma_m, sigma_rad : float
         Standard deviations of each component of a step's translation, m, and rotation, rad.
     seed : int
         Seed of the errors.
     yaw_rad : float
-        By which all steps turn too far about the z axis of the sensor, rad.
+        Yaw error of every step about the z axis of the sensor, rad.
 
     Returns
     -------

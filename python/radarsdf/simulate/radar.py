@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A radar sensor: radar equation, speckle, noise in range and angle, detection threshold and false returns."""
+"""Radar sensor model: radar equation, speckle, noise in range and angle, detection threshold and false returns."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _Height = Annotated[float, Field(gt=0, le=np.pi)]
 _Count = Annotated[int, Field(ge=1, le=10**7)]
 _Power = Annotated[float, Field(ge=-1e9, le=1e9)]
 
-_OFF_SURFACE_M = 1e-6  # a mirrored ray starts this far in front of the mirror, not to hit it again
+_OFF_SURFACE_M = 1e-6  # offset of a reflected ray from the mirror, so that it does not hit it again
 _MIN_LEG_M = 0.01  # shorter paths from a mirror to the next surface are no reflection
-# Separate streams of random numbers within a scan: more clutter, for example, must not change the noise of the surface
+# Independent streams of random numbers within a scan: for example, more clutter must not change the noise of surface
 # returns.
 _BEAMS, _SPECKLE, _NOISE, _GHOSTS, _CLUTTER, _ORDER, _SIDELOBES, _PHANTOMS = range(8)
-_PLACES = 2**31 + 3  # no scan has this number: phantoms stay where they are
+_PLACES = 2**31 + 3  # no scan has this index: phantoms keep their places
 _PHANTOM_CELL_M = 0.5
-_PHANTOM_SHARE = 0.02  # share of the cells of space in which a phantom can be
+_PHANTOM_SHARE = 0.02  # share of the cells of space that can contain a phantom
 
 
 class Origin(IntEnum):
-    """Cause of a return: the codes of `Simulation.origin_kind`."""
+    """Cause of a return, as in `Simulation.origin_kind`."""
 
     SURFACE = 0
     CLUTTER = 1
@@ -52,7 +52,7 @@ class Scan(NamedTuple):
 
     points: NDArray[np.float32]  # (N, 3) sensor frame, m
     intensities: NDArray[np.float32]  # (N,) dB
-    noiseless_intensities: NDArray[np.float32]  # (N,) dB, no speckle, noise and steps; NaN: false return
+    noiseless_intensities: NDArray[np.float32]  # (N,) dB, without speckle, noise and steps; NaN: false return
     origin_kind: NDArray[np.int8]  # (N,) codes of `Origin`
 
 
@@ -85,44 +85,44 @@ class RadarSensor:
 
     The standard deviation of a position is √(``sigma_range_m²`` + (``sigma_range_per_m`` · range)²) along the beam, and
     ``sigma_azimuth_rad`` · range and ``sigma_elevation_rad`` · range across it. Each is multiplied by
-    √(1 + ``weak_noise²`` · threshold power / power of the return). So a weak return is the worst, and a strong one has
-    the standard deviations of the sensor; the part of weak returns falls as the Cramér-Rao bound does.
+    √(1 + ``weak_noise²`` · threshold power / power of the return). So weak returns are the noisiest, and strong ones have
+    the standard deviations of the sensor; the term of weak returns falls like the Cramér-Rao bound.
 
-    There are four kinds of false returns: clutter in free space; phantoms behind surfaces, of which a share stays at its
-    places from scan to scan, as reflections of a static world do; ghosts of mirroring surfaces; and echoes in the side
-    lobes of the antenna, which have the range and the azimuth of a surface and any elevation.
+    There are four kinds of false returns: clutter in free space; phantoms behind surfaces, a share of which keeps its
+    places from scan to scan, like reflections in a static world; ghosts of mirroring surfaces; and echoes in the side
+    lobes of the antenna, with the range and azimuth of a surface and a random elevation.
 
     Raises
     ------
     ValueError
-        If a value is negative, a share beyond 1, or otherwise outside the range in its comment.
+        If a value is negative, a share exceeds 1, or a value is outside the range in its comment.
     """
 
     azimuth_fov_rad: Annotated[float, Field(gt=0, le=2 * np.pi)] = 1.92  # full width, centred on x [rad]
     elevation_fov_rad: _Height = 0.52  # full height, centred on the xy plane [rad]
     beams: _Count = 3000  # directions in a scan, a jittered grid over the field of view
-    min_range_m: _Positive = 0.5  # there are no nearer returns [m]
-    max_range_m: _Positive = 60.0  # there are no farther returns [m], > min_range_m
+    min_range_m: _Positive = 0.5  # minimum range [m]
+    max_range_m: _Positive = 60.0  # maximum range [m], > min_range_m
     sigma_range_m: _NotNegative = 0.04  # standard deviation along the beam, near the sensor [m]
-    sigma_range_per_m: _NotNegative = 0.0  # its growth, in squares, with the range [m/m]
+    sigma_range_per_m: _NotNegative = 0.0  # additional deviation per range, added in quadrature [m/m]
     sigma_azimuth_rad: _NotNegative = 0.004  # standard deviation of the azimuth [rad]
     sigma_elevation_rad: _NotNegative = 0.006  # standard deviation of the elevation [rad]
-    weak_noise: _NotNegative = 0.0  # further noise of a return at the threshold, as a multiple of these
-    sigma_power_db: _NotNegative = 1.0  # standard deviation of the receiver's noise, besides speckle [dB]
+    weak_noise: _NotNegative = 0.0  # additional noise of a return at the threshold, as a multiple of these
+    sigma_power_db: _NotNegative = 1.0  # standard deviation of receiver noise, in addition to speckle [dB]
     gain_db: _Power = 130.0  # power at 1 m of a surface with an echo of 0 dB [dB]
-    range_loss_db: _NotNegative = 40.0  # loss by a tenfold range, less if the receiver compensates [dB]
+    range_loss_db: _NotNegative = 40.0  # loss per decade of range, less if the receiver compensates [dB]
     threshold_db: _Power = 64.0  # weaker returns are not detected [dB]
-    floor_db: _Power | None = None  # intensities are clipped to at least this [dB]; None: they are not
-    saturation_db: _Power = 118.0  # and to at most this [dB], > threshold_db and floor_db
-    step_db: _NotNegative = 0.1  # intensities are multiples of this [dB]; 0: continuous
+    floor_db: _Power | None = None  # lower clipping limit of intensities [dB]; None: no clipping
+    saturation_db: _Power = 118.0  # upper clipping limit [dB], > threshold_db and floor_db
+    step_db: _NotNegative = 0.1  # quantisation of intensities [dB]; 0: continuous
     clutter_per_scan: _NotNegative = 0.0  # expected number of false returns in free space
-    clutter_near_share: _Share = 0.5  # share of them near the sensor; the rest is uniform along the beams
+    clutter_near_share: _Share = 0.5  # share of clutter near the sensor; the rest is uniform along the beams
     clutter_power_db: _NotNegative = 3.0  # mean power of clutter and phantoms above the threshold [dB]
     phantoms_per_scan: _NotNegative = 0.0  # expected number of false returns behind surfaces
-    phantom_lasting_share: _Share = 0.5  # share of them at places that are the same in all scans
+    phantom_lasting_share: _Share = 0.5  # share of phantoms at fixed places in all scans
     phantom_depth: _NotNegative = 0.05  # mean depth behind the surface, exponential, as a share of the range
-    ghost_share: _Share = 0.0  # share of the beams on mirroring surfaces that can give a ghost
-    sidelobe_share: _Share = 0.0  # share of the surface echoes seen once more, in a false elevation
+    ghost_share: _Share = 0.0  # share of the beams on mirroring surfaces that may cause a ghost
+    sidelobe_share: _Share = 0.0  # share of the surface echoes seen again at a false elevation
     sidelobe_fov_rad: _Height = 0.52  # full height of the false elevations, uniform in their sine [rad]
 
     def __post_init__(self) -> None:
@@ -148,7 +148,7 @@ class RadarSensor:
         T_world_sensor : (4, 4) ndarray of float64
             Pose of the sensor, m.
         seed, frame : int
-            Seed of the simulation and number of the scan: they determine all random numbers.
+            Seed of the simulation and index of the scan, which determine all random numbers.
 
         Returns
         -------
@@ -178,7 +178,7 @@ class RadarSensor:
     def echo_power_db(
         self, scene: Scene, origins: FloatArray, directions: FloatArray, hits: Hits
     ) -> FloatArray:
-        """Received power (N,), dB, of surface hits by the radar equation: no speckle, not clipped; -inf where there is no hit.
+        """Received power (N,), dB, of surface hits by the radar equation, without speckle or clipping; -inf without a hit.
 
         Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m.
         """
@@ -209,7 +209,7 @@ class RadarSensor:
         return _Echoes(hits.range_m[rows], rays.angles[rows], power[rows], noiseless[rows])
 
     def _ghosts(self, scene: Scene, rays: _Rays, rng: np.random.Generator) -> _Echoes:
-        """Echoes from sensor to mirror to target and back. They appear behind the mirror, at the whole path length."""
+        """Echoes along sensor - mirror - target and back, which appear behind the mirror at the full path length."""
         origin, directions, angles, hits = rays
         loss = scene.material_values(hits, "mirror_loss_db", np.inf)
         rows = np.flatnonzero((rng.random(len(directions)) < self.ghost_share) & np.isfinite(loss))
@@ -219,26 +219,26 @@ class RadarSensor:
         mirror = origin + first[:, None] * directions[rows] + _OFF_SURFACE_M * normals
         second = scene.raycast(mirror, mirrored, self.max_range_m)
         path = first + second.range_m
-        # Where a mirror stands on the ground, the path to the next surface has no length: this is no ghost.
+        # Where a mirror stands on the ground, the path to the next surface has zero length: this is no ghost.
         seen = (path <= self.max_range_m) & (second.range_m > _MIN_LEG_M)
         rows, path = rows[seen], path[seen]
         second = Hits(second.range_m[seen], second.normals[seen], second.primitive[seen])
         mirrored, target = mirrored[seen], mirror[seen] + second.range_m[:, None] * mirrored[seen]
-        # The range in the radar equation is the whole path, and the wave loses power at the mirror twice.
+        # The range in the radar equation is the full path, and the wave is attenuated at the mirror twice.
         power = self.gain_db + scene.echo_db(target, mirrored, second)
         power = power - self.range_loss_db * np.log10(path) - 2 * loss[rows]
         looks = scene.material_values(second, "looks", 1.0)
         return _Echoes(path, angles[rows], power + _speckle_db(looks, rng))
 
     def _sidelobes(self, surface: _Echoes, rng: np.random.Generator) -> _Echoes:
-        """Some of the echoes of surfaces once more, as if from another elevation."""
+        """Repeat some echoes of surfaces at false elevations."""
         rows = np.flatnonzero(rng.random(len(surface.range_m)) < self.sidelobe_share)
         angles = surface.angles[rows]
         angles[:, 1] = np.arcsin(rng.uniform(-1, 1, size=len(rows)) * np.sin(self.sidelobe_fov_rad / 2))
         return _Echoes(surface.range_m[rows], angles, surface.power_db[rows])
 
     def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:
-        """Weak returns of no surface: near the sensor, and anywhere along a beam before its surface."""
+        """Weak false returns near the sensor, and anywhere along a beam in front of its surface."""
         beam = rng.integers(len(angles), size=rng.poisson(self.clutter_per_scan))
         free = np.minimum(range_m[beam], self.max_range_m)
         anywhere = free * rng.uniform(0.05, 0.95, size=len(beam))
@@ -250,9 +250,9 @@ class RadarSensor:
         return _Echoes(distance[rows], angles[beam[rows]], power[rows])
 
     def _phantoms(self, rays: _Rays, R: FloatArray, seed: int, rng: np.random.Generator) -> _Echoes:
-        """Weak returns of no surface behind surfaces, more behind far ones, whose beams are wider.
+        """Weak false returns behind surfaces, more behind far ones, whose beams are wider.
 
-        Lasting ones are at places that hold for all scans of a seed: at most one in each cell of space.
+        Lasting ones have the same places in all scans of a seed: at most one per cell of space.
         """
         lasting = self.phantom_lasting_share
         expected = self.phantoms_per_scan * np.array([1 - lasting, lasting])
@@ -264,7 +264,7 @@ class RadarSensor:
         points = rays.origin + range_m[:, None] * rays.directions[beam]
         cells = np.floor(points[passing:] / _PHANTOM_CELL_M)
         key = int(generator(seed, _PLACES).integers(2**63))
-        is_place, *offsets = (_hashed(cells.astype(np.int64), key + k) for k in range(4))
+        is_place, *offsets = (_hash(cells.astype(np.int64), key + k) for k in range(4))
         places = _PHANTOM_CELL_M * (cells + np.stack(offsets, axis=1))
         phantoms = np.concatenate([points[:passing], places[is_place < _PHANTOM_SHARE]])
         x, y, z = ((phantoms - rays.origin) @ R).T
@@ -273,9 +273,9 @@ class RadarSensor:
         return _Echoes(np.sqrt(x**2 + y**2 + z**2), angles, power)
 
     def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> Scan:
-        """Add the sensor's noise, detect, round and clip the intensities."""
+        """Add sensor noise, apply the detection threshold, quantise and clip the intensities."""
         noise = rng.standard_normal((len(echoes.range_m), 4))
-        # What noise lifts above the threshold counts as if at it.
+        # Returns that noise lifts above the threshold count as if at it.
         excess_db = np.maximum(echoes.power_db - self.threshold_db, 0.0)
         noise[:, :3] *= np.sqrt(1 + self.weak_noise**2 * 10 ** (-excess_db / 10))[:, None]
         sigma_range_m = np.hypot(self.sigma_range_m, self.sigma_range_per_m * echoes.range_m)
@@ -301,8 +301,8 @@ def unit_vectors(angles: FloatArray) -> FloatArray:
     return np.stack([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
-def _hashed(cells: NDArray[np.int64], key: int) -> FloatArray:
-    """A number in [0, 1) for each row (N, 3) of integers, the same for the same row and key."""
+def _hash(cells: NDArray[np.int64], key: int) -> FloatArray:
+    """Hash rows (N, 3) of integers to numbers in [0, 1), reproducible by key."""
     mixed = np.full(len(cells), key, dtype=np.uint64)
     for column in (*cells.astype(np.uint64).T, np.uint64(0)):
         mixed = (mixed ^ column) + np.uint64(0x9E3779B97F4A7C15)  # SplitMix64 (Steele, Lea, Flood 2014)
@@ -315,7 +315,7 @@ def _hashed(cells: NDArray[np.int64], key: int) -> FloatArray:
 def _speckle_db(looks: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Fading (N,), dB, for numbers of scatterers (N,).
 
-    Its median is 0, so that a fit with the L1 loss, which estimates medians, finds the noiseless intensity.
+    Its median is 0, so a fit with the L1 loss, which estimates medians, finds the noiseless intensity.
     """
     power = rng.standard_gamma(looks)
     values, index = np.unique(looks, return_inverse=True)

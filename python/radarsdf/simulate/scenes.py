@@ -21,18 +21,18 @@ from .world import Box, CornerReflector, Pole, Primitive, Scene, Terrain
 
 FloatArray = NDArray[np.float64]
 Path = Callable[[FloatArray], FloatArray]
-"""Maps values (N,), 0..1 for those that are driven, to positions (N, 2), world frame, m."""
+"""Maps curve parameters (N,), 0..1 on the driven part, to positions (N, 2), world frame, m."""
 
-_BURIED_M = 1.0  # solids reach this far into the ground, so that they have no gap to the ground on a slope
+_BURIED_M = 1.0  # solids extend this far into the ground, which leaves no gap on a slope
 
 
 def vary(rng: np.random.Generator, material: Material) -> Material:
-    """The material with a random change of its reflectivity, since no two objects are the same."""
+    """Vary the reflectivity of a material at random, since no two objects are the same."""
     return replace(material, reflectivity_db=material.reflectivity_db + rng.normal(0, 1.5))
 
 
 class Site:
-    """Solids on the ground. A new one must not overlap the earlier ones, nor the circles `taken`: x, y, radius [m]."""
+    """Solids on the ground. New ones must overlap neither the earlier ones nor the circles `taken`: x, y, radius [m]."""
 
     def __init__(
         self, rng: np.random.Generator, terrain: Terrain, taken: list[tuple[float, float, float]]
@@ -47,39 +47,39 @@ class Site:
         things: Iterable[tuple[str, tuple[int, int], tuple[float, float]]],
         place: Callable[[float, float], tuple[FloatArray, float]],
     ) -> None:
-        """Add things by the names of their methods, so many of each, at positions and yaws that `place` draws within limits.
+        """Add numbers of things, by the names of their methods, at positions and yaws that `place` draws within limits.
 
-        Each has ten tries, and is left out if all fail.
+        Each has ten tries, and is omitted if all fail.
         """
         for name, counts, limits in things:
             for _ in range(int(self.rng.integers(*counts))):
                 any(getattr(self, name)(*place(*limits)) for _ in range(10))
 
     def beside(self, path: Path, u: float, near: float, far: float) -> tuple[FloatArray, float]:
-        """A random place `near` to `far` m to one side of where a path is at `u`, (2,), and its direction there, rad."""
+        """Random place `near` to `far` m to one side of a path at `u`, (2,), and the path's direction there, rad."""
         ahead, here = path(np.array([u + 0.01, u]))
         yaw = float(np.arctan2(*(ahead - here)[::-1]))
         side = self.rng.choice([-1.0, 1.0]) * self.rng.uniform(near, far)
         return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
     def building(self, xy: FloatArray, yaw: float) -> bool:
-        """A building of concrete or brick, 9 to 16 m long."""
+        """Add a building of concrete or brick, 9 to 16 m long."""
         material = vary(self.rng, materials.CONCRETE if self.rng.random() < 0.5 else materials.BRICK)
         size = self.rng.uniform([9, 6, 5], [16, 9, 9])
         return self._block(xy, yaw + self.rng.normal(0, 0.15), size, material)
 
     def wall(self, xy: FloatArray, yaw: float) -> bool:
-        """A free-standing wall, 1.4 to 2.6 m high."""
+        """Add a free-standing wall, 1.4 to 2.6 m high."""
         size = self.rng.uniform([5, 0.25, 1.4], [12, 0.4, 2.6])
         return self._block(xy, yaw + self.rng.normal(0, 0.15), size, vary(self.rng, materials.CONCRETE))
 
     def hedge(self, xy: FloatArray, yaw: float) -> bool:
-        """A hedge along a road, 1 to 2 m high."""
+        """Add a hedge along a road, 1 to 2 m high."""
         size = self.rng.uniform([4, 0.7, 1.0], [14, 1.2, 2.0])
         return self._block(xy, yaw + self.rng.normal(0, 0.05), size, vary(self.rng, materials.TREE))
 
     def car(self, xy: FloatArray, yaw: float) -> bool:
-        """A car of two boxes: the body, and the cabin on top."""
+        """Add a car of two boxes: the body, and the cabin on top."""
         metal = vary(self.rng, materials.METAL)
         yaw, size = yaw + self.rng.normal(0, 0.05), self.rng.uniform([3.9, 1.7, 0.8], [4.8, 1.9, 1.0])
         if not self._block(xy, yaw, size, metal):
@@ -89,7 +89,7 @@ class Site:
         return True
 
     def pole(self, xy: FloatArray, _yaw: float) -> bool:
-        """A lamp post of steel or the trunk of a tree."""
+        """Add a lamp post of steel or the trunk of a tree."""
         tree = self.rng.random() < 0.4
         radius = self.rng.uniform(0.15, 0.3) if tree else self.rng.uniform(0.06, 0.12)
         height = self.rng.uniform(4, 8)
@@ -97,7 +97,7 @@ class Site:
         return self.reserve([(*xy, radius)]) and self.add_pole(xy, radius, height, material)
 
     def tree(self, xy: FloatArray, _yaw: float) -> bool:
-        """A trunk, and a crown that begins 2 to 3 m above the ground."""
+        """Add a tree with a trunk, and a crown that begins 2 to 3 m above the ground."""
         radius, crown = self.rng.uniform(0.15, 0.35), self.rng.uniform([1.2, 2.0], [2.6, 5.0])
         if not self.reserve([(*xy, 0.5 * float(crown[0]))]):
             return False
@@ -108,7 +108,7 @@ class Site:
         return True
 
     def basket(self, xy: FloatArray, facing: float) -> None:
-        """A basketball hoop: a post, and a board 0.6 m from it towards x · `facing`, where `facing` is 1 or -1."""
+        """Add a basketball hoop: a post, and a board 0.6 m from it towards x · `facing`, where `facing` is 1 or -1."""
         if self.reserve([(*xy, 0.3)]):
             self.add_pole(xy, 0.1, 3.2, materials.STEEL_POLE)
             at, board = xy + np.array([0.6 * facing, 0.0]), np.array([0.06, 1.8, 1.05])
@@ -118,7 +118,7 @@ class Site:
         return float(self.terrain.height(xy[None])[0])
 
     def reserve(self, circles: list[tuple[float, float, float]]) -> bool:
-        """Whether circles are free; if so, they are taken."""
+        """Reserve circles if all of them are free; return whether they were."""
         old, new = np.array(self._taken).reshape(-1, 3), np.array(circles)
         gap = np.linalg.norm(old[:, None, :2] - new[None, :, :2], axis=2) - old[:, None, 2] - new[None, :, 2]
         if (gap < 0).any():
@@ -139,11 +139,11 @@ class Site:
     def add_box(
         self, xy: FloatArray, yaw: float, bottom: float, size: FloatArray, material: Material
     ) -> None:
-        """Add a box of a size (3,) whose lower face is at the height `bottom`, m."""
+        """Add a box of a size (3,) with its lower face at the height `bottom`, m."""
         self.solids.append(Box(np.array([*xy, bottom + size[2] / 2]), size / 2, yaw, material))
 
     def add_pole(self, xy: FloatArray, radius_m: float, height_m: float, material: Material) -> bool:
-        """Add a pole that rises so far above the ground, and return True."""
+        """Add a pole with this height above the ground, and return True."""
         base = np.array([*xy, self._ground(xy) - _BURIED_M])
         self.solids.append(Pole(base, radius_m, height_m + _BURIED_M, material))
         return True
@@ -158,9 +158,9 @@ def along_path(
     rng: np.random.Generator,
     look_at: FloatArray | None = None,
 ) -> FloatArray:
-    """Poses (frames, 4, 4), T_world_sensor, at equal steps along a path, with a little heave, pitch and roll as of a vehicle.
+    """Poses (frames, 4, 4), T_world_sensor, at equal steps along a path, with slight heave, pitch and roll of a vehicle.
 
-    The sensor is `height_m` above the ground in the mean. It looks ahead, or at the position `look_at` (2,), world, m.
+    The mean height of the sensor is `height_m`. It faces along the path, or the position `look_at` (2,), world, m.
     """
     u = (np.arange(frames) + 0.5) / frames
     xy = path(u)
@@ -177,9 +177,9 @@ def along_path(
     return poses
 
 
-_LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan has
+_LAYOUT, _TRAJECTORY = 2**31 + 1, 2**31 + 2  # streams of random numbers that no scan uses
 
-# Methods of `Site`, how many of each there are, and how far beside the path, m, or in court lengths.
+# Methods of `Site`, how many of each there are, and their distance from the path, m, or in court lengths.
 _LANE = (
     ("building", (4, 8), (13, 20)), ("wall", (3, 6), (6, 11)), ("car", (6, 11), (4, 9)), ("pole", (12, 20), (3, 14)),
 )  # fmt: skip
@@ -189,8 +189,8 @@ _STREET = (
     ("wall", (1, 6), (8, 35)), ("tree", (15, 40), (7, 60)), ("pole", (8, 20), (4, 15)),
 )  # fmt: skip
 
-# The ranges of intensities are those of the paper (Table II). Everything else is assumed, not measured: the fields of
-# view are usual ones, and noise and gain are chosen so that the kNN baseline has errors as on the paper's data sets.
+# Intensity ranges are those of the paper (Table II). Everything else is assumed, not measured: fields of
+# view are typical, and noise and gain are chosen so that the kNN baseline has errors as on the paper's data sets.
 HUGIN_A3 = RadarSensor(
     azimuth_fov_rad=np.deg2rad(110), elevation_fov_rad=np.deg2rad(30), beams=2950, max_range_m=50.0,
     sigma_range_m=0.06, sigma_azimuth_rad=np.deg2rad(0.4), sigma_elevation_rad=np.deg2rad(0.6), sigma_power_db=1.0,
@@ -206,8 +206,8 @@ OCULII_EAGLE = RadarSensor(
     gain_db=66.0, threshold_db=-1.0, floor_db=0.0, saturation_db=36.0, step_db=0.5,
     clutter_per_scan=30.0, ghost_share=0.5,
 )  # fmt: skip
-# Fitted by hand to four drives of the Astyx HiRes2019 dataset, until `python -m bench.sensor` showed about the same
-# figures; docs/simulation.md has them. The receiver makes up for nearly all loss by range.
+# Tuned by hand to four drives of the Astyx HiRes2019 dataset, until `python -m bench.sensor` showed about the same
+# figures; docs/simulation.md lists them. The receiver compensates for nearly all loss by range.
 ASTYX_HIRES = RadarSensor(
     azimuth_fov_rad=np.deg2rad(115), elevation_fov_rad=np.deg2rad(13), beams=2400, min_range_m=2.0, max_range_m=102.0,
     sigma_range_m=0.093, sigma_range_per_m=0.0026, sigma_azimuth_rad=0.0036, sigma_elevation_rad=0.014, weak_noise=2.1,
@@ -236,10 +236,10 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.45, materials.GRASS)
     sway, phase = rng.uniform(1.0, 3.5), rng.uniform(0, 2 * np.pi)
-    path = _winding(60.0, sway, 70, phase)
+    path = _lane(60.0, sway, 70, phase)
     site = Site(rng, terrain, taken=[(x, y, 2.2) for x, y in path(np.linspace(-0.1, 1.5, 200))])
     site.fill(_LANE, lambda near, far: site.beside(path, rng.uniform(0.1, 1.45), near, far))
-    return _driven(site, path, (frames, 120), HUGIN_A3, "hugin", seed, height_m=1.5)
+    return _drive(site, path, (frames, 120), HUGIN_A3, "hugin", seed, height_m=1.5)
 
 
 def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -279,7 +279,7 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
     for angle in np.arange(0, 2 * np.pi, 2 * np.pi / rng.integers(14, 22)):
         corner = np.clip(1.45 * np.array([np.cos(angle), np.sin(angle)]), -1, 1)
         site.pole(corner * np.array([length, width]), 0.0)
-    return _driven(site, path, (frames, 120), OCULII_EAGLE, "oculii", seed, height_m=1.1)
+    return _drive(site, path, (frames, 120), OCULII_EAGLE, "oculii", seed, height_m=1.1)
 
 
 def wall(seed: int = 0, frames: int | None = None) -> Simulation:
@@ -319,14 +319,14 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
         xy: FloatArray = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         return xy
 
-    return _driven(site, path, (frames, 90), HUGIN_A4, "wall", seed, height_m=1.2, look_at=mounted[:2])
+    return _drive(site, path, (frames, 90), HUGIN_A4, "wall", seed, height_m=1.2, look_at=mounted[:2])
 
 
 def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     """Simulate an automotive radar on a street: few scans, noise that grows with the range, and many false returns.
 
-    The radar is fitted to four drives of the Astyx HiRes2019 dataset; ``docs/simulation.md`` has the figures. The world is a
-    street of their kind, not a copy.
+    The radar is tuned to four drives of the Astyx HiRes2019 dataset; ``docs/simulation.md`` lists the figures. The world is a
+    similar street, not a copy.
 
     Parameters
     ----------
@@ -343,15 +343,15 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, rng.uniform(0.05, 0.3), materials.GRASS)
     length = 4.0 * rng.uniform(5, 10)
-    path = _winding(length, rng.uniform(1.0, 5.0), rng.uniform(80, 140), rng.uniform(0, 2 * np.pi))
+    path = _lane(length, rng.uniform(1.0, 5.0), rng.uniform(80, 140), rng.uniform(0, 2 * np.pi))
     first, last = -10.0, length + 100.0
     site = Site(rng, terrain, taken=[(x, y, 2.8) for x, y in path(np.arange(first, last, 2.0) / length)])
     site.fill(_STREET, lambda near, far: site.beside(path, rng.uniform(first, last) / length, near, far))
-    return _driven(site, path, (frames, 20), ASTYX_HIRES, "astyx", seed, height_m=1.25)
+    return _drive(site, path, (frames, 20), ASTYX_HIRES, "astyx", seed, height_m=1.25)
 
 
-def _winding(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
-    """A lane along x that winds as a sine."""
+def _lane(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
+    """A lane along x that meanders as a sine."""
 
     def path(u: FloatArray) -> FloatArray:
         x = length_m * u
@@ -360,7 +360,7 @@ def _winding(length_m: float, sway_m: float, wave_m: float, phase: float) -> Pat
     return path
 
 
-def _driven(
+def _drive(
     site: Site,
     path: Path,
     frames: tuple[int | None, int],
@@ -371,7 +371,7 @@ def _driven(
     height_m: float,
     look_at: FloatArray | None = None,
 ) -> Simulation:
-    """Scans of a site along a path. `frames`: their number, and the default."""
+    """Scan a site along a path. `frames`: number of scans, and its default."""
     count = frames[1] if frames[0] is None else whole_number(frames[0], "frames", 1)
     rng = generator(seed, _TRAJECTORY)
     poses = along_path(site.terrain, path, count, height_m=height_m, rng=rng, look_at=look_at)
@@ -381,4 +381,4 @@ def _driven(
 SCENES: dict[str, Callable[..., Simulation]] = {
     scene.__name__: scene for scene in (hugin, oculii, wall, astyx)
 }
-"""The simulations by name; each takes `seed` and `frames`."""
+"""Simulations by name; each takes `seed` and `frames`."""

@@ -17,15 +17,15 @@ from .world import Scene
 
 FloatArray = NDArray[np.float64]
 
-_LIDAR_RAYS = 10_000  # from each pose
+_LIDAR_RAYS = 10_000  # rays per pose
 _LIDAR_SIGMA_M = 0.01
-_LIDAR_CELL_M = 0.05  # one lidar point per cell: otherwise most would lie on the ground near the sensor
-_LIDAR_STREAM = 2**31  # no scan has this number
+_LIDAR_CELL_M = 0.05  # one lidar point per cell, or most would lie on the ground near the sensor
+_LIDAR_STREAM = 2**31  # no scan has this index
 
 
 @dataclass(frozen=True, eq=False)
 class Lidar:
-    """A lidar at some of the radar's poses, with its field of view and range, which sees what the radar can detect."""
+    """A lidar at some of the radar's poses with its field of view and range, which sees the surfaces detectable by radar."""
 
     scene: Scene
     sensor: RadarSensor
@@ -34,10 +34,10 @@ class Lidar:
 
     @cached_property
     def points(self) -> FloatArray:
-        """(M, 3) world, m, computed on first access: casting their rays takes as long as the scans."""
+        """(M, 3) world, m, computed on first access: ray casting takes as long as the scans."""
         rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
         found = [np.zeros((0, 3))]
-        every = max(1, len(self.poses) // 40)  # neighbours see the same surfaces
+        every = max(1, len(self.poses) // 40)  # neighbouring poses see the same surfaces
         for T_world_sensor in self.poses[::every]:
             u = rng.uniform(-1, 1, size=(_LIDAR_RAYS, 2))
             elevation = np.arcsin(u[:, 1] * np.sin(sensor.elevation_fov_rad / 2))
@@ -56,7 +56,7 @@ class Lidar:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Simulated radar scans with poses, and the truth about them.
+    """Simulated radar scans with poses and ground truth.
 
     There are F scans, with N_i returns in scan i.
     """
@@ -66,7 +66,7 @@ class Simulation:
     intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB
     noiseless_intensities: list[
         NDArray[np.float32]
-    ]  # F arrays (N_i,), dB, no speckle and noise; NaN: false return
+    ]  # F arrays (N_i,), dB, without speckle and noise; NaN: false return
     origin_kind: list[NDArray[np.int8]]  # F arrays (N_i,), codes of `Origin`
     scene: Scene
     sensor: RadarSensor
@@ -78,7 +78,7 @@ class Simulation:
     def ground_truth(self) -> FloatArray:
         """(M, 3) lidar points of the surfaces that the radar can detect, world frame, m.
 
-        They have a noise of 1 cm along the ray, and there is at most one in each cell of 5 cm.
+        They have a noise of 1 cm along the ray, and at most one point per cell of 5 cm.
         """
         return self.lidar.points
 
@@ -97,9 +97,9 @@ class Simulation:
         return surface
 
     def intensity_noise_floor(self) -> float:
-        """Mean absolute difference of measured and noiseless intensities over the surface returns, dB.
+        """Mean absolute difference between measured and noiseless intensities of the surface returns, dB.
 
-        It is the error of a perfect model of scene and sensor: speckle and noise cannot be predicted. The error of a
+        It is the error of a perfect model of scene and sensor: speckle and noise are unpredictable. The error of a
         fit can be slightly lower. Near the detection threshold, only returns with positive noise are detected, and a
         fit learns this bias.
         """
@@ -127,7 +127,7 @@ def simulate(scene: Scene, sensor: RadarSensor, poses: FloatArray, *, name: str,
     Returns
     -------
     Simulation
-        One scan for each pose.
+        One scan per pose.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A world of ground and solids: exact ray hits, signed distances, and the echo of every hit.
+"""A world of ground and solids: exact ray hits, signed distances, and the echoes of hits.
 
 World frame: z up, m. Signed distances are positive in free space and negative inside a solid.
 """
@@ -46,7 +46,7 @@ class Primitive(ABC):
 
 
 def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Quotient with a tiny denominator instead of zero, so that a ray parallel to a plane hits it very far away."""
+    """Divide with a tiny denominator instead of zero, so that a ray parallel to a plane hits it very far away."""
     tiny = np.abs(denominator) < 1e-12
     result: FloatArray = numerator / np.where(tiny, np.where(denominator < 0, -1e-12, 1e-12), denominator)
     return result
@@ -54,7 +54,7 @@ def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Box(Primitive):
-    """A solid box, turned about the vertical axis only."""
+    """A solid box, rotated about the vertical axis only."""
 
     center: FloatArray  # (3,) world, m
     half_extents: FloatArray  # (3,) along its own axes, m
@@ -132,15 +132,15 @@ class Pole(Primitive):
 class CornerReflector(Primitive):
     """A trihedral corner reflector of three right-angled triangular plates, open towards `axis`.
 
-    The plates are infinitely thin, so distances are never negative. The echo is the sum of that of the plates and of a
-    lobe that depends only on the angle to the axis: the three plates together send a wave back where it came from.
+    The plates are infinitely thin, so distances are never negative. The echo is the sum of those of the plates and of a
+    lobe that depends only on the angle to the axis: the three plates together reflect a wave back to its source.
     """
 
     apex: FloatArray  # (3,) world, m
     axis: FloatArray  # (3,) unit vector out of the opening, world
     edge_m: float  # length of the three edges that meet in the apex
-    material: Material  # of the plates
-    retro_db: float = 25.0  # echo on the axis, above `material.reflectivity_db` [dB]
+    material: Material  # material of the plates
+    retro_db: float = 25.0  # echo on the axis relative to `material.reflectivity_db` [dB]
     retro_width_rad: float = 0.28  # standard deviation of the lobe; 0.28 is the usual 3 dB cone of 38 degrees
 
     def _edges(self) -> FloatArray:
@@ -176,7 +176,7 @@ class CornerReflector(Primitive):
         for i in range(3):
             u, v = p[:, (i + 1) % 3], p[:, (i + 2) % 3]
             x, y = np.maximum(u, 0), np.maximum(v, 0)
-            # Nearest point of the triangle x, y >= 0, x + y <= edge. Points beyond the sloping side are moved onto it.
+            # Nearest point of the triangle x, y >= 0, x + y <= edge. Points beyond the sloping side are projected onto it.
             along = np.clip((u - v + self.edge_m) / 2, 0, self.edge_m)
             beyond = x + y > self.edge_m
             x, y = np.where(beyond, along, x), np.where(beyond, self.edge_m - along, y)
@@ -213,7 +213,7 @@ class Terrain(Primitive):
         roughness_m : float
             Amplitude of the longest waves, m. Each halving of the wavelength divides the amplitude by 2.5.
         material : Material
-            What the ground is made of.
+            Material of the ground.
 
         Returns
         -------
@@ -228,7 +228,7 @@ class Terrain(Primitive):
         return cls(waves, amplitudes, rng.uniform(0, 2 * np.pi, size=10), 0.0, material)
 
     def height(self, xy: FloatArray) -> FloatArray:
-        """Height (N,), m, of the ground at the positions (N, 2), world, m."""
+        """Height (N,), m, of the ground at positions (N, 2), world, m."""
         height: FloatArray = self.level_m + np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes
         return height
 
@@ -246,7 +246,7 @@ class Terrain(Primitive):
         return np.zeros(3), np.inf
 
     def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
-        # Each ray from above advances until it is below the ground. The steepest possible slope bounds the length of a
+        # Rays from above advance until they are below the ground. The steepest possible slope bounds the length of a
         # safe step, but a step is at least 10 cm + 1 % of the range, so a crest of millimetres can be missed.
         steepest = float(np.abs(self.amplitudes) @ np.linalg.norm(self.waves, axis=1))
         top = self.level_m + float(np.abs(self.amplitudes).sum())
@@ -286,8 +286,8 @@ class Terrain(Primitive):
         return result, normals
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
-        # Exact for points that are nearer to the ground than its radius of curvature, some metres. Farther away the
-        # result is the distance to some point of the ground: it may be too large, never too small.
+        # Exact for points nearer to the ground than its radius of curvature, some metres. Farther away, the
+        # result is the distance to some point of the ground: possibly too large, never too small.
         foot = points[:, :2].copy()
         vertical = points[:, 2] - self.height(foot)
         best = np.abs(vertical)
@@ -303,9 +303,9 @@ class Terrain(Primitive):
 class Hits(NamedTuple):
     """First hits of N rays."""
 
-    range_m: FloatArray  # (N,) inf where the ray hits nothing
-    normals: FloatArray  # (N, 3) unit vectors, world, towards the ray's origin; zero where it hits nothing
-    primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 where it hits nothing
+    range_m: FloatArray  # (N,) inf without a hit
+    normals: FloatArray  # (N, 3) unit vectors, world, towards the ray's origin; zero without a hit
+    primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 without a hit
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +315,7 @@ class Scene:
     Parameters
     ----------
     solids : sequence of Primitive
-        Boxes, poles and reflectors. They may overlap and reach below the ground.
+        Boxes, poles and reflectors. They may overlap and extend below the ground.
     terrain : Terrain, optional
         The ground. None: there is no ground.
     """
@@ -334,17 +334,17 @@ class Scene:
         Parameters
         ----------
         origins : (N, 3) or (3,) array_like
-            Where the rays begin, world, m.
+            Origins of the rays, world, m.
         directions : (N, 3) array_like
             Unit vectors, world.
         max_range_m : float
-            Farther hits do not count, m.
+            Farther hits are ignored, m.
 
         Returns
         -------
         Hits
-            `range_m` (N,), m, `normals` (N, 3), world, and `primitive` (N,), the row in `parts`. Inf, zeros and -1 where
-            a ray hits nothing.
+            `range_m` (N,), m, `normals` (N, 3), world, and `primitive` (N,), the index in `parts`. Inf, zeros and -1
+            without a hit.
         """
         directions = np.asarray(directions, dtype=np.float64)
         origins = np.broadcast_to(np.asarray(origins, dtype=np.float64), directions.shape)
@@ -374,7 +374,7 @@ class Scene:
         Returns
         -------
         (N,) ndarray of float64
-            m, positive in free space. Metres above rough ground they may be too large; inside of solids that overlap,
+            m, positive in free space. Metres above rough ground they may be too large; inside overlapping solids,
             the absolute value may be too small.
         """
         p = np.asarray(points, dtype=np.float64)
@@ -384,7 +384,7 @@ class Scene:
         return best
 
     def echo_db(self, points: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
-        """Echo (N,), dB, without the loss by range, of the hits of rays at points (N, 3); -inf where there is no hit."""
+        """Echo (N,), dB, without the loss by range, of the hits of rays at points (N, 3); -inf without a hit."""
         echo = np.full(len(points), -np.inf)
         for index in np.unique(hits.primitive[hits.primitive >= 0]):
             rows = hits.primitive == index
@@ -392,6 +392,6 @@ class Scene:
         return echo
 
     def material_values(self, hits: Hits, field: str, missing: float) -> FloatArray:
-        """A numeric field of the material at each hit, (N,) float64; `missing` where there is no hit."""
+        """A numeric field of the material at each hit, (N,) float64; `missing` without a hit."""
         table = np.array([*(getattr(part.material, field) for part in self.parts), missing], dtype=np.float64)
         return table[hits.primitive]

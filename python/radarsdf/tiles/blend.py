@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The fields of many tiles as one, of which few are in memory."""
+"""The fields of many tiles blended into one, with few tiles in memory."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from radarsdf.returns.sums import lattice_of
 from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path, neighbours
 
 _MEMORY_BYTES = 1 << 30
-_OF_FEATURES = 2.4  # bytes in memory for each of the features: measured; tables of cells, evidence
+_OF_FEATURES = 2.4  # bytes in memory per feature: measured; includes tables of cells and evidence
 _Floats = NDArray[np.float64]
 
 
 class Share(NamedTuple):
-    """What one tile contributes at some of N positions."""
+    """Contribution of one tile at some of N positions."""
 
     tile: Tile
     contents: MapContents  # the map of the tile
-    rows: NDArray[np.int64]  # (M,) of the positions at which the tile has a weight
-    weights: _Floats  # (M,) there
+    rows: NDArray[np.int64]  # (M,) indices of the positions at which the tile has a weight
+    weights: _Floats  # (M,) weights there
     local: Tensor  # (M, 3) the positions in the frame of the tile, m
 
     def at(self, points: Tensor, chosen: NDArray[np.bool_]) -> Share:
-        """The share at some (M,) of its positions, of which the local `points` (M, 3) are these."""
+        """Restrict the share to some (M,) of its positions; `points` (M, 3) are their local coordinates."""
         local = points[torch.from_numpy(chosen)]
         return self._replace(rows=self.rows[chosen], weights=self.weights[chosen], local=local)
 
 
 class TileBlend(Map):
-    """The queries of :class:`TiledMap`: averages of the tiles that know a position."""
+    """Queries of :class:`TiledMap`: weighted averages of the tiles that know a position."""
 
     def __init__(self, folder: str | PathLike[str], *, memory_bytes: float = _MEMORY_BYTES) -> None:
         self.folder = Path(folder)
@@ -54,17 +54,17 @@ class TileBlend(Map):
         self._held: OrderedDict[Tile, tuple[MapContents, int]] = OrderedDict()
         self._lock = threading.Lock()
         if not self.tiles:
-            msg = f"no tile of {self.folder} is done: radarsdf tiles fit {self.folder} makes them"
+            msg = f"no tile of {self.folder} is done: run radarsdf tiles fit {self.folder}"
             raise ValueError(msg)
 
     @cached_property
     def tiles(self) -> list[TilePlan]:
-        """The tiles that were done when they were first asked for."""
+        """Tiles that were done at the first access."""
         return [tile for tile in self.plan.tiles if is_done(self.folder, self.plan, tile)]
 
     @property
     def missing(self) -> dict[str, str]:
-        """The others by name, and why their fit failed; empty if it was not tried or was killed."""
+        """Unfinished tiles by name, with the reason of the failure; empty if the fit was not tried or was killed."""
         return {
             tile.name: failure_of(self.folder, tile) for tile in self.plan.tiles if not self.has(tile.tile)
         }
@@ -74,12 +74,12 @@ class TileBlend(Map):
         return {tile.tile for tile in self.tiles}
 
     def has(self, tile: Tile) -> bool:
-        """Whether there is such a tile, and it is done."""
+        """Whether this tile exists and is done."""
         return tile in self._done
 
     @cached_property
     def contents_of_any(self) -> MapContents:
-        """The map of a tile, for what all have in common."""
+        """The map of any tile, for what all have in common."""
         return self.contents_of(self.tiles[0].tile)
 
     @property
@@ -87,7 +87,7 @@ class TileBlend(Map):
         return self.contents_of_any
 
     def contents_of(self, tile: Tile) -> MapContents:
-        """The map of a tile that is done. It is read, unless it is in memory."""
+        """The map of a finished tile, cached in memory."""
         with self._lock:
             if tile not in self._held:
                 contents = storage.load_contents(map_path(self.folder, self.plan.by_tile[tile]))
@@ -99,16 +99,16 @@ class TileBlend(Map):
             return self._held[tile][0]
 
     def leaf_cells(self, of: Tile, within: Tile) -> NDArray[np.int64]:
-        """(C, 3) leaf cells, as the lattice numbers them, of the map of one tile that is done, which lie in another."""
+        """(C, 3) leaf cells, by lattice indices, of the map of one finished tile that lie in another one."""
         keys = storage.load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
         cells = lattice_of(keys).astype(np.int64) + self.plan.origin_cells(of)
         inside: NDArray[np.bool_] = (cells[:, :2] // self.plan.tile_cells == within).all(axis=1)
         return cells[inside]
 
     def _shares(self, world: _Floats) -> Iterator[Share]:
-        """The contribution of each tile at positions (N, 3), world, m: in ascending order, on which the bits of sums depend.
+        """Yield the shares of tiles at positions (N, 3), world, m, in ascending order, which fixes the bits of sums.
 
-        Weights depend on the borders between tiles alone, not on what a tile observed.
+        Weights depend only on the borders between tiles, not on what a tile observed.
         """
         grid = self.plan.grid
         places = world[np.isfinite(world).all(axis=1), :2]
@@ -128,8 +128,8 @@ class TileBlend(Map):
     def _seen(self, world: _Floats) -> NDArray[np.bool_]:
         """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border.
 
-        Tiles disagree, because ghosts depend on surfaces before them. The tile that a position lies in decides; in the place
-        of one that is not done, its neighbours do.
+        Tiles disagree, because ghosts depend on surfaces in front of them. The tile that contains a position decides; for
+        an unfinished one, its neighbours do.
         """
         found = np.zeros(len(world), bool)
         for share in self._shares(world):
@@ -141,7 +141,7 @@ class TileBlend(Map):
         return found
 
     def _known_shares(self, world: _Floats, extrapolate: bool) -> Iterator[Share]:
-        """The shares of the tiles that observed a position, where it was seen. `extrapolate`: elsewhere, all of them."""
+        """Yield the shares of tiles that observed a position, where any did. `extrapolate`: elsewhere, those of all tiles."""
         seen = self._seen(world)
         unseen = ~seen & np.isfinite(world).all(axis=1) & extrapolate
         for share in self._shares(world):
@@ -175,7 +175,7 @@ class TileBlend(Map):
         return self._average(world, extrapolate, of_tile)[:, 0]
 
     def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
-        """All tiles count, because each one's evidence ends smoothly: less is known where a tile that looked has no returns."""
+        """All tiles contribute, because evidence ends smoothly at each: a tile that observed no returns lowers it."""
         positions = _contiguous(world)
 
         def of_tile(share: Share) -> Tensor:
@@ -185,18 +185,18 @@ class TileBlend(Map):
         return queries.EvidenceAt(*torch.from_numpy(found).float().unbind(1))
 
     def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
-        """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, numbered from the lattice's first corner.
+        """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, indexed from the lattice's first corner.
 
-        They have the same bits whichever tile asks. NaN where no tile has an adjacent cell.
+        The bits do not depend on the calling tile. NaN where no tile has an adjacent cell.
         """
         steps = round(self.config.leaf_size_m / voxel_m)
 
         def touching() -> Iterator[Share]:
             for share in self._shares(self.config.lattice.position(lattice / steps)):
-                # From integers: the same float32 position for every tile that asks.
+                # Computed from integers: the same float32 position for every calling tile.
                 origin = self.plan.origin_cells(share.tile) * steps
                 points = torch.from_numpy(((lattice[share.rows] - origin) * voxel_m).astype(np.float32))
-                # A corner on the border of the map may be in a cell beyond it, which has no features.
+                # A corner on the border of the map may be in an outer cell, which has no features.
                 points, inside = queries.into_cells(share.contents, points, voxel_m)
                 yield share.at(points, inside.numpy())
 

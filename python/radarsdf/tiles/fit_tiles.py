@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Maps of any size: scans to tiles, a fit for each, and one map."""
+"""Fits of maps of any size: scans to tiles, a fit per tile, and one map."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from radarsdf.tiles.planning import SCANS_FILE, CheckedScans, make_plan, read_ra
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
-_HALO_CELLS = 64  # half of it counts; see docs/tiles.md
+_HALO_CELLS = 64  # half of it has a weight; see docs/tiles.md
 _LOCK = "plan.lock"
-_POLL_S = 2.0  # how often the executor itself is checked
-_NO_SCHEDULER = "the scheduler is gone: call again, what is done is kept"
+_POLL_S = 2.0  # interval of checks of the executor itself
+_NO_SCHEDULER = "the scheduler is gone: call again, finished tiles are kept"
 _CONNECT_S = 10.0
 _OURS = {PLAN, _LOCK, TILES, SCANS_FILE}
 
@@ -48,39 +48,39 @@ def fit_tiles(
     config: FitConfig | None = None,
     progress: bool | None = None,
 ) -> TiledMap:
-    """Fit a map in tiles. Neither all returns nor all of the map are ever in memory.
+    """Fit a map in tiles, with neither all returns nor the whole map in memory at any time.
 
-    If `out` holds a plan of the same scans and settings, tiles that are done are kept: call it again after anything went
-    wrong. With ``config.num_threads``, the result has the same bits with any executor.
+    If `out` holds a plan of the same scans and settings, finished tiles are kept: call it again after any
+    failure. With ``config.num_threads``, the result has the same bits with any executor.
 
     Parameters
     ----------
     scans : path-like, Scans, or iterable of Scan
-        A path is read by :func:`radarsdf.io.read`. Scans may come one after another; they are read once.
+        A path is read by :func:`radarsdf.io.read`. Scans may be a generator; they are read once.
     out : path-like
-        A folder, which is made.
+        Folder to create.
     tile_size : float, optional
         Edge of a tile, m, rounded to blocks of ``config.lattice``. Default: 512 leaf cells.
     halo : float, optional
-        Width of the margin round each tile whose returns it is fitted to, m, rounded to blocks. Tiles overlap in half of it.
+        Width of the margin of returns round each tile that are fitted, too, m, rounded to blocks. Tiles overlap in half of it.
         Default: 64 leaf cells.
     executor : concurrent.futures.Executor, optional
-        What runs the fits: processes, or that of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
-        By default one after another in this process.
+        Executor of the fits: of processes, or of a cluster (``Client.get_executor(pure=False)`` of dask.distributed).
+        By default, tiles are fitted one after another in this process.
     config : FitConfig, optional
         Settings of the fits. With an executor, each has one thread unless ``num_threads`` is set.
     progress : bool, optional
-        Whether to show progress bars. By default only on a terminal.
+        Whether to show progress bars. Default: only on a terminal.
 
     Returns
     -------
     TiledMap
-        Its ``missing`` names the tiles that failed, and why.
+        Its ``missing`` names the failed tiles and the reasons.
 
     Raises
     ------
     ValueError, OSError
-        If a scan is invalid, `out` holds something else or another plan, cannot be written, or all tiles failed.
+        If a scan is invalid, `out` holds other files or another plan, cannot be written, or all tiles failed.
     """
     threads = None if executor is None else 1
     plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=threads)
@@ -96,7 +96,7 @@ def plan_tiles(
     config: FitConfig | None = None,
     threads: int | None = None,
 ) -> Plan:
-    """Writes the plan and the rays of each tile, in one pass over the scans. `threads`: of a fit, if `config` names none."""
+    """Write the plan and the rays of each tile in one pass over the scans. `threads`: of a fit, unless `config` sets them."""
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
@@ -108,8 +108,8 @@ def plan_tiles(
         folder.mkdir(exist_ok=True)
         lock = take_lock(folder / _LOCK, "planned")
         try:
-            if not (folder / PLAN).is_file():  # another process may just have made it
-                shutil.rmtree(folder / TILES, ignore_errors=True)  # of a plan that was not finished
+            if not (folder / PLAN).is_file():  # another process may have just written it
+                shutil.rmtree(folder / TILES, ignore_errors=True)  # left by an unfinished plan
                 config = config.override(num_threads=config.num_threads or threads or torch.get_num_threads())
                 plan = make_plan(given, folder, config, grid)
                 plan.save(folder)
@@ -145,7 +145,7 @@ def run_fits(
     names: Iterable[str] | None = None,
     progress: bool | None = None,
 ) -> TiledMap:
-    """The second step: fits the tiles of a plan that are not done, all or those of these `names`."""
+    """Second step: fit the unfinished tiles of a plan, all or those of these `names`."""
     root = path_of(folder, "folder")
     plan = Plan.load(root)
     wanted = {tile.name for tile in plan.tiles} if names is None else set(names)
@@ -155,7 +155,7 @@ def run_fits(
     todo = [tile for tile in plan.tiles if tile.name in wanted and not is_done(root, plan, tile)]
     failed = run_tasks(fit_tile, [(str(root), tile.name) for tile in todo], executor, progress=progress)
     for i, tile in enumerate(todo):
-        with suppress(OSError):  # a disk that is full has said so
+        with suppress(OSError):  # a full disk has been reported
             if i in failed and not is_done(root, plan, tile):
                 write_whole(failure_path(root, tile), failed[i].encode())
             else:
@@ -167,7 +167,7 @@ def run_fits(
 
 
 def fit_tile(folder: str, name: str) -> None:
-    """Fits a tile, unless its map is there. A task takes names, so that it can run anywhere."""
+    """Fit a tile unless its map exists. Tasks take names, so that they can run anywhere."""
     root = Path(folder)
     plan = Plan.load(root)
     (tile,) = (planned for planned in plan.tiles if planned.name == name)
@@ -212,7 +212,7 @@ def run_tasks(
     *,
     progress: bool | None = None,
 ) -> dict[int, str]:
-    """Calls ``task(*arguments[i])`` for each i. Returns what went wrong, by i; the other tasks are done."""
+    """Call ``task(*arguments[i])`` for each i. Returns errors by i; the other tasks succeeded."""
     failed: dict[int, str] = {}
     futures: dict[Future[Any], int] = {}
     with tqdm(total=len(arguments), desc="fit", unit="tile", disable=hides_bar(progress)) as bar:
@@ -221,7 +221,7 @@ def run_tasks(
             try:
                 result()
             except (BrokenExecutor, CancelledError):
-                failed[i] = "a worker was killed: call again, what is done is kept"
+                failed[i] = "a worker was killed: call again, finished tiles are kept"
             except Exception as error:  # noqa: BLE001 - of any kind: the other tiles do not depend on this one
                 failed[i] = str(error) or type(error).__name__
             bar.update()
@@ -237,7 +237,7 @@ def run_tasks(
                 done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
                 for future in done:
                     note(futures[future], future.result)
-                # Futures of dask.distributed are never done once their client is cut off.
+                # Futures of dask.distributed never finish once their client is cut off.
                 if getattr(getattr(executor, "_client", None), "status", None) == "closed":
                     return failed | {futures[future]: _NO_SCHEDULER for future in waiting}
         except BaseException:
@@ -249,9 +249,9 @@ def run_tasks(
 
 @contextmanager
 def cluster_executor(address: str, memory_bytes: int) -> Iterator[Executor]:
-    """The executor of the cluster of dask.distributed at an address, such as ``tcp://host:8786``.
+    """Connect to the dask.distributed cluster at an address, such as ``tcp://host:8786``, and yield its executor.
 
-    Each worker runs a task for each of its threads, so it should have one. Raises a MemoryError if no worker may take
+    A worker runs one task per thread, so it should have one. Raises a MemoryError if no worker may use
     `memory_bytes`, an OSError if there is no cluster.
     """
     distributed = require("distributed", what="a cluster needs")
@@ -261,10 +261,10 @@ def cluster_executor(address: str, memory_bytes: int) -> Iterator[Executor]:
         if memory_bytes > largest:
             msg = f"a tile takes about {memory_bytes / 1e6:.0f} MB and no worker has more than {largest / 1e6:.0f}: make the plan with smaller tiles"
             raise MemoryError(msg)
-        # pure: a second task with the same arguments would get the first one's result, although its file may be gone.
+        # With pure=True, a second task with the same arguments would get the first result, although its file may be gone.
         executor = client.get_executor(pure=False)
         try:
             yield executor
         finally:
             if client.status == "running":
-                executor.shutdown(wait=False)  # what an error or Ctrl-C left in work is cancelled
+                executor.shutdown(wait=False)  # cancels the tasks left by an error or Ctrl-C

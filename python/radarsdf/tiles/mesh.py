@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The mesh of a map in tiles: a part for each tile, cut on the lattice of all tiles, so that parts fit to the bit."""
+"""Mesh of a tiled map: one part per tile, cut on the common lattice, so that parts fit to the bit."""
 
 from __future__ import annotations
 
@@ -42,22 +42,22 @@ from radarsdf.tiles.tileset import content_folder, write_tileset
 if TYPE_CHECKING:
     import trimesh
 
-_ON_LATTICE = 1e-4  # voxels: vertices are at least 1e-3 from the corners of their edges
-_BYTES_PER_TRIANGLE = 28  # in the file of a part
+_ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
+_BYTES_PER_TRIANGLE = 28  # size in the file of a part
 _Floats = NDArray[np.float64]
 _Box = NDArray[np.float64] | None  # (2, 3) lower and upper corner, world, m
 
 
 @dataclass(frozen=True)
 class Part:
-    """The triangles in one tile."""
+    """Triangles of one tile."""
 
     vertices: _Floats  # (V, 3) world, m
     faces: NDArray[np.int32]  # (F, 3) rows of the vertices
     confidence: NDArray[np.float32]  # (V,)
     uncertainty_m: NDArray[np.float32]  # (V,)
-    cells: NDArray[np.int64]  # (2,) leaf cells, and those in which the surface can be
-    tally: _Floats  # Tally.sums of all surface of the tile
+    cells: NDArray[np.int64]  # (2,) numbers of leaf cells, and of those that may contain surface
+    tally: _Floats  # Tally.sums of the whole surface of the tile
 
 
 _ARRAYS: dict[str, tuple[Any, ...]] = {
@@ -71,7 +71,7 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
 
 
 def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
-    """Arrays of a part, by default all."""
+    """Read arrays of a part, by default all."""
     wanted = {name: _ARRAYS[name] for name in names or _ARRAYS}
     arrays = arrays_of(path, tuple(wanted))
     try:
@@ -83,10 +83,10 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
 
 
 def voxels_along(leaf_m: float, voxel_size: float) -> int:
-    """Voxels along the edge of a leaf cell. Raises a ValueError unless they divide it, so that those of two tiles meet."""
+    """Number of voxels along a leaf cell. Raises a ValueError unless they divide it, so that those of tiles coincide."""
     steps, even = per_cell(positive(voxel_size, "voxel_size"), leaf_m)
     if not even:
-        msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as those of tiles must: use {leaf_m / 2:g} or {leaf_m:g}"
+        msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as tiles need: use {leaf_m / 2:g} or {leaf_m:g}"
         raise ValueError(msg)
     return steps
 
@@ -94,13 +94,13 @@ def voxels_along(leaf_m: float, voxel_size: float) -> int:
 def parts_of(
     city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
 ) -> tuple[list[Path], Limits, Threshold]:
-    """Meshes all tiles: the files of the parts, the limits of a mesh of them (`wanted`), and what these come to."""
+    """Mesh all tiles; return the files of the parts, the limits of a mesh (`wanted`), and the sums over the parts."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
     steps = voxels_along(city.config.leaf_size_m, voxel_size)
     corners = None if box is None else check_box(box)
     paths = []
     for planned in tqdm(city.tiles, "mesh", unit="tile", disable=hides_bar(progress)):
-        # The same settings of the same plan and neighbours give the same file.
+        # The file is determined by the settings, the plan and the neighbours.
         done = [other for other in neighbours(planned.tile) if city.has(other)]
         text = repr((city.plan.digest, steps, corners, done))
         key = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
@@ -113,7 +113,7 @@ def parts_of(
 
 
 def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
-    """The triangles near returns in the leaf cells of a tile, of `steps` voxels along their edges."""
+    """Triangles near returns in the leaf cells of a tile, with `steps` voxels along a cell's edge."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
     cells = _cells_in(city, tile)
@@ -147,7 +147,7 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
 
 
 def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
-    """(C, 3) leaf cells of a tile, as the lattice numbers them: those of its map, and of others with a weight there."""
+    """(C, 3) leaf cells in a tile, by lattice indices: those of its map, and of others with a weight there."""
     plan = city.plan
     parts = []
     for other in neighbours(tile):
@@ -160,13 +160,13 @@ def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
 
 
 def _on_borders(city: TileBlend, vertices: _Floats) -> NDArray[np.int64]:
-    """(B,) rows of the vertices (V, 3) on the borders of tiles, which the next tile may have, too."""
+    """(B,) rows of the vertices (V, 3) on borders of tiles, which the adjacent tile may share."""
     tiles = city.config.lattice.cells(vertices)[:, :2] / city.plan.tile_cells
     return np.flatnonzero((np.abs(tiles - np.round(tiles)) * city.plan.tile_cells < _ON_LATTICE).any(axis=1))
 
 
 def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
-    """The vertices (V, 3) of all parts, and the faces (F, 3), of which no two use different vertices in one place."""
+    """Merge all parts to vertices (V, 3) and faces (F, 3), without duplicate vertices."""
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0, *[len(part.vertices) for part in parts]], dtype=np.int32)
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
@@ -202,7 +202,7 @@ def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits:
 def export_mesh(
     city: TileBlend, path: str | PathLike[str], voxel_size: float, progress: bool | None, **limits: Any
 ) -> tuple[int, int]:
-    """See :meth:`TiledMap.export`. What cannot be written is noticed before the work."""
+    """See :meth:`TiledMap.export`. Unwritable paths are detected before the work."""
     if path_of(path, "path").suffix.lower() == ".json":
         content_folder(Path(path))
         parts = parts_of(city, voxel_size, progress, **limits)
@@ -220,7 +220,7 @@ def export_mesh(
 def _separate(
     city: TileBlend, paths: Sequence[Path], limits: Limits, threshold: Threshold
 ) -> Iterator[tuple[_Floats, NDArray[np.int32]]]:
-    """Vertices (V, 3), world, m, and faces (F, 3) of one tile after another. Components that reach a border stay."""
+    """Yield vertices (V, 3), world, m, and faces (F, 3) tile by tile. Components that reach a border are kept."""
     for path in paths:
         part = Part(**_read(path))
         faces = part.faces[_allowed(part, threshold.min_confidence, limits)]
@@ -234,7 +234,7 @@ def _separate(
 
 
 def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
-    """What views need of some tiles."""
+    """Arguments of views of some tiles."""
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(city.plan.origin_cells(tiles[0]))

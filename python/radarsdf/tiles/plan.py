@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The plan of a map in tiles: one JSON file, on which all tasks agree, and where the files of tiles are."""
+"""Plan of a tiled map: one JSON file shared by all tasks, and the paths of the tiles' files."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ FORMAT = {"format": "radarsdf.tiles", "format_version": 2}
 PLAN, TILES = "plan.json", "tiles"
 
 Tile = tuple[int, int]
-"""Number of a tile along x and along y. Tile (0, 0) begins where the lattice of the world does."""
+"""Index of a tile along x and y. Tile (0, 0) begins at the origin of the world's lattice."""
 
 _Floats = NDArray[np.float64]
 _Count = Annotated[int, Field(ge=0, le=2**53)]
-_Number = Annotated[int, Field(ge=-(2**53), le=2**53)]  # of a tile or a cell
+_Number = Annotated[int, Field(ge=-(2**53), le=2**53)]  # index of a tile or a cell
 _Length = Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
 _FromList = Field(strict=False)  # JSON has lists, not tuples
 _MAX_REASON_BYTES = 10_000
@@ -45,24 +45,24 @@ _MAX_REASON_BYTES = 10_000
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Squares of the horizontal plane, of any height, and a halo around each."""
+    """Squares of the horizontal plane, unbounded in height, with a halo around each."""
 
     tile_m: float  # edge of a tile: a multiple of the block
-    halo_m: float  # what a tile knows beyond its edges: at most its edge
-    corner_m: float  # where tile (0, 0) begins along x and along y, world
+    halo_m: float  # margin of a tile's returns: at most its edge
+    corner_m: float  # lower corner of tile (0, 0) along x and y, world
 
     def lower_corner(self, tile: Tile) -> _Floats:
-        """(2,) where a tile begins, world, m."""
+        """(2,) lower corner of a tile, world, m."""
         return self.corner_m + np.array(tile) * self.tile_m
 
     def tiles_of(self, positions: NDArray[Any]) -> NDArray[np.int64]:
-        """(N, 2) the tile that each position (N, 3), world, m, belongs to."""
+        """(N, 2) tiles that contain positions (N, 3), world, m."""
         return _floor(self._along(positions) / self.tile_m)
 
     def crossed(
         self, ends: _Floats, others: _Floats
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Rows (M,) of segments between `ends` and `others` (N, 3), world, m, and the tiles (M, 2) whose halos they enter, once each."""
+        """Rows (M,) of segments from `ends` to `others` (N, 3), world, m, and the tiles (M, 2) whose halos they enter, unique."""
         a, b = self._along(ends), self._along(others)
         first = _floor((np.minimum(a, b) - self.halo_m) / self.tile_m)
         last = _floor((np.maximum(a, b) + self.halo_m) / self.tile_m)
@@ -74,20 +74,20 @@ class TileGrid:
             yield rows[meets], tiles[meets]
 
     def _meets(self, a: _Floats, b: _Floats, tiles: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether segments, from the corner of tile (0, 0), meet the boxes of their tiles, all (M, 2), by slabs."""
+        """Whether segments, relative to the corner of tile (0, 0), meet the boxes of their tiles, all (M, 2), by slabs."""
         lower, extent = tiles * self.tile_m - self.halo_m, b - a
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.stack([lower - a, lower + self.tile_m + 2 * self.halo_m - a]) / extent
-        # Parallel to a slab, a segment is within: the tiles are those of its own limits.
+        # A segment parallel to a slab is inside it: the tiles come from the segment's own bounds.
         enter = np.where(extent == 0, -np.inf, ends.min(axis=0)).max(axis=1)
         leave = np.where(extent == 0, np.inf, ends.max(axis=0)).min(axis=1)
         meets: NDArray[np.bool_] = np.maximum(enter, 0) <= np.minimum(leave, 1)
         return meets
 
     def weights(self, tile: Tile, positions: _Floats) -> _Floats:
-        """(N,) weights of a tile at positions (N, 3), world, m. Those of all tiles add up to one.
+        """(N,) weights of a tile at positions (N, 3), world, m. The weights of all tiles sum to one.
 
-        They rise smoothly within half a halo around each edge. The outer half, where a tile knows less, does not count.
+        They rise smoothly within half a halo around each edge. The outer half, where a tile knows less, has no weight.
         """
         beyond_lower = self._along(positions) - np.array(tile) * self.tile_m
         factors = np.ones((len(positions), 2))
@@ -104,7 +104,7 @@ class TileGrid:
         return np.flatnonzero(((from_corner > -half_m) & (from_corner < self.tile_m + half_m)).all(axis=1))
 
     def _along(self, positions: NDArray[Any]) -> _Floats:
-        """(N, 2) from the corner of tile (0, 0) to positions (N, 3), world, m."""
+        """(N, 2) offsets of positions (N, 3), world, m, from the corner of tile (0, 0)."""
         along: _Floats = positions[:, :2] - self.corner_m
         return along
 
@@ -121,49 +121,49 @@ def neighbours(tile: Tile) -> list[Tile]:
 
 @settings
 class TilePlan:
-    """What is known of one tile before its fit."""
+    """Properties of a tile known before its fit."""
 
     tile: Annotated[tuple[_Number, _Number], _FromList]
-    returns: _Count  # in the tile itself
-    rays: Annotated[_Count, Field(ge=1)]  # that cross it or its halo
-    origin_cells: Annotated[tuple[_Number, _Number, _Number], _FromList]  # of its map, in the lattice
-    memory_bytes: _Count = 0  # estimates of what its fit takes
+    returns: _Count  # number of returns in the tile itself
+    rays: Annotated[_Count, Field(ge=1)]  # crossing it or its halo
+    origin_cells: Annotated[tuple[_Number, _Number, _Number], _FromList]  # origin of its map, in the lattice
+    memory_bytes: _Count = 0  # estimates for its fit
     seconds: Annotated[float, Field(ge=0)] = 0.0
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Name of its files."""
         return f"{self.tile[0]}_{self.tile[1]}"
 
 
 @settings
 class Plan:
-    """What the tasks have in common, and the tiles. Folders are named by its numbers, so their types are checked."""
+    """Settings common to all tasks, and the tiles. Its numbers name folders, so their types are checked."""
 
-    config: FitConfig  # of all fits, with the sensor's noise and the number of threads
+    config: FitConfig  # settings of all fits, with the sensor's noise and the number of threads
     tile_m: _Length
     halo_m: _Length
     intensity_range: Annotated[tuple[float, float], _FromList] | None  # without outliers, sensor units
     clutter_ratio: Annotated[float, Field(ge=0, le=1)]  # clutter ratio of the largest tiles
-    returns_per_cell: Annotated[float, Field(ge=0)]  # mean of the cells of surfels of these
+    returns_per_cell: Annotated[float, Field(ge=0)]  # mean over the cells of surfels of the same tiles
     sensor: Sensor
     scans: Annotated[_Count, Field(ge=1)]
-    input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # of all scans
-    tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]  # those that own a return, ascending
+    input_digest: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]  # hash of all scans
+    tiles: Annotated[tuple[TilePlan, ...], Field(min_length=1)]  # ascending: tiles that contain a return
 
     @cached_property
     def grid(self) -> TileGrid:
-        """Of the tiles."""
+        """Grid of the tiles."""
         return TileGrid(self.tile_m, self.halo_m, float(self.config.lattice.position(0)))
 
     @cached_property
     def by_tile(self) -> dict[Tile, TilePlan]:
-        """The same tiles by their numbers."""
+        """Tiles by index."""
         return {planned.tile: planned for planned in self.tiles}
 
     @property
     def scale(self) -> IntensityScale | None:
-        """Of the intensities."""
+        """Scale of the intensities."""
         return None if self.intensity_range is None else IntensityScale.between(self.intensity_range)
 
     @property
@@ -176,14 +176,14 @@ class Plan:
         return np.array(self.by_tile[tile].origin_cells, np.int64)
 
     def box_cells(self, tile: Tile) -> NDArray[np.int64]:
-        """(2, 3) first leaf cell of a tile, and the one after the last, from the origin of its map. Of any height."""
+        """(2, 3) first leaf cell of a tile and the one after the last, from the origin of its map, unbounded in height."""
         first = np.array(tile) * self.tile_cells - self.origin_cells(tile)[:2]
         height = MAX_CELLS_FROM_ORIGIN
         return np.array([[*first, -height], [*(first + self.tile_cells), height]])
 
     @cached_property
     def digest(self) -> str:
-        """Of all that is in the plan. Results of another plan are not taken for results of this one."""
+        """Hash of the whole plan, by which results of another plan are recognised."""
         return hashlib.blake2b(self._to_json(), digest_size=16).hexdigest()
 
     def _to_json(self) -> bytes:
@@ -193,15 +193,15 @@ class Plan:
         return json.dumps(FORMAT | own, indent=1).encode()
 
     def save(self, folder: Path) -> None:
-        """Writes the plan, whole or not at all."""
+        """Write the plan atomically."""
         write_whole(folder / PLAN, self._to_json())
 
     @classmethod
     def load(cls, folder: Path) -> Plan:
-        """The plan of a folder. Raises a ValueError if it has none, or it is damaged, or of another version."""
+        """Load the plan of a folder. Raises a ValueError if it is missing, damaged, or of another version."""
         path = folder / PLAN
         if folder.is_dir() and not path.exists():
-            msg = f"{folder} is no map: a folder that radarsdf tiles wrote has a {PLAN}"
+            msg = f"{folder} is not a map: folders written by radarsdf tiles have a {PLAN}"
             raise ValueError(msg)
         check_regular_file(path)
         try:
@@ -221,22 +221,22 @@ class Plan:
 
 
 def folder_of(folder: Path, tile: Tile) -> Path:
-    """Where the files of a tile are."""
+    """Folder of the files of a tile."""
     return folder / TILES / f"{tile[0]}_{tile[1]}"
 
 
 def map_path(folder: Path, tile: TilePlan) -> Path:
-    """The map of a tile."""
+    """File of the map of a tile."""
     return folder_of(folder, tile.tile) / "map.safetensors"
 
 
 def failure_path(folder: Path, tile: TilePlan) -> Path:
-    """Why the fit of a tile failed."""
+    """File with the reason why the fit of a tile failed."""
     return folder_of(folder, tile.tile) / "failed.txt"
 
 
 def failure_of(folder: Path, tile: TilePlan) -> str:
-    """Why the fit of a tile failed, as one line of letters; empty if it was not tried, or was killed."""
+    """Reason why the fit of a tile failed, as one printable line; empty if it was not tried, or was killed."""
     try:
         text = failure_path(folder, tile).read_bytes()[:_MAX_REASON_BYTES].decode(errors="replace")
     except OSError:
@@ -245,7 +245,7 @@ def failure_of(folder: Path, tile: TilePlan) -> str:
 
 
 def is_done(folder: Path, plan: Plan, tile: TilePlan) -> bool:
-    """Whether the map of a tile is there, and of this plan. Only the beginning of its file is read."""
+    """Whether the map of a tile exists and belongs to this plan. Only the header of its file is read."""
     try:
         return bool(report_of(folder, tile)["plan"] == plan.digest)
     except (OSError, KeyError, ValueError):
@@ -253,7 +253,7 @@ def is_done(folder: Path, plan: Plan, tile: TilePlan) -> bool:
 
 
 def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
-    """The report of the fit of a tile that is done, see :attr:`Map.report`. Raises a ValueError if it is damaged."""
+    """Report of the fit of a finished tile, see :attr:`Map.report`. Raises a ValueError if it is damaged."""
     path = map_path(folder, tile)
     try:
         with open_tensors(path, "np") as file:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Makes the plan: one pass over the scans, which writes the rays that cross each tile to its file."""
+"""Planning: one pass over the scans that writes the rays crossing each tile to its file."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ from radarsdf.tiles.plan import Plan, Tile, TileGrid, TilePlan, folder_of
 _LOG = logging.getLogger("radarsdf.tiles")
 SCANS_FILE = "scans.npy"
 _RECORD = np.dtype([("point", "<f4", (3,)), ("scan", "<i4"), ("intensity", "<f4")])
-"""A return in the frame of its tile, m; its scan; its intensity, sensor units, NaN if there are none."""
-_CHUNK_SCANS = 256  # in memory at a time
-_CHUNK_RETURNS = 500_000  # likewise: fewer scans of a dense sensor
+"""A return in the frame of its tile, m; index of its scan; its intensity, sensor units, NaN if there are none."""
+_CHUNK_SCANS = 256  # scans in memory at a time
+_CHUNK_RETURNS = 500_000  # returns in memory at a time: fewer scans of a dense sensor
 _CHUNK_M = 1000.0  # scans of a chunk share a local frame, in which float32 must be precise
-_SENSOR_SCANS = 512  # at most, from which the sensor is described
-_SAMPLED_TILES = 4  # whose noise and clutter ratio stand for all
+_SENSOR_SCANS = 512  # largest sample of scans for the sensor model
+_SAMPLED_TILES = 4  # tiles that estimate noise and clutter ratio
 
 
 class CheckedScans:
-    """Scans, checked one after another each time that they are read. Those without a rigid pose are left out."""
+    """Scans that are checked one by one in each pass. Those without a rigid pose are skipped."""
 
     def __init__(self, scans: Iterable[Any]) -> None:
         self._scans = scans
-        self.digest = ""  # of all, once they were read
+        self.digest = ""  # hash of all scans, after a pass
 
     def __iter__(self) -> Iterator[Scan]:
         digest = hashlib.blake2b(digest_size=16)
@@ -75,7 +75,7 @@ class CheckedScans:
 
 
 def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
-    """Reads all scans once, writes the rays of each tile, and returns the plan."""
+    """Read all scans once, write the rays of each tile, and return the plan."""
     planner, number = _Planner(folder, config, grid), 0
     for chunk in _chunks(scans, config.returns.accumulate_scans):
         planner.add(chunk, number)
@@ -87,7 +87,7 @@ def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGr
 
 
 def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
-    """Lists of consecutive scans, in which whole groups are accumulated."""
+    """Yield lists of consecutive scans that keep the groups to accumulate whole."""
     chunk: list[Scan] = []
     for scan in scans:
         if chunk and len(chunk) % together == 0:
@@ -102,20 +102,20 @@ def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
 
 
 class _Planner:
-    """Takes scans one after another, and writes the rays of each tile."""
+    """Consumes scans one by one, and writes the rays of each tile."""
 
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
         self._folder, self._config, self._grid = folder, config, grid
-        self._origins: dict[Tile, NDArray[np.int64]] = {}  # (3,) of the tiles' maps, leaf cells
-        self._counts: dict[Tile, NDArray[np.int64]] = {}  # of returns in each tile, and of rays
-        self._axes: list[NDArray[np.float64]] = []  # (F, 6) where scans were seen from, and z axes, world
+        self._origins: dict[Tile, NDArray[np.int64]] = {}  # (3,) origins of the tiles' maps, leaf cells
+        self._counts: dict[Tile, NDArray[np.int64]] = {}  # numbers of returns in each tile, and of rays
+        self._axes: list[NDArray[np.float64]] = []  # (F, 6) sensor positions and z axes, world
         self._samples: list[Scan] = []  # every n-th scan
         self._every = 1
         self._intensities = Intensities()
         self._with_intensities: bool | None = None
 
     def add(self, scans: list[Scan], first: int) -> None:
-        """Adds consecutive scans, the first of which has the number `first`."""
+        """Add consecutive scans, the first of which has the index `first`."""
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
             if self._with_intensities not in (None, has):
@@ -156,7 +156,7 @@ class _Planner:
                 file.write(records.data)
 
     def _rays(self, scans: list[Scan], first: int) -> Rays:
-        """Static returns, checked, in a frame of their own."""
+        """Prepare the static returns, checked, in a frame of their own."""
         held, given = scans_in_memory(scans), self._config.preparation
         try:
             static = StaticReturns.of(held.points, held.intensities, held.doppler_mps, self._config.returns)
@@ -166,7 +166,7 @@ class _Planner:
             raise ValueError(msg) from error
 
     def plan(self, input_digest: str) -> Plan:
-        """The plan, once all scans are given. Tiles without a return of their own are left out."""
+        """Build the plan after all scans. Tiles without returns of their own are omitted."""
         tiles = []
         for tile, (returns, rays) in sorted(self._counts.items()):
             if returns == 0:
@@ -194,7 +194,7 @@ class _Planner:
         return self._completed(draft)
 
     def _intensity_range(self, tiles: list[TilePlan]) -> tuple[float, float] | None:
-        """The lowest and the highest intensity, but for outliers."""
+        """Lowest and highest intensity without outliers."""
         if not self._with_intensities:
             return None
         low, high, plausible = self._intensities.low, self._intensities.high, self._intensities.plausible()
@@ -208,7 +208,7 @@ class _Planner:
         return low, high
 
     def _completed(self, plan: Plan) -> Plan:
-        """The plan with the noise and the clutter ratio of the largest tiles, and with the cost of each."""
+        """Complete the plan with the noise and clutter ratio of the largest tiles, and the cost of each."""
         noises: list[SensorNoise] = []
         tiles, clutter, returns, cells = [], 0.0, 0, 0
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns):
@@ -246,19 +246,19 @@ class _Planner:
 
 
 def rays_path(folder: Path, tile: Tile) -> Path:
-    """The rays of a tile."""
+    """File of the rays of a tile."""
     return folder_of(folder, tile) / "rays.bin"
 
 
 def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
-    """The rays that cross a tile, in the frame of its map, and which of their returns (N,) are in it or its halo."""
+    """Rays that cross a tile, in the frame of its map, and the mask (N,) of returns in it or its halo."""
     path = rays_path(folder, tile.tile)
     if not path.exists() or path.stat().st_size != tile.rays * _RECORD.itemsize:
         msg = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean: fit in a new folder"
         raise ValueError(msg)
     rows = np.fromfile(path, _RECORD)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
-    of_scans = np.array(array_in(folder / SCANS_FILE)[numbers])  # a memory map, of which few rows are needed
+    of_scans = np.array(array_in(folder / SCANS_FILE)[numbers])  # a memory map, of which few rows are read
     points = np.ascontiguousarray(rows["point"])
     intensities = None
     if plan.intensity_range is not None:

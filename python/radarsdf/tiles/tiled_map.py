@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One map that answers from many tiles."""
+"""One map over many tiles."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ _Floats = NDArray[np.float64]
 
 
 class TiledMap(TileBlend):
-    """A map in tiles, made by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
+    """A map in tiles, returned by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
 
     It has the methods of :class:`Map`. Where tiles overlap, their fields are averaged with weights that fall smoothly to zero,
-    so that neither surface, gradient nor intensity has a seam. Tiles are read when they are needed.
+    so neither surface, gradient nor intensity has a seam. Tiles are read on demand.
 
     Parameters
     ----------
     folder : path-like
-        Where the plan and the maps are.
+        Folder of the plan and the maps.
     memory_bytes : float
-        Memory for tiles, about, bytes. One tile at a time is always held.
+        Approximate memory for tiles, bytes. At least one tile is always held.
 
     Raises
     ------
     ValueError, OSError
-        If the plan is damaged, no tile is done, or it cannot be read.
+        If the plan is damaged, no tile is done, or a file cannot be read.
     """
 
     _viewed: tuple[list[Tile], ViewedMap] | None = None
@@ -70,16 +70,16 @@ class TiledMap(TileBlend):
         progress: bool | None = None,
         **limits: Any,
     ) -> trimesh.Trimesh:
-        """Extract the surface as one mesh, without gaps or doubled triangles between tiles.
+        """Extract the surface as one mesh, without gaps or duplicate triangles between tiles.
 
-        The triangles of tiles stay in the folder, so that another mesh of the same `voxel_size` and `box` is quick.
+        Triangles of the tiles are cached in the folder, so another mesh of the same `voxel_size` and `box` is fast.
 
         Parameters
         ----------
         voxel_size : float
-            Edge of a voxel, m. It must divide the edge of a leaf cell.
+            Edge of a voxel, m, which must divide the edge of a leaf cell.
         box, viewpoint, progress, **limits
-            As of :meth:`Map.mesh`.
+            As for :meth:`Map.mesh`.
 
         Returns
         -------
@@ -89,7 +89,7 @@ class TiledMap(TileBlend):
         Raises
         ------
         ValueError, MemoryError
-            If an argument is out of range, or memory cannot hold the mesh: :meth:`export` writes 3D Tiles one after another.
+            If an argument is out of range, or the mesh exceeds the memory: :meth:`export` writes 3D Tiles one by one.
         """
         return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
 
@@ -99,7 +99,7 @@ class TiledMap(TileBlend):
         return mesh_of(self, voxel_size, **wanted)
 
     def cells_near(self, lower: _Floats, upper: _Floats) -> queries.CellsInBox:
-        """Each cell is that of the tile that it lies in; of a tile that is not done, unknown."""
+        """Each cell belongs to the tile that contains it; cells of unfinished tiles are unknown."""
         lattice, edge = self.config.lattice, self.plan.tile_cells
         first = np.floor(lattice.cells(lower)).astype(np.int64)
         last = np.floor(lattice.cells(upper)).astype(np.int64) + 1
@@ -138,7 +138,7 @@ class TiledMap(TileBlend):
             nearest = np.clip(position[:2], lower, lower + self.plan.tile_m)
             if np.linalg.norm(nearest - position[:2]) <= range_m:
                 tiles.append(planned.tile)
-        tiles = tiles or [self.tiles[0].tile]  # of a pose far away from all, any will do to see nothing
+        tiles = tiles or [self.tiles[0].tile]  # far from all tiles, any tile shows nothing
         if self._viewed is None or self._viewed[0] != tiles:
             self._viewed = tiles, viewed_tiles(self, tiles)
         return self._viewed[1]
@@ -151,16 +151,16 @@ class TiledMap(TileBlend):
         progress: bool | None = None,
         **limits: Any,
     ) -> tuple[int, int]:
-        """Write the mesh to one file, or as 3D Tiles, of which one tile at a time is in memory.
+        """Write the mesh to one file, or as 3D Tiles, with one tile at a time in memory.
 
         Parameters
         ----------
         path : path-like
-            ``NAME.json``: 3D Tiles 1.1, a GLB file for each tile in a folder ``NAME`` next to it, in the frame of the world. To
-            place it on the earth, set the ``transform`` of its root. Small components that reach into the next tile stay.
-            Another suffix: one file, as of :func:`radarsdf.io.write_mesh`.
+            ``NAME.json``: 3D Tiles 1.1, one GLB file per tile in a folder ``NAME`` next to it, in the world frame. To
+            georeference it, set the ``transform`` of its root. Small components that reach into the next tile are kept.
+            Another suffix: one file, as for :func:`radarsdf.io.write_mesh`.
         voxel_size, progress, **limits
-            As of :meth:`mesh`; also its `box`.
+            As for :meth:`mesh`; also its `box`.
 
         Returns
         -------
@@ -170,7 +170,7 @@ class TiledMap(TileBlend):
         Raises
         ------
         ValueError, MemoryError, OSError
-            As of :meth:`mesh`, or if the suffix is another, there is no surface, or a file cannot be written.
+            As for :meth:`mesh`, or if the suffix is unknown, there is no surface, or a file cannot be written.
         """
         from radarsdf.tiles.mesh import export_mesh  # noqa: PLC0415 - as above
 
@@ -179,24 +179,24 @@ class TiledMap(TileBlend):
     def threshold(
         self, voxel_size: float = queries.VOXEL_M, *, progress: bool | None = None, **limits: Any
     ) -> Threshold:
-        """Expected precision and coverage of a mesh, by tile: no mesh of the whole map is made.
+        """Expected precision and coverage of a mesh, computed per tile without a mesh of the whole map.
 
         Parameters
         ----------
         voxel_size, progress, **limits
-            As of :meth:`mesh`; also its `box`.
+            As for :meth:`mesh`; also its `box`.
 
         Returns
         -------
         Threshold
-            The confidence that :meth:`mesh` applies, and the shares that its ``metadata`` holds.
+            The confidence threshold of :meth:`mesh`, and the shares in its ``metadata``.
         """
         from radarsdf.tiles.mesh import parts_of  # noqa: PLC0415 - as above
 
         return parts_of(self, voxel_size, progress, **limits)[2]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Copy the plan and the maps of the tiles that are done to a new folder, which :func:`radarsdf.load` reads.
+        """Copy the plan and the maps of finished tiles to a new folder for :func:`radarsdf.load`.
 
         Parameters
         ----------
@@ -218,12 +218,12 @@ class TiledMap(TileBlend):
 
     @property
     def origin(self) -> _Floats:
-        """(3,) that of the tile in the middle, world, m, for those who need coordinates near zero."""
+        """(3,) origin of the middle tile, world, m, for coordinates near zero."""
         return self.config.lattice.position(self.tiles[len(self.tiles) // 2].origin_cells)
 
     @cached_property
     def report(self) -> dict[str, Any]:
-        """Counts, noise of the sensor, parts of the method that were skipped, and seconds, of all fits together.
+        """Counts, noise of the sensor, skipped parts of the method, and seconds, over all fits.
 
         `missing_tiles`: names.
         """
@@ -244,7 +244,7 @@ class TiledMap(TileBlend):
 
     @cached_property
     def num_cells(self) -> int:
-        """Number of leaf cells, each of them in the tile that it lies in."""
+        """Number of leaf cells, each counted in the tile that contains it."""
         return sum(len(self.leaf_cells(tile.tile, tile.tile)) for tile in self.tiles)
 
     @cached_property
@@ -257,41 +257,41 @@ class TiledMap(TileBlend):
 
     @property
     def file_bytes(self) -> int:
-        """Size of the files of the tiles, bytes."""
+        """Size of all files of tiles, bytes."""
         return sum(map_path(self.folder, tile).stat().st_size for tile in self.tiles)
 
 
 def load(path: str | PathLike[str]) -> Map:
-    """Read a map: a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
+    """Load a map from a file of :meth:`Map.save`, or a folder of :func:`fit_tiles`. Nothing in it is executed.
 
     Parameters
     ----------
     path : path-like
-        Written by this version.
+        A file or folder written by this version.
 
     Returns
     -------
     RadarMap or TiledMap
-        Its results have the same bits as those of the map that was written.
+        Its results have the same bits as those of the saved map.
 
     Raises
     ------
     ValueError, OSError
-        If it is no radarsdf map, is damaged, comes from another version, or cannot be read.
+        If it is no radarsdf map, is damaged, of another version, or cannot be read.
     """
     path = path_of(path, "path")
     return TiledMap(path) if path.is_dir() else load_file(path)
 
 
 def lacking(radar_map: Map) -> str:
-    """How many tiles a map lacks, as a phrase; empty if none."""
+    """Describe how many tiles a map lacks; empty if none."""
     if not isinstance(radar_map, TiledMap) or not (missing := radar_map.missing):
         return ""
     return f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
 
 
 def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
-    """The intensities (N,) that a map predicts for rays, sensor units, and these rays: those in no tile are left out."""
+    """Predicted intensities (N,) for rays, sensor units, and these rays: those in no tile are left out."""
     found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)
     known = np.isfinite(found)
     return (rays, found) if known.all() else (rays.select(np.flatnonzero(known)), found[known])

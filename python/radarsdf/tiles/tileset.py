@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The mesh of a map in tiles as 3D Tiles 1.1 (Open Geospatial Consortium, 22-025r4): a GLB file a tile, and a JSON."""
+"""Mesh of a tiled map as 3D Tiles 1.1 (Open Geospatial Consortium, 22-025r4): a GLB file per tile, and a JSON file."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.products import turned
 from radarsdf.tiles.blend import TileBlend
 
-# Viewers open a node when its error is larger than about 16 pixels: here, from nearer than about three of its edges.
+# Viewers open a node when its error exceeds about 16 pixels: here, at less than about three times its edge.
 _ERROR_OF_EDGE = 1 / 16
-# glTF has y up and 3D Tiles z: a viewer turns each file by 90 degrees about x. This is the way back.
+# glTF has y up and 3D Tiles z: viewers rotate each file by 90 degrees about x. This is the inverse.
 _GLTF_TILE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def content_folder(path: Path) -> Path:
-    """The folder of the GLB files of a ``NAME.json``. Raises an OSError if one of the two cannot be written."""
+    """Folder of the GLB files of ``NAME.json``. Raises an OSError if one of the two cannot be written."""
     check_outputs([path])
     folder = path.with_suffix("")
     folder.mkdir(exist_ok=True)
@@ -35,10 +35,10 @@ def content_folder(path: Path) -> Path:
 def write_tileset(
     city: TileBlend, path: Path, meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int32]]]
 ) -> tuple[int, int]:
-    """Writes ``NAME.json`` and a GLB file for each tile with triangles. Returns the numbers of vertices and triangles.
+    """Write ``NAME.json`` and a GLB file per tile with triangles. Returns the numbers of vertices and triangles.
 
-    `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. GLB files have float32 from the origin of the tile,
-    which the JSON has in float64: tiles far from the world's origin are as precise as others.
+    `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. GLB files hold float32 relative to the origin of the
+    tile, which is float64 in the JSON: precision does not depend on the distance from the world's origin.
     """
     folder = content_folder(path)
     children, corners, count = [], [], np.zeros(2, np.int64)
@@ -55,7 +55,7 @@ def write_tileset(
                 "boundingVolume": _box(local),
                 "geometricError": 0.0,
                 "content": {"uri": f"{folder.name}/{name}"},
-                "transform": T_world_tile.T.ravel().tolist(),  # column by column
+                "transform": T_world_tile.T.ravel().tolist(),  # column-major
             }
         )
         corners += [vertices.min(axis=0), vertices.max(axis=0)]
@@ -70,7 +70,7 @@ def write_tileset(
         "refine": "ADD",
         "children": children,
     }
-    # The JSON comes last: once it is there, all that it names is.
+    # The JSON is last, so that all files it names exist.
     described = {"asset": {"version": "1.1"}, "geometricError": error_m, "root": root}
     write_whole(path, json.dumps(described, allow_nan=False).encode())
     num_vertices, num_faces = count.tolist()
@@ -78,7 +78,7 @@ def write_tileset(
 
 
 def _glb(local: NDArray[np.float64], faces: NDArray[np.int32]) -> bytes:
-    of_trimesh: Any = trimesh.visual  # partly without types
+    of_trimesh: Any = trimesh.visual  # incompletely typed
     material = of_trimesh.material.PBRMaterial(
         baseColorFactor=[200, 200, 200, 255], metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
@@ -90,5 +90,5 @@ def _glb(local: NDArray[np.float64], faces: NDArray[np.int32]) -> bytes:
 
 def _box(points: NDArray[np.float64]) -> dict[str, Any]:
     lower, upper = points.min(axis=0), points.max(axis=0)
-    half = np.maximum((upper - lower) / 2, 1e-3)  # a flat box has no inside
+    half = np.maximum((upper - lower) / 2, 1e-3)  # a flat box would have no volume
     return {"box": [*((lower + upper) / 2).tolist(), *np.diag(half).ravel().tolist()]}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Where to put the camera so that everything is visible and fills the frame."""
+"""Camera poses from which a whole mesh is visible and fills the frame."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _MARGIN = 1.08
 _Floats = NDArray[np.float64]
 
 
-class Look(NamedTuple):
+class CameraPose(NamedTuple):
     """A camera pose."""
 
     position: _Floats  # (3,) m
-    look_at: _Floats  # (3,) the point in the middle, which the user rotates the view about, m
+    look_at: _Floats  # (3,) m, centre of the orbit of the user's rotations
 
 
-def look_at_all(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT) -> Look:
-    """The nearest camera that sees all points (N, 3), m, with z up, in the direction `to_eye` (3,), which is not vertical."""
+def framing_pose(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT) -> CameraPose:
+    """Nearest camera, with z up, that sees all points (N, 3), m, in the direction `to_eye` (3,), which must not be vertical."""
     back = to_eye / np.linalg.norm(to_eye)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -40,9 +40,9 @@ def look_at_all(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPE
     middle = np.zeros(3)
     for (axis, x, _), (one, other, slope) in zip(sides, ends, strict=True):
         a = slope * (one - other) / 2
-        for _ in range(4):  # where the frame is wider than needed, the middle is elsewhere
+        for _ in range(4):  # if the frame is wider than needed, the middle shifts
             at = (x - a) / (far_m - depth_m)
             a += (at.max() + at.min()) / 2 * float(far_m - depth_m.mean())
         middle = middle + a * axis
     center_m = float(depth_m.min() + depth_m.max()) / 2
-    return Look(middle + far_m * back, middle + center_m * back)
+    return CameraPose(middle + far_m * back, middle + center_m * back)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A coloured mesh as GLB, the one format in which viser takes vertex colours, and colours that its page shows right."""
+"""GLB encoding of coloured meshes, the one format in which viser takes vertex colours, and compensation of tone mapping."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_UNLIT = "KHR_materials_unlit"  # colours are shown as given, as those of point clouds and of legends
+_UNLIT = "KHR_materials_unlit"  # show colours as they are, like those of point clouds and legends
 _MATERIAL = {
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     "doubleSided": True,
@@ -19,7 +19,7 @@ _MATERIAL = {
 }
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 _TO_LIGHT = np.array([-0.35, -0.5, 0.79])
-_SHADE = 0.87  # lightness of what faces away from the light: colours must stay close to those of the legend
+_SHADE = 0.87  # lightness of faces averted from the light; higher keeps colours close to those of the legend
 
 _SRGB = np.arange(256) / 255
 _LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
@@ -30,7 +30,7 @@ _IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.028
 _OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 _EXPOSURE = 0.6
 _FIT = (0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081)
-_BITS = np.uint32(13)  # of the 23 of a number, finer than the 256 steps of a screen: zeros compress better
+_BITS = np.uint32(13)  # dropped mantissa bits, below the 256 levels of a screen: zeros compress better
 
 
 def glb(vertices: NDArray[Any], faces: NDArray[Any], colors: NDArray[np.uint8]) -> bytes:

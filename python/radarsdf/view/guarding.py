@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Refuse requests from other web pages in the same browser: they can reach this machine, also by DNS rebinding.
+"""Refuse requests from other web pages in the same browser, which could reach this machine, even by DNS rebinding.
 
-Browsers report `Host`, the name that was requested, and `Origin`, the page that requests.
+Browsers report the requested name as `Host`, and the requesting page as `Origin`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 
 def refusal(hosts: Sequence[str], origins: Sequence[str], listening: str) -> str | None:
-    """Why a request with these ``Host`` and ``Origin`` headers is refused by a server on `listening`; None: it is not."""
+    """Reason to refuse a request with these ``Host`` and ``Origin`` headers by a server on `listening`; None to accept it."""
     if len(hosts) != 1 or not _is_this_machine(hosts[0], listening.lower()):
         return "the Host of the request is not this server"
     own = {f"{scheme}://{hosts[0]}".lower() for scheme in ("http", "https")}
@@ -31,7 +31,7 @@ def _is_this_machine(host: str, listening: str) -> bool:
         name = urlsplit(f"//{host}").hostname
         if name in ("localhost", "127.0.0.1", "::1", listening):
             return True
-        if listening in ("0.0.0.0", "::", ""):  # any address and the machine's name: neither can be rebound
+        if listening in ("0.0.0.0", "::", ""):  # any address or the machine's name: neither can be rebound
             machine = socket.gethostname().lower()
             return name in (machine, f"{machine}.local") or bool(ipaddress.ip_address(name or ""))
     return False
@@ -39,7 +39,7 @@ def _is_this_machine(host: str, listening: str) -> bool:
 
 @contextlib.contextmanager
 def guarded(listening: str) -> Iterator[None]:
-    """Let the server that viser starts in this block, by a function of websockets, ask :func:`refusal` first."""
+    """Make the server that viser starts in this block, by a function of websockets, call :func:`refusal` first."""
     library: Any = importlib.import_module("websockets.asyncio.server")
     serve, started = library.serve, []
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Simple pages: a surface that grows, and what changed between two maps."""
+"""Simple pages: a growing surface, and the changes between two maps."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
-from radarsdf.view.framing import look_at_all
+from radarsdf.view.framing import framing_pose
 from radarsdf.view.glb import glb, lightness_of, shaded
 from radarsdf.view.quantities import key, paragraph, table
 from radarsdf.view.scene import add_path
-from radarsdf.view.serving import Page, begin_at
+from radarsdf.view.serving import Page, set_initial_camera
 from radarsdf.view.surface import thinned
 
 if TYPE_CHECKING:
@@ -28,11 +28,11 @@ _NOTES = {"unseen": ": not observed by the other map", "gone": ": of the earlier
 MEANING = {
     NAMES[kind] + _NOTES.get(NAMES[kind], ""): color for kind, color in sorted(COLORS.items(), reverse=True)
 }
-"""sRGB colours of changes by their meaning."""
+"""sRGB colour of each kind of change."""
 
 
 def centre_of(region: Region) -> str:
-    """The centre of a change, world, in words."""
+    """Format the centre of a change, world frame."""
     return "({:.1f}, {:.1f}, {:.1f}) m".format(*region.box.mean(axis=0))
 
 
@@ -45,14 +45,14 @@ class GrowingView(Page):
         self._origin: NDArray[np.float64] | None = None
 
     def show(self, mesh: trimesh.Trimesh, path: NDArray[np.float64]) -> None:
-        """Replace what is shown by a mesh and the sensor positions (F, 3), world, m."""
+        """Show a mesh and the sensor positions (F, 3), world, m, instead of the previous ones."""
         if len(mesh.faces) == 0:
             return
         vertices = np.asarray(mesh.vertices, np.float64)
         server = self._server
-        if self._origin is None:  # of the page, which computes in float32
+        if self._origin is None:  # origin of the page, which computes in float32
             self._origin = path[0].copy()
-            begin_at(server, look_at_all(vertices - self._origin))
+            set_initial_camera(server, framing_pose(vertices - self._origin))
         local, faces = (vertices - self._origin).astype(np.float32), np.asarray(mesh.faces, np.uint32)
         with server.atomic():
             server.scene.add_mesh_simple(
@@ -77,14 +77,14 @@ class ChangesView(Page):
         super().__init__(host, port)
         mesh: Any = thinned(changes.mesh(), _MAX_VERTICES, edge_m)[0]
         if len(mesh.faces) == 0:
-            msg = "there is no surface here"
+            msg = "the map has no surface here"
             raise ValueError(msg)
         vertices = np.asarray(mesh.vertices, np.float64)
         local = vertices - vertices.mean(axis=0)  # the page computes in float32
         colors = shaded(colors_of(mesh.vertex_attributes["kind"]), lightness_of(mesh.vertex_normals))
         self._start()
         server = self._server
-        begin_at(server, look_at_all(local))
+        set_initial_camera(server, framing_pose(local))
         data = glb(local, mesh.faces, colors)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
         rows = {

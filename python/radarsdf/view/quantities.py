@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Quantities that the surface can be coloured by, and legends as HTML."""
+"""Quantities that can colour the surface, and legends as HTML."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ Color = tuple[int, int, int]
 Position = tuple[float, float, float]
 _Rows = NDArray[np.int64]
 
-_SAMPLES = 30_000  # vertices that the limits of the intensities are taken from
+_SAMPLES = 30_000  # vertices from which the intensity limits are estimated
 
 
 @dataclass(frozen=True)
 class Scale:
-    """A fixed scale of sRGB colours from `low` to `high`. NaN is grey."""
+    """A fixed scale of sRGB colours from `low` to `high`; NaN is grey."""
 
     low: float
     high: float
 
     @classmethod
     def of(cls, values: NDArray[Any]) -> Scale:
-        """From the 2nd to the 98th percentile of values (N,)."""
+        """Build from the 2nd and the 98th percentile of values (N,)."""
         known = values[np.isfinite(values)]
         low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
         return cls(float(low), float(high))
@@ -49,9 +49,9 @@ class Scale:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A value of each vertex."""
+    """A scalar per vertex."""
 
-    label: str  # with its unit
+    label: str  # name and unit
     values: Callable[[_Rows, Position], NDArray[Any]]  # (N,) of vertices (N,), for a sensor at a position
     scale: Scale
     of_sensor: bool = False  # whether it depends on the sensor position
@@ -62,7 +62,7 @@ class Quantity:
 
 
 def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> dict[str, Quantity]:
-    """The quantities by name, the default first. The intensity scale is that for the first `sensor` position."""
+    """Quantities by name, the default first. The intensity scale is that for the first `sensor` position."""
     vertices, found = surface.vertices, {}
 
     def intensity(rows: _Rows, sensor: Position) -> NDArray[Any]:
@@ -80,16 +80,16 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     }
     for name, (label, values) in of_vertices.items():
         scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
-        found[name] = Quantity(label, _looked_up(values), scale)
+        found[name] = Quantity(label, _lookup(values), scale)
     return found
 
 
-def _looked_up(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
+def _lookup(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
     return lambda rows, _: values[rows]
 
 
 def legend(quantity: Quantity) -> str:
-    """The colour scale of a quantity."""
+    """Format the colour scale of a quantity as HTML."""
     scale = quantity.scale
     bar = f"height:0.8em;border-radius:0.2em;background:linear-gradient(to right,{scale.css})"
     ends = "display:flex;justify-content:space-between;font-variant-numeric:tabular-nums"
@@ -100,7 +100,7 @@ def legend(quantity: Quantity) -> str:
 
 
 def key(colors: Mapping[str, Color | Scale]) -> str:
-    """The meaning of colours and scales."""
+    """Format the meaning of colours and scales as HTML."""
     rows = []
     for name, color in colors.items():
         limits = ""
@@ -118,12 +118,12 @@ def key(colors: Mapping[str, Color | Scale]) -> str:
 
 
 def paragraph(text: str) -> str:
-    """A text."""
+    """Format a text as HTML."""
     return _block(escape(text))
 
 
 def table(rows: Mapping[str, str]) -> str:
-    """Names and values."""
+    """Format names and values as an HTML table."""
     cells = (f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows.items())
     return _block(f'<table style="border-spacing:0.6em 0">{"".join(cells)}</table>')
 

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What a viewer's page shows: the surface and one scan. A thread draws the newest state that controls asked for.
+"""Scene of a viewer's page: the surface and one scan, redrawn by a thread from the newest state of the controls.
 
-viser takes vertex colours only with a whole mesh. That is too much for each step of a drag, and the page would be blank
-between two meshes. So a step recolours a cloud of some vertices in place. After the drag a new mesh is sent, and what is
-shown stays until the page has drawn it.
+viser takes vertex colours only with a whole mesh, which is too much for each step of a drag and leaves the page blank
+between two meshes. So a step recolours a cloud of some vertices in place. After the drag a new mesh is sent, and the old
+scene stays until the page has drawn it.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from radarsdf.view.quantities import Position, Quantity, Scale
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
 from radarsdf.view.surface import ShownSurface, spread_evenly
 
-HELD_S = 2.0  # the mesh is drawn after the sensor was held still for so long
-SLID_S = 0.25  # a slider reports no end of a drag: this pause counts as one
+HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
+SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
 PATH_COLOR = (40, 44, 52)
-MEASURED_COLOR = (0, 72, 140)  # without intensities
+MEASURED_COLOR = (0, 72, 140)  # colour without intensities
 PREDICTED_COLOR = (0, 158, 115)  # not on the intensity scale, so that predictions stand out from the surface
 
 # On two cores, intensities of 30,000 points take about 0.025 s, of 400,000 about 0.4 s.
 _DRAG_POINTS = 30_000
-_POINT_SIZE = 1.4  # in vertex spacings, so that there are no holes between points
+_POINT_SIZE = 1.4  # size in vertex spacings, which leaves no holes between points
 _STYLES = {"measured": ("circle", 0.25), "predicted": ("diamond", 0.2)}  # size, m
-# In float16 points would be on a grid of 3 cm at 60 m.
+# In float16, points would lie on a grid of 3 cm at 60 m.
 _POINTS = {"point_shading": "flat", "precision": "float32"}
 
 
 @dataclass(frozen=True)
 class State:
-    """What the page is to show."""
+    """State of the controls."""
 
     sensor: Position  # world, m
     max_uncertainty_m: float
     min_confidence: float
     quantity: str = ""
     scan: int | None = None
-    coarse: bool = False  # whether the sensor is moving: the cloud is shown first
-    settle_s: float = 0.0  # the mesh is drawn if nothing changes for so long
+    coarse: bool = False  # whether the sensor is moving: show the cloud first
+    settle_s: float = 0.0  # draw the mesh if nothing changes for this long
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -59,11 +59,11 @@ class State:
 
 
 class Painter:
-    """Draws the newest state on a canvas, from a thread of its own. States that are superseded are skipped."""
+    """Draws the newest state on a canvas in its own thread, skipping superseded states."""
 
     def __init__(self, canvas: Any, state: State) -> None:
         self._canvas = canvas
-        self.newest = state  # which may not be drawn yet
+        self.newest = state  # may not be drawn yet
         self._changed = threading.Condition()
         self._pending, self._stopped = True, False
         self._ended = threading.Event()
@@ -72,21 +72,21 @@ class Painter:
         self._thread.start()
 
     def change(self, **fields: Any) -> None:
-        """Change the state, from any thread, without waiting."""
+        """Change fields of the state, from any thread, without waiting."""
         with self._changed:
             self.newest = dataclasses.replace(self.newest, **fields)
             self._pending = True
             self._changed.notify_all()
 
     def wait(self) -> None:
-        """Wait for the end of the thread. Raises the error that ended it."""
+        """Wait for the thread to end. Raises the error that ended it."""
         while not self._ended.wait(WAIT_STEP_S):
             pass
         if self._error is not None:
             raise self._error
 
     def stop(self) -> None:
-        """End the thread, after what it is drawing."""
+        """End the thread after the current drawing."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
@@ -113,7 +113,7 @@ class Painter:
 
 
 class Canvas:
-    """Draws the surface, coloured by a quantity, and the scan. `shown` is called with a state when its mesh was sent."""
+    """Draws the surface, coloured by a quantity, and the scan. Calls `shown` with a state once its mesh is sent."""
 
     def __init__(
         self,
@@ -131,9 +131,9 @@ class Canvas:
         self._cloud_rows = self._spread
         self._cloud_limits: tuple[float, float] | None = None
         self._drawn: Hashable = None  # what the mesh depends on
-        self._meshes: list[Any] = []  # the newest is last; the others go when the page has drawn that
-        self.sent = 0  # meshes so far
-        self.faces = surface.faces  # (F, 3) the triangles that are shown, rows of the vertices
+        self._meshes: list[Any] = []  # newest last; the older ones are removed once the page has drawn it
+        self.sent = 0  # number of meshes so far
+        self.faces = surface.faces  # (F, 3) visible triangles, rows of the vertices
         self.coarse = False  # whether the cloud is shown
         self.node: Any = server.scene.add_frame("/surface", show_axes=False)  # the parent of mesh and cloud
         self._cloud: Any = None
@@ -172,7 +172,7 @@ class Canvas:
                 mesh.visible = False
 
     def show_mesh(self, state: State, superseded: Callable[[], bool]) -> None:
-        """Send the mesh, and show it alone once the page has drawn it, unless the state is superseded before."""
+        """Send the mesh, and show only it once the page has drawn it, unless the state is superseded before."""
         of_sensor = self._quantities[state.quantity].of_sensor
         drawn = (state.limits, state.quantity, state.sensor if of_sensor else None)
         if drawn == self._drawn and not self.coarse:
@@ -209,7 +209,7 @@ class Canvas:
 class ScanClouds:
     """The sensor's path, and the returns of one scan, measured and predicted.
 
-    `scale`: of measured intensities. `text`: what shows a sentence about the scan that is shown.
+    `scale`: that of measured intensities. `text`: element for a sentence about the current scan.
     """
 
     def __init__(self, server: Any, radar_map: Map, scans: Scans, scale: Scale | None, text: Any) -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The server of a page, and where it listens. The one module that imports viser."""
+"""Server of a page and its address. The only module that imports viser."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from typing import TYPE_CHECKING, Any
 
 from radarsdf.checks import whole_number
 from radarsdf.extras import require
-from radarsdf.view.framing import FOV_RAD, Look
+from radarsdf.view.framing import FOV_RAD, CameraPose
 from radarsdf.view.guarding import guarded
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 _FIRST_PORT, _PORTS_TRIED = 8080, 100
-WAIT_STEP_S = 0.2  # the main thread waits in such steps: Windows does not interrupt an endless wait by Ctrl-C
+WAIT_STEP_S = 0.2  # step of waits in the main thread: on Windows, Ctrl-C does not interrupt an endless wait
 
 
 def require_viser() -> None:
-    """Raise an ImportError that names what to install if viser is missing."""
+    """Raise an ImportError with the install command if viser is missing."""
     require("viser", what="the viewer needs")
 
 
@@ -41,7 +41,7 @@ def has_viser() -> bool:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """The port to listen on: `port`, or if that is None, from 8080 on the next that is free.
+    """Port to listen on: `port`, or if it is None, the first free one from 8080.
 
     Raises an OSError if none is free or the host is not an address of this machine: viser would wait forever.
     """
@@ -54,7 +54,7 @@ def free_port(host: str, port: int | None) -> int:
             with socket.create_server((host, candidate), family=family) as listening:
                 found: int = listening.getsockname()[1]
                 return found
-        except OSError as error:  # also for an unknown host name
+        except OSError as error:  # raised also for an unknown host name
             reason = error.strerror or str(error)
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 break
@@ -73,9 +73,9 @@ def start_server(host: str, port: int) -> Any:
         warnings.warn(msg, RuntimeWarning, stacklevel=2)
     with contextlib.redirect_stdout(io.StringIO()), guarded(host):  # viser prints
         server: Any = viser.ViserServer(host, port, "radarsdf", verbose=False)
-    # viser's objects of a connection form cycles that hold all that was sent, 1 MB each with a mesh of 1 MB.
+    # viser's objects for a connection form cycles that hold all sent data, 1 MB each with a mesh of 1 MB.
     server.on_client_disconnect(lambda _: gc.collect())
-    # A message of a page would open a public tunnel through a third party.
+    # A message from the page would open a public tunnel through a third party.
     server.request_share_url = lambda *_, **__: None
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     if server.get_port() != port:
@@ -91,18 +91,18 @@ def stop_server(server: Any) -> None:
         server.stop()
 
 
-def begin_at(server: Any, look: Look) -> None:
-    """Set the camera that new pages start with."""
+def set_initial_camera(server: Any, pose: CameraPose) -> None:
+    """Set the initial camera of new pages."""
     camera = server.initial_camera
     camera.fov = FOV_RAD
-    camera.position, camera.look_at = map(tuple, look)
+    camera.position, camera.look_at = map(tuple, pose)
 
 
 def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: float = 20.0) -> None:
-    """Wait until each page has drawn what was sent so far, or something newer is to be drawn.
+    """Wait until each page has drawn what was sent so far, or `superseded` returns True.
 
-    viser does not report that, but a page answers a question after what came before it. The first answer says that the last
-    messages are on their way, the second that these have arrived, the third that another frame was drawn.
+    viser does not report that, but a page answers a request after the messages before it. The first answer shows that the last
+    messages are under way, the second that they have arrived, the third that another frame was drawn.
     """
     time.sleep(0.05)  # viser collects messages for a sixtieth of a second
     for client in server.get_clients().values():
@@ -113,14 +113,14 @@ def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: fl
                 client.local_storage.get_item("drawn", timeout=0.5)
             except TimeoutError:
                 continue
-            except RuntimeError as error:  # the page has no storage, which is an answer too, or is gone
+            except RuntimeError as error:  # a page without storage, which is an answer too, or a closed page
                 if "disconnected" in str(error):
                     break
             answers += 1
 
 
 class Page:
-    """A page that is served until it is stopped. An OSError reports a port that is taken before any work."""
+    """A page served until it is stopped. Raises an OSError for a taken port before any work."""
 
     def __init__(self, host: str, port: int | None) -> None:
         require_viser()
@@ -147,7 +147,7 @@ class Page:
 
 
 def has_display() -> bool:
-    """Whether a browser that is started here would be visible to the user."""
+    """Whether a browser started here would be visible to the user."""
     if "SSH_CONNECTION" in os.environ:
         return False
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The surface that a page shows: thinned to what a browser can draw, and clickable."""
+"""Surface of a page, thinned to what a browser can draw, and hits of clicks on it."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
 _Floats = NDArray[np.float64]
 _Rows = NDArray[np.int64]
 
-_MIN_VERTICES = 1000  # of max_vertices: fewer are not worth a look
+_MIN_VERTICES = 1000  # smallest max_vertices: fewer show nothing useful
 
 
 @dataclass(frozen=True)
 class ShownSurface:
-    """Triangles and what the map knows about their vertices."""
+    """Triangles and the attributes of their vertices."""
 
     vertices: _Floats  # (V, 3) world, m
     faces: NDArray[np.int32]  # (F, 3) rows of vertices; normals point into free space
     uncertainty_m: NDArray[np.float32]  # (V,)
     confidence: NDArray[np.float32]  # (V,)
     lightness: NDArray[np.float32]  # (V,) factor of colours
-    threshold: Threshold  # the confidence from which on the mesh was kept
-    spacing_m: float  # of vertices: the voxel edge, or more if the mesh was thinned
+    threshold: Threshold  # confidence threshold of the mesh
+    spacing_m: float  # spacing of vertices: the voxel edge, or more if the mesh was thinned
 
     @classmethod
     def of(
@@ -74,7 +74,7 @@ class ShownSurface:
         return Limits(None, max_uncertainty_m, 0).met(min_confidence, self.confidence, self.uncertainty_m)
 
     def part(self, kept: NDArray[np.bool_]) -> tuple[_Rows, NDArray[np.int32]]:
-        """Rows (N,) of the vertices of triangles with all vertices kept, and these triangles (M, 3) as rows of them."""
+        """Rows (N,) of the vertices of triangles with all vertices kept, and these triangles (M, 3) as indices of these rows."""
         used, faces = renumbered(len(kept), self.faces[with_all(kept, self.faces)])
         return np.flatnonzero(used), faces
 
@@ -82,8 +82,8 @@ class ShownSurface:
 def spread_evenly(points: _Floats, count: int, edge_m: float) -> tuple[_Rows, _Rows, float]:
     """Choose at most `count` evenly spread points of (N, 3), m: the nearest to the mean of each cube of a grid.
 
-    Returns the chosen rows (M,), which of the M represents each point (N,), and the edge of the cubes, m. `edge_m`: the
-    spacing of the points, where the search begins.
+    Returns the chosen rows (M,), the index in M that represents each point (N,), and the edge of the cubes, m. The search
+    begins at `edge_m`, the spacing of the points.
     """
     if len(points) <= count:
         everything = np.arange(len(points))
@@ -102,9 +102,9 @@ def spread_evenly(points: _Floats, count: int, edge_m: float) -> tuple[_Rows, _R
 
 
 def thinned(mesh: trimesh.Trimesh, max_vertices: int, edge_m: float) -> tuple[trimesh.Trimesh, float]:
-    """Cluster the vertices of a mesh in cubes, of which one each stays with its attributes, if it has too many.
+    """Thin a mesh with too many vertices: cluster them in cubes, and keep one with its attributes per cube.
 
-    Returns the mesh and its vertex spacing, m, which is `edge_m` if nothing was to be done.
+    Returns the mesh and its vertex spacing, m, which is `edge_m` if it was not thinned.
     """
     import trimesh  # noqa: PLC0415 - slow
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The viewer of a map."""
+"""Interactive viewer of a map in the browser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
-from radarsdf.view.framing import FOV_RAD, Look, look_at_all
+from radarsdf.view.framing import FOV_RAD, CameraPose, framing_pose
 from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
 from radarsdf.view.scene import (
     HELD_S,
@@ -25,18 +25,18 @@ from radarsdf.view.scene import (
     ScanClouds,
     State,
 )
-from radarsdf.view.serving import Page, begin_at
+from radarsdf.view.serving import Page, set_initial_camera
 from radarsdf.view.surface import ShownSurface, first_hit
 
-_GIZMO_SHARE = 0.06  # size of the sensor's handles, in diagonals of the surface
-_MARK_SHARE = 0.012  # radius of the mark of a click, in distances to it: of one size on the screen
+_GIZMO_SHARE = 0.06  # size of the sensor's handles, as a share of the surface's diagonal
+_MARK_SHARE = 0.012  # radius of a click's mark, as a share of its distance: of constant size on the screen
 _MARK_COLOR = (0, 190, 255)  # not on the colour scale
 
 
 class Viewer(Page):
     """Serves a map, and scans to browse, in the browser until it is stopped.
 
-    While the sensor is dragged, 30,000 vertices are recoloured; all of them are when the drag ends. The page computes in
+    During a drag of the sensor, 30,000 vertices are recoloured; all of them are when it ends. The page computes in
     float32 in the map's local frame, but displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for
     :meth:`Map.mesh`, with its errors.
     """
@@ -67,7 +67,7 @@ class Viewer(Page):
             raise
 
     def wait(self) -> None:
-        """Wait until the viewer is stopped. Raises an error of its thread."""
+        """Wait until the viewer is stopped. Raises an error of the drawing thread."""
         self._painter.wait()
 
     def stop(self) -> None:
@@ -76,14 +76,14 @@ class Viewer(Page):
         super().stop()
 
     def _fill(self, scans: Scans | None) -> None:
-        """Add everything to the page."""
+        """Add all elements to the page."""
         server, radar_map, surface = self._server, self._map, self.surface
         origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.poses[:, :3, 3] - origin
         self._extent = np.concatenate([surface.vertices - origin, path])
-        begin_at(server, look_at_all(self._extent))
+        set_initial_camera(server, framing_pose(self._extent))
         x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
-        self.quantities = quantities_of(radar_map, surface, (x, y, z))  # what the surface can be coloured by
+        self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
         self._clicked: NDArray[np.float64] | None = None
         panel = self._add_controls()
         self._clouds = None if scans is None else self._add_scans(panel, scans)
@@ -96,9 +96,9 @@ class Viewer(Page):
         server.on_client_connect(self._on_connect)
         server.scene.on_click()(self._on_click)
 
-    # Callbacks are coroutines, because viser would run functions in several threads, in any order.
+    # Callbacks are coroutines, since viser would run functions in several threads, in any order.
     def _add_controls(self) -> Any:
-        """Add the panels. A narrow screen shows the second one, which is returned, folded, so that little covers the map."""
+        """Add the panels. A narrow screen shows the second one, which is returned, folded, to cover little of the map."""
         gui, surface = self._server.gui, self.surface
         self._legend = gui.add_html(legend(next(iter(self.quantities.values()))))
         self._quantity = gui.add_dropdown("colour by", tuple(self.quantities), hint="what the surface shows")
@@ -113,9 +113,9 @@ class Viewer(Page):
         step_m = 10.0 ** math.floor(math.log10(max(largest_m, 1e-6) / 100))
         end_m = math.ceil(largest_m / step_m) * step_m
         with tab, gui.add_folder("surface"):
-            hint = "hides what is more uncertain"
+            hint = "hides surface with a larger standard error"
             self._uncertainty = gui.add_slider("uncertainty ≤ m", 0.0, end_m, step_m, end_m, hint=hint)
-            hint = f"hides what is less probable; the mesh is {surface.threshold}"
+            hint = f"hides surface with a lower confidence; the mesh is {surface.threshold}"
             self._confidence = gui.add_slider("confidence ≥", 0.0, 1.0, 0.01, 0.0, hint=hint)
 
         async def on_limit(_: Any) -> None:
@@ -126,7 +126,7 @@ class Viewer(Page):
             self._painter.change(**self._surface_state(), coarse=False, settle_s=0.0)
 
         async def on_reset(event: Any) -> None:
-            self._look_at_all(event.client)
+            self._frame_all(event.client)
 
         self._uncertainty.on_update(on_limit)
         self._confidence.on_update(on_limit)
@@ -135,7 +135,7 @@ class Viewer(Page):
         return tab
 
     def _add_scans(self, tab: Any, scans: Scans) -> ScanClouds:
-        """Add the returns of scans, and the controls that choose one and what is shown of it."""
+        """Add the returns of scans, and controls to choose a scan and its elements."""
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
         colors = {"measured": scale or MEASURED_COLOR, "predicted": PREDICTED_COLOR, "trajectory": PATH_COLOR}
@@ -161,7 +161,7 @@ class Viewer(Page):
         return clouds
 
     def _surface_state(self) -> dict[str, Any]:
-        """The fields of :class:`State` that the controls of the surface set. At its end, the slider limits nothing."""
+        """Fields of :class:`State` set by the controls of the surface. At its maximum, the slider sets no limit."""
         uncertainty_m = self._uncertainty.value
         return {
             "max_uncertainty_m": math.inf if uncertainty_m >= self._uncertainty.max else float(uncertainty_m),
@@ -169,25 +169,25 @@ class Viewer(Page):
             "quantity": str(self._quantity.value),
         }
 
-    def _look_at_all(self, client: Any) -> Look:
+    def _frame_all(self, client: Any) -> CameraPose:
         camera = client.camera
-        look = look_at_all(self._extent, aspect=_aspect(camera))
+        pose = framing_pose(self._extent, aspect=_aspect(camera))
         with client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.fov = FOV_RAD
-            camera.position, camera.look_at = look
-        return look
+            camera.position, camera.look_at = pose
+        return pose
 
     async def _on_connect(self, client: Any) -> None:
-        """Let a new page show everything, also after its frame has changed, until the user moves the camera."""
-        first = look_at_all(self._extent)  # which a page may take after it was told a better one
-        aspect, look = _aspect(client.camera), self._look_at_all(client)
+        """Frame the whole scene in a new page, also after its frame has changed, until the user moves the camera."""
+        first = framing_pose(self._extent)  # a page may apply this one after a better one
+        aspect, pose = _aspect(client.camera), self._frame_all(client)
 
         async def on_update(camera: Any) -> None:
-            nonlocal aspect, look
-            untouched = _is_at(camera, look) and _aspect(camera) != aspect
-            if untouched or (_is_at(camera, first) and not _is_at(camera, look)):
-                aspect, look = _aspect(camera), self._look_at_all(client)
+            nonlocal aspect, pose
+            untouched = _is_at(camera, pose) and _aspect(camera) != aspect
+            if untouched or (_is_at(camera, first) and not _is_at(camera, pose)):
+                aspect, pose = _aspect(camera), self._frame_all(client)
 
         client.camera.on_update(on_update)
 
@@ -231,7 +231,7 @@ class Viewer(Page):
         self._describe(self._painter.newest)
 
     def _describe(self, state: State) -> None:
-        """Show what the map knows about the point that was clicked, for the sensor of a state."""
+        """Show the map's values at the clicked point, for the sensor of a state."""
         if self._clicked is None:
             return
         x, sensor = self._clicked[None], np.array(state.sensor)
@@ -248,7 +248,7 @@ class Viewer(Page):
 
     @property
     def notes(self) -> list[str]:
-        """What is shown more coarsely than it is, in words."""
+        """Sentences on reduced details of the page."""
         shown, spacing_m = len(self.surface.vertices), self.surface.spacing_m
         thinned = (
             f"the mesh is thinned to {shown} vertices, {spacing_m:.2g} m apart: --max-vertices allows more"
@@ -257,9 +257,9 @@ class Viewer(Page):
 
 
 def _aspect(camera: Any) -> float:
-    """Width of a page's frame over its height, within what a screen can have."""
+    """Aspect ratio of a page's frame, clipped to what a screen can have."""
     return float(np.clip(camera.image_width / max(camera.image_height, 1), 0.1, 10.0))
 
 
-def _is_at(camera: Any, look: Look) -> bool:
-    return bool(np.allclose(camera.position, look.position, atol=0.01))
+def _is_at(camera: Any, pose: CameraPose) -> bool:
+    return bool(np.allclose(camera.position, pose.position, atol=0.01))
