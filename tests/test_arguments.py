@@ -5,8 +5,6 @@
 The same examples on every run; RADARSDF_EXAMPLES=5000 tries more of them.
 """
 
-from __future__ import annotations
-
 import math
 import os
 

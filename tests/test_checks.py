@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The limits of the checks of arguments: the last value that passes, and the first that does not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf import checks

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Every example in a public docstring runs."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import pkgutil

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The lattice of the world, on which the cells of all maps lie."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The memory that is left is the least of what system and control groups have, and a mesh beyond it is refused."""
 
-from __future__ import annotations
-
 import pytest
 import radarsdf
 from radarsdf import FitConfig

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The names of the package: complete, and imported only when they are used."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What Windows and macOS lack, or do otherwise: the tests take it away here."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Forked and spawned processes, pickles, many threads: right answers, and never a deadlock."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import multiprocessing

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """No transcendental function of PyTorch's is called first by several threads at once: its bits could differ."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

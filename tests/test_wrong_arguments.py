@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What is no argument at all is refused by an error that names the argument."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The bench of changes counts what it says."""
 
-from __future__ import annotations
-
 import numpy as np
 from radarsdf.changes.changes import GONE, SAME, ChangedSurface, Changes
 from radarsdf.simulate import Box

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The street of the growth benches, and their check of the map."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf import FitConfig, RadarMap, fit

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Counts of callgrind are added up by shared object, and what is too much is named."""
 
-from __future__ import annotations
-
 import pytest
 
 from bench.instructions import by_object, faults

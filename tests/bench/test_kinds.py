@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Scenes of each kind are what their name says, and their radars and drives differ."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The scenes of the experiments: simulated ones, files and folders arrive in one form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Distances to true surfaces along normals, where they are known in closed form."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The ways to break good data do what they say, and the check names them on a small scene."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

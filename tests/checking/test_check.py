@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The input of a check, errors of poses by noise, and drift."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """`radarsdf eval`."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import numpy as np

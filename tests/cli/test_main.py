@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Help, usage errors, exit statuses and streams of all commands."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """``radarsdf info``, ``mesh`` and ``render``; `test_eval.py` has ``eval``, other folders ``grid`` and ``compare``."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Options that several commands share."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf import FitConfig

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Means in cells of several kinds, by place, direction and incidence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import CellMeans, cell_rows, fit_cell_means

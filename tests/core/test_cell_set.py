@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The set of cells and the order of keys, against NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import CellSet, cell_keys, gather_rows, stable_order

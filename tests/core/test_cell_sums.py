@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Rows of cells by their keys, and sums over returns and over neighbouring cells."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import DIRECTION_QUANTA, CellBlocks, cell_keys, principal_axes, sum_returns

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What common planes say of poses, against the same least squares with all unknowns in one dense matrix."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import CommonPlanes

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Which leaf cells rays passed, beside a plain search."""
 
-from __future__ import annotations
-
 import numpy as np
 from radarsdf._core import cell_keys, find_free_space
 from radarsdf.returns.free_space import FreeSpace

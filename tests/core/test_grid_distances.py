@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Distances of a grid at the corners of voxels, and the areas of triangles at their vertices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The planes that a scan is held against, while others come and go."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import LocalPlanes

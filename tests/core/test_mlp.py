@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The networks' kernel against PyTorch's operations one after the other."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

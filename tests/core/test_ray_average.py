@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Cells along rays and the average over rays, against what they are by definition."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Rays meet the first triangle, as a loop over all triangles finds it, and exact spheres and planes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

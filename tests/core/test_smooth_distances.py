@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Smoothed distances, against the least sum of squares that they are to come near."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import CellBlocks, CellSet, Encoding, VertexTable, cell_keys

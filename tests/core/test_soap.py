@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Steps of SOAP against the same in NumPy, and what they must survive."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Rays that skip empty space cross what rays cross that are walked cell by cell."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import SurfelMap, cell_keys

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The files and names that the architecture page refers to exist."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """`docs/draw.py` draws all figures, and the pages show them."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Every Python, shell and console block of the pages runs and prints what the page shows."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path

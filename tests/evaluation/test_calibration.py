@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Statistics of errors that are drawn from known distributions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

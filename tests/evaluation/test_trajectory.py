@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Errors of trajectories: against known ones, and against evo where it is installed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.evaluation import trajectory_metrics

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What each block of numbers of an encoding is, and where features are and are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Distances at corners: what is stored there, what is linear in between, and nothing outside."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The networks' inputs and outputs, and which parameters which loss may reach."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Stage 1: exact where rays agree, the mean where they do not, smooth where the surface is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

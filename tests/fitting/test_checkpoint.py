@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A fit that goes on from a checkpoint ends with the bits of one without a stop, and from nothing else."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import signal

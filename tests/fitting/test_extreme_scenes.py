@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Scenes far away, tiny, huge, flat, dense, empty or spoilt: an answer that means something, or a clear error."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Intensities that cannot belong to the others: left out of the reflectance, but not of the surface."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

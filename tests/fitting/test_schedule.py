@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Batches and iterations follow the size of the data."""
 
-from __future__ import annotations
-
 import pytest
 from radarsdf import FitConfig
 from radarsdf.fitting.schedule import Schedule

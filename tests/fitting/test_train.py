@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Losses of a training: their history, what they show of a divergence, and which parts a batch is divided into."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Dense walls: quick fits and live maps have no surface where no returns lie."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

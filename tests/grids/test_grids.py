@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Grids of a plane and a wall: what is occupied, free and unknown, and what planners read."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

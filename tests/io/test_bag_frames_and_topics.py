@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Bags of several sensors: the frame of each message, the topic that has the poses, and messages that are damaged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose

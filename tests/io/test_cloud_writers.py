@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """One cloud of all returns, written scan by scan, and read back to the same numbers."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Files of one point cloud, in each format, and damaged ones."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

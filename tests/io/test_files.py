@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Outputs are checked before the work, and written whole."""
 
-from __future__ import annotations
-
 import os
 import stat
 import sys

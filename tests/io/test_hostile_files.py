@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Meshes in UTM coordinates survive their files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Files of poses in each format, what was assumed of them, and interpolation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The one door for files and folders: what comes out, in which order, with which poses, and what is said."""
 
-from __future__ import annotations
-
 import logging
 import tracemalloc
 

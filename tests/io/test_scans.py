@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Scan files: what is read, what is left out, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.io.npz import read_scans, write_scans

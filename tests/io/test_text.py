@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Text as other programs write it: the same numbers, or an error, and never a line less."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

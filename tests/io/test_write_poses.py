@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Poses written are those that are read again, here and by evo; scans without poses are read as such."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.io import write_poses

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What was put away to a folder comes back with the same bits, when a scan reaches it."""
 
-from __future__ import annotations
-
 import pytest
 from radarsdf import LiveMap
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A map that grows is a function of the scans that are in it, however they came, moved and went."""
 
-from __future__ import annotations
-
 import errno
 import os
 import threading

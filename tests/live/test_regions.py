@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Rows kept region by region, and ghosts that are asked for only there, against tables and ghosts of all at once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A map that was saved goes on as if nothing had happened, and damaged files are refused."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The probability that a surface is where a map says: from information, detections, looks, and what all returns tell."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

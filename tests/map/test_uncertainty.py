@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The standard error of the surface's position: from the noise of the returns, by range and number."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

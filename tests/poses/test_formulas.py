@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Covariances, derivatives and rates of motions against draws, differences and numbers by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """How an IMU sits on a radar, which way is up, and what time is between their clocks: found from the drive."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

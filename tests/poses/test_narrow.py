@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Poses of radars with a narrow field of view and few returns, whose Doppler leaves a direction open."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

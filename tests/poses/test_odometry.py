@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Poses of simulated drives, from nothing but what a radar and a gyroscope measure."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Common planes, and scans that move in groups."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.config.groups import ReturnsConfig

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Poses that returns mend, and those that they leave alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

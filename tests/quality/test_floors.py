@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The default fit and the quick one are no worse than they were, beyond what chance explains; and worse is noticed."""
 
-from __future__ import annotations
-
 import functools
 import math
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The whole job on scans of a real automotive radar, where they are at hand; their licence keeps them out of here."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The report of what changed names each change, lists it and shows it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.changes.changes import (

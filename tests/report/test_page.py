@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The file in a real browser: it needs no network, its scene is drawn, and it fits a narrow screen."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.view.page import drawn, open_page, why_no_browser

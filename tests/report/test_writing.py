@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The report of a map: every section has its figures, and the page neither loads nor executes anything it reads."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

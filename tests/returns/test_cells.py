@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The cells that hold returns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.returns.rays import prepare

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Velocities by Doppler, the interval into which it is folded, and Doppler that was not measured."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.returns.moving import folding_interval_mps, sensor_velocity, without_filler

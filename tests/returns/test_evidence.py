@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What the returns tell of each leaf cell, and how many scans looked there."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

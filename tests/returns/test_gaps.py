@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Gaps between returns are bridged where a surface goes on, and nowhere else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import CellSet, cell_keys

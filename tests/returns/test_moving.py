@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Returns that move are left out of a fit, and only these."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The noise of the sensor: found in its returns, along the beam, in azimuth and in elevation."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

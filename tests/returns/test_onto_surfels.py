@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Returns come nearer to the surface by the planes that they make, and keep its shape."""
 
-from __future__ import annotations
-
 import numpy as np
 from radarsdf.returns.noise import SensorNoise, onto_surfels
 from radarsdf.returns.planes import Surfels

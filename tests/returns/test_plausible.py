@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Which intensities can belong to the others."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.returns import intensities as plausible

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Intensities in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

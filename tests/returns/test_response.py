@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """How strong a return is by range, elevation, incidence and the kind of surface."""
 
-from __future__ import annotations
-
 import numpy as np
 from radarsdf.returns.response import LEVEL, NO_SURFACE, STEEP, Response, kinds_of
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Sums over scans: the same in any order, and after a scan was taken out again."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import operator

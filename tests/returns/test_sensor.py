@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A sensor is what its scans show."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Planes through returns: what lies behind them, and how many returns support a place."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What is measured of a motion: its derivatives, with the noise that the documentation states; and poses that drift."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf import simulate as sim

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Noise that depends on axis, range and strength, and the false returns: each as its setting says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

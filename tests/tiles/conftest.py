@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A small city for tests: a wall along a drive, averaged in tiles of 12.8 m."""
 
-from __future__ import annotations
-
 import pytest
 import radarsdf
 from radarsdf import FitConfig

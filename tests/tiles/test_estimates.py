@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What a plan says of memory and time follows from each tile's own rays."""
 
-from __future__ import annotations
-
 import pytest
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.tiles.plan import Plan, report_of

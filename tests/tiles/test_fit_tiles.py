@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Fits in tiles: the same steps as one fit, whatever runs them and whatever goes wrong."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import multiprocessing

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The grid of tiles: weights that add up to one, and rays that cross."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.tiles.plan import TileGrid, neighbours

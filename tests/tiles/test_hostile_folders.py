@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Folders of tiles that are damaged, or come from elsewhere: what is wrong is named, and nothing else is touched."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The mesh of a map in tiles, against one that is cut from all cells at once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """3D Tiles of a map in tiles, read as a viewer reads them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

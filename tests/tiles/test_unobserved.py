@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What was not observed has no answer, in every kind of map and for every kind of number."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Which requests the server of a page answers. viser is not needed."""
 
-from __future__ import annotations
-
 import socket
 
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Where the page is served, and when it has been drawn. viser is not needed."""
 
-from __future__ import annotations
-
 import socket
 import sys
 
