@@ -152,6 +152,15 @@ def test_a_sensor_that_goes_straight_on_leaves_it_open():
     assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None
 
 
+@pytest.mark.parametrize(("scans", "enough"), [(19, False), (20, True)])
+def test_two_windows_of_scans_are_the_fewest(ride, imu, monkeypatch, scans, enough):
+    times_s, _, velocities = ride
+    asked, rows = [], slice(0, 5 * scans, 5)
+    monkeypatch.setattr("radarsdf.poses.imu._first_guess", lambda *given: asked.append(given))
+    assert ImuAlignment.of(imu, velocities.select(rows), times_s[rows]) is None
+    assert bool(asked) == enough
+
+
 def test_a_rotation_that_nothing_determines_is_asked_for(ride, imu):
     times_s, _, velocities = ride
     found = Inertial.of(dataclasses.replace(imu, specific_force=None), velocities, times_s, 0.0)
