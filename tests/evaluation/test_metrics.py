@@ -64,8 +64,8 @@ def by_definition(samples, ground_truth):
 )
 def test_shifted_plane(shift, right, outlier_ratio, offset):
     # Lidar lies 2 cm apart: a sample is at most 1.4 cm aside, which lengthens its distance by less than 1 %.
-    m = surface_metrics(plane(shift, offset=offset), grid(offset=offset), samples=200_000)
-    assert (m["protocol"], m["num_mesh_samples"]) == ("radarsdf-surface-1", 200_000)
+    m = surface_metrics(plane(shift, offset=offset), grid(offset=offset), samples=50_000)
+    assert (m["protocol"], m["num_mesh_samples"]) == ("radarsdf-surface-1", 50_000)
     for name in ("accuracy_ratio", "completion_ratio", "precision", "f_score", "f_score_all"):
         assert m[name] == right, name
     assert m["outlier_ratio"] == outlier_ratio

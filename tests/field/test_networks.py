@@ -110,8 +110,7 @@ def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geom
 def test_the_second_derivative_through_the_normals_is_right():
     # Double precision: the networks bend at few places.
     config = BARE.override(
-        networks={"normals": True, "intensity_hidden": (6,)},
-        encoding={"fourier_count": 2},
+        networks={"normals": True, "intensity_hidden": (6,)}, encoding={"fourier_count": 2}
     )
     field, points = make_field(config)
     field = field.double()

@@ -122,10 +122,7 @@ def test_map_and_finish_are_fits_of_all_scans():
     points, poses, intensities = scans
     for found, settings in (
         (live.finish(progress=False), config),
-        (
-            live.map(),
-            FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4}),
-        ),
+        (live.map(), FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4})),
     ):
         fitted = radarsdf.fit(
             points, np.stack(poses), intensities, config=settings, origin=ORIGIN, progress=False

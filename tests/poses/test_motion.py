@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate
 from radarsdf.poses.rigid import moved
-from radarsdf.poses.tracking import Drive, Tracked, rates_of
 from radarsdf.simulate import drifted
 
 from .drift import trajectory
@@ -62,23 +61,6 @@ def test_turns_come_to_what_is_usual_and_moves_stay():
     np.testing.assert_allclose(late.covariance, np.diag(TURNS.usual))
     np.testing.assert_array_equal(MOVES.after(RATE, 1e3).mean, RATE.mean)
     np.testing.assert_allclose(MOVES.after(RATE, 2.0).covariance, RATE.covariance + 2 * np.diag(MOVES.change))
-
-
-def test_an_expected_step_lasts_as_long_as_the_scans_are_apart_and_shows_its_rates():
-    """Deviations grow with the duration, and covariances with its square."""
-    step = Drive([], np.array([0.0, 0.5]), None, None, TURNS, MOVES).expected(1, RATE, RATE)
-    turn, move = TURNS.after(RATE, 0.25), MOVES.after(RATE, 0.25)
-    np.testing.assert_allclose(step.turn.mean, 0.5 * turn.mean)
-    np.testing.assert_allclose(step.turn.covariance, 0.25 * turn.covariance)
-    np.testing.assert_allclose(step.translation_covariance, 0.25 * move.covariance)
-    covariance = np.diag([1.0, 2, 3, 4, 5, 6])
-    found = Tracked(
-        moved(np.eye(4)[None], np.array([[1.0, 0, 0, 0, 0, 0]]))[0], covariance, 1.0, 0, np.zeros(3)
-    )
-    turned, moving = rates_of(np.eye(4), found, 0.5)
-    np.testing.assert_allclose(moving.mean, [2, 0, 0])
-    np.testing.assert_allclose(moving.covariance, 4 * covariance[:3, :3])
-    np.testing.assert_allclose(turned.covariance, 4 * covariance[3:, 3:])
 
 
 @pytest.mark.parametrize("habits", [TURNS, MOVES], ids=["turns", "moves"])

@@ -86,10 +86,7 @@ def test_errors_agree_with_the_covariance(drive, found):
 
 def test_a_gyroscope_turns_and_its_bias_is_found(drive, motion, found):
     with_it = radarsdf.odometry(
-        drive.points,
-        doppler_mps=motion.doppler_mps,
-        times_s=motion.times_s,
-        imu=gyroscope(motion),
+        drive.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s, imu=gyroscope(motion)
     )
     assert errors(with_it.poses, drive.poses)[1] < errors(found.poses, drive.poses)[1]
     np.testing.assert_allclose(with_it.report["gyroscope_bias"], BIAS_RAD_S, atol=0.006)

@@ -118,9 +118,9 @@ def test_the_mesh_covers_what_radar_and_lidar_saw(job, tmp_path):
     returns = np.concatenate([rays_of(scans)[0] for scans in (train, test)])
     lidar = train.ground_truth
     seen = lidar[cKDTree(returns).query(lidar, distance_upper_bound=1.0)[0] <= 1.0]
-    in_place = surface_metrics(mesh, seen, samples=300_000)["completion_ratio"]
+    in_place = surface_metrics(mesh, seen, samples=100_000)["completion_ratio"]
     # The same mesh put a metre aside covers what a mesh of this size covers by chance.
     for aside in ([1.0, 0, 0], [0, 1.0, 0]):
         moved = mesh.copy()
         moved.vertices = moved.vertices + aside
-        assert in_place > 1.5 * surface_metrics(moved, seen, samples=300_000)["completion_ratio"]
+        assert in_place > 1.5 * surface_metrics(moved, seen, samples=100_000)["completion_ratio"]

@@ -130,10 +130,7 @@ def test_a_false_return_is_no_evidence_but_its_scan_looked(rays):
     assert at(Evidence.of(returns, real, leaf_keys, LEAF_M), leaf_keys, BEHIND) == (0, 0, 0)
 
 
-STARTS = {
-    "average": FitConfig.quick(),
-    "noise": FitConfig(training={"sdf_iterations": 2, "batch_size": 64}),
-}
+STARTS = {"average": FitConfig.quick(), "noise": FitConfig(training={"sdf_iterations": 2, "batch_size": 64})}
 
 
 @pytest.mark.parametrize("start", STARTS)

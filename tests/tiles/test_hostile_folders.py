@@ -13,21 +13,8 @@ from radarsdf.tiles.plan import Plan, failure_path, map_path
 from ..cli.calls import refusal
 
 WILD = [
-    None,
-    True,
-    -1,
-    1.5,
-    10**400,
-    1e308,
-    float("nan"),
-    "",
-    "../../x",
-    "\x1b[2J",
-    [],
-    [[]],
-    ["0", "x/../../../v"],
-    {},
-]
+    None, True, -1, 1.5, 10**400, 1e308, float("nan"), "", "../../x", "\x1b[2J", [], [[]], ["0", "x/../../../v"], {},
+]  # fmt: skip
 
 
 @pytest.fixture
