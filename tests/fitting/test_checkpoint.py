@@ -120,15 +120,17 @@ fitted(ground_and_wall(returns_per_scan=300), {str(path)!r})
     assert_same_bits(fitted(scene), fitted(scene, path))
 
 
+@pytest.fixture(scope="module")
+def state(scene, tmp_path_factory):
+    """The bytes of a checkpoint after three iterations."""
+    path = tmp_path_factory.mktemp("checkpoint") / "state"
+    with pytest.MonkeyPatch.context() as patch:
+        interrupted_after(3, patch, scene, path)
+    return path.read_bytes()
+
+
 class TestOtherFiles:
     """One clear ValueError, and the file stays."""
-
-    @pytest.fixture(scope="class")
-    def state(self, scene, tmp_path_factory):
-        path = tmp_path_factory.mktemp("checkpoint") / "state"
-        with pytest.MonkeyPatch.context() as patch:
-            interrupted_after(3, patch, scene, path)
-        return path.read_bytes()
 
     @pytest.fixture
     def path(self, state, tmp_path):
