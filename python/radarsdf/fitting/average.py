@@ -187,7 +187,7 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     scale = contents.intensity_scale
     assert scale is not None
     known = rays.with_intensity
-    if known.any() and not known.all():  # a tile may have none: its returns then count as the middle of the range
+    if known.any() and not known.all():  # a tile without any counts as the middle of the range
         rays = rays.select(known)
     assert rays.intensities is not None
 
