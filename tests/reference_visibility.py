@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """How many scans looked at a place, said plainly: cube by cube along each ray."""
 
-from __future__ import annotations
-
 import numpy as np
 
 CUBE_CELLS = 8

@@ -37,6 +37,9 @@ _VALUES: list[Any] = [
     None, True, -1, 0, 1, 12, 13, 2**31, 2**63, 10**400, 1e308, -0.0, float("nan"), float("inf"), "", "x" * 10_000, [],
     [[]], [1e6] * 4, [30_000, 30_000, 30_000], [1] * 20_000, [2**62, 2**62], {}, {"a": {}}, "octree", "tri-quadtree",
 ]  # fmt: skip
+_TYPES = ["f2", "f8", "i1", "u8", "c16", "S3", "U2", "M8[s]", "m8[s]", "V4", "?", ">f4", "f4,i4", "V0", "U0"]
+_TENSOR_TYPES = ["F64", "F16", "BF16", "I64", "U8", "BOOL", "F8_E4M3", "X", ""]
+_CLAIMS = [(10**12,), (2**32, 2**32), (2**63,), (-1, 3), (10**9, 3), (0, 2**62, 2**62), (2**16,) * 4]
 
 
 def _small_scans(with_intensity: bool) -> Scans:
@@ -57,9 +60,8 @@ def maps() -> list[bytes]:
             scans = _small_scans(with_intensity)
             config = _CONFIG.override(encoding={"kind": encoding})
             path = Path(folder) / "map.safetensors"
-            radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config, progress=False).save(
-                path
-            )
+            fitted = radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config, progress=False)
+            fitted.save(path)
             found.append(path.read_bytes())
     return found
 
@@ -148,9 +150,7 @@ def hostile_map(rng: np.random.Generator) -> bytes:
                 shapes = [value, [2**32, 2**32], [0, 2**63], [10**12], [-1], [8, 8]]
                 tensor["shape"] = shapes[rng.integers(len(shapes))]
             case 4:
-                tensor["dtype"] = str(
-                    rng.choice(["F64", "F16", "BF16", "I64", "U8", "BOOL", "F8_E4M3", "X", ""])
-                )
+                tensor["dtype"] = str(rng.choice(_TENSOR_TYPES))
             case 5:
                 begin = int(rng.choice([0, 1, len(body), 2**40, 2**62]))
                 tensor["data_offsets"] = [begin, begin + int(rng.choice([-1, 0, 4, len(body), 2**40]))]
@@ -158,9 +158,8 @@ def hostile_map(rng: np.random.Generator) -> bytes:
     header["__metadata__"] = metadata  # older files have no checksums, which would find most changes
     metadata["description"] = json.dumps(description)
     if rng.random() < 0.1:
-        metadata[str(rng.choice(["format", "format_version"]))] = str(
-            rng.choice(["", "2", "9" * 5000, "٣", "1.0"])
-        )
+        key, value = rng.choice(["format", "format_version"]), rng.choice(["", "2", "9" * 5000, "٣", "1.0"])
+        metadata[str(key)] = str(value)
     text = json.dumps(header).encode()
     if rng.random() < 0.1:  # the same key twice
         text = text[:-1] + b"," + text[1:]
@@ -195,58 +194,23 @@ def hostile_scans(rng: np.random.Generator) -> bytes:
         shape = shapes.get(name, (18,))
         match rng.integers(6):
             case 0:
-                types = [
-                    "f2",
-                    "f8",
-                    "i1",
-                    "u8",
-                    "c16",
-                    "S3",
-                    "U2",
-                    "M8[s]",
-                    "m8[s]",
-                    "V4",
-                    "?",
-                    ">f4",
-                    "f4,i4",
-                    "V0",
-                    "U0",
-                ]
-                arrays[name] = _npy(np.zeros(shape, str(rng.choice(types))))
+                arrays[name] = _npy(np.zeros(shape, str(rng.choice(_TYPES))))
             case 1:
-                other = [
-                    (0, *shape[1:]),
-                    shape[:-1],
-                    (*shape, 1),
-                    (),
-                    (1,) * 30,
-                    (0,),
-                    tuple(reversed(shape)),
-                ]
+                other = [(0, *shape[1:]), shape[:-1], (*shape, 1), (), (1,) * 30, (0,), shape[::-1]]
                 arrays[name] = _npy(np.zeros(other[rng.integers(len(other))]))
             case 2:
                 values = [np.nan, np.inf, -1, 2**63, 1e308, 0.5]
                 arrays[name] = _npy(np.full(shape, values[rng.integers(len(values))]))
             case 3:
-                claims = [
-                    (10**12,),
-                    (2**32, 2**32),
-                    (2**63,),
-                    (-1, 3),
-                    (10**9, 3),
-                    (0, 2**62, 2**62),
-                    (2**16,) * 4,
-                ]
-                arrays[name] = _claim(claims[rng.integers(len(claims))])
+                arrays[name] = _claim(_CLAIMS[rng.integers(len(_CLAIMS))])
             case 4:
                 heads = [b"(" * 9000, b"[" * 9000, b"{'descr': '<f4', 'fortran_order': 0, 'shape': 3}", b"__import__('os')",
                          b"{'descr': [('a', " * 400, b"\x00" * 50, b"{'descr': '<f4'}", b"9" * 9000]  # fmt: skip
                 arrays[name] = _header(heads[rng.integers(len(heads))])
             case 5:
                 del arrays[name]
-                arrays[str(rng.choice(["../points", "/points", "points/points", "x", "C:\\points"]))] = _npy(
-                    np.ones((18, 3))
-                )
+                other_names = ["../points", "/points", "points/points", "x", "C:\\points"]
+                arrays[str(rng.choice(other_names))] = _npy(np.ones((18, 3)))
         arrays.setdefault(name, _npy(np.zeros(shape)))
     result = io.BytesIO()
     kind = int(rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]))
@@ -255,9 +219,8 @@ def hostile_scans(rng: np.random.Generator) -> bytes:
             file.writestr(name + ".npy", data)
     data = result.getvalue()
     if rng.random() < 0.1:
-        data = data.replace(
-            b"PK\x01\x02\x14\x03\x14\x00\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01\x00"
-        )  # "encrypted"
+        head = b"PK\x01\x02\x14\x03\x14\x00"
+        data = data.replace(head + b"\x00\x00", head + b"\x01\x00")  # "encrypted"
     return data
 
 
@@ -310,11 +273,8 @@ def meshes() -> list[bytes]:
     make_cloud: Any = trimesh.PointCloud
     cloud = make_cloud(np.random.default_rng(2).normal(size=(9, 3)))
     box: Any = trimesh.creation.box()
-    return [
-        cloud.export(file_type="ply"),
-        box.export(file_type="ply", encoding="ascii"),
-        box.export(file_type="ply"),
-    ]
+    of_box = [box.export(file_type="ply", encoding=encoding) for encoding in ("ascii", "binary")]
+    return [cloud.export(file_type="ply"), *of_box]
 
 
 def write_folder(folder: Path) -> None:

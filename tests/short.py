@@ -18,7 +18,7 @@ from .poses.drift import first
 
 _SCANS = {
     "hugin": (12, 2),
-    "oculii": (90, 2),
+    "oculii": (84, 4),
 }  # and every second return; so many determine the axes of an IMU
 
 

@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The limits of the checks of arguments: the last value that passes, and the first that does not."""
-
-from __future__ import annotations
+"""Modules below all subpackages: the limits of checks, the lattice of the world, and the memory that is left."""
 
 import numpy as np
 import pytest
-from radarsdf import checks
+import radarsdf
+from radarsdf import FitConfig, checks
 from radarsdf.imu import Imu
+from radarsdf.lattice import WorldLattice
+from radarsdf.memory import available_bytes
 from scipy.spatial.transform import Rotation
 
 FAR = np.nextafter(1e12, np.inf)
@@ -92,3 +93,66 @@ def test_measurements_of_an_imu():
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"IMU|R_sensor_imu"):
             Imu(*wrong)
+
+
+LATTICE = WorldLattice(0.2, 32)
+
+
+def test_positions_and_cells_are_inverse():
+    cells = np.random.default_rng(0).integers(-(10**7), 10**7, (100, 3))
+    np.testing.assert_allclose(LATTICE.cells(LATTICE.position(cells)), cells, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(LATTICE.position(cells + 5) - LATTICE.position(cells), 1.0, atol=1e-8)
+
+
+def test_the_nearest_block_is_within_half_a_block():
+    places = np.random.default_rng(1).uniform(-1e6, 1e6, (1000, 3))
+    blocks = LATTICE.nearest_block(places)
+    assert (blocks % 32 == 0).all()
+    assert np.abs(LATTICE.position(blocks) - places).max() <= 3.2 + 1e-9
+
+
+@pytest.mark.parametrize("level", range(6))
+@pytest.mark.parametrize("coordinate_m", [0.0, 0.2, 1.0, -2.0, 5.0, 6.4, 12.8, 100.0])
+def test_no_plane_at_a_round_coordinate_is_a_face_of_cells(level, coordinate_m):
+    place = LATTICE.cells(coordinate_m) / 2**level
+    assert abs(place - np.round(place)) * 2**level > 0.3  # leaf cells
+
+
+def test_maps_of_overlapping_scans_share_their_cells():
+    scans = radarsdf.simulate.wall(frames=8)
+    config = FitConfig.quick()
+    corners = [
+        config.lattice.cells(radarsdf.fit(scans.points[part], scans.poses[part], config=config).origin)
+        for part in (slice(0, 4), slice(4, 8))
+    ]
+    for corner in corners:
+        np.testing.assert_allclose(corner, 32 * np.round(corner / 32), rtol=0, atol=1e-9)
+    assert not np.allclose(corners[0], corners[1])
+
+
+def tree(root, groups, **files):
+    (root / "proc/self").mkdir(parents=True)
+    (root / "proc/meminfo").write_text("MemTotal: 9000 kB\nMemAvailable: 5000 kB\n")
+    (root / "proc/self/cgroup").write_text(groups)
+    for name, content in files.items():
+        path = root / "sys/fs/cgroup" / name.replace("__", "/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.with_name(path.name.replace("memory_", "memory.")).write_text(content)
+
+
+def test_of_the_system(tmp_path):
+    tree(tmp_path, "0::/\n", memory_max="max\n", memory_current="7")
+    assert available_bytes(tmp_path) == 5000 * 1024
+
+
+def test_of_a_control_group(tmp_path):
+    files = {"a__b__memory_max": "3000000", "a__b__memory_current": "1000000"}
+    tree(tmp_path, "0::/a/b\n", **files, a__b__memory_stat="anon 5\ninactive_file 200000\n")
+    assert available_bytes(tmp_path) == 2_200_000
+
+
+def test_a_mesh_beyond_the_budget_is_refused(scene):
+    radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(max_memory_bytes=10**9))
+    radar_map.mesh(0.1)
+    with pytest.raises(MemoryError, match=r"voxels of 0\.005 m"):
+        radar_map.mesh(0.005)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Settings are checked where they are made, say in one line what is wrong, and survive files."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import json

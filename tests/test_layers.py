@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Imports of the package go downwards, from layer to layer, and never in a circle."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import graphlib

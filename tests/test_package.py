@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The names of the package: complete, and imported only when they are used."""
+"""The names of the package: complete, imported only when they are used, and with examples that run."""
 
-from __future__ import annotations
-
+import doctest
+import importlib
 import os
+import pkgutil
 import re
 import subprocess
 import sys
@@ -110,3 +111,28 @@ def test_an_unknown_instruction_set_is_a_warning():
         check=True,
     )
     assert done.stderr.count("RADARSDF_ISA=nonsense is none of baseline") == 1
+
+
+MODULES = ["radarsdf"] + [
+    module.name
+    for module in pkgutil.walk_packages(radarsdf.__path__, "radarsdf.")
+    if module.name
+    not in ("radarsdf.__main__", "radarsdf._core")  # one runs the command line, one is compiled
+]
+
+
+def examples(name):
+    module = importlib.import_module(name)
+    return [test for test in doctest.DocTestFinder().find(module, name) if test.examples]
+
+
+@pytest.mark.parametrize("test", [test for name in MODULES for test in examples(name)], ids=lambda t: t.name)
+def test_example(test, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    report = []
+    failures, _ = doctest.DocTestRunner(verbose=False).run(test, out=report.append)
+    assert failures == 0, "".join(report)
+
+
+def test_what_is_public_has_a_docstring():
+    assert [name for name in radarsdf.__all__ if not (getattr(radarsdf, name).__doc__ or "").strip()] == []

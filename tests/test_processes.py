@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Forked and spawned processes, pickles, many threads: right answers, and never a deadlock."""
-
-from __future__ import annotations
+"""Forked and spawned processes, pickles, many threads, other platforms: correct results, and never a deadlock."""
 
 import copy
 import dataclasses
@@ -13,12 +11,14 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
+from radarsdf.io.files import write_whole
 
 QUICK = FitConfig(training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024})
 X = np.random.default_rng(0).uniform([8, -5, -1], [20, 5, 3], (30_000, 3))
@@ -116,3 +116,79 @@ def test_a_service_without_standard_error(scene, monkeypatch, progress):
     monkeypatch.setattr(sys, "stderr", None)
     radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(), progress=progress)
     radar_map.mesh(0.4, progress=progress)
+
+
+# Modules and functions of Python that only POSIX has.
+MODULES = ("fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios")
+FUNCTIONS = ("fork", "register_at_fork", "sched_getaffinity", "getuid", "statvfs")
+SIGNALS = ("SIGKILL", "SIGHUP", "SIGALRM", "setitimer", "pthread_sigmask")
+
+
+def test_every_module_is_imported_and_a_fit_works_without_what_only_posix_has():
+    code = f"""
+import importlib, os, pkgutil, signal, sys
+import numpy, pydantic, scipy, torch, trimesh  # which may use what they find
+for name in {MODULES}:
+    sys.modules[name] = None
+for module, names in ((os, {FUNCTIONS}), (signal, {SIGNALS})):
+    for name in names:
+        if hasattr(module, name):
+            delattr(module, name)
+import radarsdf
+extras = ("radarsdf.view", "radarsdf.report", "radarsdf.__main__")
+for module in pkgutil.walk_packages(radarsdf.__path__, "radarsdf."):
+    if not module.name.startswith(extras):
+        importlib.import_module(module.name)
+scans = radarsdf.simulate.wall(frames=2)
+radar_map = radarsdf.fit(scans.points, scans.poses, config=radarsdf.FitConfig.quick())
+assert len(radar_map.mesh(0.2).faces)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_file_that_another_program_has_open_stays(tmp_path, monkeypatch):
+    """Windows refuses to replace it."""
+    path = tmp_path / "map.safetensors"
+    path.write_bytes(b"old")
+
+    def refuse(self, target):
+        raise PermissionError(13, "The process cannot access the file", str(self), 32, str(target))
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(PermissionError, match=r"map\.safetensors"):
+        write_whole(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["map.safetensors"]
+
+
+RECORDED = """
+import threading
+import torch
+from radarsdf import threads
+
+calls = []
+
+def recorded(name):
+    function = getattr(torch, name)
+    def record(*arguments, **keywords):
+        dtype = arguments[0].dtype if isinstance(arguments[0], torch.Tensor) else keywords["dtype"]
+        calls.append((name, dtype, threading.current_thread() is threading.main_thread()))
+        return function(*arguments, **keywords)
+    setattr(torch, name, record)
+
+names = [*threads._TRANSCENDENTAL, "randn"]
+for name in names:
+    recorded(name)
+everything = {(name, dtype, True) for name in names for dtype in (torch.float32, torch.float64)}
+for _ in range(2):
+    with threads.ThreadPool(2) as pool:
+        assert all(pool.map(lambda _: set(calls) == everything, range(8)))
+assert len(calls) == len(everything)
+"""
+
+
+def test_before_the_first_work_and_only_once():
+    subprocess.run([sys.executable, "-c", RECORDED], check=True)

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The numbers of a map have the same bits whatever number of threads BLAS has: nobody but `products` multiplies matrices."""
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess

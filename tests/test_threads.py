@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Worker threads: PyTorch's settings come back, order stays, and fits beside each other do not mix."""
 
-from __future__ import annotations
-
 import threading
 import time
 

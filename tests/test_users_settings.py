@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What users set in PyTorch and NumPy for themselves changes no bit of ours."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The calibration experiment, with maps whose answers are known to be right, too small, or missing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

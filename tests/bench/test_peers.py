@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Peers run in processes of their own, alike for all, and say why they cannot."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The runner writes the rows of each experiment, and tables of them; what has no result says why."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Drives past a wall, before and after something beside it changed."""
 
-from __future__ import annotations
-
 import pytest
 import radarsdf
 from radarsdf.simulate import Scene, simulate

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Two drives through one place, between which a box goes and another one comes."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

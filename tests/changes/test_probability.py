@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Probabilities of changes against numeric integrals, draws, and searches of all pairs."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Two drives through one place, between which boxes are of changed reflectance."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

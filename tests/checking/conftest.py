@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Checks without their longest part."""
 
-from __future__ import annotations
-
 import pytest
 
 

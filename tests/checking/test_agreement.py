@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Each hypothesis moves the scans as its words say, and the agreement of scans against a plain calculation."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: MIT
 """The input of a check, errors of poses by noise, and drift."""
 
-from __future__ import annotations
-
+import dataclasses
 import re
 
 import numpy as np
@@ -17,7 +16,7 @@ from radarsdf.simulate import drifted
 
 from tests.conftest import recorded_file
 
-from .breakages import slow
+from .breakages import WAYS, found_in, simulated, slow
 
 SCANS = 36
 CONFIG = radarsdf.FitConfig(num_threads=1)
@@ -122,3 +121,55 @@ def test_large_recordings_are_looked_at_in_windows(drive, monkeypatch):
 def test_a_drift_below_the_noise_of_a_coarse_sensor_is_none(kind):
     creep = slow(kind, 0.02, seed=6, cell=0.5)
     assert list(check_drift(checked_input(creep.points, creep.poses), CONFIG)) == []
+
+
+@pytest.fixture(scope="module")
+def good():
+    return simulated("wall", 20)
+
+
+def differs(a, b):
+    pairs = ((getattr(a, field.name), getattr(b, field.name)) for field in dataclasses.fields(a))
+    return any(
+        len(x) != len(y) or any(not np.array_equal(u, v) for u, v in zip(x, y, strict=True)) for x, y in pairs
+    )
+
+
+def test_good_data_have_nothing_worse_than_notes(good):
+    assert [name for name, severity in found_in(good, cheap=False) if severity != "note"] == []
+    assert [name for name, severity in found_in(good, cheap=True) if severity != "note"] == []
+
+
+# A steady motion is the same at any time, and a slow one hardly differs from none: tests/checking has clocks that are off
+# where the motion changes, and drifts.
+NOT_HERE = {
+    "poses of two scans before",
+    "degrees taken for rad",
+    "drift of 1.5 m and 6 degrees",
+    "there and back, drift of 0.4 m",
+}
+
+
+# The others are named by what `fit` checks, too, in a tenth of the time.
+WHOLE_CHECK = {"poses of a vehicle, sensor turned by 15 degrees of pitch", "Doppler with the other sign"}
+
+
+SEVERITIES = {
+    "intensity_constant": "error",
+    "intensity_is_doppler": "error",
+    "intensity_steps": "note",
+    "intensity_offset": "note",
+}
+
+
+@pytest.mark.parametrize("way", sorted(set(WAYS) - NOT_HERE))
+def test_a_breakage_is_named(good, way, request):
+    finding, broken = WAYS[way]
+    if finding.startswith(("intensity", "duplicate", "below")):
+        request.getfixturevalue("right_frames")
+    data = broken(good)
+    assert differs(good, data)
+    found = dict(found_in(data, cheap=way not in WHOLE_CHECK))
+    assert finding in found
+    if finding.startswith("intensity"):
+        assert found[finding] == SEVERITIES.get(finding, "warning")

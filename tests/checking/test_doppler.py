@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The sensor's velocity from Doppler, against the truth of a simulation and the flags of recorded drives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

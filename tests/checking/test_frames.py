@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Good data have no finding worse than a note; broken in one way, the finding is named."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Intensities broken in one way, and returns below the ground."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

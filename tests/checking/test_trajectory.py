@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Findings about the poses alone, about copies, and about numbers that are none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Calls of the command line within this process."""
 
-from __future__ import annotations
-
 import json
 
 from radarsdf.cli import main

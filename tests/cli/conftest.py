@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A file of scans and a file of a map, made once for all commands."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """``radarsdf fit`` and ``demo``: the map, what is printed of it, and what happens where it cannot be written."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile

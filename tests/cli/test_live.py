@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """``radarsdf live`` replays a recording, says how the map kept up, and writes it."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import numpy as np

@@ -1,14 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf info``, ``mesh`` and ``render``; `test_eval.py` has ``eval``, other folders ``grid`` and ``compare``."""
+"""``radarsdf info``, ``mesh``, ``render`` and ``eval``; other folders have ``grid`` and ``compare``."""
 
-from __future__ import annotations
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import radarsdf
 import trimesh
 from radarsdf import _core
+from radarsdf.io.cloud_writing import write_cloud
+from radarsdf.io.npz import read_scans, write_scans
+from radarsdf.scans import Scans
 
 from .calls import call, refusal, values
 
@@ -105,3 +108,106 @@ def test_a_view_as_points_and_as_a_picture(map_file, tmp_path):
 )
 def test_views_that_make_no_sense(map_file, tmp_path, capsys, words, named):
     assert named in refusal(capsys, tmp_path, "render", map_file, "-o", tmp_path / "view.npz", *words)
+
+
+SAMPLES = ["--samples", 20000]
+
+
+@pytest.fixture(scope="module")
+def mesh_file(map_file, tmp_path_factory):
+    path = tmp_path_factory.mktemp("mesh") / "mesh.ply"
+    assert call("mesh", map_file, "-o", path, "--quiet") == 0
+    return path
+
+
+def row(printed, name):
+    return next(line for line in printed.splitlines() if line.startswith(name))
+
+
+def test_a_map_and_its_mesh_have_the_same_surface_errors(map_file, mesh_file, scans_file, capsys):
+    rows = []
+    for what in (mesh_file, map_file):
+        capsys.readouterr()
+        assert call("eval", what, scans_file, *SAMPLES, *BOX) == 0
+        printed = capsys.readouterr()
+        assert printed.err == ""
+        assert "intensity" not in printed.out
+        rows.append(row(printed.out, "F-score"))
+    assert rows[0] == rows[1]
+
+
+def test_held_out_intensities_without_their_outliers(map_file, scene, tmp_path, capsys):
+    intensities = [np.where(np.arange(len(scan)) % 100, scan, -9999) for scan in scene.intensities]
+    path = tmp_path / "scans.npz"
+    write_scans(path, Scans(scene.points, scene.poses, intensities))
+    assert "lidar points" in refusal(capsys, tmp_path, "eval", map_file, path)
+    found = values(capsys, "eval", map_file, path, "--holdout", 3)  # the scans 0 and 3
+    assert "surface" not in found
+    assert (found["not_compared"], found["held_out"]["num_returns"], found["knn"]["num_returns"]) == (
+        30,
+        2970,
+        2970,
+    )
+
+
+def test_files_that_cannot_be_evaluated(map_file, mesh_file, scans_file, tmp_path, capsys):
+    garbage, cloud = tmp_path / "garbage.ply", tmp_path / "cloud.ply"
+    garbage.write_bytes(b"\x93 nothing \x00\xff")
+    trimesh.PointCloud(np.eye(3)).export(cloud)
+    for words, named in (
+        ([garbage, scans_file], "garbage.ply"),
+        ([mesh_file, garbage], "garbage.ply"),
+        ([cloud, scans_file], "no surface"),
+        ([tmp_path / "absent.ply", scans_file], "absent.ply"),
+        ([mesh_file, tmp_path / "absent.ply"], "absent.ply"),
+        ([mesh_file, scans_file, *SAMPLES, "--box", 900, 900, 900, 901, 901, 901], "box"),
+    ):
+        assert named in refusal(capsys, tmp_path, "eval", *words)
+    for words in ([mesh_file, scans_file], [map_file, mesh_file]):
+        assert "--holdout 3" in refusal(capsys, tmp_path, "eval", *words, "--holdout", 3, status=2)
+
+
+def test_points_of_several_formats(mesh_file, tmp_path, capsys):
+    points = np.random.default_rng(0).uniform([9, -4, 0], [18, 4, 0.01], (500, 3))
+    np.save(tmp_path / "lidar.npy", points)
+    np.savetxt(tmp_path / "lidar.xyz", np.column_stack([points, points]))
+    np.savetxt(tmp_path / "lidar.csv", points, delimiter=",")
+    np.savez(tmp_path / "lidar.npz", lidar_points=points)
+    cloud = Scans([points], np.eye(4)[None])
+    names = ["lidar.pcd", "lidar.las", "lidar.laz"] if find_spec("laspy") else ["lidar.pcd"]
+    for name in names:
+        write_cloud(tmp_path / name, cloud)
+    trimesh.PointCloud(points).export(tmp_path / "lidar.ply")
+    rows = set()
+    for name in ("lidar.npy", "lidar.xyz", "lidar.csv", "lidar.ply", "lidar.npz", *names):
+        assert call("eval", mesh_file, tmp_path / name, *SAMPLES) == 0
+        rows.add(row(capsys.readouterr().out, "completion"))
+    assert len(rows) == 1
+
+
+PLANE = trimesh.Trimesh([[9, -4, 0], [18, -4, 0], [18, 4, 0], [9, 4, 0]], [[0, 1, 2], [0, 2, 3]])
+
+
+def test_a_surface_is_ground_truth_everywhere_on_its_triangles(mesh_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("radarsdf.io.meshes._SAMPLES", 20_000)
+    path = tmp_path / "plane.ply"
+    PLANE.export(path)
+    printed = values(capsys, "eval", mesh_file, path, *SAMPLES)["surface"]
+    assert printed["num_ground_truth"] == 20_000
+    assert printed["completion_ratio"] > 0.9  # of its four vertices, none is near a return
+
+
+def test_scans_of_other_kinds(map_file, scans_file, tmp_path, capsys):
+    """A folder with poses and lidar points: the same errors as of the .npz file."""
+    scans = read_scans(scans_file)
+    (tmp_path / "clouds").mkdir()
+    for i, (points, power) in enumerate(zip(scans.points, scans.intensities, strict=True)):
+        np.save(tmp_path / "clouds" / f"{i}.npy", np.column_stack([points, power]))
+    np.save(tmp_path / "poses.npy", scans.poses)
+    trimesh.PointCloud(scans.ground_truth).export(tmp_path / "lidar.ply")
+    errors = [
+        values(capsys, "eval", map_file, *words, *SAMPLES, "--holdout", 3)
+        for words in ([scans_file], [tmp_path], [tmp_path, tmp_path / "poses.npy"])
+    ]
+    assert errors[0]["held_out"] == errors[1]["held_out"] == errors[2]["held_out"]
+    assert errors[0]["surface"]["f_score"] == pytest.approx(errors[1]["surface"]["f_score"])

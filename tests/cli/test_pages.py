@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """``radarsdf view`` and ``report``."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """`radarsdf poses`, and fits of scans whose poses are mended or missing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """``radarsdf check`` and ``convert``."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

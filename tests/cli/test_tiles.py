@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """``radarsdf tiles``, and the other commands given its folder as a map."""
 
-from __future__ import annotations
-
 import shutil
 
 import numpy as np

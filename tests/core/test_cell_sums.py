@@ -2,11 +2,24 @@
 # SPDX-License-Identifier: MIT
 """Rows of cells by their keys, and sums over returns and over neighbouring cells."""
 
-from __future__ import annotations
+import itertools
 
 import numpy as np
 import pytest
-from radarsdf._core import DIRECTION_QUANTA, CellBlocks, cell_keys, principal_axes, sum_returns
+from radarsdf._core import (
+    DIRECTION_QUANTA,
+    CellBlocks,
+    CellMeans,
+    CellSet,
+    cell_keys,
+    cell_rows,
+    fit_cell_means,
+    gather_rows,
+    principal_axes,
+    stable_order,
+    sum_returns,
+)
+from radarsdf.map.marching_cubes import sparse_lattice
 
 
 def keys_of(cells):
@@ -132,3 +145,159 @@ def test_axes_of_what_is_not_finite_are_not_numbers():
     assert (values[[0, 2]] == 1).all()
     with pytest.raises(ValueError, match="shape"):
         principal_axes(np.zeros((2, 3)))
+
+
+LEAF_M = 0.2
+OFFSETS_M = np.linspace(-0.3, 0.3, 7).astype(np.float32)
+
+
+def rays_of(count, half_m=20.0):
+    rng = np.random.default_rng(count)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    return rng.uniform(-half_m, half_m, (count, 3)).astype(np.float32), directions.astype(np.float32)
+
+
+def along(points, directions):
+    return (points[:, None] + OFFSETS_M[:, None] * directions[:, None]).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 300, 70_000])  # the last: more than are marked at a time
+def test_points_along_rays_mark_the_cells_of_those_points(count, threads):
+    points, directions = rays_of(count)
+    expected = np.unique(cell_keys(along(points, directions), LEAF_M))
+    for cells, insert in ((CellSet(LEAF_M), "along"), (CellSet(LEAF_M), "points")):
+        if insert == "along":
+            cells.insert_along(points, directions, OFFSETS_M, threads)
+        else:
+            cells.insert(along(points, directions), threads)
+        np.testing.assert_array_equal(cells.sorted_keys(threads), expected)
+        assert len(cells) == len(expected)
+
+
+@pytest.mark.parametrize("highest", [1, 2**9, 2**40, 2**64])
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_the_order_of_keys_is_stable(highest, count):
+    keys = np.random.default_rng(count).integers(0, highest, count, np.uint64)
+    np.testing.assert_array_equal(stable_order(keys), np.argsort(keys, kind="stable"))
+
+
+@pytest.mark.parametrize("count", [0, 1, 40_000])
+def test_rows_of_blocks_are_gathered_side_by_side(count):
+    generator = np.random.default_rng(0)
+    blocks = [generator.normal(size=(50_000, width)).astype(np.float32) for width in (3, 1, 4)]
+    order = generator.integers(0, 50_000, count, np.int32)
+    for threads in (1, 3):
+        out = np.zeros((count, 8), np.float32)
+        gather_rows(blocks, order, out, threads)
+        np.testing.assert_array_equal(out, np.concatenate(blocks, 1)[order])
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 7, 50_000])
+def test_sparse_lattice_against_numpy(threads, count):
+    rng = np.random.default_rng(count)
+    cells = rng.integers([-5, 1000, -(2**31)], [60, 1030, -(2**31) + 40], size=(count, 3), dtype=np.int64)
+    unique, corners, cell_corners = sparse_lattice(cells, num_threads=threads)
+    offsets = np.array(list(itertools.product((0, 1), repeat=3)))
+    expected = np.unique(cells, axis=0)
+    assert np.array_equal(unique, expected)
+    all_corners = expected[:, None] + offsets
+    assert np.array_equal(corners, np.unique(all_corners.reshape(-1, 3), axis=0))
+    assert np.array_equal(corners[cell_corners], all_corners)
+
+
+KINDS = np.array([[4.0, 0, 0], [1.0, 0.2, 0], [1.0, 0, 0.1]])
+
+
+def views(count=3000, seed=0):
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    incidence = rng.uniform(0, np.pi / 2, count)
+    incidence[::7] = np.nan
+    arrays = rng.uniform(-6, 6, (count, 3)), directions, incidence
+    return tuple(np.ascontiguousarray(a, np.float32) for a in arrays)
+
+
+def bins(kind, points, directions, incidence, offset=0.0):
+    """The cell of each view, as numbers that NumPy can compare."""
+    edge, by_direction, by_incidence = kind
+    columns = [np.floor(points.astype(float) / edge + offset)]
+    if by_direction:
+        columns.append(np.floor(directions.astype(float) / by_direction + offset + 0.37))
+    if by_incidence:
+        angle = np.floor(incidence.astype(float) / by_incidence + offset)
+        columns.append(np.nan_to_num(angle, nan=-2)[:, None])
+    return np.unique(np.concatenate(columns, 1), axis=0, return_inverse=True)[1].ravel()
+
+
+def fitted_slowly(tiling, num_tilings, asked, values, weights, shrinkage, rounds):
+    """What the definition says that the means of one tiling explain."""
+    rows = [bins(kind, *asked, tiling / num_tilings) for kind in KINDS]
+    means = [np.zeros(row.max() + 1) for row in rows]
+    left, weight = values.astype(float), weights.astype(float)
+    for turn in range(rounds):
+        for row, mean in zip(rows, means, strict=True):
+            left += mean[row]
+            mean[:] = np.bincount(row, weight * left) / (np.bincount(row, weight) + shrinkage)
+            left -= mean[row]
+        if turn == 0 and rounds > 1:
+            scale = 2 * np.sort(np.abs(left))[len(left) // 2]
+            weight = weights / np.sqrt(1 + (left / scale) ** 2)
+    return values - left
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 4])
+def test_means_are_those_of_the_definition(rounds):
+    asked = views()
+    rng = np.random.default_rng(1)
+    values = (asked[0][:, 0] + 3 * np.cos(np.nan_to_num(asked[2])) + rng.normal(size=3000)).astype(np.float32)
+    weights = rng.uniform(0.5, 2, 3000).astype(np.float32)
+    keys, means, explained = fit_cell_means(KINDS, 3, *asked, values, weights, 5.0, rounds)
+    expected = np.mean([fitted_slowly(t, 3, asked, values, weights, 5.0, rounds) for t in range(3)], axis=0)
+    assert expected.std() > 1
+    np.testing.assert_allclose(explained, expected, rtol=0, atol=2e-6)
+    answers = CellMeans(KINDS, 3, keys, means).sums(*asked)
+    np.testing.assert_allclose(answers, expected, rtol=0, atol=5e-6)
+
+
+def test_any_number_of_threads_has_the_same_bits():
+    asked, values = views(20_000), np.random.default_rng(2).normal(size=20_000).astype(np.float32)
+    fits = [fit_cell_means(KINDS, 4, *asked, values, np.ones_like(values), 3.0, 2, 0.0, n) for n in (1, 2, 5)]
+    for other in fits[1:]:
+        assert all((a == b).all() for a, b in zip(fits[0], other, strict=True))
+    cells = CellMeans(KINDS, 4, *fits[0][:2])
+    assert (cells.sums(*asked, 1) == cells.sums(*asked, 4)).all()
+
+
+def test_small_means_are_left_out_of_what_is_found():
+    asked, values = views(), np.random.default_rng(3).normal(size=3000).astype(np.float32)
+    arguments = KINDS, 2, *asked, values, np.ones_like(values), 5.0, 2
+    keys, means, explained = fit_cell_means(*arguments)
+    large_keys, large_means, still_explained = fit_cell_means(*arguments, 0.1)
+    kept = np.abs(means) >= np.float32(0.1)
+    assert 0.1 < kept.mean() < 0.9
+    np.testing.assert_array_equal(large_keys, keys[kept])
+    np.testing.assert_array_equal(large_means, means[kept])
+    np.testing.assert_array_equal(still_explained, explained)
+
+
+def test_rows_number_the_cells_as_they_occur():
+    asked = views()
+    for kind in KINDS:
+        rows, count = cell_rows(kind[None], *asked)
+        expected = bins(kind, *asked)
+        assert count == expected.max() + 1
+        assert len(np.unique(np.stack([rows, expected], 1), axis=0)) == count
+        first = np.unique(rows, return_index=True)[1]
+        assert (np.diff(first) > 0).all()
+
+
+def test_far_away_nothing_is_known():
+    asked, ones = views(), np.ones(3000, np.float32)
+    cells = CellMeans(KINDS, 2, *fit_cell_means(KINDS, 2, *asked, ones, ones, 1.0, 2)[:2])
+    assert cells.sums(*asked).min() > 0.5
+    points = np.array([[1e5, 0, 0], [3e38, 0, 0]], np.float32)
+    assert cells.sums(points, asked[1][:2].copy(), asked[2][:2].copy()).tolist() == [0, 0]

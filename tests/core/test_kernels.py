@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The compiled kernels against plain references, their gradients, and what they promise about bits and threads."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The planes that a scan is held against, while others come and go."""
-
-from __future__ import annotations
+"""Planes that scans are tracked by while others come and go, and planes common to scans, against dense least squares."""
 
 import numpy as np
 import pytest
-from radarsdf._core import LocalPlanes
+from radarsdf._core import CommonPlanes, LocalPlanes
 from radarsdf.poses.rigid import moved
 
 VARIANCES = [0.02**2, 0.002**2, 0.002**2]
@@ -96,3 +94,122 @@ def test_scores_fall_with_the_distance():
     assert (np.diff(scores[:3]) < -0.03).all()
     assert scores[3] < 0.5 * scores[0]
     assert not planes.scores(scan + [500.0, 0, 0], poses, VARIANCES).any()
+
+
+SCANS, PLANES, EXTENT_M = 7, 12, 0.8
+SPREAD = [0.05**2, 0.01**2, 0.02**2]
+
+
+def returns(seed=0, count=600):
+    """Returns near random planes, each of which few scans see."""
+    rng = np.random.default_rng(seed)
+    scans = np.sort(rng.integers(0, SCANS, count)).astype(np.int32)
+    planes = ((scans + rng.integers(0, 5, count)) % PLANES).astype(np.int32)
+    planes[rng.random(count) < 0.1] = -1
+    planes[(planes == 0) & (scans > 0)] = -1  # only the first scan sees it
+    normals = rng.normal(size=(PLANES, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    centres, positions = rng.normal(0, 5, (PLANES, 3)), rng.normal(0, 1, (SCANS, 3))
+    points = centres[planes] + rng.normal(0, 0.2, (count, 3))
+    rays = points - positions[scans]
+    ranges_m = np.linalg.norm(rays, axis=1)
+    up = np.tile([0.0, 0, 1], (SCANS, 1))
+    return (
+        points.astype(np.float32), (rays / ranges_m[:, None]).astype(np.float32), ranges_m.astype(np.float32),
+        scans, planes, positions, up, centres, normals,
+    )  # fmt: skip
+
+
+def dense(given, scale):
+    """Hessian (F, 6, F, 6) and gradient (F, 6) of the poses: unknowns of planes eliminated by NumPy."""
+    points, directions, ranges_m, scans, planes, positions, up, centres, normals = given
+    size = 6 * SCANS + 3 * PLANES
+    H, g = np.zeros((size, size)), np.zeros(size)
+    for p in range(PLANES):
+        rows = np.flatnonzero(planes == p)
+        if len(set(scans[rows])) < 2:
+            continue
+        n = normals[p]
+        across = np.linalg.svd(n[None])[2][1:]  # any two, for the tilts are eliminated
+        for i in rows:
+            d = directions[i].astype(float)
+            azimuth = np.cross(up[scans[i]], d)
+            azimuth /= np.linalg.norm(azimuth)
+            axes = np.stack([d, azimuth, np.cross(d, azimuth)]) @ n
+            variance = scale * (axes**2 @ (np.array(SPREAD) * [1, ranges_m[i] ** 2, ranges_m[i] ** 2]))
+            off = points[i] - centres[p]
+            r = off @ n
+            w = (1 + r**2 / (4 * variance)) ** -2 / variance
+            j = np.zeros(size)
+            j[6 * scans[i] : 6 * scans[i] + 6] = [*n, *np.cross(points[i] - positions[scans[i]], n)]
+            j[6 * SCANS + 3 * p : 6 * SCANS + 3 * p + 3] = [-1, *(-(across @ off) / EXTENT_M)]
+            H += w * np.outer(j, j)
+            g += w * r * j
+    a, b, c = H[: 6 * SCANS, : 6 * SCANS], H[: 6 * SCANS, 6 * SCANS :], H[6 * SCANS :, 6 * SCANS :]
+    taken = b @ np.linalg.pinv(c)
+    return a - taken @ b.T, g[: 6 * SCANS] - taken @ g[6 * SCANS :]
+
+
+def prior(rng):
+    """Block tridiagonal: diagonal, below, gradient, and as one matrix."""
+    diagonal = np.tile(30 * np.eye(6), (SCANS, 1, 1))
+    below = rng.normal(0, 1, (SCANS - 1, 6, 6))
+    whole = np.zeros((6 * SCANS, 6 * SCANS))
+    for s in range(SCANS):
+        whole[6 * s : 6 * s + 6, 6 * s : 6 * s + 6] = diagonal[s]
+        if s:
+            whole[6 * s : 6 * s + 6, 6 * s - 6 : 6 * s] = below[s - 1]
+            whole[6 * s - 6 : 6 * s, 6 * s : 6 * s + 6] = below[s - 1].T
+    return diagonal, below, rng.normal(0, 1, (SCANS, 6)), whole
+
+
+@pytest.mark.parametrize("together", [1, 2, 4, SCANS])
+def test_increments_are_those_of_the_dense_matrix(together):
+    given = returns()
+    found = CommonPlanes(*given, EXTENT_M, SPREAD, together, 2)
+    scans, planes = given[3:5]
+    seen = [p for p in range(PLANES) if len(set(scans[planes == p])) > 1]
+    assert 5 < len(seen) < PLANES
+    assert found.num_used == np.isin(planes, seen).sum()
+    H, g = dense(given, found.scale)
+    diagonal, below, gradient, whole = prior(np.random.default_rng(1))
+    x, inverse, inverse_below, decrement = found.solve(diagonal, below, gradient, 1e-10, 200, True, 2)
+    expected = -np.linalg.solve(H + whole, g + gradient.reshape(-1))
+    np.testing.assert_allclose(x.reshape(-1), expected, atol=2e-5 * np.abs(expected).max())
+    assert decrement == pytest.approx(-(g + gradient.reshape(-1)) @ expected, rel=1e-4)
+    C = np.linalg.inv(H + whole).reshape(SCANS, 6, SCANS, 6)
+    for s in range(SCANS):
+        if together == SCANS:
+            np.testing.assert_allclose(inverse[s], C[s, :, s], atol=2e-5 * np.abs(C).max())
+            if s:
+                np.testing.assert_allclose(inverse_below[s - 1], C[s, :, s - 1], atol=2e-5 * np.abs(C).max())
+        else:  # the band knows less
+            assert np.linalg.eigvalsh(inverse[s] - C[s, :, s]).min() > -1e-6 * np.abs(C).max()
+
+
+def test_the_scale_is_that_of_the_residuals():
+    rng = np.random.default_rng(2)
+    given = list(returns(count=4000))
+    points, _, ranges_m, _, planes, _, _, centres, normals = given
+    scales = []
+    for sigma_m in (0.01, 0.05, 0.2):
+        off = rng.normal(0, sigma_m, len(points))[:, None] * normals[planes]
+        given[0] = (centres[planes] + off).astype(np.float32)
+        isotropic = [0.05**2, (0.05 / ranges_m.max()) ** 2, (0.05 / ranges_m.max()) ** 2]
+        given[2] = np.full(len(points), ranges_m.max(), np.float32)
+        scales.append(CommonPlanes(*given, EXTENT_M, isotropic, SCANS).scale)
+    np.testing.assert_allclose(scales, [1, 1, 16], rtol=0.1)
+
+
+def test_the_bits_do_not_depend_on_threads():
+    given = returns(3, 40_000)
+    diagonal, below, gradient, _ = prior(np.random.default_rng(1))
+    answers = [
+        CommonPlanes(*given, EXTENT_M, SPREAD, 3, threads).solve(
+            diagonal, below, gradient, 1e-6, 50, True, threads
+        )
+        for threads in (1, 2, 5)
+    ]
+    for answer in answers[1:]:
+        for found, expected in zip(answer[:3], answers[0][:3], strict=True):
+            np.testing.assert_array_equal(found, expected)

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: MIT
 """The networks' kernel against PyTorch's operations one after the other."""
 
-from __future__ import annotations
-
+import functools
 import itertools
 
+import numpy as np
 import pytest
 import torch
+from radarsdf import _core
 from radarsdf.field.kernels import mlp
 from radarsdf.threads import ThreadPool
 
@@ -116,3 +117,123 @@ def test_what_is_not_a_number_stays_so():
     with ThreadPool(1):
         grads = torch.autograd.grad(out.sum(), [layers[0][0]])
     assert grads[0].isnan().any()
+
+
+RATE = 1e-2
+
+
+class Reference:
+    """SOAP as published, with bases that are turned after 1, 2, 4, …, 32, 64, 96, … steps, rows as their vectors."""
+
+    def __init__(self, rows, columns, longest=512):
+        self.sides = [
+            {"sum": np.zeros((n, n)), "basis": np.eye(n), "turns": n <= longest} for n in (rows, columns)
+        ]
+        self.mean, self.square, self.step = np.zeros((rows, columns)), np.zeros((rows, columns)), 0
+        self.mean_square = 0.0  # of whole gradients
+
+    def turned(self, matrix, forth):
+        left, right = (side["basis"] if forth else side["basis"].T for side in self.sides)
+        return left @ matrix @ right.T
+
+    def move(self, weights, gradient, rate):
+        self.step += 1
+        for side, g in zip(self.sides, (gradient, gradient.T), strict=True):
+            side["sum"] = 0.95 * side["sum"] + g @ g.T
+        if self.step in (1, 2, 4, 8, 16) or self.step % 32 == 0:
+            mean = self.turned(self.mean, forth=False)
+            for side in self.sides:
+                if not side["turns"]:
+                    continue
+                vectors = side["basis"] @ side["sum"] * (len(side["sum"]) / np.trace(side["sum"]))
+                q, r = np.linalg.qr((vectors + 1e-3 * side["basis"]).T)
+                side["basis"] = (q * np.sign(np.diag(r))).T
+            self.mean = self.turned(mean, forth=True)
+        turned = self.turned(gradient, forth=True)
+        self.mean = 0.95 * self.mean + 0.05 * turned
+        self.square = 0.95 * self.square + 0.05 * turned**2
+        self.mean_square = 0.95 * self.mean_square + 0.05 * (gradient**2).mean()
+        grown = 1 - 0.95**self.step
+        way = self.mean / np.sqrt(grown) / (np.sqrt(self.square) + 1e-2 * np.sqrt(self.mean_square))
+        return weights - rate * self.turned(way, forth=False)
+
+
+def memory_of(weights):
+    return np.zeros(_core.soap_memory_size(*weights.shape), weights.dtype)
+
+
+def dependent_gradients(rng, rows, columns):
+    """Gradients whose columns depend on each other, as those of a layer do whose inputs are the same features."""
+    mix = rng.normal(size=(columns, columns)) * np.geomspace(0.1, 1, columns)
+    return rng.normal(size=(rows, columns)) @ mix
+
+
+@functools.cache
+def way_of_the_formula(rows, columns):
+    """Weights before all steps, and of each step the gradient and the weights after it; for all instruction sets."""
+    rng = np.random.default_rng(0)
+    weights, reference, steps = rng.normal(size=(rows, columns)), Reference(rows, columns), []
+    expected = weights
+    for _ in range(1, 40):
+        gradient = dependent_gradients(rng, rows, columns)
+        expected = reference.move(expected, gradient, RATE)
+        steps.append((gradient, expected))
+    return weights, steps
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize(("rows", "columns"), [(20, 37), (2, 3), (3, 520)])
+def test_steps_are_those_of_the_formula(rows, columns):
+    start, steps = way_of_the_formula(rows, columns)
+    weights, memory = start.copy(), memory_of(start)
+    for step, (gradient, expected) in enumerate(steps, start=1):
+        _core.soap_step([weights], [gradient], [memory], step, RATE)
+        np.testing.assert_allclose(weights, expected, atol=1e-6)
+    assert np.abs(weights).max() > 10 * RATE
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_it_is_faster_than_adam_where_inputs_depend_on_each_other(dtype):
+    rng = np.random.default_rng(1)
+    inputs = dependent_gradients(rng, 2000, 24).astype(dtype)
+    truth = rng.normal(size=(8, 24)).astype(dtype)
+
+    def error_after(move):
+        weights = np.zeros_like(truth)
+        for step in range(1, 301):
+            x = inputs[rng.integers(len(inputs), size=256)]
+            gradient = (x @ (weights - truth).T).T @ x / len(x)
+            move(weights, gradient, step, 0.05 * (1 - step / 301))
+        return float(np.abs(inputs @ (weights - truth).T).mean())
+
+    memory, moments = memory_of(truth), np.zeros((2, *truth.shape))
+
+    def adam(weights, gradient, step, rate):
+        moments[0] += 0.1 * (gradient - moments[0])
+        moments[1] += 0.001 * (gradient**2 - moments[1])
+        mean, square = moments[0] / (1 - 0.9**step), moments[1] / (1 - 0.999**step)
+        weights -= (rate * mean / (np.sqrt(square) + 1e-15)).astype(dtype)
+
+    soap = error_after(lambda w, g, step, rate: _core.soap_step([w], [g], [memory], step, rate))
+    assert soap < 0.25 * error_after(adam)
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_hostile_gradients(dtype):
+    rng = np.random.default_rng(2)
+    for scale in (0.0, 1e-30, 1e-10, 1e12):
+        weights = np.zeros((24, 40), dtype)
+        memory = memory_of(weights)
+        for step in range(1, 100):
+            gradient = scale * rng.normal(size=weights.shape)
+            gradient[:, ::3] = 0  # inputs that are never seen
+            gradient[:, 1] = gradient[:, 4]  # and two that are always the same
+            if step == 50:
+                gradient[:] = 0
+            _core.soap_step([weights], [gradient.astype(dtype)], [memory], step, RATE)
+        assert np.isfinite(weights).all()
+        assert np.isfinite(memory).all()
+        assert np.abs(weights).max() < 100 * 20 * RATE
+        assert (np.abs(weights).max() > RATE) == (scale > 1e-15)  # less does not count, as with Adam

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """How many scans looked at a place, and how many had returns there."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf._core import cell_keys, count_scans, count_visibility

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Short fits of short drives."""
 
-from __future__ import annotations
-
 import pytest
 
 from ..short import shorten

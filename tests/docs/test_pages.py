@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Every Python, shell and console block of the pages runs and prints what the page shows."""
+"""Every block of the pages runs and prints what the page shows; figures are drawn, and references exist."""
 
-from __future__ import annotations
-
+import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
@@ -70,3 +70,51 @@ def test_console_blocks_are_compared(printed, matches):
     else:
         with pytest.raises(AssertionError, match="the page has"):
             run_console(block)
+
+
+def test_figures_are_drawn_and_shown(tmp_path):
+    pytest.importorskip("matplotlib")
+    code = runpy.run_path(str(DOCS / "draw.py"))
+    code["SIZE"].update(width=240, height=112)  # most of the time is spent on pixels
+    code["draw"](tmp_path, frames=6)
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert drawn == {path.name for path in (DOCS / "figures").iterdir()}
+    pages = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    assert [name for name in drawn if f"figures/{name}" not in pages] == []
+
+
+ROOT = Path(__file__).resolve().parents[2]
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").replace("\n", " ")
+PLACES = (
+    "",
+    "python/radarsdf",
+    *(f"python/radarsdf/{subpackage}" for subpackage in ("checking", "report", "view")),
+)
+FILE = r"`([\w/]+\.(?:py|hpp|cpp|md|txt|svg|sh))`"
+
+
+def found(path):
+    return next((ROOT / place / path for place in PLACES if (ROOT / place / path).is_file()), None)
+
+
+def test_files_exist():
+    paths = set(re.findall(FILE, ARCHITECTURE))
+    assert len(paths) > 40
+    assert sorted(path for path in paths if found(path) is None) == []
+
+
+def test_names_are_in_their_files():
+    """References of the form `Name` (`file`), and `Name` in or of `file`."""
+    references = [
+        (name, path)
+        for names, path in re.findall(rf"((?:`[\w.]+`(?:, | and )?)+) (?:\(|in |of ){FILE}", ARCHITECTURE)
+        for name in re.findall(r"[\w.]+(?=`)", names)
+    ]
+    assert len(references) > 40
+    missing = [
+        (name, path)
+        for name, path in references
+        for word in name.split(".")
+        if found(path) is None or not re.search(rf"\b{word}\b", found(path).read_text(encoding="utf-8"))
+    ]
+    assert missing == []

@@ -8,8 +8,21 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.evaluation import KNNIntensity, format_metrics, holdout, intensity_metrics, surface_metrics
+from radarsdf.evaluation import (
+    KNNIntensity,
+    confidence_metrics,
+    format_metrics,
+    holdout,
+    intensity_metrics,
+    surface_metrics,
+    trajectory_metrics,
+    uncertainty_metrics,
+)
+from radarsdf.poses.rigid import moved
+from radarsdf.simulate import drifted
 from scipy.spatial import cKDTree
+
+from ..poses.drift import trajectory
 
 
 def plane(height=0.0, size=4.0, cells=8, offset=(0.0, 0.0, 0.0)):
@@ -51,8 +64,8 @@ def by_definition(samples, ground_truth):
 )
 def test_shifted_plane(shift, right, outlier_ratio, offset):
     # Lidar lies 2 cm apart: a sample is at most 1.4 cm aside, which lengthens its distance by less than 1 %.
-    m = surface_metrics(plane(shift, offset=offset), grid(offset=offset), samples=200_000)
-    assert (m["protocol"], m["num_mesh_samples"]) == ("radarsdf-surface-1", 200_000)
+    m = surface_metrics(plane(shift, offset=offset), grid(offset=offset), samples=50_000)
+    assert (m["protocol"], m["num_mesh_samples"]) == ("radarsdf-surface-1", 50_000)
     for name in ("accuracy_ratio", "completion_ratio", "precision", "f_score", "f_score_all"):
         assert m[name] == right, name
     assert m["outlier_ratio"] == outlier_ratio
@@ -238,3 +251,170 @@ def test_knn_with_few_returns_and_bad_input():
         KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0, 56.0])
     with pytest.raises(ValueError, match="k <= candidates"):
         KNNIntensity([[1.0, 0.0, 0.0]], [0.0, 0.0, 0.0], [55.0], candidates=4, k=5)
+
+
+WHOLE = moved(np.eye(4)[None], np.array([[30.0, -20, 10, 0.4, -0.3, 2.1]]))[0]
+
+
+def test_the_same_trajectory_in_another_frame_has_no_error():
+    true = trajectory(50)
+    for align in ("positions", "poses"):
+        metrics = trajectory_metrics(WHOLE @ true, true, align=align)
+        for name in (
+            "absolute_m",
+            "absolute_rad",
+            "step_m",
+            "step_rad",
+            "relative_ratio",
+            "relative_rad_per_m",
+        ):
+            assert metrics[name] == pytest.approx(0, abs=1e-6), (align, name)
+    assert trajectory_metrics(WHOLE @ true, true, align="none")["absolute_m"] > 10
+
+
+def test_a_turn_that_is_too_sharp_has_the_error_of_its_length():
+    true = np.tile(np.eye(4), (101, 1, 1))
+    true[:, 0, 3] = np.arange(101)
+    found = drifted(true, 0, 0, 0, yaw_rad=0.001)
+    metrics = trajectory_metrics(found, true, align="none")
+    assert metrics["step_rad"] == pytest.approx(0.001)
+    assert metrics["step_m"] == pytest.approx(0, abs=1e-9)
+    assert metrics["relative_rad_per_m"] == pytest.approx(0.001)
+    # The sides of an arc: half of its angle, so 5 to 25 thousandths of 10 to 50 m; there are 91 to 51 of each.
+    counts, angles = np.arange(91, 50, -10), 0.001 * np.arange(10, 51, 10) / 2 - 0.0005
+    assert metrics["relative_ratio"] == pytest.approx(counts @ angles / counts.sum(), rel=0.02)
+    assert metrics["length_m"] == pytest.approx(100)
+
+
+def test_segments_of_long_trajectories_are_those_of_kitti():
+    true = np.tile(np.eye(4), (802, 1, 1))
+    true[:, 0, 3] = np.arange(802)
+    found = drifted(true, 0, 0, 0, yaw_rad=1e-5)
+    counts, angles = 802 - np.arange(100, 801, 100), 1e-5 * np.arange(100, 801, 100) / 2
+    ratio = trajectory_metrics(found, true, align="none")["relative_ratio"]
+    assert ratio == pytest.approx(counts @ angles / counts.sum(), rel=0.01)
+
+
+def test_one_pose_has_no_steps():
+    metrics = trajectory_metrics(np.eye(4)[None], np.eye(4)[None])
+    assert (metrics["step_m"], metrics["relative_ratio"], metrics["length_m"]) == (0, None, 0)
+
+
+def test_wrong_arguments_are_refused():
+    poses = trajectory(4)
+    with pytest.raises(ValueError, match="align"):
+        trajectory_metrics(poses, poses, align="scale")
+    with pytest.raises(ValueError, match="poses"):
+        trajectory_metrics(poses[:3], poses)
+
+
+def test_they_are_those_of_evo():
+    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed: pip install evo")
+    PoseTrajectory3D = pytest.importorskip("evo.core.trajectory").PoseTrajectory3D
+    true = trajectory(200)
+    found = WHOLE @ drifted(true, 0.03, 0.004, 7)
+    stamps = np.arange(200.0)
+    reference = PoseTrajectory3D(poses_se3=list(true), timestamps=stamps)
+    raw, brought = (PoseTrajectory3D(poses_se3=list(found), timestamps=stamps) for _ in range(2))
+    brought.align(reference)
+    ours = trajectory_metrics(found, true)
+
+    def of_evo(metric, estimate):
+        metric.process_data((reference, estimate))
+        return metric.get_statistic(metrics.StatisticsType.rmse)
+
+    relations = (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad)
+    for relation, absolute, step in zip(
+        relations, ("absolute_m", "absolute_rad"), ("step_m", "step_rad"), strict=True
+    ):
+        assert ours[absolute] == pytest.approx(of_evo(metrics.APE(relation), brought), rel=1e-6)
+        rpe = metrics.RPE(relation, delta=1, delta_unit=metrics.Unit.frames)
+        assert ours[step] == pytest.approx(of_evo(rpe, raw), rel=1e-6)
+
+
+def drawn(count=100_000, seed=0):
+    """Uncertainties from 1 cm to 1 m, and errors of exactly these deviations."""
+    rng = np.random.default_rng(seed)
+    uncertainty_m = 10 ** rng.uniform(-2, 0, count)
+    return uncertainty_m * rng.standard_normal(count), uncertainty_m
+
+
+def test_perfect_uncertainties():
+    error_m, uncertainty_m = drawn()
+    m = uncertainty_metrics(error_m, uncertainty_m)
+    assert m["coverage_68"] == pytest.approx(0.68, abs=0.005)
+    assert m["coverage_95"] == pytest.approx(0.95, abs=0.005)
+    assert m["ence"] < 0.02
+    assert m["z_rms"] == pytest.approx(1, abs=0.01)
+    assert m["worst_decile_factor"] < 1.03
+    assert (m["num_points"], m["num_unknown"]) == (100_000, 0)
+
+
+@pytest.mark.parametrize(("factor", "ence"), [(2.0, 1.0), (0.5, 0.5)], ids=["overconfident", "too careful"])
+def test_wrong_by_two(factor, ence):
+    error_m, uncertainty_m = drawn()
+    m = uncertainty_metrics(error_m, uncertainty_m / factor)
+    assert m["ence"] == pytest.approx(ence, abs=0.02)
+    assert m["z_rms"] == pytest.approx(factor, rel=0.01)
+    assert m["worst_decile_factor"] == pytest.approx(2, rel=0.03)
+    # Of a Gaussian, 1.96 / 2 deviations hold 67.3 %, and 1.96 · 2 hold 99.99 %.
+    assert m["coverage_95"] == pytest.approx(math.erf(1.959964 / factor / math.sqrt(2)), abs=0.005)
+
+
+def test_bins_agree_with_a_plain_loop():
+    error_m, uncertainty_m = drawn(1003)
+    order = np.argsort(uncertainty_m)
+    predicted, measured = [], []
+    for rows in np.array_split(order, 10):
+        predicted.append(math.sqrt(sum(uncertainty_m[i] ** 2 for i in rows) / len(rows)))
+        measured.append(math.sqrt(sum(error_m[i] ** 2 for i in rows) / len(rows)))
+    m = uncertainty_metrics(error_m, uncertainty_m)
+    np.testing.assert_allclose(m["decile_predicted_m"], predicted)
+    np.testing.assert_allclose(m["decile_rmse_m"], measured)
+
+
+def test_perfect_confidences():
+    rng = np.random.default_rng(0)
+    confidence = rng.random(100_000)
+    m = confidence_metrics(confidence, rng.random(100_000) < confidence)
+    assert sum(m["bin_count"]) == 100_000
+    np.testing.assert_allclose(m["bin_confidence"], np.arange(0.05, 1, 0.1), atol=0.005)
+    np.testing.assert_allclose(m["bin_true_share"], m["bin_confidence"], atol=0.02)
+    assert m["worst_gap"] < 0.02
+    assert m["mean_gap"] < 0.01
+    assert m["auc"] == pytest.approx(5 / 6, abs=0.005)
+    assert m["true_share"] == pytest.approx(0.5, abs=0.01)
+
+
+def test_auc_agrees_with_all_pairs():
+    rng = np.random.default_rng(0)
+    confidence, truth = np.round(rng.random(200), 1), rng.random(200) < 0.4
+    a, b = confidence[truth][:, None], confidence[~truth]
+    assert confidence_metrics(confidence, truth)["auc"] == pytest.approx(np.mean((a > b) + 0.5 * (a == b)))
+    assert confidence_metrics(confidence, np.ones(200, bool))["auc"] is None
+
+
+def test_bins_of_few_points_do_not_make_the_worst_gap():
+    confidence, truth = np.append(np.full(1000, 0.95), 0.05), np.append(np.arange(1000) >= 50, True)
+    m = confidence_metrics(confidence, truth)
+    assert m["worst_gap"] == pytest.approx(0, abs=1e-9)
+    assert m["bin_true_share"] == [1.0, *[None] * 8, pytest.approx(0.95)]
+    assert m["bin_count"] == [1, *[0] * 8, 1000]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "name"),
+    [
+        (uncertainty_metrics, (np.zeros(30), np.ones(31)), "uncertainty_m"),
+        (uncertainty_metrics, (np.zeros(30), -np.ones(30)), "uncertainty_m"),
+        (uncertainty_metrics, (np.full(30, -np.inf), np.ones(30)), "error_m"),
+        (uncertainty_metrics, (np.full(30, np.nan), np.ones(30)), "0 points are too few"),
+        (confidence_metrics, ([0.5], [True, False]), "is_true"),
+        (confidence_metrics, ([1.5], [True]), "confidence"),
+        (confidence_metrics, ([0.5], [np.nan]), "is_true"),
+        (confidence_metrics, ([np.nan], [True]), "confidence"),
+    ],
+)
+def test_wrong_errors_are_refused(function, arguments, name):
+    with pytest.raises(ValueError, match=name):
+        function(*arguments)

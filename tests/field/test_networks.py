@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The networks' inputs and outputs, and which parameters which loss may reach."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 
@@ -112,8 +110,7 @@ def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geom
 def test_the_second_derivative_through_the_normals_is_right():
     # Double precision: the networks bend at few places.
     config = BARE.override(
-        networks={"normals": True, "intensity_hidden": (6,)},
-        encoding={"fourier_count": 2},
+        networks={"normals": True, "intensity_hidden": (6,)}, encoding={"fourier_count": 2}
     )
     field, points = make_field(config)
     field = field.double()

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A fit that goes on from a checkpoint ends with the bits of one without a stop, and from nothing else."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import signal
@@ -77,10 +75,7 @@ def assert_same_bits(one, other):
     assert next(histories) == next(histories)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"optimiser": "adam", "num_threads": 1}],
-)
+@pytest.mark.parametrize("changes", [{}, {"optimiser": "adam", "num_threads": 1}])
 def test_stopped_again_and_again_it_ends_with_the_same_bits(scene, tmp_path, monkeypatch, changes):
     config = QUICK.override(**grouped(**changes))
     whole = fitted(scene, config=config)
@@ -125,12 +120,21 @@ fitted(ground_and_wall(returns_per_scan=300), {str(path)!r})
     assert_same_bits(fitted(scene), fitted(scene, path))
 
 
+@pytest.fixture(scope="module")
+def state(scene, tmp_path_factory):
+    """The bytes of a checkpoint after three iterations."""
+    path = tmp_path_factory.mktemp("checkpoint") / "state"
+    with pytest.MonkeyPatch.context() as patch:
+        interrupted_after(3, patch, scene, path)
+    return path.read_bytes()
+
+
 class TestOtherFiles:
     """One clear ValueError, and the file stays."""
 
     @pytest.fixture
-    def path(self, scene, tmp_path, monkeypatch):
-        interrupted_after(3, monkeypatch, scene, tmp_path / "state")
+    def path(self, state, tmp_path):
+        (tmp_path / "state").write_bytes(state)
         return tmp_path / "state"
 
     @staticmethod

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Estimates of memory, size and work hold, and what cannot be done is refused before it is begun."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A fit finds the surface and the intensities of an analytic scene, says no to bad input, and repeats itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Adam is PyTorch's, without what PyTorch's brings along; by rows it is the same where all rows are touched; SOAP."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Samples along rays: labels are geometry, and every ray has its turn."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A fit that ends before its time, by Ctrl-C or by numbers that are not finite, ends soon and hands back what it has."""
 
-from __future__ import annotations
-
 import math
 import signal
 import subprocess

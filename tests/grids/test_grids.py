@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Grids of a plane and a wall: what is occupied, free and unknown, and what planners read."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf
@@ -107,6 +105,7 @@ def test_costs_where_the_ground_is_unknown():
     np.testing.assert_allclose(costs.slope_rad[3:9, 2], np.arctan(0.2), atol=1e-5)  # by those around
     grid.distance_m[:, :] = np.nan
     grid.distance_m[0, 0], grid.distance_m[0, 1] = ramp(0.2)[0].distance_m[0, :2]
+    grid.distance_m[1, 0, 5:7] = grid.distance_m[0, 0, 0]  # no height lies between equal distances
     lone = grid.costmap()
     assert np.isfinite(lone.height_m).sum() == 2
     assert np.isnan(lone.slope_rad).all()  # two columns have no plane
@@ -266,6 +265,12 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
         made(np.ones((2, 2, 2)), [0.07, 0.2, 0.4], 0.2).save(tmp_path / "off.bt")
     with pytest.raises(ValueError, match="32768"):
         made(np.ones((2, 2, 2)), [7000.0, 0, 0], 0.2).save(tmp_path / "far.bt")
+    ends = np.ones((2, 1, 1))  # the tree spans 2 ** 16 voxels
+    for first in (-32768, 32766):
+        assert (in_octomap(made(ends, [first * 0.5, 0, 0], 0.5), tmp_path / "end.bt")[0] == 1).all()
+    for first in (-32769, 32767):
+        with pytest.raises(ValueError, match="32768"):
+            made(ends, [first * 0.5, 0, 0], 0.5).save(tmp_path / "far.bt")
 
 
 def test_a_map_without_free_space_is_refused(scene):

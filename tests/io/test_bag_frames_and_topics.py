@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Bags of several sensors: the frame of each message, the topic that has the poses, and messages that are damaged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -94,10 +92,7 @@ def test_several_topics_are_merged_by_time(tmp_path, poses):
         read(path, topic=["/front", "/up"])
 
 
-@pytest.mark.parametrize(
-    "topic",
-    ["/robotGoalPose", "/initialpose", "/mavros/setpoint_position/local"],
-)
+@pytest.mark.parametrize("topic", ["/robotGoalPose", "/initialpose", "/mavros/setpoint_position/local"])
 def test_what_somebody_wants_is_no_pose_of_the_sensor(tmp_path, topic):
     """Though it is as dense as the scans."""
 

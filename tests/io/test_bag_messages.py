@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Messages of radars' own types."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Bags of ROS 1 and ROS 2: each kind of message, each source of poses, clocks, several bags, and damaged ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

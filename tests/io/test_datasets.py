@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Published data sets: a tiny folder or bag in the layout of each becomes the same scans with the right poses."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

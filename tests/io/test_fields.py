@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What fields of radars mean: by their names, whatever their case and order, by their units, or by choice."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Outputs are checked before the work, and written whole."""
-
-from __future__ import annotations
+"""Outputs are checked before the work, and written whole; meshes in UTM coordinates survive their files."""
 
 import os
 import stat
 import sys
 
+import numpy as np
 import pytest
+import trimesh
 from radarsdf.io.files import check_outputs, write_whole
+from radarsdf.io.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="links, pipes and permissions of POSIX")
 
@@ -59,3 +60,51 @@ def test_the_same_file_twice_is_refused(tmp_path):
         with pytest.raises(ValueError, match="same file"):
             check_outputs([tmp_path / "link"], [scans])
     assert scans.read_bytes() == b"scans"
+
+
+UTM_M = np.array([691_000.0, 5_335_000.0, 520.0])
+
+
+def sphere(origin=UTM_M):
+    mesh = trimesh.creation.icosphere(3, 5.0)
+    mesh.vertices = mesh.vertices + origin
+    mesh.vertex_attributes["confidence"] = np.linspace(0, 1, len(mesh.vertices), dtype=np.float32)
+    return mesh
+
+
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+def test_vertices_are_right_to_a_tenth_of_a_millimetre(tmp_path, suffix):
+    mesh, path = sphere(), tmp_path / f"mesh{suffix}"
+    if suffix in (".stl", ".glb"):
+        with pytest.raises(ValueError, match="float32"):
+            write_mesh(path, mesh)
+        mesh = sphere(np.array([900.0, -300.0, 20.0]))
+    write_mesh(path, mesh)
+    read = trimesh.load_mesh(path, process=False)
+    vertices = np.asarray(read.triangles).reshape(-1, 3)
+    if suffix == ".glb":  # x right, y up, z towards the viewer
+        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
+    np.testing.assert_allclose(vertices, np.asarray(mesh.triangles).reshape(-1, 3), atol=1e-4)
+
+
+def test_glb_stands_upright_in_programs_that_read_gltf(tmp_path):
+    tower = trimesh.creation.box([1.0, 2.0, 30.0])
+    write_mesh(tmp_path / "tower.glb", tower)
+    np.testing.assert_allclose(trimesh.load_scene(tmp_path / "tower.glb").extents, [1, 30, 2])
+    np.testing.assert_allclose(read_mesh(tmp_path / "tower.glb").extents, [1, 2, 30])
+
+
+def test_ply_keeps_attributes_colours_and_faces(tmp_path):
+    mesh = sphere()
+    mesh.visual = trimesh.visual.ColorVisuals(
+        mesh, vertex_colors=np.arange(4 * len(mesh.vertices)).reshape(-1, 4) % 256
+    )
+    write_mesh(tmp_path / "mesh.ply", mesh)
+    read = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    np.testing.assert_array_equal(read.vertices, mesh.vertices)  # to the bit
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    np.testing.assert_array_equal(read.visual.vertex_colors, mesh.visual.vertex_colors)
+    header = (tmp_path / "mesh.ply").read_bytes()[:500]
+    assert b"property double x" in header
+    confidence = read.metadata["_ply_raw"]["vertex"]["data"]["confidence"].ravel()
+    np.testing.assert_array_equal(confidence, mesh.vertex_attributes["confidence"])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Folders of recorded scans: tiny ones in each layout, whose numbers come back exactly; and damaged ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

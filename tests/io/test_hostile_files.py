@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os
@@ -19,7 +17,6 @@ from radarsdf.io.npz import read_scans
 
 from .. import samples
 from . import hostile_files as files
-from .mutations import boundaries
 
 FILES = 70
 
@@ -31,7 +28,7 @@ def test_damaged_files_are_read_or_refused(name, tmp_path, monkeypatch):
     path = files.place(reader, tmp_path)
     outcomes = files.Outcomes()
     # The long run begins with cuts at every boundary; of these, some.
-    cuts = sum(1 + len(boundaries(data)) for data in reader.valid())
+    cuts = sum(1 + len(files.boundaries(data)) for data in reader.valid())
     stream = files.damaged(reader, seed=0)
     some = list(itertools.islice(stream, 0, cuts, 7)) + list(itertools.islice(stream, FILES))
     with warnings.catch_warnings():

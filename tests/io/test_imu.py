@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Inertial measurements beside scans: of bags, by the clock of the scans, and of our own files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

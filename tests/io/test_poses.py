@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: MIT
 """Files of poses in each format, what was assumed of them, and interpolation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from radarsdf.io import write_poses
 from radarsdf.io.poses import Trajectory, TransformChain, are_poses, poses_of, read_poses, trajectory_of
 from radarsdf.scans import Notes
 from scipy.spatial.transform import Rotation
 
 from ..conftest import pose
+from ..poses.drift import trajectory
 
 POSES = np.stack([pose([i, 2.0, 3.0], 0.1 * i) for i in range(3)])
 # A camera looks along z, its x to the right: the sensor looks along x, its y to the left. It is 0.2 m behind and above.
@@ -163,3 +163,28 @@ def test_most_rows_of_a_table_must_be_poses():
     rows[1, 0] = 0  # of two poses at one time, the first counts
     with pytest.raises(ValueError, match="x holds 1 poses at different times"):
         trajectory_of(rows, "x")
+
+
+POSES, TIMES = trajectory(7), np.arange(7) * 0.25 + 1.6e9
+
+
+@pytest.mark.parametrize("name", ["a.tum", "a.kitti", "a.npy"])
+def test_poses_come_back(tmp_path, name):
+    write_poses(tmp_path / name, POSES, TIMES)
+    found = read_poses(tmp_path / name, Notes())
+    if not isinstance(found, np.ndarray):
+        np.testing.assert_allclose(found.times_s, TIMES)
+        found = found.poses(TIMES)
+    np.testing.assert_allclose(found, POSES, atol=1e-8)
+
+
+def test_wrong_arguments_are_refused_and_nothing_is_written(tmp_path):
+    with pytest.raises(ValueError, match=r"\.tum, \.kitti, \.npy"):
+        write_poses(tmp_path / "a.txt", POSES, TIMES)
+    with pytest.raises(ValueError, match="needs times"):
+        write_poses(tmp_path / "a.tum", POSES)
+    with pytest.raises(ValueError, match="times_s must be"):
+        write_poses(tmp_path / "a.tum", POSES, TIMES[:3])
+    with pytest.raises(ValueError, match="rigid"):
+        write_poses(tmp_path / "a.kitti", 2 * POSES)
+    assert list(tmp_path.iterdir()) == []

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A real ROS 1 bag of a handheld radar, whose header stamps are all zero, becomes the scans that it holds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

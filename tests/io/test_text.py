@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Text as other programs write it: the same numbers, or an error, and never a line less."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -53,11 +51,7 @@ def test_the_same_numbers_in_all_layouts(tmp_path, layout, encoding):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("\x001 2 3\n4 5\n6\n", "a.csv"),
-        ("1 2 3\n4 5\n6\n", "a.csv"),
-    ],
+    ("text", "message"), [("\x001 2 3\n4 5\n6\n", "a.csv"), ("1 2 3\n4 5\n6\n", "a.csv")]
 )
 def test_no_line_is_lost(tmp_path, text, message):
     (tmp_path / "a.csv").write_text(text)

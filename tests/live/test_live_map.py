@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A map that grows is a function of the scans that are in it, however they came, moved and went."""
 
-from __future__ import annotations
-
 import errno
 import os
 import threading
@@ -124,10 +122,7 @@ def test_map_and_finish_are_fits_of_all_scans():
     points, poses, intensities = scans
     for found, settings in (
         (live.finish(progress=False), config),
-        (
-            live.map(),
-            FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4}),
-        ),
+        (live.map(), FitConfig.quick(num_threads=1, encoding={"bridge_cells": 4})),
     ):
         fitted = radarsdf.fit(
             points, np.stack(poses), intensities, config=settings, origin=ORIGIN, progress=False

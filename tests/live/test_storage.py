@@ -1,20 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A map that was saved goes on as if nothing had happened, and damaged files are refused."""
-
-from __future__ import annotations
+"""Maps that were saved, or put away region by region, go on as if nothing had happened; damaged files are refused."""
 
 import io
 import json
 import math
+from functools import partial
 
 import numpy as np
 import pytest
-from radarsdf import LiveMap
+import radarsdf
+from radarsdf import FitConfig, LiveMap
+from radarsdf._core import cell_keys
+from radarsdf.live.regions import REGION_CELLS, RegionTable, region_places
+from radarsdf.returns.sums import lattice_of
 
 from bench.live.removal import state
 
-from .test_live_map import SCENE, map_of, mesh_bits
+from .test_live_map import SCENE, map_bits, map_of, mesh_bits
 
 
 def test_a_map_goes_on_from_its_file(tmp_path):
@@ -83,3 +86,115 @@ def test_damaged_files_are_refused(tmp_path):
         np.savez(file, **arrays | {"described": np.frombuffer(text, np.uint8)})
         with pytest.raises(ValueError, match=r"live\.npz"):
             LiveMap.load(file)
+
+
+FAR = SCENE.poses.copy()
+FAR[4:, 0, 3] += 200.0
+
+
+far_map_of = partial(map_of, poses=FAR)
+
+
+def put_away(folder):
+    return sorted(folder.glob("region-*.npz"))
+
+
+def test_a_map_that_was_put_away_comes_back_where_scans_reach_it(tmp_path):
+    live, other = far_map_of(range(7), folder=tmp_path / "kept"), far_map_of(range(7))
+    whole, mesh = state(live), mesh_bits(live.mesh())
+    for _ in range(2):
+        cells = live._state.sums.num_cells
+        gone = live.clear_outside(FAR[6][:3, 3], 60.0)
+        assert len(gone) > 0
+        assert 0 < live._state.sums.num_cells < cells
+        assert len(put_away(tmp_path / "kept")) > 1
+        near = live.mesh()
+        assert near.vertices[:, 0].min() > 150
+        assert len(live.clear_outside(FAR[6][:3, 3], 60.0)) == 0
+        # What needs all of it has all of it, and leaves it where it was.
+        assert map_bits(live.map()) == map_bits(other.map())
+        assert len(put_away(tmp_path / "kept")) > 1
+        assert mesh_bits(live.mesh()) == mesh_bits(near)
+        live.remove(0)
+        live.integrate(SCENE.points[0], FAR[0], SCENE.intensities[0], scan_id=0)
+        assert put_away(tmp_path / "kept") == []
+        assert state(live) == whole
+        assert mesh_bits(live.mesh()) == mesh
+    assert live.sealed_scans == 0
+
+
+def test_a_state_has_what_is_put_away(tmp_path):
+    live = far_map_of(range(7), folder=tmp_path / "kept")
+    whole = state(live)
+    live.clear_outside(FAR[6][:3, 3], 60.0)
+    live.save(tmp_path / "live.npz")
+    del live
+    # As after a process was killed: the folder still has files, of which the state knows nothing.
+    loaded = LiveMap.load(tmp_path / "live.npz", folder=tmp_path / "kept")
+    assert state(loaded) == whole
+    loaded.integrate(SCENE.points[7], FAR[0], SCENE.intensities[7])
+    loaded.clear_outside(FAR[0][:3, 3], 60.0)
+    loaded.move_all({4: FAR[5]})
+    assert put_away(tmp_path / "kept") != []  # of before
+    expected = far_map_of([0, 1, 2, 3, 5, 6])
+    expected.integrate(SCENE.points[4], FAR[5], SCENE.intensities[4])
+    expected.integrate(SCENE.points[7], FAR[0], SCENE.intensities[7])
+    assert state(loaded) == state(expected)
+
+
+def test_a_damaged_region_leaves_the_map_as_it_was(tmp_path):
+    live = far_map_of(range(7), folder=tmp_path / "kept")
+    live.clear_outside(FAR[6][:3, 3], 60.0)
+    before, files = state(live), put_away(tmp_path / "kept")
+    intact = files[0].read_bytes()
+    for damaged in (b"", intact[: len(intact) // 2], b"PK" + bytes(200)):
+        for file in files:
+            file.write_bytes(damaged)
+        with pytest.raises(ValueError, match="region-"):
+            live.integrate(SCENE.points[7], FAR[0], SCENE.intensities[7])
+        assert (state(live), len(live)) == (before, 7)
+    live.integrate(SCENE.points[7], FAR[6], SCENE.intensities[7])  # which does not reach them
+
+
+RNG = np.random.default_rng(3)
+CELLS = RNG.integers(-150, 150, (4000, 3))
+
+
+def keys_of(cells):
+    return np.unique(cell_keys(np.ascontiguousarray(cells, np.float64) + 0.5, 1.0))
+
+
+@pytest.mark.parametrize("leaves_per_cell", [1, 2])
+def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
+    keys = keys_of(CELLS)
+    table = RegionTable(leaves_per_cell, number=np.zeros(1))
+    regions = np.unique(table.regions_of(keys))
+    table.put(regions, {"keys": keys, "number": np.arange(len(keys)) * 1.0})
+    whole = table.gather(regions)
+    np.testing.assert_array_equal(whole["keys"], keys)
+    np.testing.assert_array_equal(whole["number"], np.arange(len(keys)))
+    edge = REGION_CELLS // leaves_per_cell
+    for region, cube in zip(regions, region_places(regions), strict=True):
+        expected = (lattice_of(keys) // edge == cube).all(axis=1)
+        np.testing.assert_array_equal(table.gather(region[None])["number"], np.flatnonzero(expected))
+    some = regions[::3]
+    table.put(some, {"keys": keys[:0], "number": np.zeros(0)})
+    left = table.gather()["keys"]
+    np.testing.assert_array_equal(left, keys[~np.isin(table.regions_of(keys), some)])
+    assert table.num_bytes == 16 * len(left)
+
+
+def test_ghosts_of_a_grown_map_are_those_of_a_fresh_one():
+    scans = radarsdf.simulate.oculii(seed=6, frames=16)
+    known = {"range_noise_m": 0.09, "azimuth_noise_rad": 0.012, "elevation_noise_rad": 0.02}
+    live, fresh = (LiveMap(FitConfig(num_threads=1, returns=known), origin=(0, 0, 0)) for _ in range(2))
+    for i in range(16):
+        live.integrate(scans.points[i], scans.poses[i], scan_id=i)
+        if i >= 8:
+            live.remove(2 * (i - 8))
+        if i % 8 == 7:
+            live.mesh()
+    for i in live.scan_ids:
+        fresh.integrate(scans.points[i], scans.poses[i], scan_id=i)
+    assert mesh_bits(live.mesh()) == mesh_bits(fresh.mesh())
+    assert len(live._state._surface._ghosts) > 50

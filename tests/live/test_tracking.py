@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Scans without poses are put where they were taken, or refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Gradients of a mesh's vertices by the samples."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

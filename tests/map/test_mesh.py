@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Meshes of the plane z = 0 and the wall x = 20: where they are, which way they face, and where they end."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A map answers in kind, in any chunks and from any thread."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A map's file: whole or not at all, and the same bits again."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The mesh keeps what is probable enough for the highest expected F-score, and says what that costs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Views of a map of a plane and a wall: returns and beams lie on them, within the sensor's limits."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Trajectories, and errors that add up from step to step."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

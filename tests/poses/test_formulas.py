@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Covariances, derivatives and rates of motions against draws, differences and numbers by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 
@@ -39,6 +37,7 @@ from radarsdf.poses.tracking import (
     _apart_m,
     _removed_share,
     begun,
+    followed,
     rates_of,
     thinned,
 )
@@ -229,6 +228,17 @@ def test_rates_of_a_step_lead_to_the_next_one():
     assert fast.usual_turn_rad_s == pytest.approx(2 / 25)
     assert fast.turns_slowly
     assert not drive.turns_slowly
+
+
+def test_a_gyroscope_learns_from_turns_with_the_covariance_of_their_rates(monkeypatch):
+    rate, asked = MotionRate(np.array([0.1, -0.2, 0.3]), spread(12, 3)), []
+    passed = [begun(np.eye(4))] * 3, [(rate, rate), (None, None)]
+    monkeypatch.setattr("radarsdf.poses.tracking._tracked", lambda *_: passed)
+    gyroscope = SimpleNamespace(learnt=lambda *turns: asked.append(turns))
+    followed(Drive([np.eye(3)] * 3, np.array([0, 0.5, 0.7]), None, gyroscope), FitConfig(), 1, False)
+    ((vectors, covariance),) = asked
+    assert_allclose(vectors, [0.5 * rate.mean, [np.nan] * 3])
+    assert_allclose(covariance[0], 0.25 * rate.covariance)
 
 
 def test_what_returns_remove_and_what_errors_add():

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """How an IMU sits on a radar, which way is up, and what time is between their clocks: found from the drive."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -152,6 +150,15 @@ def test_a_sensor_that_goes_straight_on_leaves_it_open():
     rng = np.random.default_rng(2)
     velocities = velocities_of([1, 0, 0] + rng.normal(0, 0.02, (200, 3)), 0.02**2 * np.eye(3))
     assert ImuAlignment.of(measured_imu(poses, times_s), velocities, times_s) is None
+
+
+@pytest.mark.parametrize(("scans", "enough"), [(19, False), (20, True)])
+def test_two_windows_of_scans_are_the_fewest(ride, imu, monkeypatch, scans, enough):
+    times_s, _, velocities = ride
+    asked, rows = [], slice(0, 5 * scans, 5)
+    monkeypatch.setattr("radarsdf.poses.imu._first_guess", lambda *given: asked.append(given))
+    assert ImuAlignment.of(imu, velocities.select(rows), times_s[rows]) is None
+    assert bool(asked) == enough
 
 
 def test_a_rotation_that_nothing_determines_is_asked_for(ride, imu):

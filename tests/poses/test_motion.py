@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The motion prior, and motions that sources measured."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

@@ -2,14 +2,23 @@
 # SPDX-License-Identifier: MIT
 """Poses that returns mend, and those that they leave alone."""
 
-from __future__ import annotations
+import json
 
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf import FitConfig
+from radarsdf import FitConfig, RefinedPoses
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.map.storage import checked_report
+from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, unbiased_normals
+from radarsdf.poses.posed import trajectory_report
 from radarsdf.poses.rigid import aligned, turned_by
+from radarsdf.poses.verdict import Verdict
+from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.planes import Surfels
 from radarsdf.simulate import drifted
+
+from bench.kinds import KINDS
 
 from .drift import position_error_m
 
@@ -181,3 +190,119 @@ def test_covariance_of_kept_poses_spans_those_that_were_not_excluded(street):
     assert not found.improved
     variances = np.einsum("fii->f", found.covariance[:, :3, :3])
     assert variances[[0, -1]].min() > found.report["moved_m"] ** 2 / 4
+
+
+def test_one_thing_that_moves_does_not_call_poses_improved():
+    # The gain of each scan is the same, so that scans alone would be sure of it.
+    one, many = _verdict(1), _verdict(60)
+    assert one.gain > 0
+    assert not one.improved
+    assert many.improved
+
+
+def test_scans_on_top_of_each_other_do_not_agree_better():
+    drive = KINDS["tunnel"](seed=8, frames=16)
+    returns = SensorReturns.of(drive.points, 0.1, None)
+    held = np.random.default_rng(0).random(len(returns)) < 0.2
+    for share in (0.0, 0.5):  # of the distance driven
+        after = drive.poses.copy()
+        after[:, :3, 3] *= share
+        verdict = Verdict.of(
+            returns.select(held), returns.select(~held), drive.poses, after, SensorNoise(0.1, 0.01, 0.01)
+        )
+        assert verdict.gain > 0  # their density alone says so
+        assert not verdict.improved
+
+
+def _verdict(things: int) -> Verdict:
+    """Of poses 0.3 m a scan off the given ones, where a share of all returns lies on so many things that stay only with these."""
+    rng, frames = np.random.default_rng(0), 12
+    before = np.tile(np.eye(4), (frames, 1, 1))
+    after = before.copy()
+    after[:, 0, 3] = 0.3 * np.arange(frames)
+    places = rng.uniform(-40, 40, (things, 3))
+    scans = []
+    for pose in after:
+        staying = places[rng.integers(0, things, 240)] + rng.normal(0, 0.2, (240, 3)) - pose[:3, 3]
+        scans.append(np.concatenate([staying, rng.uniform(-40, 40, (1000, 3))]))
+    returns = SensorReturns.of(scans, 0.1, None)
+    held = rng.random(len(returns)) < 0.2
+    noise = SensorNoise(0.2, 0.001, 0.001)
+    return Verdict.of(returns.select(held), returns.select(~held), before, after, noise)
+
+
+def refined_of(scans):
+    poses = np.tile(np.eye(4), (scans, 1, 1))
+    poses[:, 0, 3] = np.arange(scans)
+    covariance = np.tile(np.diag([1.0, 4, 4, 0.01, 0.01, 0.04]), (scans, 1, 1))
+    return RefinedPoses(poses, covariance, True, {"verdict": "Better.", "sigma_m": 0.1, "sigma_rad": 0.02})
+
+
+def test_it_is_kept_with_the_map():
+    found = refined_of(1201)
+    given = found.poses + 0.0
+    given[:, 1, 3] = 1
+    way = json.loads(json.dumps(trajectory_report(found, given)))
+    assert len(way["scans"]) == len(way["before"]) == len(way["after"]) == len(way["sigma_m"]) == 500
+    assert way["after"][-1] == [1200, 0, 0]
+    assert way["before"][-1] == [1200, 1, 0]
+    assert (way["verdict"], way["improved"], way["step_m"]) == ("Better.", True, 0.1)
+    assert checked_report({"poses": way})["poses"] == way
+    with pytest.raises(ValueError, match=r"report\.poses"):
+        checked_report({"poses": 3})
+
+
+def surfels_of(points):
+    """Of returns (N, 3) around the sensor."""
+    returns = SensorReturns.of([points], 0.0, None)
+    return Surfels.of(returns.posed(np.eye(4)[None]), 0.2)
+
+
+def test_normals_of_a_wall_do_not_point_along_it():
+    rng = np.random.default_rng(0)
+    wall = np.column_stack(
+        [rng.normal(5, 0.05, 20_000), rng.uniform(-6, 6, 20_000), rng.uniform(-1, 2, 20_000)]
+    )
+    surfels = surfels_of(wall)
+    flat = surfels.is_flat()
+    along, observed = surfels.normals[flat, 1], unbiased_normals(surfels, 1)[flat, 1]
+    assert along.std() > 0.003
+    assert observed.std() < 0.2 * along.std()
+
+
+def test_scans_that_move_together_cost_nothing():
+    rng = np.random.default_rng(1)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [0, 0.5, 1.2]
+    scans = [np.column_stack([rng.uniform(2, 9, (3000, 2)), rng.normal(-1, 0.05, 3000)]) for _ in poses]
+    returns = SensorReturns.of(scans, 0.0, None)
+    planes, _ = common_planes(returns, poses, PlaneGrid(3, False, 0.4), None, ReturnsConfig(), 1)
+    weak = np.tile(np.eye(6), (3, 1, 1))
+    pull = np.zeros((3, 6))
+    for k, direction in enumerate(np.eye(3)):
+        # A pull that would move all scans together by one metre if they were free.
+        pull[:] = 0
+        pull[:, :3] = -direction
+        free = planes.solve(weak, np.zeros((2, 6, 6)), pull, 1e-9, 200, False, 1)[0]
+        still = planes.solve(weak, np.zeros((2, 6, 6)), 0 * pull, 1e-9, 200, False, 1)[0]
+        assert (free - still)[:, :3] == pytest.approx(np.tile(direction, (3, 1)), abs=1e-2), k
+
+
+@pytest.mark.parametrize("height_m", [-2.05, -1.95])
+def test_a_noisy_scan_is_as_high_as_others(height_m):
+    # Noise reaches over the borders of cells, 0.4 m high.
+    rng = np.random.default_rng(3)
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, 0, 3] = 0.2 * np.arange(10)
+    noises_m = np.tile([0.02, 0.15], 5)
+    scans = [
+        np.column_stack([rng.uniform(-3, 3, (3000, 2)), rng.normal(height_m, noise_m, 3000)])
+        for noise_m in noises_m
+    ]
+    returns = SensorReturns.of(scans, 0.0, None)
+    planes, _ = common_planes(returns, poses, PlaneGrid(10, False, 0.4), None, ReturnsConfig(), 1)
+    weak = np.tile(np.eye(6), (10, 1, 1))
+    moved = planes.solve(weak, np.zeros((9, 6, 6)), np.zeros((10, 6)), 1e-6, 100, False, 1)[0][:, 2]
+    assert (
+        abs(moved[::2].mean() - moved[1::2].mean()) < 0.01
+    )  # 0.02, if returns belonged to the cell that they lie in

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Times, ranges, speeds and rates in wrong units, signs and axes are named, and long gaps end a segment."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

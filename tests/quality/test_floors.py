@@ -2,13 +2,20 @@
 # SPDX-License-Identifier: MIT
 """The default fit and the quick one are no worse than they were, beyond what chance explains; and worse is noticed."""
 
-from __future__ import annotations
-
 import functools
 import math
 
+import numpy as np
 import pytest
+import radarsdf
+import trimesh
+from radarsdf import FitConfig
+from radarsdf.evaluation import KNNIntensity, holdout, intensity_metrics, surface_metrics
+from radarsdf.io.npz import read_scans
+from radarsdf.returns.rays import prepare
+from scipy.spatial import cKDTree
 
+from ..conftest import recorded_scans
 from .floors import (
     KINDS,
     MEASURED,
@@ -68,3 +75,52 @@ def test_a_fit_that_is_bad_on_purpose_fails(spoilt, kind, what_fails):
 )
 def test_each_number_can_fail_alone(quality, names):
     assert failures(quality, limits((91.0, 4.0, 4.2), (1.0, 1.0, 0.2))) == names
+
+
+SCENES = ["r0009_0024"]  # others are in test_floors.py
+
+
+def rays_of(scans):
+    """World points, sensor positions and intensities of the returns between 2.5 and 60 m."""
+    rays = prepare(scans.points, scans.poses, scans.intensities, min_range_m=2.5, max_range_m=60.0)
+    return *rays.in_world(), rays.intensities
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def job(request):
+    scans = read_scans(recorded_scans(request.param))
+    train, test = (scans.select(frames) for frames in holdout(len(scans.points), 5))
+    config = FitConfig().override(returns={"max_range_m": 60.0})
+    radar_map = radarsdf.fit(train.points, train.poses, train.intensities, config=config, progress=False)
+    return radar_map, train, test
+
+
+def test_held_out_intensities_are_better_than_the_neighbours(job):
+    radar_map, train, test = job
+    x, sensors, measured = rays_of(test)
+    ours = intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)
+    known = prepare(train.points, train.poses, train.intensities, min_range_m=2.5, max_range_m=60.0)
+    knn = KNNIntensity.chosen(*rays_of(train), known.scans)
+    neighbours = intensity_metrics(knn.predict(x, sensors), measured)
+    assert ours["mae"] < neighbours["mae"]
+
+
+def test_the_mesh_covers_what_radar_and_lidar_saw(job, tmp_path):
+    radar_map, train, test = job
+    viewpoint = train.poses[len(train.poses) // 2, :3, 3]
+    extracted = radar_map.mesh(viewpoint=viewpoint, progress=False)
+    assert len(extracted.faces) > 1000
+    extracted.export(tmp_path / "mesh.ply")
+    mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    assert len(mesh.faces) == len(extracted.faces)
+    assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
+    # Lidar sees all round; only what lies within 1 m of a static return can be asked of a radar map.
+    returns = np.concatenate([rays_of(scans)[0] for scans in (train, test)])
+    lidar = train.ground_truth
+    seen = lidar[cKDTree(returns).query(lidar, distance_upper_bound=1.0)[0] <= 1.0]
+    in_place = surface_metrics(mesh, seen, samples=100_000)["completion_ratio"]
+    # The same mesh put a metre aside covers what a mesh of this size covers by chance.
+    for aside in ([1.0, 0, 0], [0, 1.0, 0]):
+        moved = mesh.copy()
+        moved.vertices = moved.vertices + aside
+        assert in_place > 1.5 * surface_metrics(moved, seen, samples=100_000)["completion_ratio"]

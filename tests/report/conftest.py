@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A report of the small scene, with held-out scans and ground truth, written once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Parse a page as a browser would."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 EMPTY = {"meta", "img", "link", "br", "input", "hr"}

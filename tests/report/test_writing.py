@@ -2,16 +2,28 @@
 # SPDX-License-Identifier: MIT
 """The report of a map: every section has its figures, and the page neither loads nor executes anything it reads."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 
 import numpy as np
+import pytest
 import radarsdf
+from radarsdf.changes.changes import (
+    APPEARED,
+    COLORS,
+    MOVED,
+    NAMES,
+    REFLECTANCE_CHANGED,
+    SAME,
+    ChangedSurface,
+    Changes,
+)
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 from radarsdf.io import Scans
+from radarsdf.view.pages import centre_of
 from scipy.spatial import cKDTree
+
+from tests.view.page import drawn, open_page, why_no_browser
 
 from .conftest import HOSTILE
 from .reading import Page
@@ -100,7 +112,7 @@ def test_figures_are_those_of_the_evaluation(written, subject, scene):
     assert f"{metrics['mae']:.2f} sensor units" in page.sections["conclusion"]
     off = np.abs(scene.intensities[0] - np.median(scene.intensities[0]))
     assert f"Median of all returns {off.mean():.2f} {np.median(off):.2f}" in page.sections["intensity"]
-    assert "1,500 returns of 1 scans" in page.sections["intensity"]
+    assert "1,500 returns of 1 scan that" in page.sections["intensity"]
     report = subject.radar_map.report
     assert f"{report['noise']['range_m']:.3f} m" in page.sections["conclusion"]
     for name in ("returns", "leaf_cells", "vertices"):
@@ -164,3 +176,87 @@ def test_the_truth_and_the_viewpoint_are_those_of_the_scans_in_the_box(subject, 
     boxed = dataclasses.replace(subject, box=[corner - [0, 0, 1], corner + step_m])  # on its faces is within
     assert len(boxed.ground_truth) == 4
     assert dataclasses.replace(subject, box=[corner + [0, 0, 1], corner + [9, 9, 2]]).ground_truth is None
+
+
+@pytest.mark.skipif(why_no_browser() is not None, reason=str(why_no_browser()))
+@pytest.mark.parametrize("width", [380, 1200])
+def test_a_browser_shows_it_without_a_network(written, width):
+    path, _ = written
+    with open_page(path.as_uri(), width, 700) as page:
+        frame = page.tab.frame_locator("iframe")
+        canvas = frame.locator("canvas").first
+        page.tab.locator("iframe").scroll_into_view_if_needed()  # a frame that is not seen draws nothing
+        canvas.wait_for(state="visible")
+        page.wait_until(lambda: drawn(page.screenshot_of("iframe")) > 2_000)
+        box = canvas.bounding_box()
+        assert box["width"] > 0.8 * page.tab.locator("iframe").bounding_box()["width"]
+
+        # The scene fits into its frame: nothing is drawn at its sides and at its bottom.
+        seen = page.screenshot_of("iframe")
+        for edge in (seen[4:-4, 4:8], seen[4:-4, -8:-4], seen[-8:-4, 4:-4]):
+            assert (edge > 235).all()
+
+        assert page.tab.title()
+        assert [name for name in page.requests if not name.startswith(("data:", "blob:", "about:"))] == [
+            path.as_uri()
+        ]
+        assert page.errors == []
+        for scrolled, seen in ((page.tab, width), (page.tab.frames[1], box["width"])):
+            assert scrolled.evaluate("document.documentElement.scrollWidth") <= seen
+
+
+HOSTILE_NAME = "<script>alert(1)</script>.safetensors"
+
+
+def surface(kinds):
+    """A sheet of 2 × 2 m for each kind, side by side."""
+    steps = np.linspace(0, 2, 9)
+    sheet = np.stack(np.meshgrid(steps, steps, [0.0], indexing="ij"), -1).reshape(-1, 3)
+    corner = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1)
+    faces = np.concatenate([corner[:, None] + [0, 9, 1], corner[:, None] + [1, 9, 10]])
+    count = len(sheet)
+    vertices = np.concatenate([sheet + [0, 3.0 * number, 0] for number in range(len(kinds))])
+    faces = np.concatenate([faces + count * number for number in range(len(kinds))]).astype(np.int32)
+    kind = np.repeat(np.array(kinds, np.int8), count)
+    moved = np.where(kind == MOVED, 0.25, np.nan).astype(np.float32)
+    change = np.where(kind == REFLECTANCE_CHANGED, 6.5, np.nan).astype(np.float32)
+    return ChangedSurface(vertices, faces, kind, np.full(len(kind), 0.9, np.float32), moved, change)
+
+
+@pytest.mark.parametrize("kinds", [[SAME], [SAME, APPEARED, MOVED, REFLECTANCE_CHANGED]])
+def test_each_change_is_named_listed_and_shown(kinds, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    pytest.importorskip("matplotlib", reason="the extra plot is not installed")
+    from radarsdf.report import changes as module  # noqa: PLC0415
+
+    scene, shown = module.scene, []
+    monkeypatch.setattr(module, "scene", lambda *mesh: shown.append(mesh) or scene(*mesh))
+    areas_m2 = {NAMES[kind]: 4.0 * kinds.count(kind) for kind in (APPEARED, 1, MOVED, REFLECTANCE_CHANGED)}
+    report = {
+        "alignment": "As <b>given</b>.",
+        "areas_m2": areas_m2,
+        "compared_m2": 20.0,
+        "reflectance": "+0.4",
+    }
+    changes = Changes(surface([SAME]), surface(kinds), np.eye(4), report)
+    regions, path = changes.regions(0.1), tmp_path / "changes.html"
+    assert (
+        module.write_changes_report(path, changes, ("monday", HOSTILE_NAME), 0.2, regions)
+        == path.stat().st_size
+    )
+    np.testing.assert_allclose(shown[0][0].mean(axis=0), 0, atol=1e-9)  # the page computes in float32
+    page = Page(path.read_text("utf-8"))
+    assert "As <b>given</b>." in page.sections["conclusion"]
+    for region in regions:
+        assert region.kind.capitalize() in page.sections["conclusion"]
+        size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
+        figures = f"{size} {region.area_m2:.2f} {region.probability:.2f}"
+        assert f"{region.words} {centre_of(region)} {figures}" in page.sections["changes"]
+    assert len(regions) == len(kinds) - 1
+    assert len(page.all("tr")) == (1 + len(regions) if regions else 0)
+    assert len(page.all("img")) == 2
+    assert len(page.frames) == 1
+    styles = [found.get("style", "") for found in page.all("i")]
+    assert all("background:rgb({} {} {})".format(*color) in styles for color in COLORS.values())
+    assert not page.all("script")
+    assert all(address.startswith(("#", "data:")) for address in page.addresses())

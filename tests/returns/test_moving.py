@@ -1,15 +1,19 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Returns that move are left out of a fit, and only these."""
-
-from __future__ import annotations
+"""Returns that move are left out, and only these: velocities by Doppler, folded or not measured."""
 
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.doppler import velocity_of_poses
-from radarsdf.returns.moving import MovingReturns, StaticReturns
+from radarsdf.returns.moving import (
+    MovingReturns,
+    StaticReturns,
+    folding_interval_mps,
+    sensor_velocity,
+    without_filler,
+)
 from radarsdf.scans import Scans
 
 from tests.conftest import recorded_scans
@@ -123,3 +127,94 @@ def test_moving_returns_of_recorded_drives_agree_with_their_flags(name):
     )
     assert found.why_none is None
     assert wrong.mean() < 0.1
+
+
+@pytest.fixture
+def directions():
+    return [np.random.default_rng(k).normal(size=(80, 3)) for k in range(5)]
+
+
+def speeds_of(directions, velocity_mps, step_mps):
+    return [step_mps * np.round(-d @ velocity_mps / np.linalg.norm(d, axis=1) / step_mps) for d in directions]
+
+
+@pytest.mark.parametrize("filler", [0.0, -128.0])
+@pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
+def test_fillers_are_left_out(directions, filler, share):
+    rng = np.random.default_rng(9)
+    speeds = speeds_of(directions, np.array([8.0, 1.0, 0.0]), 1e-3)
+    filled = [np.where(rng.random(len(v)) < share, filler, v) for v in speeds]
+    found, note = without_filler(directions, filled)
+    counted = np.mean(np.concatenate(filled) == filler)
+    assert (
+        note
+        == f"{counted:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out"
+    )
+    for v, measured, given in zip(found, speeds, filled, strict=True):
+        np.testing.assert_array_equal(v, np.where(given == filler, np.nan, measured))
+
+
+@pytest.mark.parametrize("velocity_mps", [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)])
+def test_equal_speeds_of_a_slow_sensor_stay(directions, velocity_mps):
+    rng = np.random.default_rng(9)
+    speeds = speeds_of(directions, np.array(velocity_mps), 0.125)
+    speeds = [np.where(rng.random(len(v)) < 0.2, rng.uniform(-5, 5, len(v)), v) for v in speeds]
+    found, note = without_filler(directions, speeds)
+    assert note is None
+    for v, given in zip(found, speeds, strict=True):
+        np.testing.assert_array_equal(v, given)
+
+
+def test_a_velocity_is_the_least_squares_solution_of_the_returns_that_agree(directions):
+    rng = np.random.default_rng(3)
+    true = np.array([8.0, -2.0, 0.5])
+    x = directions[0] * [1, 1, 0.2]
+    away = -x / np.linalg.norm(x, axis=1)[:, None]
+    speeds = away @ true + rng.normal(0, 0.04, 80) + 3.0 * (np.arange(80) < 16)
+    speeds[70] = np.nan
+    x[71] = 0
+    found = sensor_velocity(x, speeds)
+    np.testing.assert_array_equal(found.static, (np.arange(80) >= 16) & ~np.isin(np.arange(80), [70, 71]))
+    a, b = away[found.static], speeds[found.static]
+    solution, squares, *_ = np.linalg.lstsq(a, b)
+    np.testing.assert_allclose(found.velocity_mps, solution, atol=1e-5)
+    variance = squares[0] / (len(a) - 3)
+    np.testing.assert_allclose(found.covariance, variance * np.linalg.inv(a.T @ a), rtol=1e-3)
+    # Nine returns determine no velocity, ten do; nor do they if seven of ten move on their own.
+    few = np.flatnonzero(found.static)[:10]
+    assert sensor_velocity(x[few], speeds[few]).found
+    assert not sensor_velocity(x[few[:9]], speeds[few[:9]]).found
+    assert not sensor_velocity(x[few], speeds[few] + np.r_[np.zeros(3), 5.0 * 1.7 ** np.arange(7)]).found
+
+
+def test_a_component_that_no_return_measures_is_zero_with_a_deviation_of_100_mps(directions):
+    x = directions[0] * [1, 1, 0]
+    speeds = -x @ [8.0, -2.0, 5.0] / np.linalg.norm(x, axis=1) + np.random.default_rng(4).normal(0, 0.04, 80)
+    found = sensor_velocity(x, speeds)
+    assert found.velocity_mps[2] == 0
+    assert np.sqrt(found.covariance[2, 2]) == pytest.approx(100, rel=0.3)
+
+
+STEPS = 0.1 * np.arange(-100, 100)  # -10 to 9.9 m/s, each once
+
+
+@pytest.mark.parametrize(
+    ("speeds", "interval_mps"),
+    [
+        (STEPS, 20.0),
+        (STEPS + 1.0, 20.0),  # -9 to 10.9: about as far from 0
+        (STEPS + 1.2, None),  # -8.8 to 11.1
+        (STEPS - 1.3, None),
+        (STEPS + 11, None),
+        (np.r_[STEPS, np.nan, np.inf], 20.0),
+        (STEPS[50:149], None),  # 99
+        (STEPS[50:150], 10.0),
+        (np.repeat(np.arange(-5.0, 6), 20), 10.0),  # too coarse to be steps
+        (np.r_[STEPS[::199], np.linspace(-8, 8, 998)], None),  # a thousandth at each end
+        (np.r_[np.repeat(STEPS[::199], 2), np.linspace(-8, 8, 996)], 19.9),  # two: the interval is filled
+        (np.r_[np.repeat(STEPS[:1], 100), np.linspace(-9, 8, 899), 9.9], None),
+    ],
+)
+def test_speeds_that_fill_an_interval_are_folded_into_it(speeds, interval_mps):
+    found = folding_interval_mps([speeds[:70], speeds[70:]])
+    assert found == (None if interval_mps is None else pytest.approx(interval_mps, abs=0.02))

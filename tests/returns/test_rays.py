@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Preparation: from sensor frames to rays of one local frame."""
 
-from __future__ import annotations
-
 import numpy as np
 from radarsdf.returns.rays import prepare
 

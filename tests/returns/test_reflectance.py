@@ -1,17 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Intensities in closed form."""
-
-from __future__ import annotations
+"""Intensities in closed form: by range, elevation, incidence and kind of surface, and means of what that leaves."""
 
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf.evaluation import KNNIntensity, holdout
+from radarsdf.returns import intensities as plausible
 from radarsdf.returns import reflectance
+from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.reflectance import Reflectance
+from radarsdf.returns.response import LEVEL, NO_SURFACE, STEEP, Response, kinds_of
 
 LEAF_M = 0.2
 
@@ -63,6 +64,19 @@ def test_with_a_network_the_answer_is_the_mean_of_two(rays):
     np.testing.assert_allclose(found.network_share * answers + whole, expected, rtol=0, atol=1e-4)
 
 
+def test_a_network_is_asked_at_groups_along_unit_vectors(rays, monkeypatch):
+    monkeypatch.setattr(reflectance, "_MOST_ASKED", 1000)
+    asked = []
+
+    def network(points, directions, _):
+        asked.append(directions)
+        return np.zeros(len(points), np.float32)
+
+    Reflectance.of(rays, unit(rays), Surfels.of(rays, LEAF_M, 1), LEAF_M, network)
+    assert 100 < len(asked[0]) < len(rays) / 2
+    np.testing.assert_allclose(np.linalg.norm(asked[0], axis=1), 1, atol=1e-6)
+
+
 @pytest.mark.parametrize("most", [1000, 10**9], ids=["groups", "returns"])
 def test_any_number_of_threads_has_the_same_bits(rays, monkeypatch, most):
     monkeypatch.setattr(reflectance, "_MOST_RETURNS", most)
@@ -79,3 +93,131 @@ def test_answers_are_numbers_everywhere(rays):
     directions = np.tile(np.float32([1, 0, 0]), (3, 1))
     answers = found.at(points, directions, np.array([0, 1e7, 1e30], np.float32), 1)
     assert np.isfinite(answers).all()
+
+
+COUNT = 6000
+
+
+def views(seed=0, kinds=(LEVEL, STEEP), count=COUNT):
+    """Directions, ranges, incidences and kinds of surfaces of random returns, as :meth:`Response.at` takes them."""
+    rng = np.random.default_rng(seed)
+    elevation, azimuth = rng.uniform(-0.4, 0.4, count), rng.uniform(-1, 1, count)
+    directions = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
+    kind = rng.choice(np.array(kinds, np.int8), count)
+    incidence = np.where(kind == NO_SURFACE, np.nan, rng.uniform(0, 1.4, count))
+    return (
+        directions.astype(np.float32),
+        rng.uniform(2, 40, count).astype(np.float32),
+        incidence.astype(np.float32),
+        kind,
+    )
+
+
+def error(values, seen, asked=None, truth=None):
+    """Mean absolute error of what `values` of returns tell."""
+    asked, truth = (seen, values) if asked is None else (asked, truth)
+    return float(np.abs(Response.of(values, *seen).at(*asked) - truth).mean())
+
+
+def test_level_and_steep_surfaces_have_their_own_incidence():
+    def truth(seen):
+        _, ranges_m, incidence, kind = seen
+        lobe = np.exp(-0.5 * (incidence / 0.2) ** 2)
+        return (
+            0.8 - 0.2 * np.log10(ranges_m) - np.where(kind == LEVEL, 0.1 * incidence, -0.4 * lobe)
+        ).astype(np.float32)
+
+    seen, asked = views(), views(1)
+    assert truth(seen).std() > 0.1
+    assert error(truth(seen), seen, asked, truth(asked)) < 0.005
+
+
+def test_where_no_scan_was_the_ground_is_known_by_its_height():
+    """A sum of functions of range and elevation cannot tell what is 1.5 m below the sensor."""
+
+    def truth(seen):
+        directions, ranges_m = seen[:2]
+        return np.where(ranges_m * directions[:, 2] < -1.5, np.float32(0.3), np.float32(0.7))
+
+    seen, asked = views(kinds=(LEVEL, STEEP)), views(1, kinds=(NO_SURFACE,))
+    assert error(truth(seen), seen, asked, truth(asked)) < 0.03
+
+
+def test_a_kind_is_that_of_the_plane():
+    normals = np.array([[0, 0, 1], [0.6, 0, -0.8], [0.8, 0, 0.6], [1, 0, 0]], np.float32)
+    found = kinds_of(normals, np.array([0, 1, 2, 3, -1], np.int32))
+    assert found.tolist() == [LEVEL, LEVEL, STEEP, STEEP, NO_SURFACE]
+    assert kinds_of(normals[:0], np.array([-1], np.int32)).tolist() == [NO_SURFACE]
+
+
+N = 20_000
+
+
+def decibels(rng):
+    """In steps of half a decibel above a threshold, as automotive radars give them."""
+    return np.round(2 * (45 + rng.gamma(1.2, 6, N))) / 2
+
+
+USUAL = {
+    "dB": decibels,
+    "linear": lambda rng: 10 ** (decibels(rng) / 10),
+    "lognormal": lambda rng: rng.lognormal(0, 2.3, N),
+    "exponential": lambda rng: rng.exponential(size=N),
+    "Gaussian": lambda rng: rng.normal(-3, 5, N),
+    "radar equation": lambda rng: rng.uniform(1, 100, N) ** -4.0,
+    "bytes": lambda rng: np.clip(np.round(rng.normal(90, 60, N)), 0, 255),
+    "clipped": lambda rng: np.minimum(decibels(rng), 50),
+    "mostly one value": lambda rng: np.where(rng.random(N) < 0.9, 0, rng.normal(30, 8, N)),
+    "few values": lambda rng: rng.integers(0, 3, N),
+    "few returns of another kind": lambda rng: np.where(
+        rng.random(N) < 0.01, rng.normal(90, 3, N), rng.normal(50, 8, N)
+    ),
+}
+
+
+@pytest.mark.parametrize("values", USUAL.values(), ids=USUAL)
+def test_all_of_one_kind_belong_together(values):
+    for seed in range(5):
+        intensities = values(np.random.default_rng(seed)).astype(np.float32)
+        assert Plausible.of(intensities).holds(intensities).all()
+
+
+WILD = {
+    "one of 1e9": (0, [1e9]),
+    "one of -9999": (0, [-9999]),
+    "-9999": (0.01, [-9999]),
+    "65535": (0.01, [65535]),
+    "999": (0.01, [999]),
+    "-9999 in two of five": (0.4, [-9999]),
+    "two sentinels": (0.2, [-9999, -32768]),
+    "at both ends": (0.1, [-9999, 65535]),
+    "garbage": (0.02, np.linspace(-1e9, 1e9, 1000)),
+    "a sentinel and garbage": (0.02, np.append(np.linspace(-1e30, 1e30, 500), np.full(500, -9999))),
+}
+
+
+@pytest.mark.parametrize("case", WILD.values(), ids=WILD)
+def test_only_outliers_are_left_out(case):
+    share, values = case
+    rng = np.random.default_rng(1)
+    intensities = decibels(rng).astype(np.float32)
+    rows = rng.choice(N, max(1, round(share * N)), replace=False)
+    intensities[rows] = rng.choice(values, len(rows))
+    held = Plausible.of(intensities).holds(intensities)
+    np.testing.assert_array_equal(np.flatnonzero(~held), np.sort(rows))
+
+
+@pytest.mark.parametrize("most", [1 << 15, 2000], ids=["all", "some"])
+def test_parts_have_the_limits_of_the_whole(monkeypatch, most):
+    monkeypatch.setattr(plausible, "_MOST", most)
+    intensities = decibels(np.random.default_rng(0)).astype(np.float32)
+    intensities[12_345] = 1e9  # those that stand for all need not hold it
+    parts = Intensities()
+    for part in np.split(intensities, [10, 10, 3000, 9001]):
+        parts.add(part)
+    found = parts.plausible()
+    assert found == Plausible.of(intensities)
+    assert np.flatnonzero(~found.holds(intensities)).tolist() == [12_345]
+    assert (parts.low, parts.high) == (45, 1e9)

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Sums over scans: the same in any order, and after a scan was taken out again."""
-
-from __future__ import annotations
+"""Cells that hold returns, and integer sums in them: the same in any order, and after a scan was removed."""
 
 import dataclasses
 import functools
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 from radarsdf._core import QUANTA
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.sums import UPPER, MeanRays, ReturnCells, ScanSums
+from radarsdf.returns.sums import UPPER, MeanRays, ReturnCells, ScanSums, merged_keys
 
 from ..conftest import ground_and_wall
 
@@ -78,8 +76,20 @@ def test_moments_are_those_of_the_returns_in_cells_twice_as_large(rays):
     expected = np.stack([np.bincount(cells.cell_of_ray, column) for column in columns], 1)
     keys, moments = sums_of(rays).merged_moments()
     np.testing.assert_array_equal(keys, cells.keys)
+    np.testing.assert_array_equal(keys, np.unique(merged_keys(sums_of(rays).keys)))
     np.testing.assert_array_equal(moments[:, 0], expected[:, 0])
     # A product of two coordinates has an error of a quantum times both.
     quantum_m = LEAF_M / QUANTA
     bound = quantum_m * (np.abs(points).max() + quantum_m) * expected[:, 0]
     assert (np.abs(moments - expected).max(axis=1) <= bound).all()
+
+
+@pytest.mark.parametrize("size_m", [0.1, 0.2, 0.37])
+@pytest.mark.parametrize("extent_m", [1.0, 30.0, 9e4])
+def test_merged_cells_are_those_of_twice_the_size(size_m, extent_m):
+    points = np.random.default_rng(0).uniform(-extent_m, extent_m, (2000, 3))
+    rays = prepare([points], np.eye(4)[None])
+    leaves, found = ReturnCells.of(rays, size_m), ReturnCells.of(rays, 2 * size_m)
+    merged = merged_keys(leaves.keys)
+    np.testing.assert_array_equal(np.unique(merged), found.keys)
+    np.testing.assert_array_equal(merged[leaves.cell_of_ray], found.keys[found.cell_of_ray])

@@ -1,19 +1,21 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A sensor is what its scans show."""
-
-from __future__ import annotations
+"""A sensor is what its scans show: noise along the beam, in azimuth and in elevation, ranges and angles."""
 
 import dataclasses
 import json
 
 import numpy as np
 import pytest
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.config.groups import ReturnsConfig
+from radarsdf.returns.evidence import ReturnsOfCells, VisibilityCounts
+from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.sensor import Sensor
 
-from ..conftest import pose
+from ..conftest import ground_and_wall, pose
+from .walls import a_wall
 
 NOISE = SensorNoise(0.1, 0.01, 0.02)
 
@@ -96,3 +98,82 @@ def test_wrong_numbers(change, said):
     sensor = Sensor.of(*scans())
     with pytest.raises(ValueError, match=said):
         dataclasses.replace(sensor, **change)
+
+
+LEAF_M = 0.2
+
+
+def noise_of(rays, **known):
+    surfels = Surfels.of(rays, LEAF_M)
+    return sensor_noise(surfels, rays, ReturnsConfig(**known))
+
+
+@pytest.mark.parametrize(("range_m", "angle_rad"), [(0.05, 0.004), (0.05, 0.012), (0.1, 0.008)])
+def test_the_noise_is_found_in_the_data(range_m, angle_rad):
+    points, poses, _ = a_wall(range_m, angle_rad)
+    noise = noise_of(prepare(points, poses))
+    assert noise.range_m == pytest.approx(range_m, rel=0.35)
+    assert noise.angle_rad == pytest.approx(angle_rad, rel=0.35)
+
+
+@pytest.mark.parametrize("roll_rad", [0.0, 0.5 * np.pi])
+def test_elevation_noise_is_separated_from_azimuth_noise(roll_rad):
+    """A sensor that lies on its side has its azimuth where others have their elevation."""
+    points, poses, _ = a_wall(0.05, 0.004, noise_elevation_rad=0.012, scans=16)
+    roll = np.eye(4)
+    roll[1:3, 1:3] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+    noise = noise_of(prepare([p @ roll[:3, :3] for p in points], poses @ roll))
+    vertical, horizontal = noise.elevation_rad, noise.azimuth_rad
+    if roll_rad > 0:
+        vertical, horizontal = horizontal, vertical
+    assert vertical == pytest.approx(0.012, rel=0.35)
+    assert horizontal < 0.7 * vertical
+
+
+def test_what_the_user_knows_stays():
+    points, poses, _ = a_wall(0.05, 0.008)
+    rays = prepare(points, poses)
+    noise = noise_of(rays, range_noise_m=0.07)
+    assert noise.range_m == pytest.approx(0.07)
+    assert noise.elevation_rad == pytest.approx(0.008, rel=0.35)
+    known = {"range_noise_m": 0.5, "azimuth_noise_rad": 0.2, "elevation_noise_rad": 0.1}
+    assert dataclasses.astuple(noise_of(rays, **known)) == pytest.approx((0.5, 0.2, 0.1))
+
+
+def test_few_returns_give_a_guess():
+    few = ground_and_wall(scans=2, returns_per_scan=20)
+    assert dataclasses.astuple(noise_of(prepare(few.points, few.poses))) == pytest.approx((0.1, 0.01, 0.01))
+
+
+def test_variances_of_positions_by_range():
+    noise, ranges_m = SensorNoise(0.1, 0.003, 0.004), np.array([2.0, 50], np.float32)
+    assert noise.variances == pytest.approx([0.01, 9e-6, 16e-6])
+    assert noise.angle_rad == pytest.approx(0.005 / np.sqrt(2))
+    np.testing.assert_allclose(noise.variances_m2(ranges_m), 0.01 + 0.5 * (0.005 * ranges_m) ** 2, rtol=1e-6)
+    np.testing.assert_allclose(noise.mean_variances_m2(ranges_m), (0.01 + (0.005 * ranges_m) ** 2) / 3)
+    noises = [noise, SensorNoise(0.3, 0.001, 0.002), SensorNoise(0.2, 0.002, 0.009)]
+    assert dataclasses.astuple(SensorNoise.median(noises)) == pytest.approx((0.2, 0.002, 0.004))
+    assert ReturnsConfig(**noise.settings).elevation_noise_rad == 0.004
+
+
+def test_errors_of_poses_are_common_to_the_returns_of_a_scan():
+    keys, scans = np.arange(3, dtype=np.uint64), np.array([1, 4, 2], np.uint32)
+    returns = ReturnsOfCells(keys, np.array([100.0, 400, 25], np.float32), scans, np.ones(3))
+    ranges_m = np.array([10.0, 20, 5], np.float32)
+    config = ReturnsConfig(pose_sigma_m=0.03, pose_sigma_rad=0.004)
+    found = returns.with_uncertain_poses(ranges_m, config)
+    variances = 1 / returns.information + 9 * (0.03**2 + (0.004 * ranges_m) ** 2) / scans
+    np.testing.assert_allclose(found.information, 1 / variances, rtol=1e-6)
+    assert returns.with_uncertain_poses(ranges_m, ReturnsConfig()) is returns
+    for name in ("pose_sigma_m", "pose_sigma_rad"):
+        assert (
+            returns.with_uncertain_poses(ranges_m, ReturnsConfig(**{name: 0.01})).information
+            < returns.information
+        ).all()
+
+
+def test_visibility_is_counted_in_blocks():
+    counts = VisibilityCounts(np.array([2, 5], np.uint64), np.array([7, 9], np.uint32))
+    leaves = np.array([0, 2 << 9, (2 << 9) + 511, 3 << 9, 5 << 9, 6 << 9], np.uint64)
+    assert counts.at(leaves).tolist() == [0, 7, 7, 0, 9, 0]
+    assert VisibilityCounts(counts.keys[:0], counts.scans[:0]).at(leaves).tolist() == [0] * 6

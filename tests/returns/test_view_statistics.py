@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Echoes: means of returns that are close and seen alike."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Scans of a wall, for tests of what is known of the returns."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """A small city for tests: a wall along a drive, averaged in tiles of 12.8 m."""
 
-from __future__ import annotations
-
 import pytest
 import radarsdf
 from radarsdf import FitConfig
@@ -11,10 +9,7 @@ from radarsdf.io import Scans
 
 TILE_M = 12.8
 # No bridges: estimates do not count them.
-CONFIG = FitConfig.quick(
-    num_threads=1,
-    encoding={"bridge_cells": 0},
-)
+CONFIG = FitConfig.quick(num_threads=1, encoding={"bridge_cells": 0})
 
 
 def scans_of(simulation, with_intensities=True):

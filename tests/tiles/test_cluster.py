@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Tiles on dask.distributed: the same bits, and what was done is kept."""
 
-from __future__ import annotations
-
 from concurrent.futures import Future
 
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Fits in tiles: the same steps as one fit, whatever runs them and whatever goes wrong."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import multiprocessing
@@ -15,13 +13,14 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
+from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io import Scan
 from radarsdf.io.files import take_lock
 from radarsdf.map import storage
 from radarsdf.returns.sensor import Sensor
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
-from radarsdf.tiles.plan import Plan, map_path
-from radarsdf.tiles.planning import _chunks
+from radarsdf.tiles.plan import Plan, TileGrid, map_path, neighbours, report_of
+from radarsdf.tiles.planning import _chunks, read_rays
 
 from .conftest import CONFIG, TILE_M
 
@@ -274,3 +273,58 @@ def test_chunks_end_between_groups_where_they_are_long_dense_or_far():
     assert sizes(10, step_m=-199.9) == [6, 4]
     assert sizes(10, step_m=-334.0) == [3, 3, 3, 1]
     assert sizes(0) == []
+
+
+GRID = TileGrid(tile_m=12.8, halo_m=6.4, corner_m=-2.0)
+
+
+def test_weights_add_up_to_one_and_ignore_the_outer_half_of_the_halo():
+    points = np.random.default_rng(0).uniform(0, 12.8, (500, 3))
+    weights = np.stack([GRID.weights(tile, points) for tile in neighbours((0, 0))])
+    np.testing.assert_allclose(weights.sum(axis=0), 1, atol=1e-12)
+    assert (weights >= 0).all()
+    beyond = points + [12.8 + 3.2, 0, 0]
+    assert (GRID.weights((0, 0), beyond) == 0).all()
+    middle = np.array([[6.4, 6.4, 0.0]])
+    assert GRID.weights((0, 0), middle) == 1
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_a_ray_goes_to_each_tile_that_it_crosses(straight):
+    rng = np.random.default_rng(2)
+    a, b = rng.uniform(-40, 40, (2, 200, 3))
+    if straight:
+        b[:, 0] = a[:, 0]  # parallel to the edges of tiles
+    found = {
+        (int(row), *tile)
+        for rows, tiles in GRID.crossed(a, b)
+        for row, tile in zip(rows, tiles.tolist(), strict=True)
+    }
+    assert found == {(row, i, j) for i in range(-5, 5) for j in range(-5, 5) for row in through((i, j), a, b)}
+
+
+def through(tile, a, b):
+    """Rows of the rays from a to b (N, 3) that go through a tile and its halo."""
+    lower = GRID.lower_corner(tile) - GRID.halo_m
+    sides = np.stack([lower, lower + GRID.tile_m + 2 * GRID.halo_m])[:, None]
+    with np.errstate(
+        divide="ignore"
+    ):  # along an axis that a ray keeps its place on, it is there always or never
+        shares = np.sort((sides - a[:, :2]) / (b - a)[:, :2], axis=0)
+    first, last = shares[0].max(axis=1), shares[1].min(axis=1)
+    return np.flatnonzero(np.maximum(first, 0) <= np.minimum(last, 1)).tolist()
+
+
+def test_the_cells_are_those_that_the_fit_of_the_tile_has(folder):
+    plan = Plan.load(folder)
+    for tile in plan.tiles:
+        rays, inside = read_rays(folder, plan, tile)
+        assert inside.sum() < len(rays)  # others only pass
+        report, expected = report_of(folder, tile), estimate_rays(rays, plan.config, inside)
+        assert expected.returns == inside.sum()
+        for name in ("leaf_cells", "vertices"):  # the promise of an estimate: within a factor of two
+            assert 0.5 < getattr(expected, name) / report[name] < 2
+        assert (tile.memory_bytes, tile.seconds) == (
+            expected.peak_memory_bytes,
+            pytest.approx(expected.seconds, abs=1e-3),
+        )

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Folders of tiles that are damaged, or come from elsewhere: what is wrong is named, and nothing else is touched."""
 
-from __future__ import annotations
-
 import json
 import shutil
 
@@ -15,21 +13,8 @@ from radarsdf.tiles.plan import Plan, failure_path, map_path
 from ..cli.calls import refusal
 
 WILD = [
-    None,
-    True,
-    -1,
-    1.5,
-    10**400,
-    1e308,
-    float("nan"),
-    "",
-    "../../x",
-    "\x1b[2J",
-    [],
-    [[]],
-    ["0", "x/../../../v"],
-    {},
-]
+    None, True, -1, 1.5, 10**400, 1e308, float("nan"), "", "../../x", "\x1b[2J", [], [[]], ["0", "x/../../../v"], {},
+]  # fmt: skip
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """One map that answers from many tiles."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 

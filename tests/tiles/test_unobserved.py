@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What was not observed has no answer, in every kind of map and for every kind of number."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import radarsdf
@@ -17,22 +15,11 @@ CONFIGS = {
     "octree": FitConfig.paper(training=SHORT, encoding={"kind": "octree"}),
 }
 # In free space before the sensor, below the ground, far away, and no places at all.
-NOWHERE = np.array(
-    [
-        [2.0, 0.0, 1.0],
-        [2.0, 0.0, -40.0],
-        [1e7, 0.0, 0.0],
-        [0.0, -1e30, 0.0],
-        [1e30, 1e30, 1e30],
-        [0.0, 0.0, 1e30],
-        [np.nan, 0.0, 0.0],
-        [0.0, 0.0, np.nan],
-        [0.0, np.inf, 0.0],
-        [-np.inf, 0.0, 0.0],
-        [0.0, 0.0, -np.inf],
-        [np.nan, np.inf, 1e30],
-    ]
-)
+NAN, INF = np.nan, np.inf
+NOWHERE = np.array([
+    [2.0, 0, 1], [2, 0, -40], [1e7, 0, 0], [0, -1e30, 0], [1e30, 1e30, 1e30], [0, 0, 1e30],
+    [NAN, 0, 0], [0, 0, NAN], [0, INF, 0], [-INF, 0, 0], [0, 0, -INF], [NAN, INF, 1e30],
+])  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=[*CONFIGS, "tiles"])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The page in a headless browser: a drag and a click by the mouse, every frame meanwhile, and a narrow screen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from radarsdf.io import Scans

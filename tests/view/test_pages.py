@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Pages of a growing surface and of changes, in coordinates that float32 can hold."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from types import SimpleNamespace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """What the page shows meanwhile and in the end. viser is not needed: the scene only records its nodes."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

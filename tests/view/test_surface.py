@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Thinning, colours, framing and picking of the surface."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """The viewer as its clients see it: what they receive, and whom it refuses."""
 
-from __future__ import annotations
-
 import gc
 import re
 import socket

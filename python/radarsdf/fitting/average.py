@@ -187,7 +187,7 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     scale = contents.intensity_scale
     assert scale is not None
     known = rays.with_intensity
-    if known.any() and not known.all():  # a tile may have none: its returns then have the lowest intensity
+    if known.any() and not known.all():  # a tile without any counts as the middle of the range
         rays = rays.select(known)
     assert rays.intensities is not None
 
@@ -195,6 +195,6 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
         sensors = torch.from_numpy(points - directions * ranges_m[:, None])
         return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
 
-    unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False)
+    unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
     ask = network if contents.config.trains_intensity else None
     return Reflectance.of(rays, unit, surfels, contents.config.leaf_size_m, ask, num_threads)

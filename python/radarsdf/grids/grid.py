@@ -313,7 +313,7 @@ class Grid:
         upper = np.concatenate([lower[..., 1:], np.full_like(lower[..., :1], np.nan)], axis=2)
         with np.errstate(invalid="ignore"):
             up = (lower <= 0) & (upper > 0) & (occupied[..., :-1] | occupied[..., 1:])
-            share = np.where(up, lower / (lower - upper), 0)
+            share = np.divide(lower, lower - upper, out=np.zeros_like(lower), where=up)
         found: NDArray[np.bool_] = np.asarray(up.any(axis=2))
         first = up.argmax(axis=2)
         share = np.take_along_axis(share, first[..., None], 2)[..., 0]

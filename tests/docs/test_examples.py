@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: MIT
 """Each example runs as a user runs it, and writes the files that it should."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import sys
