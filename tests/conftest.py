@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scenes that several tests share: small, analytic, made once."""
+"""Small analytic scenes shared by several tests."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def recorded_scans(name):
 def recorded_file(name):
     """A file of recorded data; without it the test is skipped, for its licence keeps it out of the repository.
 
-    It is looked for in the folder that RADARSDF_DATA names, else in shared/data of a folder above this one.
+    It is searched for in the folder RADARSDF_DATA, else in shared/data of a parent folder.
     """
     above = [folder / "shared" / "data" for folder in Path(__file__).resolve().parents]
     named = os.environ.get("RADARSDF_DATA")
@@ -81,7 +81,7 @@ def with_truth(scene):
 
 
 def draw_small(patch):
-    """Reports with small pictures and few samples of the truth, so that they take less time."""
+    """Faster reports, with small pictures and few samples of the ground truth."""
     patch.setattr("radarsdf.report.surface._WIDTH", 160)
     patch.setattr("radarsdf.report.surface._HEIGHT", 100)
     patch.setattr("radarsdf.report.errors._SAMPLES", 20_000)
@@ -89,7 +89,7 @@ def draw_small(patch):
 
 @pytest.fixture(scope="session", autouse=True)
 def ctrl_c():
-    """A shell starts its background jobs deaf to Ctrl-C, and so would be the tests of it and their processes."""
+    """Restores the handler of Ctrl-C, which shells disable in background jobs and their child processes."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -97,7 +97,7 @@ def ctrl_c():
 
 @pytest.fixture(autouse=True)
 def log_as_before():
-    """Benches are programs of their own, and some silence the notes of readers: not for the next tests."""
+    """Restores logging, since some benchmarks are programs that silence the notes of readers."""
     log = logging.getLogger("radarsdf.io")
     level = log.level
     yield
@@ -116,7 +116,7 @@ def radar_map(scene):
 
 @pytest.fixture(scope="session")
 def sharp_map(scene):
-    """Fitted until the plane and the wall are sharp, by numbers of its own: no test of a map's use is a test of the
+    """A map of a sharp plane and wall, fitted with its own settings: tests of a map's use must not depend on the
     default schedule."""
     training = {"sdf_iterations": 150, "intensity_iterations": 60, "batch_size": 4096}
     config = FitConfig(training=training | {"learning_rate": 1e-2, "sigma_cells": 0.75})

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Fields with known level sets, and what can be measured on a mesh."""
+"""Fields with known level sets, and measurements on meshes."""
 
 import itertools
 
@@ -41,12 +41,12 @@ def directed_edges(faces):
 
 
 def pair_keys(pairs):
-    """A number for each pair of vertices (N, 2): NumPy compares numbers many times as fast as rows."""
+    """A number for each pair of vertices (N, 2): NumPy compares numbers many times faster than rows."""
     return pairs[:, 0].astype(np.int64) << 32 | pairs[:, 1].astype(np.int64)
 
 
 def single_edges(faces):
-    """Edges of one triangle only; fails unless all others have two, which run along them in opposite directions."""
+    """Edges of a single triangle; fails unless all others have two, with opposite directions."""
     edges = directed_edges(faces)
     assert len(np.unique(pair_keys(edges))) == len(edges), (
         "two triangles run along an edge in the same direction"
@@ -59,7 +59,7 @@ def single_edges(faces):
 
 def has_single_cycle_links(faces, num_vertices):
     """True for each vertex whose triangles form one fan, closed or open."""
-    # Corner i of a triangle has an edge to the next corner and one from the last; the corner beyond either shares it.
+    # Corner i of a triangle shares an edge with the next corner and one with the previous corner.
     vertices = faces.T.reshape(-1)
     to_next = pair_keys(np.stack([vertices, np.roll(faces, -1, axis=1).T.reshape(-1)], 1))
     from_last = pair_keys(np.stack([vertices, np.roll(faces, 1, axis=1).T.reshape(-1)], 1))
@@ -94,7 +94,7 @@ def signed_volume(vertices, faces):
 def triangle_set(vertices, faces):
     """Triangles by position, each rotated so that its smallest vertex comes first, in sorted order."""
     triangles = vertices[faces]
-    # Every vertex has a position of its own, so their order by position names them.
+    # Vertices have distinct positions, so their order by position identifies them.
     _, names = np.unique(vertices, axis=0, return_inverse=True)
     first = names.reshape(-1)[faces].argmin(axis=1)
     rotated = np.take_along_axis(triangles, ((first[:, None] + np.arange(3)) % 3)[:, :, None], axis=1)
@@ -118,7 +118,7 @@ def cells_in_use(volume, mask=None):
 
 
 def on_border(vertices, edges, cells):
-    """Whether each edge lies in a face between a cell in use and one that is not."""
+    """Whether each edge lies in a face between a used and an unused cell."""
     padded = np.pad(cells, 1)
     ends = vertices[edges]
     answer = np.zeros(len(edges), dtype=bool)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Marching cubes as one would explain it: cell by cell, with a dictionary from edges to vertices.
+"""Plain marching cubes: cell by cell, with a dictionary from edges to vertices.
 
-It takes the pattern's triangles from the compiled core, by asking it for a single cell, and nothing else.
+The compiled core is used only for the triangles of a pattern, on a single cell.
 """
 
 import itertools

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How many scans looked at a place, said plainly: cube by cube along each ray."""
+"""Plain visibility counts: cube by cube along each ray."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ PASSED_CUBES = 4
 
 
 def looks_at(cells, leaf_size_m, points, directions, ranges_m, scans):
-    """(C,) number of scans with a ray through the cube of each leaf cell, or to there.
+    """Numbers (C,) of scans with a ray that crosses or ends in the cube of each leaf cell.
 
     `cells` (C, 3): lattice coordinates; `points`, `directions` (N, 3), `ranges_m`, `scans` (N,). A ray is followed
     from its return until others of its scan have passed four cubes on end.
@@ -31,7 +31,7 @@ def looks_at(cells, leaf_size_m, points, directions, ranges_m, scans):
 
 
 def cubes_from_return(point, direction, range_m, size_m):
-    """The cubes that a ray goes through, as tuples, from its return to its sensor."""
+    """Cubes crossed by a ray, as tuples, from its return to its sensor."""
     begin = point.astype(np.float64)
     step = -direction.astype(np.float64)
     end = begin + step * float(range_m)

@@ -68,7 +68,7 @@ def maps() -> list[bytes]:
 
 @functools.cache
 def training() -> Training:
-    """The training of :func:`fit_of_checkpoints`, to which the files of :func:`checkpoints` belong."""
+    """The training of :func:`fit_of_checkpoints`, for the files of :func:`checkpoints`."""
     rays, scale, config = fit_of_checkpoints()
     keys = near_leaf_keys(rays, config, 1)
     field = NeuralField(keys, config, with_intensity=True, num_threads=1)
@@ -155,7 +155,7 @@ def hostile_map(rng: np.random.Generator) -> bytes:
                 begin = int(rng.choice([0, 1, len(body), 2**40, 2**62]))
                 tensor["data_offsets"] = [begin, begin + int(rng.choice([-1, 0, 4, len(body), 2**40]))]
     metadata = {k: v for k, v in header["__metadata__"].items() if not k.startswith("crc32")}
-    header["__metadata__"] = metadata  # older files have no checksums, which would find most changes
+    header["__metadata__"] = metadata  # like older files without checksums, which detect most changes
     metadata["description"] = json.dumps(description)
     if rng.random() < 0.1:
         key, value = rng.choice(["format", "format_version"]), rng.choice(["", "2", "9" * 5000, "٣", "1.0"])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Settings by their names alone, for tests that vary one after the other."""
+"""Settings by name without groups, for tests that vary single ones."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Pages and examples are about words and files: what they fit need not be good, and their drives need not be long."""
+"""Short fits and drives for pages and examples, which test text and files, not quality."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .poses.drift import first
 _SCANS = {
     "hugin": (12, 2),
     "oculii": (84, 4),
-}  # and every second return; so many determine the axes of an IMU
+}  # and every second return; enough to determine the axes of an IMU
 
 
 def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Any arguments for the public functions: an answer with the properties that are stated, or a ValueError or TypeError.
+"""Any arguments of public functions give a result with the documented properties, or a ValueError or TypeError.
 
-The same examples on every run; RADARSDF_EXAMPLES=5000 tries more of them.
+The examples are the same in every run; RADARSDF_EXAMPLES=5000 tries more of them.
 """
 
 import math
@@ -89,7 +89,7 @@ def arrays(draw, *shape):
 
 
 def answer(function, *args, **kwargs):
-    """What the function returns, or None if it refuses in a documented way. Warnings are errors here."""
+    """The result of the function, or None if it raises a documented error. Warnings are errors here."""
     try:
         return function(*args, **kwargs)
     except (ValueError, TypeError, radarsdf.Diverged):  # one iteration may end above the limit of a loss
@@ -230,7 +230,7 @@ def wall():
 
 
 def refused(name, function, values, /, *given, **others):
-    """Each of the `values` of the argument is refused by an error that has its name."""
+    """Each of the `values` of the argument is rejected by an error that names it."""
     for value in values:
         with pytest.raises((TypeError, ValueError), match=name.removesuffix("s")):
             function(*given, **others | {name: value})

@@ -64,7 +64,7 @@ def test_rigid_transforms():
     assert found.tolist() == [True] + [False] * 6
 
 
-def test_a_minority_of_wrong_poses_is_interpolated():
+def test_a_minority_of_invalid_poses_is_interpolated():
     poses = np.tile(np.eye(4), (7, 1, 1))
     poses[:, :3, 3] = np.arange(7)[:, None] * [1.0, 2, 3]
     poses[:, :3, :3] = Rotation.from_euler("z", 0.2 * np.arange(7)[:, None]).as_matrix()
@@ -75,7 +75,7 @@ def test_a_minority_of_wrong_poses_is_interpolated():
     np.testing.assert_allclose(found[1:], poses[1:], atol=1e-12)
     np.testing.assert_allclose(found[0], poses[1], atol=1e-12)  # nothing is known before
     broken[6] = np.nan
-    for wrong in (broken, broken[:2]):  # one of two is no minority
+    for wrong in (broken, broken[:2]):  # one of two is not a minority
         with pytest.raises(ValueError, match="pose 0 is not a rigid transform"):
             checks.usable_poses(wrong)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Settings are checked where they are made, say in one line what is wrong, and survive files."""
+"""Settings are validated at construction, with errors of one line, and saved without loss."""
 
 import copy
 import dataclasses
@@ -80,7 +80,7 @@ def get(config, name):
 
 
 def refused(name, value, says=r"."):
-    """By the constructor, by override and from a file alike, with the setting's name."""
+    """Rejected by constructor, override and file, with the name of the setting."""
     base = FitConfig()
     for make in (FitConfig, base.override, lambda **values: FitConfig.from_dict(values)):
         with pytest.raises(ValidationError) as caught:
@@ -162,7 +162,7 @@ def test_messages(values, message):
 
 
 @pytest.mark.parametrize("values", [[1], None, "seed", [("seed", 1)], {1: 2}, {None: {}}, {("seed",): 1}])
-def test_what_is_no_mapping_of_names(values):
+def test_mappings_must_have_string_keys(values):
     with pytest.raises(ValueError, match="the settings must be a mapping of names"):
         FitConfig.from_dict(values)
 
@@ -177,12 +177,12 @@ def test_groups_are_groups(group):
     assert FitConfig(**{group: getattr(FitConfig(), group)}) == FitConfig()
 
 
-def test_settings_are_given_by_name():
+def test_settings_are_keyword_arguments():
     with pytest.raises(ValidationError):
         FitConfig(0.2)
 
 
-def test_override_changes_what_it_names_alone():
+def test_override_changes_only_the_named_settings():
     base = FitConfig.paper(seed=3, training={"sdf_iterations": 200}, networks={"normals": False})
     changed = base.override(leaf_size_m=0.3, training={"batch_size": 77}, returns={"drop_ghosts": True})
     differing = {name for name in NAMES if get(base, name) != get(changed, name)}
@@ -210,7 +210,7 @@ CONFIGS = {
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_there_and_back(config):
+def test_to_dict_and_from_dict_are_inverse(config):
     values = config.to_dict()
     assert FitConfig.from_dict(values) == config
     assert FitConfig.from_dict(json.loads(json.dumps(values))) == config  # JSON has no tuples
@@ -228,7 +228,7 @@ def test_from_dict_fills_what_is_missing():
     assert found == FitConfig(seed=2, networks={"dropout": False}) != FitConfig()
 
 
-def test_lengths_go_with_the_cells():
+def test_lengths_scale_with_the_cells():
     assert (FitConfig().sigma_m, FitConfig(leaf_size_m=0.4).sigma_m) == (0.1, 0.2)
     assert FitConfig().metres(1.5) == 0.3  # not 0.30000000000000004
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Imports of the package go downwards, from layer to layer, and never in a circle."""
+"""Imports of the package go from higher to lower layers, without cycles."""
 
 import ast
 import functools
@@ -30,7 +30,7 @@ def modules():
 
 
 def imports_of(path, name):
-    """What a module imports from the package: in functions and for the type checker, too."""
+    """Imports of a module from the package, including those in functions and for the type checker."""
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
@@ -53,7 +53,7 @@ def graph():
     for name, path in known.items():
         uses = set()
         for target in imports_of(path, name):
-            # `from radarsdf.returns.rays import Rays` names something in a module, or a module in a package.
+            # `from radarsdf.returns.rays import Rays` names an object of a module, or a module of a package.
             parts = target.split(".")
             while parts and ".".join(parts) not in known:
                 parts.pop()
@@ -73,7 +73,7 @@ def test_imports_go_downwards():
         for target in targets
         if target.split(".")[0] in LEVEL and LEVEL[target.split(".")[0]] > LEVEL[name.split(".")[0]]
     ]
-    # The commands use the front door, as users do.
+    # Commands import the public package, as users do.
     assert upwards == []
     assert len(graph()["fitting.fit"]) > 5  # imports are found at all
 

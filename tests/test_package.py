@@ -27,7 +27,7 @@ CONDA_NAMES = {"torch": "pytorch-cpu", "matplotlib": "matplotlib-base"}
 
 
 def run(code):
-    """Run code in a Python of its own, where nothing of the package is imported yet."""
+    """Run code in a new Python process without imports of the package."""
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
@@ -39,8 +39,8 @@ def test_importing_the_package_imports_nothing_else():
     )
 
 
-def test_the_names_are_those_of_the_reference():
-    """A name that goes, or one that comes without a word in the reference, is seen here."""
+def test_public_names_equal_the_reference():
+    """Detects removed names, and new ones that the reference lacks."""
     pages = (ROOT / "docs/api").glob("*.md")
     named = set()
     for page in pages:
@@ -67,7 +67,7 @@ def test_the_version_is_written_once():
     assert re.findall(r'version: "(.+)"', recipe) == [PROJECT["version"]]
 
 
-def test_conda_asks_for_what_pip_asks_for():
+def test_conda_and_pip_have_the_same_requirements():
     recipe = (ROOT / "conda/recipe.yaml").read_text(encoding="utf-8")
     asked = re.search(r"  run:\n((?:    - .+\n)+)", recipe)[1]
     found = {tuple(line[6:].partition("#")[0].split()) for line in asked.splitlines()}
@@ -79,7 +79,7 @@ def test_conda_asks_for_what_pip_asks_for():
     assert found == wanted
 
 
-def test_what_is_missing_is_named_with_a_command(monkeypatch):
+def test_missing_packages_are_named_with_an_install_command(monkeypatch):
     extras = PROJECT["optional-dependencies"]
     wanted = {one for name in ("cluster", "las", "plot", "ros", "view") for one in extras[name]}
     assert set(REQUIREMENTS.values()) == wanted
@@ -134,5 +134,5 @@ def test_example(test, tmp_path, monkeypatch):
     assert failures == 0, "".join(report)
 
 
-def test_what_is_public_has_a_docstring():
+def test_public_names_have_docstrings():
     assert [name for name in radarsdf.__all__ if not (getattr(radarsdf, name).__doc__ or "").strip()] == []

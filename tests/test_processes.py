@@ -25,7 +25,7 @@ X = np.random.default_rng(0).uniform([8, -5, -1], [20, 5, 3], (30_000, 3))
 
 
 def everywhere(radar_map, x=X):
-    """Signed distances, also where nothing was observed: NaN would hide other bits."""
+    """Signed distances, including unobserved places: NaN would hide differences."""
     return radar_map.sdf(x, extrapolate=True)
 
 
@@ -58,7 +58,7 @@ assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 17
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
-def test_a_forked_child_answers_and_fits_as_its_parent():
+def test_a_forked_child_queries_and_fits_like_its_parent():
     subprocess.run([sys.executable, "-c", FORK + CHILD], check=True, timeout=100)
 
 
@@ -67,7 +67,7 @@ def answers(radar_map, x):
     return everywhere(radar_map, x), radar_map.confidence(x), intensities
 
 
-def test_a_map_goes_to_spawned_workers(radar_map):
+def test_a_map_is_usable_in_spawned_workers(radar_map):
     pieces = np.array_split(X[:2000], 4)
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         found = list(pool.map(answers, [radar_map] * 4, pieces))
@@ -88,7 +88,7 @@ def test_pickles_and_copies_are_the_same_map(radar_map):
             assert other.origin.tolist() == original.origin.tolist()
 
 
-def test_queries_from_many_threads_give_the_bits_of_one(radar_map):
+def test_concurrent_queries_change_no_bit(radar_map):
     threads_before = torch.get_num_threads()
     wrong = []
 
@@ -124,7 +124,7 @@ FUNCTIONS = ("fork", "register_at_fork", "sched_getaffinity", "getuid", "statvfs
 SIGNALS = ("SIGKILL", "SIGHUP", "SIGALRM", "setitimer", "pthread_sigmask")
 
 
-def test_every_module_is_imported_and_a_fit_works_without_what_only_posix_has():
+def test_imports_and_a_fit_work_without_posix_features():
     code = f"""
 import importlib, os, pkgutil, signal, sys
 import numpy, pydantic, scipy, torch, trimesh  # which may use what they find
@@ -149,7 +149,7 @@ assert len(radar_map.mesh(0.2).faces)
     assert done.returncode == 0, done.stderr
 
 
-def test_a_file_that_another_program_has_open_stays(tmp_path, monkeypatch):
+def test_a_file_open_in_another_program_is_kept(tmp_path, monkeypatch):
     """Windows refuses to replace it."""
     path = tmp_path / "map.safetensors"
     path.write_bytes(b"old")
@@ -190,5 +190,5 @@ assert len(calls) == len(everything)
 """
 
 
-def test_before_the_first_work_and_only_once():
+def test_functions_are_initialised_once_before_first_use():
     subprocess.run([sys.executable, "-c", RECORDED], check=True)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The numbers of a map have the same bits whatever number of threads BLAS has: nobody but `products` multiplies matrices."""
+"""Maps do not depend on the number of BLAS threads, because only `products` multiplies matrices."""
 
 import ast
 import os
@@ -14,13 +14,13 @@ import radarsdf
 from radarsdf.products import normal_matrix, product, turned
 
 ROOT = Path(radarsdf.__file__).parent
-# Rooms that make the numbers of a map, and those that answer from it.
+# Subpackages that compute or query maps.
 ROOMS = ("returns", "field", "fitting", "map", "tiles")
 CALLS = {"dot", "vdot", "inner", "matmul", "tensordot", "lstsq", "polyfit", "cov"}
-# Three equations: LAPACK has no use for a second thread.
+# Three equations: LAPACK uses a single thread.
 ALLOWED = {"returns/noise.py: lstsq"}
 
-# As large as OpenBLAS needs to use a second thread; with Doppler, so that velocities count.
+# Large enough for OpenBLAS to use a second thread; with Doppler, for velocities.
 FIT = """
 import hashlib, sys
 import numpy as np, radarsdf
@@ -41,7 +41,7 @@ for config in (radarsdf.FitConfig.quick(), radarsdf.FitConfig(effort=0.02)):
 
 
 def uses(path):
-    """What of BLAS and LAPACK a file may call with many rows."""
+    """Calls of BLAS and LAPACK in a file that may have many rows."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
             yield "@"
@@ -51,7 +51,7 @@ def uses(path):
             yield "optimize"
 
 
-def test_nobody_else_multiplies_matrices():
+def test_only_products_multiplies_matrices():
     found = {
         f"{path.relative_to(ROOT).as_posix()}: {use}"
         for room in ROOMS
@@ -61,7 +61,7 @@ def test_nobody_else_multiplies_matrices():
     assert found == ALLOWED
 
 
-def test_products_are_those_of_blas():
+def test_products_equal_blas():
     rng = np.random.default_rng(0)
     a, b, c = rng.normal(size=(50, 4)), rng.normal(size=(4, 3)), rng.normal(size=(50, 2))
     np.testing.assert_allclose(product(a, b), a @ b, rtol=1e-12)
@@ -75,7 +75,7 @@ def test_products_are_those_of_blas():
 
 def run_fit(threads):
     names = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
-    # Not all kernels of OpenBLAS show the fault: those of old processors do, and run on all.
+    # Not all kernels of OpenBLAS depend on threads: those of old processors do, and run on all.
     environment = os.environ | dict.fromkeys(names, str(threads)) | {"OPENBLAS_CORETYPE": "Prescott"}
     done = subprocess.run(
         [sys.executable, "-c", FIT],

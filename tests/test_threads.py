@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Worker threads: PyTorch's settings come back, order stays, and fits beside each other do not mix."""
+"""Worker threads: PyTorch's settings are restored, order is kept, and concurrent fits are independent."""
 
 import threading
 import time
@@ -18,21 +18,21 @@ QUICK = FitConfig(
 
 @pytest.fixture(autouse=True)
 def two_threads():
-    """As if there were two processors, whatever there is; and a test that fails must not spoil the next."""
+    """Simulates two processors, and restores settings after a failing test."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
     torch.set_num_threads(before)
 
 
-def test_torch_has_one_thread_inside_and_its_own_number_after():
+def test_torch_has_one_thread_inside_and_is_restored_after():
     with ThreadPool(3) as pool:
         assert torch.get_num_threads() == 1
         assert set(pool.map(lambda _: torch.get_num_threads(), range(8))) == {1}
     assert torch.get_num_threads() == 2
 
 
-def test_an_error_on_a_worker_arrives_and_restores():
+def test_an_error_on_a_worker_is_raised_and_settings_are_restored():
     def fail(item):
         if item == 5:
             msg = "item 5"
@@ -85,7 +85,7 @@ def test_blocks_of_several_threads(first_in_is_first_out):
         leave.set()
         thread.join()
     assert seen == {"pool": 2, "inside": 1, "after": 2}
-    # PyTorch's number is each thread's own: it must be back in all of them.
+    # The number of PyTorch threads is thread-local: it must be restored in all threads.
     assert torch.get_num_threads() == 2
     fresh = []
     thread = threading.Thread(target=lambda: fresh.append(torch.get_num_threads()))
@@ -125,7 +125,7 @@ def fitted(scene, seed):
     return radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
 
 
-def test_fits_at_once_give_the_bits_of_fits_in_turn(scene):
+def test_concurrent_fits_equal_sequential_fits(scene):
     in_turn = [fitted(scene, seed) for seed in (0, 1)]
     at_once = [None, None]
     start = threading.Barrier(2)

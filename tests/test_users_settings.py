@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What users set in PyTorch and NumPy for themselves changes no bit of ours."""
+"""Users' settings of PyTorch and NumPy do not change results."""
 
 import contextlib
 
@@ -36,7 +36,7 @@ CONFIGS = {"core": {}, "normals": {"networks": {"normals": True}}}
 
 
 def answers(scene, path, changes):
-    """All that a map says, as bytes."""
+    """All query results of a map, as bytes."""
     found = {}
     config = FitConfig(num_threads=2, training=TRAINING).override(**changes)
     for name, intensities in {"geometry": None, "both": scene.intensities}.items():
@@ -61,7 +61,7 @@ def answers(scene, path, changes):
 
 @pytest.fixture(scope="module")
 def few():
-    """Few returns: what is fitted many times here need not be good."""
+    """Few returns, since quality does not matter here."""
     return ground_and_wall(scans=4, returns_per_scan=300)
 
 
@@ -75,7 +75,7 @@ def usual(few, tmp_path_factory):
     ("setting", "config"),
     [*((setting, "core") for setting in SETTINGS), ("float64", "normals"), ("inference mode", "normals")],
 )
-def test_the_same_bits(few, tmp_path, usual, setting, config):
+def test_settings_of_users_change_no_bit(few, tmp_path, usual, setting, config):
     with SETTINGS[setting]():
         found = answers(few, tmp_path / "map.safetensors", CONFIGS[config])
     assert found == usual[config]
@@ -94,10 +94,10 @@ def test_small_batches_give_a_finite_map(few, tmp_path, size):
     config = FitConfig(num_threads=3, training=small)
     radar_map = radarsdf.fit(few.points, few.poses, few.intensities, config=config, progress=False)
     assert radar_map.report["iterations_done"] == radar_map.report["iterations"]
-    radar_map.save(tmp_path / "map.safetensors")  # which refuses what is not finite
+    radar_map.save(tmp_path / "map.safetensors")  # which rejects values that are not finite
 
 
-def test_tensors_that_are_not_here_are_refused(radar_map):
+def test_sparse_and_meta_tensors_are_rejected(radar_map):
     for absent in (torch.zeros(2, 3, device="meta"), torch.zeros(2, 3).to_sparse()):
         for query in (radar_map.sdf, radar_map.gradient, radar_map.observed, radar_map.confidence):
             with pytest.raises(TypeError, match="dense tensor on the CPU"):

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Shapes are checked here, once, so that the core may trust its pointers. Arrays are never converted: a wrong dtype or
-// layout is an error of the caller (the package's own Python), not a silent copy.
+// Shapes are validated here, once, so that the core may trust its pointers. Arrays are never converted: a wrong dtype
+// or layout is an error of the caller (the package's own Python), not a silent copy.
 #pragma once
 
 #include <pybind11/numpy.h>
@@ -23,7 +23,7 @@ namespace py = pybind11;
 template <typename T>
 using Array = py::array_t<T, py::array::c_style>;
 
-// Rows of contiguous numbers, any distance apart: a block of columns of a larger matrix.
+// Contiguous rows with any stride: a block of columns of a larger matrix.
 template <typename T>
 using Rows = py::array_t<T, 0>;
 
@@ -44,7 +44,7 @@ std::int64_t row_stride(const Rows<T>& array, const char* name) {
   return array.shape(0) > 1 ? array.strides(0) / item : array.shape(1);
 }
 
-// Number of points (N, 3).
+// Returns the number of points (N, 3).
 inline std::int64_t check_points(const py::array& points) {
   if (points.ndim() != 2 || points.shape(1) != 3) throw std::invalid_argument("points must have shape (N, 3)");
   return points.shape(0);
@@ -56,7 +56,7 @@ std::int64_t check_column(const Array<T>& array, const char* name) {
   return array.shape(0);
 }
 
-// Number of returns; `cells` (N,) is the row of each one's cell.
+// Returns the number of returns; `cells` (N,) are the rows of their cells.
 inline std::int64_t check_cells_of_returns(const Array<std::int32_t>& cells, std::int64_t num_cells) {
   const std::int64_t count = check_column(cells, "cells");
   const std::int32_t* c = cells.data();
@@ -66,14 +66,14 @@ inline std::int64_t check_cells_of_returns(const Array<std::int32_t>& cells, std
   return count;
 }
 
-// Hands a vector's memory to NumPy without a copy.
+// Moves a vector into a NumPy array without a copy.
 template <typename T>
 Array<T> to_array(std::vector<T> values) {
   auto owner = std::make_unique<std::vector<T>>(std::move(values));
   T* data = owner->data();
   const auto size = static_cast<py::ssize_t>(owner->size());
   const py::capsule free(owner.get(), [](void* p) { delete static_cast<std::vector<T>*>(p); });
-  owner.release();  // only once the capsule exists
+  owner.release();  // only after the capsule owns it
   return Array<T>({size}, {static_cast<py::ssize_t>(sizeof(T))}, data, free);
 }
 

@@ -60,7 +60,7 @@ void bind_cell_means(py::module_& m) {
         return std::make_pair(rows, count);
       },
       "kind"_a.noconvert(), "points"_a.noconvert(), "directions"_a.noconvert(), "incidence_rad"_a.noconvert(),
-      "The cell of each view, (N,) int32, numbered as they first occur, and how many there are. `kind` (1, 3).");
+      "Cell indices of views (N,) int32, in order of first occurrence, and the number of cells. `kind` (1, 3).");
   m.def(
       "fit_cell_means",
       [](const Array<double>& kinds, int num_tilings, const Array<float>& points, const Array<float>& directions,
@@ -85,11 +85,11 @@ void bind_cell_means(py::module_& m) {
       "kinds"_a.noconvert(), "num_tilings"_a, "points"_a.noconvert(), "directions"_a.noconvert(),
       "incidence_rad"_a.noconvert(), "values"_a.noconvert(), "weights"_a.noconvert(), "shrinkage"_a, "rounds"_a,
       "least_mean"_a = 0, "num_threads"_a = 0,
-      "Splits `values` (N,) into means in cells of several `kinds` (K, 3): edge in m, step of the direction's "
-      "components, step of the incidence in rad; a step of 0: not by it. `points`, `directions` (N, 3) float32, "
-      "`incidence_rad` (N,), NaN: not known. Gives keys (M,) uint64 and means (M,) float32 of the cells, "
-      "without means smaller than `least_mean`, and what all explain of each value (N,).");
-  py::class_<CellMeansAt>(m, "CellMeans", "Answers from means in cells.")
+      "Decomposes `values` (N,) into means in cells of several `kinds` (K, 3): cell edge (m), bin width of direction "
+      "components, bin width of incidence (rad), 0 for no bins. `points`, `directions` (N, 3) float32, `incidence_rad` "
+      "(N,), NaN if unknown. Returns keys (M,) uint64 and means (M,) float32 of the cells, without means smaller than "
+      "`least_mean`, and the fitted part of each value (N,).");
+  py::class_<CellMeansAt>(m, "CellMeans", "Look-up of means in cells.")
       .def(py::init([](const Array<double>& kinds, int num_tilings, const Array<std::uint64_t>& keys,
                        const Array<float>& means) {
              std::vector<CellKind> k = kinds_of(kinds);
@@ -102,7 +102,7 @@ void bind_cell_means(py::module_& m) {
              return std::make_unique<CellMeansAt>(std::move(k), tilings, key, mean, count);
            }),
            "kinds"_a.noconvert(), "num_tilings"_a, "keys"_a.noconvert(), "means"_a.noconvert(),
-           "Keys and means as `fit_cell_means` gives them for the same `kinds` and `num_tilings`.")
+           "Keys and means returned by `fit_cell_means` for the same `kinds` and `num_tilings`.")
       .def(
           "sums",
           [](const CellMeansAt& cells, const Array<float>& points, const Array<float>& directions,
@@ -117,7 +117,7 @@ void bind_cell_means(py::module_& m) {
             return sums;
           },
           "points"_a.noconvert(), "directions"_a.noconvert(), "incidence_rad"_a.noconvert(), "num_threads"_a = 0,
-          "Means of the cells of each view, added over the kinds, averaged over the tilings: (N,) float32.");
+          "Means of the cells of each view, summed over kinds and averaged over tilings: (N,) float32.");
 }
 
 }  // namespace radarsdf

@@ -35,7 +35,7 @@ void bind_cells(py::module_& m, py::class_<CellSet>& cls) {
         const py::gil_scoped_release release;
         cells.insert(p, count, num_threads);
       },
-      "points"_a.noconvert(), "num_threads"_a = 0, "Marks the leaf cells that hold the points (N, 3), local frame, m.");
+      "points"_a.noconvert(), "num_threads"_a = 0, "Inserts the leaf cells of points (N, 3), local frame, m.");
 }
 
 }  // namespace
@@ -56,9 +56,8 @@ void bind_cell_set(py::module_& m) {
             cells.insert_along(p, d, count, o, num_offsets, num_threads);
           },
           "points"_a.noconvert(), "directions"_a.noconvert(), "offsets_m"_a.noconvert(), "num_threads"_a = 0,
-          "Marks the leaf cells of the points `offsets_m` (K,) float32 behind the points (N, 3) float32 along the "
-          "rays' "
-          "`directions` (N, 3) float32, local frame, m.")
+          "Inserts the leaf cells of the points at distances `offsets_m` (K,) float32 behind the points (N, 3) float32 "
+          "along the unit `directions` (N, 3) float32 of their rays, local frame, m.")
       .def(
           "insert_rays",
           [](CellSet& cells, const Array<float>& points, const Array<float>& directions, double reach_m,
@@ -70,7 +69,7 @@ void bind_cell_set(py::module_& m) {
             cells.insert_rays(p, d, count, reach_m, num_threads);
           },
           "points"_a.noconvert(), "directions"_a.noconvert(), "reach_m"_a, "num_threads"_a = 0,
-          "Marks the leaf cells that rays go through within `reach_m` before and behind their points (N, 3) float32, "
+          "Inserts the leaf cells that rays cross within `reach_m` before and behind their points (N, 3) float32, "
           "local frame, m; `directions` are unit vectors (N, 3) float32.")
       .def(
           "sorted_keys",
@@ -82,7 +81,7 @@ void bind_cell_set(py::module_& m) {
             }
             return to_array(std::move(keys));
           },
-          "num_threads"_a = 0, "Morton keys of the cells (C,) uint64, ascending.");
+          "num_threads"_a = 0, "Ascending Morton keys of the cells (C,) uint64.");
   m.def(
       "stable_order",
       [](const Array<std::uint64_t>& keys) {
@@ -95,7 +94,7 @@ void bind_cell_set(py::module_& m) {
         }
         return to_array(std::move(order));
       },
-      "keys"_a.noconvert(), "Positions (N,) int32 of `keys` (N,) uint64 in ascending order; equal ones in their own.");
+      "keys"_a.noconvert(), "Permutation (N,) int32 that sorts `keys` (N,) uint64 in ascending order, stably.");
   m.def(
       "gather_rows",
       [](const std::vector<Array<float>>& blocks, const Array<std::int32_t>& order, Array<float>& out,
@@ -120,7 +119,7 @@ void bind_cell_set(py::module_& m) {
         gather_rows(matrices, from, count, to, num_threads);
       },
       "blocks"_a.noconvert(), "order"_a.noconvert(), "out"_a.noconvert(), "num_threads"_a = 0,
-      "Writes rows of `blocks` (N, W) float32 side by side, in `order` (M,) int32, to `out` (M, sum of the W) "
+      "Writes the rows `order` (M,) int32 of `blocks` (N, W) float32, concatenated, to `out` (M, sum of the W) "
       "float32.");
   bind_cells<float>(m, cell_set);
   bind_cells<double>(m, cell_set);

@@ -12,14 +12,14 @@
 namespace radarsdf {
 void bind_cell_sums(py::module_& m) {
   using namespace py::literals;
-  py::class_<CellBlocks>(m, "CellBlocks", "From the keys of cells to their rows, and sums over the cells round a key.")
+  py::class_<CellBlocks>(m, "CellBlocks", "Rows of cells by key, and sums over the neighbourhoods of cells.")
       .def(py::init([](const Array<std::uint64_t>& keys) {
              const std::int64_t count = check_column(keys, "keys");
              const std::uint64_t* k = keys.data();
              const py::gil_scoped_release release;
              return std::make_unique<CellBlocks>(k, count);
            }),
-           "keys"_a.noconvert(), "`keys` (C,) uint64 of `cell_keys`, ascending, each once.")
+           "keys"_a.noconvert(), "`keys` (C,) uint64 of `cell_keys`, ascending and unique.")
       .def("__len__", &CellBlocks::size)
       .def(
           "rows",
@@ -34,7 +34,7 @@ void bind_cell_sums(py::module_& m) {
             }
             return rows;
           },
-          "keys"_a.noconvert(), "num_threads"_a = 0, "Row of each key (N,) int32, -1 where there is no such cell.")
+          "keys"_a.noconvert(), "num_threads"_a = 0, "Row of each key (N,) int32, -1 without a cell.")
       .def(
           "neighbour_sums",
           [](const CellBlocks& cells, const Array<std::uint64_t>& keys, const Array<double>& values, double weight,
@@ -53,8 +53,8 @@ void bind_cell_sums(py::module_& m) {
             return sums;
           },
           "keys"_a.noconvert(), "values"_a.noconvert(), "weight"_a, "num_threads"_a = 0,
-          "For each key the sum of `values` (C, K) float64 over its cell and the 26 round it: (N, K). A cell that "
-          "shares a face counts `weight` times, an edge its square, a corner its cube.")
+          "Sums of `values` (C, K) float64 over the cell of each key and its 26 neighbours: (N, K). Cells across a "
+          "face have the weight `weight`, across an edge its square, across a corner its cube.")
       .def(
           "interpolate",
           [](const CellBlocks& cells, double cell_size_m, const Array<float>& values, const Array<float>& points,
@@ -73,9 +73,8 @@ void bind_cell_sums(py::module_& m) {
             return interpolated;
           },
           "cell_size_m"_a, "values"_a.noconvert(), "points"_a.noconvert(), "num_threads"_a = 0,
-          "`values` (C, K) float32 of the cells' centres, trilinear at `points` (N, 3) float32, local frame, m; 0 "
-          "where "
-          "there is no cell: (N, K).");
+          "Trilinear interpolation of `values` (C, K) float32 at the centres of cells, 0 without a cell, at `points` "
+          "(N, 3) float32, local frame, m: (N, K).");
   m.def(
       "bridge_cells",
       [](const Array<std::uint64_t>& leaf_keys, const Array<std::uint64_t>& ends, const Array<double>& support,
@@ -94,9 +93,9 @@ void bind_cell_sums(py::module_& m) {
       },
       "leaf_keys"_a.noconvert(), "ends"_a.noconvert(), "support"_a.noconvert(), "max_cells"_a, "least_dense"_a,
       "num_threads"_a = 0,
-      "Keys, ascending, of `leaf_keys` (C,) and of the at most `max_cells` cells between two of `ends` (E,), in one of "
-      "13 directions, where the `support` (E,) float64 of the two, added up, is below `least_dense`. All keys uint64, "
-      "ascending, each once.");
+      "Keys of `leaf_keys` (C,) and of the cells, at most `max_cells`, between pairs of `ends` (E,) along one of 13 "
+      "directions, if the sum of the `support` (E,) float64 of both ends is below `least_dense`. All keys are uint64, "
+      "ascending and unique.");
   m.attr("DIRECTION_QUANTA") = kDirectionQuanta;
   m.def(
       "sum_returns",
@@ -122,11 +121,9 @@ void bind_cell_sums(py::module_& m) {
       "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "cells"_a.noconvert(),
       "corners"_a.noconvert(), "quantum_m"_a, "num_threads"_a = 0,
       "Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. "
-      "Lengths "
-      "are in quanta, positions from the corners (C, 3) int64 of the cells, in quanta; directions are times "
-      "DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, the row of "
-      "each "
-      "return's cell.");
+      "Lengths are in quanta, positions relative to the corners (C, 3) int64 of the cells, in quanta; directions are "
+      "multiplied by DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, "
+      "the row of each return's cell.");
   m.attr("QUANTA") = kQuanta;
   const auto check_sums = [](const Array<std::uint64_t>& keys, const Array<std::int64_t>& sums) {
     const std::int64_t count = check_column(keys, "keys");
@@ -150,8 +147,8 @@ void bind_cell_sums(py::module_& m) {
             Array<double>(to_array(std::move(merged.numbers)).reshape({rows, py::ssize_t{kSums - 1}})));
       },
       "keys"_a.noconvert(), "sums"_a.noconvert(), "leaf_size_m"_a,
-      "Keys (P,) uint64, ascending, of the cells twice as large as leaf cells with these `keys` (C,), ascending, and "
-      "moments (P, 13) float64 of their returns, local frame, m, from `sums` (C, 14) of `sum_returns`.");
+      "Ascending keys (P,) uint64 of the parents of leaf cells with ascending `keys` (C,), and moments (P, 13) float64 "
+      "of their returns, local frame, m, from `sums` (C, 14) of `sum_returns`.");
   m.def(
       "mean_rays",
       [check_sums](const Array<std::uint64_t>& keys, const Array<std::int64_t>& sums, double leaf_size_m,
@@ -169,8 +166,8 @@ void bind_cell_sums(py::module_& m) {
         return std::make_tuple(points, directions, ranges, counts);
       },
       "keys"_a.noconvert(), "sums"_a.noconvert(), "leaf_size_m"_a, "num_threads"_a = 0,
-      "Of the returns in each leaf cell, from `sums` (C, 14) of `sum_returns`: mean points (C, 3) and unit directions "
-      "(C, 3), ranges (C,) and number (C,), float32, local frame, m.");
+      "Means of the returns in each leaf cell, from `sums` (C, 14) of `sum_returns`: points (C, 3), unit directions "
+      "(C, 3) and ranges (C,), and their number (C,), float32, local frame, m.");
   m.def(
       "principal_axes",
       [](const Array<double>& matrices, int num_threads) {
@@ -188,7 +185,7 @@ void bind_cell_sums(py::module_& m) {
         return std::make_pair(values, vectors);
       },
       "matrices"_a.noconvert(), "num_threads"_a = 0,
-      "Eigenvalues (N, 3), ascending, and eigenvectors (N, 3, 3), in columns, of symmetric `matrices` (N, 3, 3) "
+      "Ascending eigenvalues (N, 3), and eigenvectors (N, 3, 3) in columns, of symmetric `matrices` (N, 3, 3) "
       "float64.");
 }
 

@@ -44,7 +44,7 @@ void bind_fixed_encodings(py::module_& m) {
         spherical_harmonics(d, count, result, stride, num_threads);
       },
       "directions"_a.noconvert(), "out"_a.noconvert(), "num_threads"_a = 0,
-      "Writes the real spherical harmonics of degree 0 to 3 of unit vectors (N, 3) to `out` (N, 16).");
+      "Writes the real spherical harmonics of degrees 0 to 3 of unit vectors (N, 3) to `out` (N, 16).");
 }
 
 }  // namespace

@@ -21,10 +21,10 @@ namespace {
 template <typename T>
 using Network = std::pair<Arrays<T>, Arrays<T>>;  // weights and biases
 
-using Drop = std::pair<std::uint64_t, int>;                        // seed of a dropout, and what it keeps
-using Parts = std::vector<std::pair<std::int64_t, std::int64_t>>;  // samples of each, and those with a label
+using Drop = std::pair<std::uint64_t, int>;                        // seed of a dropout, and its `keep`
+using Parts = std::vector<std::pair<std::int64_t, std::int64_t>>;  // samples, and samples with a label
 
-// A FieldLoss with the arrays that it reads, and those that it writes the gradients of the networks to.
+// A FieldLoss with references to its parameters and to the gradients of the networks.
 template <typename T>
 class LossArrays {
  public:
@@ -64,7 +64,7 @@ class LossArrays {
   std::optional<FieldLoss<T>> loss_;
 };
 
-// What Python knows as FieldLoss: its numbers have the type of the features.
+// FieldLoss in Python: of the dtype of the features.
 class AnyFieldLoss {
  public:
   template <typename Kind, typename... Arguments>
@@ -157,9 +157,9 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       }),
       py::keep_alive<1, 2>(), "table"_a, "features"_a.noconvert(), "frequencies"_a, "sdf"_a.noconvert(),
       "intensity"_a.noconvert(), "sees"_a, "sigma_m"_a, "intensity_in_free_space"_a,
-      "`features` (num_rows, 8); `frequencies`: half width (m), the first exponent and how many; `sdf` and "
-      "`intensity`: weights and biases of their layers, `intensity` may be None; `sees`: whether the intensity "
-      "network sees SDF, viewing direction and range. The arrays are read anew by each call, where they are.");
+      "`features` (num_rows, 8); `frequencies`: half width (m), first exponent and number; `sdf`, `intensity`: weights "
+      "and biases of the layers, `intensity` may be None; `sees`: whether the intensity network has the inputs SDF, "
+      "viewing direction and range. The arrays are kept by reference: each call reads their current values.");
   cls.def(
       "begin_sdf",
       [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, double weight,
@@ -172,12 +172,11 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "weight"_a, "located"_a.noconvert(),
       "interpolated_grad"_a.noconvert(), "pool"_a,
-      "Begins the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: the other threads "
-      "of `pool` do, and `finish` is the end. `parts` are runs of the samples, each the work of one thread: how many "
-      "samples, and how many of these have labels of intensities. Their gradients are added in their order, so the "
-      "threads change no bit. The gradients of `weight` times the loss go to `sdf_gradients`, and by what is "
-      "interpolated of the features to `interpolated_grad` (N, 8 L), with the points' cells in `located` (N, L) "
-      "int32.");
+      "Starts computing the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m, on the "
+      "other threads of `pool`; `finish` waits for it. `parts` are consecutive samples for one thread: numbers of "
+      "samples, and of samples with intensity labels. Gradients are summed in the order of the parts, independent of "
+      "the number of threads. Gradients of `weight` times the loss are written to `sdf_gradients` and, by the "
+      "interpolated features, to `interpolated_grad` (N, 8 L), the cells of the points to `located` (N, L) int32.");
   cls.def(
       "begin_joint",
       [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, const Rows<T>& rays,
@@ -191,9 +190,9 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "rays"_a.noconvert(), "dropout"_a, "weights"_a,
       "located"_a.noconvert(), "interpolated_grad"_a.noconvert(), "pool"_a,
-      "Like `begin_sdf`, of both losses at once: their means, and the gradients of their sum weighted by `weights`. "
-      "`rays` (N, 8) are the samples' rays. `dropout` has up to two pairs, of the encodings of cells and positions: "
-      "the seed of `random_bytes` (samples seen, columns), and the number below which a byte keeps its column.");
+      "Like `begin_sdf`, for both losses: their means, and the gradients of their sum weighted by `weights`. `rays` "
+      "(N, 8) are the rays of the samples. `dropout` has up to two pairs, for the encodings of cells and positions: "
+      "seed of `random_bytes` (samples seen, columns), and the bound below which a byte keeps its element.");
   cls.def(
       "begin_intensity",
       [](AnyFieldLoss& self, const Array<T>& points, const Array<T>& sdf_m, const Parts& parts, const Rows<T>& rays,
@@ -204,7 +203,7 @@ void bind_methods(py::class_<AnyFieldLoss>& cls) {
         pool.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays));
       },
       "points"_a.noconvert(), "sdf_m"_a.noconvert(), "parts"_a, "rays"_a.noconvert(), "dropout"_a, "weight"_a, "pool"_a,
-      "Like `begin_joint`, of the intensities alone while the SDF network and the features are frozen: writes to "
+      "Like `begin_joint`, for the intensities alone, with frozen SDF network and features: writes to "
       "`intensity_gradients` only.");
 }
 
@@ -246,11 +245,9 @@ void bind_samples(py::module_& m) {
       "rays"_a.noconvert(), "places"_a.noconvert(), "ray"_a.noconvert(), "number"_a.noconvert(), "kind"_a.noconvert(),
       "segments"_a.noconvert(), "seed"_a,
       "Random samples on `rays` (N, 7 or 8) float32: points (B, 3), m, signed distances along the ray to the return "
-      "(B,), "
-      "m, and rows of `rays`. Sample i is on ray `places[ray[i]]`; its random number, found by `seed` and `number[i]`, "
-      "is "
-      "uniform in row `kind[i]` of `segments` (K, 4): start and length in metres, each a constant and a factor on the "
-      "range.");
+      "(B,), m, and rows of `rays`. Sample i is on ray `places[ray[i]]`; its random number, from `seed` and "
+      "`number[i]`, is uniform in row `kind[i]` of `segments` (K, 4): start and length in metres, each a constant and "
+      "a factor on the range.");
 }
 
 }  // namespace
@@ -259,18 +256,18 @@ void bind_field_loss(py::module_& m) {
   bind_samples(m);
   py::class_<AnyFieldLoss> cls(
       m, "FieldLoss",
-      "The losses of batches and their gradients, as the package's Field and its losses define "
-      "them. One thread at a time may use an object.");
+      "Losses of batches and their gradients, as defined by the package's neural field and losses. An object is not "
+      "thread-safe.");
   bind_methods<float>(cls);
   bind_methods<double>(cls);
   cls.def(
       "finish", &AnyFieldLoss::finish, py::arg("pool"),
-      "Helps the thread pool with the batch that was begun. Gives both mean losses, 0 for one that was not asked for.");
+      "Joins the thread pool until the batch is complete. Returns both mean losses, 0 for one that was not requested.");
   cls.def_property_readonly("sdf_gradients", &AnyFieldLoss::sdf_gradients,
-                            "By weights and biases of each layer of the SDF network in turn, as the last call that "
-                            "trained it wrote them.");
+                            "Gradients by weights and biases of each layer of the SDF network in turn, written by the "
+                            "last call that trained it.");
   cls.def_property_readonly("intensity_gradients", &AnyFieldLoss::intensity_gradients,
-                            "The same of the intensity network.");
+                            "Like `sdf_gradients`, of the intensity network.");
 }
 
 }  // namespace radarsdf

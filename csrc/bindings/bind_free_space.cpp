@@ -37,11 +37,10 @@ void bind_free_space(py::module_& m) {
       },
       "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "passed_m"_a.noconvert(),
       "scans"_a.noconvert(), "leaf_size_m"_a, "lower"_a, "upper"_a, "num_threads"_a = 0,
-      "Which leaf cells rays passed, from their sensor to `passed_m` along them, and in which there are returns: keys "
-      "(B,) uint64 of blocks of 8 x 8 x 8 leaf cells, ascending, and their bit planes (B, 4, 8) uint64. Three planes "
-      "are "
-      "the number of scans that passed, up to 7. `points`, `directions` (N, 3), `ranges_m`, `passed_m` (N,) float32, "
-      "local frame, m; `scans` (N,) int32, ascending; blocks outside leaf cells [`lower`, `upper`) (3,) are left out.");
+      "Leaf cells crossed by rays from the sensor to the range `passed_m`, and leaf cells with returns: ascending keys "
+      "(B,) uint64 of blocks of 8 x 8 x 8 leaf cells, and their bit planes (B, 4, 8) uint64. Three planes are the "
+      "number of scans with a crossing, at most 7. `points`, `directions` (N, 3), `ranges_m`, `passed_m` (N,) float32, "
+      "local frame, m; `scans` (N,) int32, ascending; blocks outside leaf cells [`lower`, `upper`) (3,) are omitted.");
 }
 
 }  // namespace radarsdf

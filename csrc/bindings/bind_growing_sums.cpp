@@ -26,7 +26,7 @@ py::array_t<std::int64_t> matrix(std::vector<std::int64_t> values) {
 
 void bind_growing_sums(py::module_& m) {
   using namespace py::literals;
-  py::class_<SumsChange>(m, "SumsChange", "What changes in `GrowingSums` if scans come or go.")
+  py::class_<SumsChange>(m, "SumsChange", "Change of `GrowingSums` by added and removed scans.")
       .def(py::init<double, double>(), "leaf_size_m"_a, "quantum_m"_a)
       .def(
           "collect",
@@ -38,10 +38,10 @@ void bind_growing_sums(py::module_& m) {
             change.collect(rays, sign);
           },
           "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "sign"_a,
-          "One scan comes (1) or goes (-1): `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.")
+          "Adds (1) or removes (-1) a scan: `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.")
       .def(
           "block_keys", [](const SumsChange& change) { return to_array(change.block_keys()); },
-          "Keys of the blocks that it may change, uint64, ascending.");
+          "Ascending keys of the blocks that may change, uint64.");
   py::class_<GrowingSums>(
       m, "GrowingSums",
       "Sums over scans in cells, and visibility counts of blocks of 8 x 8 x 8 cells, in a table that grows.")
@@ -60,13 +60,11 @@ void bind_growing_sums(py::module_& m) {
             return py::make_tuple(to_array(std::move(changed.returns)), to_array(std::move(changed.visibility)));
           },
           "change"_a,
-          "Makes a change, whole or not at all. Gives the keys of the blocks whose sums and whose visibility counts "
-          "are others: "
-          "two "
-          "uint64 arrays, ascending.")
+          "Applies a change, completely or not at all. Returns the ascending keys of the blocks with changed sums and "
+          "with changed visibility counts: two uint64 arrays.")
       .def(
           "block_keys", [](const GrowingSums& sums) { return to_array(sums.block_keys()); },
-          "Keys of all blocks, uint64, ascending.")
+          "Ascending keys of all blocks, uint64.")
       .def(
           "sums_of",
           [](const GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
@@ -81,8 +79,8 @@ void bind_growing_sums(py::module_& m) {
                                   to_array(std::move(found.scans)));
           },
           "block_keys"_a.noconvert(),
-          "Of the blocks with these keys (B,), ascending: Morton keys (C,) of the leaf cells with returns, their sums "
-          "(C, 14) int64, and numbers of scans (C,) uint32.")
+          "Contents of the blocks with ascending keys (B,): Morton keys (C,) of the leaf cells with returns, their "
+          "sums (C, 14) int64, and numbers of scans (C,) uint32.")
       .def(
           "visibility_of",
           [](const GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
@@ -90,8 +88,7 @@ void bind_growing_sums(py::module_& m) {
             return py::make_tuple(to_array(std::move(found.keys)), to_array(std::move(found.visibility)));
           },
           "block_keys"_a.noconvert(),
-          "Of those of the blocks with these keys (B,), ascending, that are there: keys, and numbers of scans that "
-          "looked, uint32.")
+          "Keys and visibility counts, uint32, of those blocks with ascending keys (B,) that are stored.")
       .def(
           "insert",
           [](GrowingSums& sums, const Array<std::uint64_t>& keys, const Array<std::int64_t>& of_cells,
@@ -110,13 +107,13 @@ void bind_growing_sums(py::module_& m) {
                          {visibility.data(), visibility.data() + blocks}});
           },
           "keys"_a.noconvert(), "sums"_a.noconvert(), "scans"_a.noconvert(), "visibility_keys"_a.noconvert(),
-          "visibility"_a.noconvert(), "Puts in what `sums_of` and `visibility_of` gave.")
+          "visibility"_a.noconvert(), "Inserts blocks returned by `sums_of` and `visibility_of`.")
       .def(
           "erase",
           [](GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
             sums.erase(block_keys.data(), check_column(block_keys, "block_keys"));
           },
-          "block_keys"_a.noconvert(), "Takes blocks away, with their sums and visibility counts.");
+          "block_keys"_a.noconvert(), "Removes blocks with their sums and visibility counts.");
 }
 
 }  // namespace radarsdf

@@ -10,8 +10,7 @@
 namespace radarsdf {
 namespace {
 
-// Calls `by` with the checked batch, the gradient and its stride, and what they are added to; without the interpreter's
-// lock.
+// Calls `by` with the checked batch, the gradient and its stride, and the sums, without the GIL.
 template <typename T, typename By>
 void scatter_by(const VertexTable& table, const Array<T>& points, const Array<std::int32_t>& located,
                 const std::optional<Array<T>>& directions, const Rows<T>& out_grad, Array<T>& features_grad,
@@ -61,7 +60,7 @@ void bind_kernels(py::class_<VertexTable>& cls) {
         encode(table, f, p, count, found, result, stride, num_threads);
       },
       "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "out"_a.noconvert(),
-      "num_threads"_a = 0, "Locates the points and writes their interpolated features to `out` (N, 8 L).");
+      "num_threads"_a = 0, "Locates points and writes their interpolated features to `out` (N, 8 L).");
 
   cls.def(
       "interpolate",
@@ -101,7 +100,7 @@ void bind_kernels(py::class_<VertexTable>& cls) {
         });
       },
       "points"_a.noconvert(), "located"_a.noconvert(), "out_grad"_a.noconvert(), "features_grad"_a.noconvert(),
-      "pool"_a, "The same by the threads of a thread pool, without directions.");
+      "pool"_a, "Like `scatter`, on the threads of a thread pool, without directions.");
 
   cls.def(
       "coordinate_gradient",

@@ -45,8 +45,8 @@ void bind_networks(py::module_& m) {
       },
       "inputs"_a.noconvert(), "weights"_a.noconvert(), "biases"_a.noconvert(), "out"_a.noconvert(), "keep_hidden"_a,
       "num_threads"_a = 0,
-      "Writes to `out` (N, outputs) what linear layers with ReLU between them make of blocks of columns side by side. "
-      "Gives what `mlp_backward` needs, if it is to be kept.");
+      "Writes to `out` (N, outputs) the output of linear layers with ReLU activations for concatenated blocks of "
+      "columns. Returns the hidden activations for `mlp_backward` if `keep_hidden`.");
   m.def(
       "mlp_backward",
       [](const std::vector<Rows<T>>& blocks, const Arrays<T>& weights, const Arrays<T>& biases, const Array<T>& hidden,
@@ -83,8 +83,8 @@ void bind_networks(py::module_& m) {
       "inputs"_a.noconvert(), "weights"_a.noconvert(), "biases"_a.noconvert(), "hidden"_a.noconvert(),
       "out_grad"_a.noconvert(), "weight_grads"_a.noconvert(), "bias_grads"_a.noconvert(), "input_grads"_a.noconvert(),
       "num_threads"_a = 0,
-      "Writes the gradients of (mlp . out_grad): by weights and biases, unless these are None, and by those inputs for "
-      "which there is a matrix. `hidden` is what `mlp` gave.");
+      "Writes the gradients of (mlp . out_grad) by weights and biases, unless these are None, and by the inputs that "
+      "have a matrix in `input_grads`. `hidden` was returned by `mlp`.");
 }
 
 }  // namespace

@@ -53,10 +53,10 @@ void bind_adam(VertexTableClass& cls) {
       },
       "batches"_a, "features"_a.noconvert(), "moments"_a.noconvert(), "marks"_a.noconvert(), "decays"_a.noconvert(),
       "step"_a, "learning_rate"_a, "epsilon"_a, "pool"_a,
-      "Moves the features that batches of (points, located, out_grad) touch by one step of Adam, as `scatter` sums "
-      "their gradients: the other threads of `pool` begin, and its `finish` is the end. `moments` (num_rows, 16) and "
-      "`marks` (num_rows, 2) int32, the step in which a row last moved and a zero, are its memory, `decays` (more than "
-      "step, 2) the powers of both betas.");
+      "Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed "
+      "like `scatter`, on the other threads of `pool`; its `finish` waits for it. The state is `moments` (num_rows, "
+      "16) and `marks` (num_rows, 2) int32: the last step that updated a row, and a zero. `decays` (more than step, 2) "
+      "are the powers of both betas.");
 }
 
 }  // namespace

@@ -31,7 +31,7 @@ void bind_local_planes(py::module_& m) {
             planes.add(points.data(), check_points(points), sign);
           },
           "points"_a.noconvert(), "sign"_a = 1,
-          "Adds points (N, 3) float64, world frame, m; with sign -1, takes them out again, exactly.")
+          "Adds points (N, 3) float64, world frame, m; sign -1 removes them exactly.")
       .def(
           "agreement",
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& pose,
@@ -46,10 +46,9 @@ void bind_local_planes(py::module_& m) {
             return py::make_tuple(hessian, gradient, doubt, found.weight);
           },
           "points"_a.noconvert(), "pose"_a.noconvert(), "variances"_a,
-          "Of points (N, 3) float64, sensor frame, m, at `pose` (4, 4): the Hessian (6, 6) and the gradient (6,) of "
-          "half "
-          "the sum of squares of their distances over the deviations, by increments of the pose as in CommonPlanes; "
-          "the part of the Hessian (6, 6) that errors of the normals make; the sum of the weights.")
+          "Normal equations of points (N, 3) float64, sensor frame, m, at `pose` (4, 4): Hessian (6, 6) and gradient "
+          "(6,) of half the sum of squared normalised residuals, by increments of the pose as in CommonPlanes; the "
+          "part of the Hessian (6, 6) caused by errors of normals; the sum of weights.")
       .def(
           "scores",
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& poses,
@@ -64,8 +63,8 @@ void bind_local_planes(py::module_& m) {
             return scores;
           },
           "points"_a.noconvert(), "poses"_a.noconvert(), "variances"_a,
-          "(K, N) float64, of each of the poses (K, 4, 4) and the points (N, 3), sensor frame, m: 1 / (1 + r² / 4), r "
-          "a distance from a plane in deviations; 0 for a point without a plane.");
+          "Scores 1 / (1 + r² / 4), (K, N) float64, for poses (K, 4, 4) and points (N, 3), sensor frame, m, with the "
+          "residual r from a plane in standard deviations; 0 for points without a plane.");
 }
 
 }  // namespace
@@ -73,7 +72,7 @@ void bind_local_planes(py::module_& m) {
 void bind_poses(py::module_& m) {
   using namespace py::literals;
   bind_local_planes(m);
-  py::class_<CommonPlanes>(m, "CommonPlanes", "What returns of different scans on common planes say of their poses.")
+  py::class_<CommonPlanes>(m, "CommonPlanes", "Normal equations of poses from returns of scans on common planes.")
       .def(py::init([](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
                        const Array<std::int32_t>& scans, const Array<std::int32_t>& planes,
                        const Array<double>& positions, const Array<double>& up_of_scan, const Array<double>& centres,
@@ -111,15 +110,15 @@ void bind_poses(py::module_& m) {
            "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "scans"_a.noconvert(),
            "planes"_a.noconvert(), "positions"_a.noconvert(), "up_of_scan"_a.noconvert(), "centres"_a.noconvert(),
            "normals"_a.noconvert(), "extent_m"_a, "variances"_a, "scans_together"_a, "num_threads"_a = 0,
-           "Returns (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, "
-           "ascending; `planes` (N,) int32, -1: none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` "
+           "Points (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, "
+           "ascending; `planes` (N,) int32, -1 for none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` "
            "(P, 3) float64. `extent_m` of a plane; `variances` along the beam, m^2, in azimuth and elevation, rad^2.")
       .def_property_readonly("scale", &CommonPlanes::scale,
-                             "Median of squared residuals over their variances, over that of noise; at least 1.")
+                             "Median squared normalised residual, relative to that of Gaussian noise; at least 1.")
       .def_property_readonly("num_used", &CommonPlanes::num_used, "Number of returns on planes of several scans.")
       .def_property_readonly(
           "weights", [](const CommonPlanes& planes) { return to_array(std::vector<double>(planes.weights())); },
-          "(F,) float64, sum of the weights of the returns of each scan, each at most 1.")
+          "Sums of the weights, each at most 1, of the returns of each scan: (F,) float64.")
       .def(
           "solve",
           [](const CommonPlanes& planes, const Array<double>& diagonal, const Array<double>& below,
@@ -149,10 +148,10 @@ void bind_poses(py::module_& m) {
           },
           "diagonal"_a.noconvert(), "below"_a.noconvert(), "gradient"_a.noconvert(), "tolerance"_a, "max_iterations"_a,
           "with_inverse"_a, "num_threads"_a = 0,
-          "Increments (F, 6) of the poses: translation, rotation vector, from the left about the sensor; blocks of the "
-          "inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), if wanted; the square of the increments "
-          "over their deviations. The prior "
-          "is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, 6, 6), `gradient` (F, 6), all float64.");
+          "Increments (F, 6) of the poses: translation, and rotation vector applied from the left about the sensor; "
+          "blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), `with_inverse`; squared "
+          "Mahalanobis norm of the increments. The prior is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, "
+          "6, 6), `gradient` (F, 6), all float64.");
 }
 
 }  // namespace radarsdf

@@ -35,12 +35,11 @@ void bind_ray_average(VertexTableClass& table) {
       },
       "points"_a.noconvert(), "directions"_a.noconvert(), "normals"_a.noconvert(), "weights"_a.noconvert(),
       "truncation_m"_a, "num_threads"_a = 0,
-      "Of an octree: for each vertex (num_rows,) float32 the mean of its signed distances, m, to planes through "
-      "the "
-      "`points` (N, 3) with these `normals` (N, 3), over the rays along `directions` (N, 3) that go through one of "
-      "its leaf cells within `truncation_m` of their points, each as often as it does; all float32, local frame. And "
-      "(num_rows,) int8: 1 if many rays passed the vertex, -1 if "
-      "it lies behind many returns where nothing was seen, else 0.");
+      "For an octree, mean signed distance of each vertex, (num_rows,) float32, m, to planes through `points` (N, 3) "
+      "with `normals` (N, 3). The mean is over rays along `directions` (N, 3) that cross leaf cells of the vertex "
+      "within `truncation_m` of their points, one term per cell; all float32, local frame. Also the sides of the "
+      "vertices, (num_rows,) int8: 1 if many rays passed it, -1 if it lies in unobserved space behind many returns, "
+      "else 0.");
   table.attr("SMOOTHING_REACH") = kSmoothingReach;
   table.def(
       "smoothed",
@@ -70,12 +69,10 @@ void bind_ray_average(VertexTableClass& table) {
       },
       "distances_m"_a.noconvert(), "points"_a.noconvert(), "normals"_a.noconvert(), "information"_a.noconvert(),
       "sides"_a.noconvert(), "iterations"_a, "num_threads"_a = 0,
-      "Of an octree: `distances_m` (num_rows,) float32 after so many steps towards distances that agree with the "
-      "planes "
-      "through `points` (N, 3) with these `normals` (N, 3) and this `information` (N,), m^-2, all float32, local "
-      "frame, "
-      "and bend as little as they can. Vertices stay on the `sides` (num_rows,) int8 of `average_rays`. An iteration "
-      "carries what is known SMOOTHING_REACH vertices far.");
+      "For an octree, smooths `distances_m` (num_rows,) float32 by `iterations` steps towards the minimum of squared "
+      "residuals from planes through `points` (N, 3) with `normals` (N, 3) and `information` (N,), m^-2, all float32, "
+      "local frame, plus bending energy. Vertices stay on the `sides` (num_rows,) int8 of `average_rays`. An iteration "
+      "propagates information by SMOOTHING_REACH vertices.");
 }
 
 }  // namespace radarsdf

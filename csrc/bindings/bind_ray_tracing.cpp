@@ -12,7 +12,7 @@ namespace radarsdf {
 void bind_ray_tracing(py::module_& m) {
   using namespace py::literals;
   using Hits = py::typing::Tuple<py::array_t<float>, py::array_t<std::int32_t>>;
-  py::class_<SurfaceTracer>(m, "SurfaceTracer", "Finds where rays first meet a triangle mesh.")
+  py::class_<SurfaceTracer>(m, "SurfaceTracer", "First hits of rays on a triangle mesh.")
       .def(py::init([](const Array<double>& vertices, const Array<std::int32_t>& faces, int num_threads) {
              const std::int64_t num_vertices = check_points(vertices), num_faces = check_points(faces);
              const double* v = vertices.data();
@@ -40,9 +40,9 @@ void bind_ray_tracing(py::module_& m) {
             return py::make_tuple(std::move(ranges_m), std::move(faces));
           },
           "origin"_a, "directions"_a.noconvert(), "max_range_m"_a, "front_only"_a = false, "num_threads"_a = 0,
-          "Distance to the first triangle along each ray (N,) float32, m, infinite without one, and its row in `faces` "
-          "(N,) int32, -1 without one. `origin` (3,), local frame, m; `directions` (N, 3) float32 unit vectors. "
-          "`front_only`: rays pass through triangles from behind.");
+          "Range of the first hit along each ray (N,) float32, m, infinite without a hit, and row of the triangle in "
+          "`faces` (N,) int32, -1 without a hit. `origin` (3,), local frame, m; `directions` (N, 3) float32 unit "
+          "vectors. `front_only`: back faces are culled.");
 }
 
 }  // namespace radarsdf

@@ -48,15 +48,15 @@ void bind_step(py::module_& m) {
       },
       "weights"_a.noconvert(), "gradients"_a.noconvert(), "memories"_a.noconvert(), "step"_a, "learning_rate"_a,
       "pool"_a = py::none(),
-      "Moves matrices of weights by step number `step`, from 1 on, of SOAP. `memories`, of `soap_memory_size` numbers "
-      "each, are zero before the first step. The threads of a `pool` share the matrices.");
+      "Updates matrices of weights by step `step` >= 1 of SOAP. `memories`, the states of `soap_memory_size` elements "
+      "each, are zero before the first step. The matrices are distributed to the threads of a `pool`.");
 }
 
 }  // namespace
 
 void bind_soap(py::module_& m) {
   m.def("soap_memory_size", &soap_memory_size, py::arg("rows"), py::arg("columns"),
-        "Numbers that SOAP remembers of a matrix of weights.");
+        "Number of elements of SOAP's state of a matrix of weights.");
   bind_step<float>(m);
   bind_step<double>(m);
 }

@@ -20,7 +20,7 @@ static_assert(kSurfelFloats == 8, "a surfel is a row of eight floats");
 
 void bind_surface_crossings(py::module_& m) {
   using namespace py::literals;
-  py::class_<SurfelMap>(m, "SurfelMap", "Pieces of plane in cells, and the rays that pass through them.")
+  py::class_<SurfelMap>(m, "SurfelMap", "Surfels in cells, and rays that cross them.")
       .def(py::init([](const Array<std::uint64_t>& keys, const Array<float>& surfels, double cell_size_m) {
              if (keys.ndim() != 1) throw std::invalid_argument("keys must have shape (M,)");
              check_shape(surfels, keys.shape(0), kSurfelFloats, "surfels");
@@ -28,9 +28,9 @@ void bind_surface_crossings(py::module_& m) {
                                                 keys.shape(0), cell_size_m);
            }),
            "keys"_a.noconvert(), "surfels"_a.noconvert(), "cell_size_m"_a,
-           "`keys` (M,) uint64 of `cell_keys`, each once; `surfels` (M, 8) float32: centre, normal towards the "
-           "sensors, standard deviation of the returns across the plane, how far from the centre a ray crosses it, "
-           "in its cell, inf: anywhere; local frame, m.")
+           "`keys` (M,) uint64 of `cell_keys`, unique; `surfels` (M, 8) float32: centre, normal towards the sensors, "
+           "standard deviation of the returns along the normal, maximum distance of crossings from the centre, inf for "
+           "all of the cell; local frame, m.")
       .def(
           "first_crossings",
           [](const SurfelMap& map, const Array<float>& points, const Array<float>& directions,
@@ -52,8 +52,8 @@ void bind_surface_crossings(py::module_& m) {
           },
           "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "sigma_range_m"_a,
           "sigma_angle_rad"_a, "margin_m"_a, "sigmas"_a, "num_threads"_a = 0,
-          "For each ray the first surfel that it crosses from the front and ends behind of by more than `margin_m` "
-          "and `sigmas` standard deviations, -1 where there is none: (N,) int32.");
+          "First surfel that each ray crosses from the front and ends behind, by more than `margin_m` plus `sigmas` "
+          "standard deviations, or -1: (N,) int32.");
   m.def(
       "move_onto_planes",
       [](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
@@ -88,11 +88,9 @@ void bind_surface_crossings(py::module_& m) {
       "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "scans"_a.noconvert(),
       "up_of_scan"_a.noconvert(), "planes"_a.noconvert(), "centres"_a.noconvert(), "normals"_a.noconvert(),
       "variances_m2"_a.noconvert(), "noise"_a, "num_threads"_a = 0,
-      "Points, directions and ranges of rays whose returns are moved towards their `planes` (N,) int32, -1 for none, "
-      "as "
-      "far as their noise explains. Of rays: `points`, `directions` (N, 3), `ranges_m` (N,) float32, `scans` (N,) "
-      "int32; "
-      "`up_of_scan` (F, 3) float64. Of planes: `centres`, `normals` (P, 3), `variances_m2` (P,) of their returns, "
+      "Points, directions and ranges of rays with returns shrunk towards their `planes` (N,) int32, -1 for none, by "
+      "the share of their noise. Rays: `points`, `directions` (N, 3), `ranges_m` (N,) float32, `scans` (N,) int32; "
+      "`up_of_scan` (F, 3) float64. Planes: `centres`, `normals` (P, 3), `variances_m2` (P,) of their returns, "
       "float64. `noise`: variances along the beam, m^2, in azimuth and elevation, rad^2. Local frame, m.");
 }
 

@@ -25,14 +25,14 @@ namespace {
 template <typename T>
 using Array = py::array_t<T, py::array::c_style>;
 
-// A NumPy array that owns the memory it is given.
+// NumPy array that takes ownership of the memory.
 template <typename T>
 py::array_t<T> adopt(std::unique_ptr<T[]> data, const std::vector<py::ssize_t>& shape) {
   const py::capsule owner(data.get(), [](void* memory) { delete[] static_cast<T*>(memory); });
   return py::array_t<T>(shape, data.release(), owner);
 }
 
-// What the functions return, spelled out for the type stub.
+// Return types, explicit for the type stub.
 template <typename... T>
 using Arrays = py::typing::Tuple<py::array_t<T>...>;
 
@@ -203,16 +203,15 @@ void bind_for_type(py::module_& m) {
 }  // namespace
 
 void bind_surfaces(py::module_& m, VertexTableClass& table) {
-  table.def(
-      "distances_at", &distances_at_corners, py::arg("distances_m").noconvert(), py::arg("corners").noconvert(),
-      py::arg("parts"), py::arg("num_threads") = 0,
-      "Of an octree: `distances_m` (num_rows,) float32 interpolated trilinearly at `corners` (K, 3) int32 of voxels "
-      "of which `parts` make the edge of a leaf cell, (K,) float32. NaN in no cell.");
+  table.def("distances_at", &distances_at_corners, py::arg("distances_m").noconvert(), py::arg("corners").noconvert(),
+            py::arg("parts"), py::arg("num_threads") = 0,
+            "For an octree, trilinear interpolation of `distances_m` (num_rows,) float32 at `corners` (K, 3) int32 of "
+            "voxels, with `parts` voxels per edge of a leaf cell: (K,) float32. NaN outside all cells.");
   bind_for_type<float>(m);
   bind_for_type<double>(m);
   m.def("sparse_lattice", &lattice, py::arg("cells").noconvert(), py::arg("num_threads") = 0);
   m.def("vertex_areas", &areas_of_vertices, py::arg("vertices").noconvert(), py::arg("faces").noconvert(),
-        "A third of the areas of the triangles (F, 3) at each vertex (V, 3): (V,) float64.");
+        "A third of the area of the triangles (F, 3) at each vertex (V, 3): (V,) float64.");
   m.def("mesh_components", &components, py::arg("faces").noconvert(), py::arg("num_vertices"));
 }
 

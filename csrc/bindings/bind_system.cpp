@@ -20,10 +20,10 @@
 namespace radarsdf {
 namespace {
 
-unsigned long main_thread = 0;  // as PyThread_get_thread_ident has it
+unsigned long main_thread = 0;  // of PyThread_get_thread_ident
 
-// Python runs its handlers of signals, Ctrl-C's among them, only when a call returns, unless it is asked to. It does so
-// in the main thread alone. Others must not ask for the lock here: while the interpreter ends, that would end them.
+// Python runs its signal handlers, that of Ctrl-C among them, only when a call returns, unless requested, and only in
+// the main thread. Other threads must not acquire the GIL here: that ends them while the interpreter shuts down.
 void check_signals() {
   if (PyThread_get_thread_ident() != main_thread) return;
   const py::gil_scoped_acquire hold;
@@ -35,9 +35,9 @@ void check_signals() {
 
 std::terminate_handler terminate_before = nullptr;
 
-// A daemon thread that wants Python's lock while the interpreter ends is ended by unwinding its stack. No destructor of
-// C++ lets that pass, such as those that take the lock again here and in PyTorch: the whole process would abort. The
-// thread waits for the end of the process instead, as it does from Python 3.14 on.
+// A daemon thread that acquires the GIL while the interpreter shuts down is ended by unwinding its stack. C++
+// destructors, such as those that reacquire the GIL here and in PyTorch, do not permit that: the process would abort.
+// The thread waits for the end of the process instead, as from Python 3.14 on.
 void wait_or_terminate() {
   const bool ended = Py_IsInitialized() == 0 && PyThread_get_thread_ident() != main_thread;
   while (ended && !std::current_exception()) pause();
@@ -45,13 +45,13 @@ void wait_or_terminate() {
 }
 #endif
 
-// What Python must know of the core's arrays. It is defined in the core's headers and nowhere else.
+// Constants of array layouts, defined only in the headers of the core.
 void bind_numbers(py::module_& m) {
   m.attr("FEATURE_DIM") = kFeatureDim;
   m.attr("MAX_LEVELS") = kMaxLevels;
   m.attr("MAX_FREQUENCIES") = kMaxFrequencies;
   m.attr("NUM_SPHERICAL_HARMONICS") = kHarmonics;
-  // The first column of each part of a ray's row, and how many columns there are.
+  // First column of each part of a ray's row, and the number of columns.
   m.attr("RAY_POINT") = kRayPoint;
   m.attr("RAY_DIRECTION") = kRayDirection;
   m.attr("RAY_RANGE") = kRayRange;
@@ -70,12 +70,11 @@ void bind_system(py::module_& m) {
   using namespace py::literals;
   py::class_<HeldThreadPool>(
       m, "ThreadPool",
-      "Threads for short pieces of work, the calling one among them. They end with the object. One "
-      "thread at a time may use it.")
+      "Threads for short tasks, including the calling one. They end with the object, which is not thread-safe.")
       .def(py::init<int>(), "num_threads"_a)
       .def(
           "finish", [](HeldThreadPool& pool) { pool.finish([](ThreadPool& own) { own.finish(); }); },
-          "Helps with what was begun, and returns at its end.");
+          "Joins the threads until all tasks that were started are complete.");
   m.def(
       "random_bytes",
       [](std::uint64_t seed, std::int64_t rows, std::int64_t columns) {
@@ -87,7 +86,7 @@ void bind_system(py::module_& m) {
         }
         return bytes;
       },
-      "seed"_a, "rows"_a, "columns"_a, "Random bytes (rows, columns), those of a dropout with this seed.");
+      "seed"_a, "rows"_a, "columns"_a, "Random bytes (rows, columns) of a dropout with this seed.");
   m.attr("__version__") = RADARSDF_VERSION;
   bind_numbers(m);
   m.def(
@@ -114,7 +113,7 @@ void bind_system(py::module_& m) {
 #endif
       },
       "OpenMP version as yyyymm, 0 for a serial build.");
-  m.def("num_threads", &resolve_num_threads, "num_threads"_a = 0, "Threads that a call with this argument uses.");
+  m.def("num_threads", &resolve_num_threads, "num_threads"_a = 0, "Number of threads of a call with this argument.");
   m.def(
       "instruction_set", [] { return instruction_set_name(instruction_set()); },
       "Instruction set of the kernels in use.");
@@ -125,10 +124,10 @@ void bind_system(py::module_& m) {
         for (const InstructionSet isa : available_instruction_sets()) names.emplace_back(instruction_set_name(isa));
         return names;
       },
-      "Instruction sets that were compiled in and that this processor runs, slowest first.");
+      "Compiled instruction sets that this processor supports, slowest first.");
   m.def(
       "set_instruction_set", [](const std::string& name) { set_instruction_set(instruction_set_from_name(name)); },
-      "name"_a, "Chooses the kernels: for tests and benches; not while another call runs.");
+      "name"_a, "Selects the kernels, for tests and benchmarks; not while another call runs.");
 }
 
 }  // namespace radarsdf

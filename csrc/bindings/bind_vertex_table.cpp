@@ -10,14 +10,14 @@ namespace radarsdf {
 
 VertexTableClass bind_vertex_table(py::module_& m) {
   using namespace py::literals;
-  py::enum_<Encoding>(m, "Encoding", "Which vertices of a cell carry features.")
+  py::enum_<Encoding>(m, "Encoding", "Vertices of a cell that have features.")
       .value("TRI_QUADTREE", Encoding::kTriQuadtree)
       .value("OCTREE", Encoding::kOctree)
       .def_property_readonly("num_vertex_groups", &num_vertex_groups,
-                             "Groups of a cell's corners: three planes, or all of space.")
-      .def_property_readonly("corners_per_group", &corners_per_group, "Corners of a cell in each group.");
+                             "Number of groups of a cell's corners: three planes, or one for an octree.")
+      .def_property_readonly("corners_per_group", &corners_per_group, "Number of corners of a cell in each group.");
 
-  VertexTableClass table(m, "VertexTable", "From points to rows of the feature matrix (num_rows, 8).");
+  VertexTableClass table(m, "VertexTable", "Look-up of rows of the feature matrix (num_rows, 8) for points.");
   table
       .def(py::init([](const Array<std::uint64_t>& leaf_keys, double leaf_size_m, int num_levels, Encoding encoding,
                        int num_threads) {
@@ -34,7 +34,7 @@ VertexTableClass bind_vertex_table(py::module_& m) {
       .def_property_readonly("encoding", &VertexTable::encoding)
       .def(
           "leaf_keys", [](const VertexTable& t) { return to_array(std::vector<std::uint64_t>(t.leaf_keys())); },
-          "Morton keys of the occupied leaf cells (C,) uint64, ascending.")
+          "Ascending Morton keys of the occupied leaf cells (C,) uint64.")
       .def(
           "leaf_cells",
           [](const VertexTable& t) {
@@ -63,8 +63,8 @@ VertexTableClass bind_vertex_table(py::module_& m) {
             Array<std::int32_t>(to_array(std::move(vertices.of_cells)).reshape({cells, py::ssize_t{8}})));
       },
       "num_threads"_a = 0,
-      "Of an octree: lattice coordinates (V, 3) int32 of the leaf cells' vertices, in the order of the feature "
-      "matrix, whose first V rows are theirs, and the vertices (C, 8) int32 of each cell, in C order.");
+      "For an octree, lattice coordinates (V, 3) int32 of the vertices of leaf cells, which have the first V rows of "
+      "the feature matrix, and the rows (C, 8) int32 of each cell's vertices in C order.");
   return table;
 }
 

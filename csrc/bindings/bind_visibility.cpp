@@ -33,9 +33,9 @@ void bind_visibility(py::module_& m) {
       },
       "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "points"_a.noconvert(), "directions"_a.noconvert(),
       "ranges_m"_a.noconvert(), "scans"_a.noconvert(), "num_threads"_a = 0,
-      "For each leaf cell (C,) the number of scans with a ray through its cube of 8 x 8 x 8 leaf cells, or to there: "
-      "(C,) uint32. `leaf_keys` (C,) uint64, ascending; `points`, `directions` (N, 3), `ranges_m` (N,) float32, local "
-      "frame, m; `scans` (N,) int32, ascending.");
+      "Visibility counts of leaf cells (C,) uint32: numbers of scans with a ray that crosses or ends in the block, of "
+      "8 x 8 x 8 leaf cells. `leaf_keys` (C,) uint64, ascending; `points`, `directions` (N, 3), `ranges_m` (N,) "
+      "float32, local frame, m; `scans` (N,) int32, ascending.");
   m.def(
       "count_scans",
       [](const Array<std::int32_t>& cells, const Array<std::int32_t>& scans, std::int64_t num_cells, int num_threads) {
@@ -51,8 +51,8 @@ void bind_visibility(py::module_& m) {
         return counts;
       },
       "cells"_a.noconvert(), "scans"_a.noconvert(), "num_cells"_a, "num_threads"_a = 0,
-      "Number of different scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each "
-      "return's cell; `scans` (N,) int32, ascending.");
+      "Number of scans with returns in each cell: (num_cells,) uint32. `cells` (N,) int32, the row of each return's "
+      "cell; `scans` (N,) int32, ascending.");
   m.def(
       "scan_rays",
       [](const Array<double>& points, const Array<double>& rotation, const Array<double>& position,
@@ -76,10 +76,10 @@ void bind_visibility(py::module_& m) {
       },
       "points"_a.noconvert(), "rotation"_a.noconvert(), "position"_a.noconvert(), "seen_from"_a.noconvert(),
       "min_range_m"_a, "max_range_m"_a,
-      "Which of the `points` (N, 3) of a scan, sensor frame, m, lie within the ranges from the sensor, (N,) bool, and "
-      "these K returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. `rotation` "
-      "(3, 3) from the sensor to the world, `position` (3,) of the sensor and `seen_from` (3,), where the rays begin, "
-      "local frame, m, float64.");
+      "Selects `points` (N, 3) of a scan, sensor frame, m, by range from the sensor: mask (N,) bool, and the K "
+      "selected returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. `rotation` "
+      "(3, 3) from sensor to world, `position` (3,) of the sensor and `seen_from` (3,), the origin of the rays, local "
+      "frame, m, float64.");
 }
 
 }  // namespace radarsdf

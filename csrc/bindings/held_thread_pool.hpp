@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// What Python knows as ThreadPool.
+// ThreadPool in Python.
 #pragma once
 
 #include <pybind11/pybind11.h>
@@ -12,7 +12,7 @@
 
 namespace radarsdf {
 
-// A thread pool, and the arrays of the tasks that it has begun: Python must not free them before the end.
+// Thread pool with references to the arrays of running tasks, which Python must not free.
 class HeldThreadPool {
  public:
   explicit HeldThreadPool(int num_threads) : pool_(num_threads) {}
@@ -23,12 +23,12 @@ class HeldThreadPool {
 
   ThreadPool& pool() { return pool_; }
 
-  // Until the end of what `pool` has begun.
+  // Keeps arrays alive until the running tasks of `pool` are complete.
   void hold(pybind11::object arrays) { arrays_ = std::move(arrays); }
-  // Calls `end`, which finishes what was begun.
+  // Calls `end`, which waits for the running tasks, without the GIL.
   template <typename End>
   auto finish(const End& end) {
-    const pybind11::object arrays = std::move(arrays_);  // freed at the end, also after an exception
+    const pybind11::object arrays = std::move(arrays_);  // released on return, also after an exception
     const pybind11::gil_scoped_release release;
     return end(pool_);
   }

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Networks as lists of arrays, checked.
+// Validated layers of networks from lists of arrays.
 #pragma once
 
 #include <pybind11/stl.h>

@@ -1,11 +1,11 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Table of contents of the compiled core. Each subject has its own file; the core itself knows no Python.
+// Table of contents of the Python bindings. Each subject has its own file; the core itself is independent of Python.
 #include "bindings/subjects.hpp"
 
 PYBIND11_MODULE(_core, m, pybind11::mod_gil_not_used()) {
-  m.doc() = "Compiled core of radarsdf: private, use the functions of the package.";
+  m.doc() = "Compiled core of radarsdf. Private: use the functions of the package.";
   radarsdf::bind_system(m);
   radarsdf::bind_cell_set(m);
   radarsdf::VertexTableClass table = radarsdf::bind_vertex_table(m);

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// One function for each subject, called by module.cpp. Kernels that work on a table are methods of its class.
+// One function for each subject, called by module.cpp. Kernels that use a table are methods of its class.
 #pragma once
 
 #include <pybind11/pybind11.h>

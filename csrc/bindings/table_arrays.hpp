@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Arrays that belong to a table, checked.
+// Validated arrays of a vertex table.
 #pragma once
 
 #include <pybind11/stl.h>
@@ -18,7 +18,7 @@ void check_features(const VertexTable& table, const Array<T>& features) {
   check_shape(features, table.num_rows(), kFeatureDim, "features");
 }
 
-// Checked arguments of the kernels that work on located points.
+// Validated arguments of kernels on located points.
 template <typename T>
 PointBatch<T> point_batch(const VertexTable& table, const Array<T>& points, const Array<std::int32_t>& located,
                           const std::optional<Array<T>>& directions) {

@@ -11,7 +11,7 @@
 namespace radarsdf {
 namespace {
 
-// About 50 us of work: to wake a thread for it costs a few us.
+// About 50 us of work; waking a thread takes a few us.
 constexpr std::int64_t kMinPoints = 512;
 
 }  // namespace
@@ -29,7 +29,7 @@ void encode(const VertexTable& table, const T* features, const T* points, std::i
   const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
   const Interpolation<T> in = interpolation<T>(table, {points, nullptr, located, count});
   parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    constexpr std::int64_t kBlock = 256;  // the cells found are still in the first-level cache when they are used
+    constexpr std::int64_t kBlock = 256;  // located cells are still in the L1 cache when they are used
     for (std::int64_t first = begin; first < end; first += kBlock) {
       const std::int64_t last = std::min(end, first + kBlock);
       table.locate(points + 3 * first, last - first, located + first * table.num_levels());
@@ -90,7 +90,7 @@ void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::i
     for (std::int64_t n = begin; n < end; ++n) {
       const T x = directions[3 * n], y = directions[3 * n + 1], z = directions[3 * n + 2];
       const T xx = x * x, yy = y * y, zz = z * z;
-      // sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times sqrt(2) for m != 0, times the Legendre factor.
+      // sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times sqrt(2) if m != 0, times the Legendre factor.
       const T values[16] = {T(0.28209479177387814),
                             T(0.4886025119029199) * y,
                             T(0.4886025119029199) * z,

@@ -15,7 +15,7 @@
 namespace radarsdf {
 namespace {
 
-// What a sum over a batch is to be multiplied by.
+// Factor that converts a sum over a batch to a mean.
 double mean(std::int64_t count) { return 1 / static_cast<double>(std::max<std::int64_t>(count, 1)); }
 
 template <typename T>
@@ -68,11 +68,11 @@ struct FieldLoss<T>::Job {
 
   PassWeights<T> weights;
   std::vector<PassInput<T>> parts;
-  std::vector<NetworkGradients<T>> by_networks;  // of each part
-  std::vector<FieldLosses> sums;                 // of each part
-  FieldLosses means;                             // what the sums are multiplied by
+  std::vector<NetworkGradients<T>> by_networks;  // by part
+  std::vector<FieldLosses> sums;                 // by part
+  FieldLosses means;                             // factors that convert sums to means
   bool trains, sees;
-  std::unique_ptr<std::int32_t[]> located;  // where the caller does not ask for it
+  std::unique_ptr<std::int32_t[]> located;  // if the caller does not request it
 };
 
 template <typename T>

@@ -38,7 +38,7 @@ class Pass {
         waves_(field.waves()),
         feature_(field.feature()) {}
 
-  // Sums over the samples.
+  // Returns the losses summed over the samples.
   FieldLosses run() {
     encode();
     const bool trains = request_.sdf != nullptr;
@@ -70,7 +70,7 @@ class Pass {
  private:
   bool sums_levels() const { return field_.table->encoding() == Encoding::kOctree; }
   std::int64_t dim() const { return cells_ + waves_; }
-  std::int64_t row() const { return padded(dim()); }  // of the encoding, as the products take it
+  std::int64_t row() const { return padded(dim()); }  // padded row length of the encoding
 
   void encode() {
     encoding_ = matrix<T>(part_.count, row());
@@ -93,7 +93,7 @@ class Pass {
     }
   }
 
-  // Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma), as `sdf_loss` of the Python package has it.
+  // Binary cross-entropy of sigmoid(logit) and sigmoid(sdf / sigma), as in `sdf_loss` of the Python package.
   double sdf_loss() {
     const std::int64_t outputs = 1 + feature_;
     const T inverse_sigma = static_cast<T>(1 / options_.sigma_m);
@@ -108,7 +108,7 @@ class Pass {
     return sum;
   }
 
-  // Applies a dropout to rows of an encoding, or of its gradient, one for each sample that is seen. `to` may be `from`.
+  // Applies a dropout to the rows of an encoding, or of its gradient, of the samples seen. `to` may equal `from`.
   void drop(const Dropout& dropout, std::int64_t columns, const T* from, std::int64_t from_row, T* to,
             std::int64_t to_row) const {
     if (dropout.keep >= 256 && to == from) return;
@@ -124,11 +124,11 @@ class Pass {
     }
   }
 
-  // Mean absolute error, and the gradients by the layers and, where `trains`, by what the SDF network hands on.
+  // Mean absolute error, and gradients by the layers and, if `trains`, by the outputs of the SDF network.
   double intensity_loss(bool trains) {
     const std::int64_t count = part_.num_seen, width = field_.intensity[0].inputs;
-    const std::int64_t links = feature_ + field_.sees.sdf;  // columns that the SDF network gives
-    const std::int64_t rest = dim() + links;                // the columns from here on are data and need no gradient
+    const std::int64_t links = feature_ + field_.sees.sdf;  // columns from the SDF network
+    const std::int64_t rest = dim() + links;                // columns from here on are data and need no gradient
     const std::int64_t row_of_x = padded(width);
     const Matrix<T> x = matrix<T>(count, row_of_x);
     drop(part_.dropout[0], cells_, encoding_.get(), row(), x.get(), row_of_x);
@@ -169,7 +169,7 @@ class Pass {
     const T share = static_cast<T>(request_.shares.intensity);
     double sum = 0;
     for (std::int64_t i = 0; i < count; ++i) {
-      // No return is expected from free space (3QFPI).
+      // The label in free space is 0 (3QFPI).
       const T label = i < part_.num_labelled ? part_.rays[i * part_.ray_stride + kRayIntensity] : T(0);
       const T error = std::isnan(label) ? T(0) : predicted[i] - label;
       sum += static_cast<double>(std::abs(error));
@@ -180,7 +180,7 @@ class Pass {
     return sum;
   }
 
-  // What the intensity network sees of a sample after the encodings, but for the harmonics.
+  // Inputs of the intensity network after the encodings, except the harmonics.
   void fill(std::int64_t i, T* x) const {
     const T* out = out_.get() + i * (1 + feature_);
     x = std::copy_n(out + 1, feature_, x);
@@ -192,7 +192,7 @@ class Pass {
     }
   }
 
-  // Gradients of the intensity by the outputs of the SDF network.
+  // Adds the gradients of the intensity loss by the outputs of the SDF network.
   void add_links() {
     if (!links_grad_) return;
     const std::int64_t links = feature_ + field_.sees.sdf;
@@ -204,7 +204,7 @@ class Pass {
     }
   }
 
-  // Gradients of the intensity by the cells' encoding.
+  // Adds the gradients of the intensity loss by the cells' encoding.
   void add_cells(T* cells_grad) {
     if (!cells_grad_) return;
     T* own = cells_grad_.get();
@@ -212,7 +212,7 @@ class Pass {
     for (std::int64_t i = 0; i < part_.num_seen * cells_; ++i) cells_grad[i] += own[i];
   }
 
-  // The encoding is the sum of the levels, so each level's gradient is that of the sum.
+  // The encoding is the sum over levels, so every level has the gradient of the sum.
   void spread(const T* cells_grad) const {
     for (std::int64_t i = 0; i < part_.count; ++i) {
       for (std::int64_t first = 0; first < levels_; first += cells_) {
@@ -228,7 +228,7 @@ class Pass {
   const PassRequest<T>& request_;
   std::int64_t levels_, cells_, waves_, feature_;  // numbers of columns
   Matrix<T> encoding_, out_, out_grad_;
-  Matrix<T> cells_grad_, links_grad_;  // of the intensity's loss alone
+  Matrix<T> cells_grad_, links_grad_;  // of the intensity loss alone
 };
 
 }  // namespace

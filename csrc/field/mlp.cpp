@@ -13,9 +13,9 @@
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kTile = 64;         // rows that go through all layers together
-constexpr std::int64_t kMinRows = 512;     // that are worth waking a thread for
-constexpr std::int64_t kChunkRows = 2048;  // that are summed together; then the sums of the chunks are added
+constexpr std::int64_t kTile = 64;         // rows per tile, which passes all layers
+constexpr std::int64_t kMinRows = 512;     // least rows worth waking a thread
+constexpr std::int64_t kChunkRows = 2048;  // rows per partial sum
 constexpr std::int64_t kMaxChunks = 16;
 
 template <typename T>
@@ -26,7 +26,7 @@ std::vector<T> zeros(std::int64_t size) {
   return std::vector<T>(static_cast<std::size_t>(size));
 }
 
-// Where each hidden layer's columns begin, and how many there are.
+// First column of each hidden layer, and the number of columns.
 template <typename T>
 std::vector<std::int64_t> hidden_offsets(const std::vector<Layer<T>>& layers) {
   std::vector<std::int64_t> offsets = {0};
@@ -34,7 +34,7 @@ std::vector<std::int64_t> hidden_offsets(const std::vector<Layer<T>>& layers) {
   return offsets;
 }
 
-// Rows [first, first + rows) of matrices side by side, with zeros up to `columns`.
+// Concatenates rows [first, first + rows) of matrices, padded with zeros to `columns`.
 template <typename T>
 void gather(const std::vector<Columns<const T>>& matrices, std::int64_t first, std::int64_t rows, std::int64_t columns,
             T* tile) {
@@ -47,7 +47,7 @@ void gather(const std::vector<Columns<const T>>& matrices, std::int64_t first, s
   }
 }
 
-// Whether the inputs are columns of one matrix whose rows are as long as padded ones.
+// Whether the inputs are adjacent columns of one matrix with padded rows.
 template <typename T>
 bool side_by_side(const std::vector<Columns<const T>>& inputs) {
   const T* next = inputs[0].data;
@@ -58,7 +58,7 @@ bool side_by_side(const std::vector<Columns<const T>>& inputs) {
   return padded(next - inputs[0].data) <= inputs[0].stride;
 }
 
-// Rows [first, first + rows) into `hidden` (rows, hidden columns) and `results` (rows, padded outputs).
+// Forward pass of rows [first, first + rows) to `hidden` (rows, hidden columns) and `results` (rows, padded outputs).
 template <typename T>
 void forward_tile(const ForwardWeights<T>& weights, const std::vector<Columns<const T>>& inputs, std::int64_t first,
                   std::int64_t rows, T* hidden, T* results) {
@@ -108,7 +108,7 @@ class Backward {
         by_layers_(by_layers),
         gathers_(by_layers && !side_by_side(inputs)) {}
 
-  // Adds the sums of rows [begin, end) to `sums`, and writes the gradients by the inputs.
+  // Adds the gradients by the layers of rows [begin, end) to `sums`, and writes the gradients by the inputs.
   void rows(std::int64_t begin, std::int64_t end, T* sums) const {
     std::vector<T> inputs = zeros<T>(gathers_ ? kTile * padded(layers_[0].inputs) : 0);
     std::vector<T> grads[2] = {zeros<T>(kTile * weights_.widest), zeros<T>(kTile * weights_.widest)};
@@ -123,7 +123,7 @@ class Backward {
     const T* input = gathers_ ? inputs : inputs_[0].data + first * inputs_[0].stride;
     const std::int64_t input_row = gathers_ ? padded(layers_[0].inputs) : inputs_[0].stride;
     if (gathers_) gather(inputs_, first, rows, input_row, inputs);
-    const T* grad = out_grad_.data + first * out_grad_.stride;  // by the outputs of layer i
+    const T* grad = out_grad_.data + first * out_grad_.stride;  // gradient by the outputs of layer i
     std::int64_t grad_row = out_grad_.stride;
     for (std::size_t i = layers_.size(); i-- > 0;) {
       const T* before = i > 0 ? hidden_ + first * offsets.back() + offsets[i - 1] : input;
@@ -173,7 +173,7 @@ class Backward {
     product.add = true;
     kernel_.multiply(product);
     T* biases = sums + layer.outputs * product.columns;
-    if (i + 1 < layers_.size()) {  // columns are padded: their sums are a product with ones
+    if (i + 1 < layers_.size()) {  // padded columns: column sums are a product with ones
       product.a = &kOne<T>;
       product.a_row = product.a_depth = 0;
       product.b = grad;

@@ -17,7 +17,7 @@ void adam_task(const VertexTable& table, const std::vector<PointBatch<T>>& batch
   const std::int64_t corners = corners_per_group(table.encoding());
   std::int64_t points = 0;
   for (const PointBatch<T>& batch : batches) points += batch.count;
-  // Kept from call to call: fresh pages would cost as much as the sums.
+  // Reused between calls: page faults of a new allocation would cost as much as the sums.
   thread_local std::vector<std::int32_t> rows;
   thread_local std::vector<T> sums;  // zero between calls
   const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows())) + 1;

@@ -12,7 +12,7 @@ namespace radarsdf {
 
 void draw_samples(const TakenRays& rays, const SampleLayout& layout, std::uint64_t seed, float* points, float* sdf_m,
                   float* of_ray) {
-  constexpr std::int64_t kAhead = 16;  // rows far apart: each would be a wait for memory
+  constexpr std::int64_t kAhead = 16;  // prefetch distance: scattered rows are cache misses
   const auto row = [&](std::int64_t sample) { return rays.rows + rays.places[layout.ray[sample]] * rays.columns; };
   for (std::int64_t i = 0; i < layout.count; ++i) {
     prefetch(row(std::min(i + kAhead, layout.count - 1)));

@@ -14,25 +14,25 @@
 namespace radarsdf {
 namespace {
 
-constexpr double kBeta = 0.95;  // of means, squares and sums, as published
-// Steps after which the bases are turned; in the beginning after 1, 2, 4 and so on. Measured: each 10, as published,
-// and each 30 train as well.
+constexpr double kBeta = 0.95;  // decay of means, squares and sums, as published
+// Steps between updates of the bases; initially after 1, 2, 4 and so on. Measured: intervals of 10, as published, and
+// of 30 train equally well.
 constexpr std::int64_t kTurnEvery = 32;
-// Of the mean eigenvalue, added to all: of axes along which gradients are zero, rounding would leave nothing
-// orthogonal.
+// Fraction of the mean eigenvalue added to all: without it, rounding makes axes with zero gradients lose
+// orthogonality.
 constexpr double kRidge = 1e-3;
-// Of the root mean square of the gradient: along axes where it is less, a gradient may be nothing but rounding, and
-// Adam would make a whole step of it.
+// Fraction of the RMS gradient: gradients along axes with less may be rounding errors, which Adam would scale to a full
+// step.
 constexpr double kFloor = 1e-2;
-constexpr double kLeast = 1e-15;            // for gradients of zero, as for Adam
-constexpr std::int64_t kLongestSide = 512;  // turning takes time with the cube of it
+constexpr double kLeast = 1e-15;            // epsilon for zero gradients, as for Adam
+constexpr std::int64_t kLongestSide = 512;  // updates of the bases take cubic time
 
 bool has_basis(std::int64_t side) { return side <= kLongestSide; }
 
-// Numbers of a square matrix for one side; none if it has no basis.
+// Size of a square matrix for one side; 0 without a basis.
 std::int64_t square_size(std::int64_t side) { return has_basis(side) ? side * padded(side) : 0; }
 
-// Rows of numbers, padded with zeros.
+// Matrix of rows padded with zeros.
 template <typename T>
 struct Matrix {
   T* data;
@@ -105,7 +105,7 @@ class Soap {
     into_bases(gradient_, turned_);
     kernels_.add(turned_.data, T(kBeta), epsilon(), means_.data, squares_.data, turned_.data, turned_.size());
     out_of_bases(turned_, gradient_);
-    // Means over few steps are too small by 1 - beta^number, roots of squares by the root of that.
+    // Bias correction: means are too small by 1 - beta^number, roots of squares by its square root.
     const double grown = 1 - std::pow(kBeta, static_cast<double>(number));
     const T rate = static_cast<T>(learning_rate / std::sqrt(grown));
     for (std::int64_t r = 0; r < matrix_.rows; ++r) {
@@ -120,7 +120,7 @@ class Soap {
     for (std::int64_t i = 0; i < basis.rows; ++i) basis.row(i)[i] = 1;
   }
 
-  // c = a b, or a' b, and what is in c if `add`.
+  // c = a b, or a' b; adds to c if `add`.
   void multiply(Matrix<T> a, bool transposed, Matrix<T> b, Matrix<T> c, bool add = false) const {
     Product<T> product{};
     product.a = a.data;
@@ -149,7 +149,7 @@ class Soap {
     }
   }
 
-  // A turn changes no sum of squares, so that of the gradient is the trace of either sum.
+  // Rotations preserve the sum of squares, so that of the gradient is the trace of either sum.
   T epsilon() const {
     const Matrix<T> sum = left_.data ? left_sum_ : right_sum_;
     const double mean_square =
@@ -157,7 +157,7 @@ class Soap {
     return static_cast<T>(kFloor * std::sqrt(mean_square) + kLeast);
   }
 
-  // The rows of a basis are its vectors: turned = left G right'.
+  // Rows of a basis are its vectors: turned = left G right'.
   void into_bases(Matrix<T> from, Matrix<T> to) {
     if (left_.data) multiply(left_, false, from, half_);
     const Matrix<T> half = left_.data ? half_ : from;
@@ -178,8 +178,8 @@ class Soap {
     }
   }
 
-  // One step of subspace iteration towards the eigenvectors, which change slowly. The means turn along; the squares, as
-  // published, do not.
+  // One step of subspace iteration towards the eigenvectors, which change slowly. Means are rotated; squares, as
+  // published, are not.
   void turn() {
     out_of_bases(means_, turned_);
     turn_basis(left_sum_, left_);
@@ -199,8 +199,8 @@ class Soap {
   }
 
   const SoapMatrix<T>& matrix_;
-  Matrix<T> means_{}, squares_{};                                               // of gradients in the bases
-  Matrix<T> left_sum_{}, left_{}, right_sum_{}, right_{}, right_transposed_{};  // without data: its own axes
+  Matrix<T> means_{}, squares_{};                                               // moments of gradients in the bases
+  Matrix<T> left_sum_{}, left_{}, right_sum_{}, right_{}, right_transposed_{};  // without data: identity
   std::vector<T> gradient_numbers_, half_numbers_, turned_numbers_, scratch_;
   Matrix<T> gradient_{}, half_{}, turned_{};
   ProductKernel<T> product_kernel_ = RADARSDF_KERNEL(product_kernel<T>)();

@@ -13,7 +13,7 @@ namespace {
 inline float root(float v) { return sqrtf(v); }
 inline double root(double v) { return sqrt(v); }
 
-constexpr std::int64_t kBlock = 16;  // rows side by side, so that the arithmetic is one long loop of vectors
+constexpr std::int64_t kBlock = 16;  // rows per block, processed as one long vector loop
 
 template <typename T>
 void move(const AdamStep<T>& adam, const std::int32_t* rows, T* gradients, std::int64_t count) {

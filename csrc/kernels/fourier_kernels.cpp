@@ -15,9 +15,9 @@ namespace {
 inline float round_to_even(float v) { return rintf(v); }
 inline double round_to_even(double v) { return rint(v); }
 
-// sin and cos of pi * t. The argument is reduced to |e| <= 1/4 before it is multiplied by pi, so large frequencies cost
-// no accuracy beyond that of t itself (2^15 pi in single precision would be off by 1e-2 radians). Taylor series: at
-// pi/4 the first term left out is below 2e-9 (float) and 1e-19 (double).
+// sin and cos of pi * t. Range reduction to |e| <= 1/4 precedes the multiplication by pi, so large frequencies lose no
+// accuracy beyond that of t itself (2^15 pi in single precision has an error of 1e-2 radians). Taylor series: the first
+// omitted term at pi/4 is below 2e-9 (float) and 1e-19 (double).
 template <typename T>
 inline void sincos_pi(T t, T* sine, T* cosine) {
   const T quarter = round_to_even(2 * t);
@@ -35,7 +35,7 @@ inline void sincos_pi(T t, T* sine, T* cosine) {
     }
     s *= e;
   }
-  const T quadrant = quarter - 4 * round_to_even(quarter / 4);  // -2 .. 2, of which -2 and 2 are one
+  const T quadrant = quarter - 4 * round_to_even(quarter / 4);  // -2 .. 2; -2 and 2 are equivalent
   const bool swapped = quadrant == 1 || quadrant == -1;
   const T unsigned_sine = swapped ? c : s, unsigned_cosine = swapped ? s : c;
   *sine = quadrant == 0 || quadrant == 1 ? unsigned_sine : -unsigned_sine;
@@ -45,7 +45,7 @@ inline void sincos_pi(T t, T* sine, T* cosine) {
 template <typename T>
 void encode(const T* points, T inverse_half_width, int first, int count, T* out, std::int64_t stride,
             std::int64_t begin, std::int64_t end) {
-  constexpr int kLanes = 8;            // whole vectors: the last numbers of a shorter loop would be single ones
+  constexpr int kLanes = 8;            // full vectors: a shorter loop would have a scalar tail
   T angles[3 * kMaxFrequencies] = {};  // in units of pi; scaling by a power of two is exact
   T sines[3 * kMaxFrequencies], cosines[3 * kMaxFrequencies];
   for (std::int64_t n = begin; n < end; ++n) {

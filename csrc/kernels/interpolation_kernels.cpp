@@ -24,7 +24,7 @@ constexpr int axis_of(int group, int i) {
   return i == 0 ? (group == 2 ? 1 : 0) : (group == 0 ? 1 : 2);
 }
 
-// Where a point lies in its cell.
+// Position of a point in its cell.
 template <typename T>
 struct Local {
   T fraction[3];
@@ -34,7 +34,7 @@ struct Local {
 template <typename T>
 inline Local<T> local_coordinates(const Interpolation<T>& in, std::int64_t n, int level) {
   Local<T> local;
-  const T scale = T(1) / static_cast<T>(1 << level);  // a power of two: all levels agree exactly on a point's cell
+  const T scale = T(1) / static_cast<T>(1 << level);  // a power of two: cells of a point are exactly nested
   local.inverse_size = in.inverse_leaf_size * scale;
   for (int axis = 0; axis < 3; ++axis) {
     const T u = in.points[3 * n + axis] * in.inverse_leaf_size * scale;
@@ -45,7 +45,7 @@ inline Local<T> local_coordinates(const Interpolation<T>& in, std::int64_t n, in
 }
 
 // Product over the group's axes of the linear basis function of corner c, or, along the axes in the bit mask
-// `derivatives`, of its derivative (1/m). A second derivative along one axis is zero and never asked for.
+// `derivatives`, of its derivative (1/m). Second derivatives along one axis are zero and never requested.
 template <typename C, typename T>
 inline T basis(const Local<T>& local, int group, int c, int derivatives) {
   T product = 1;
@@ -114,7 +114,7 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
   }
 }
 
-// Where the gradients of rows are added up, with or without a list of them.
+// Accumulators of row gradients, with or without a list of touched rows.
 template <typename T>
 struct AllRows {
   T* gradients;
@@ -128,7 +128,7 @@ template <typename T>
 struct TouchedRows {
   RowSums<T> touched;
   void add(std::int32_t row, Features<T> gradient) {
-    // Without a branch: the processor cannot predict whether a row is new, and a wrong guess costs more than the sum.
+    // Branch-free: whether a row is new is unpredictable, and a misprediction costs more than the sum.
     const std::int32_t known = touched.marks[row].place;
     touched.rows[touched.count] = row;
     touched.count += known == 0;
@@ -139,8 +139,8 @@ struct TouchedRows {
   }
 };
 
-// The group is a constant, so that the compiler drops the code of the other groups. Arguments are passed by value: of
-// references, the compiler would have to assume that each store into the sums changes them.
+// The group is a template constant, so that code of other groups is eliminated. Arguments are passed by value: with
+// references, the compiler would have to assume that every store to the sums aliases them.
 template <typename C, bool kDirectional, int kGroup, typename T, typename Sums>
 Sums scatter(Interpolation<T> in, const T* __restrict out_grad, std::int64_t stride, Sums sums, int level,
              std::int64_t begin, std::int64_t end) {
@@ -179,7 +179,7 @@ template <typename C, bool kDirectional, typename T>
 void coordinate_gradient(const Interpolation<T>& in, const T* __restrict features, const T* __restrict out_grad,
                          std::int64_t stride, T* __restrict points_grad, std::int64_t begin, std::int64_t end) {
   for (std::int64_t n = begin; n < end; ++n) {
-    Features<T> sum[3] = {};  // one lane a feature, added up once a point
+    Features<T> sum[3] = {};  // one lane per feature, reduced once per point
     for (int level = 0; level < in.num_levels; ++level) {
       const std::int32_t cell = in.located[n * in.num_levels + level];
       if (cell < 0) continue;
@@ -205,7 +205,7 @@ void coordinate_gradient(const Interpolation<T>& in, const T* __restrict feature
   }
 }
 
-// The version with or without directions is chosen once a call, not once a point.
+// The version with or without directions is selected once per call, not once per point.
 template <typename C, typename T>
 constexpr InterpolationKernels<T> kKernels = {
     [](const Interpolation<T>& in, const T* features, T* out, std::int64_t stride, std::int64_t begin,

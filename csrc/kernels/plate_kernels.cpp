@@ -16,7 +16,7 @@ namespace {
 
 using Floats = VectorOf<float, kPlateVertices>::Type;
 
-// Lane i of the result is lane kLane(i) of `first`, or from 8 on of `second`.
+// Lane i of the result is lane kLane(i) of `first` and `second` concatenated.
 template <int (*kLane)(int)>
 inline Floats shuffled(const Floats& first, const Floats& second) {
 #ifdef RADARSDF_SHUFFLE
@@ -29,8 +29,8 @@ inline Floats shuffled(const Floats& first, const Floats& second) {
 #endif
 }
 
-// Of vertex i: the other one of its block along the axis; the one next to it in the block before or after; the next but
-// one there.
+// Neighbours of vertex i along an axis: the other vertex of its block; the adjacent one in the previous or next block;
+// the second one there.
 template <int kBit>
 constexpr int across(int i) {
   return i ^ kBit;
@@ -44,8 +44,8 @@ constexpr int beyond(int i) {
   return i + ((i & kBit) != 0 ? kPlateVertices : 0);
 }
 
-// Where they are bent, second differences along an axis, and of these once more: the slopes of the sum of their
-// squares.
+// Derivative of the sum of squared second differences along an axis, where distances are bent: second differences of
+// second differences.
 template <int kBit>
 inline Floats slopes(const Floats& own, const Floats& before, const Floats& after, const Floats& is_bent,
                      const Floats& next_is_bent) {
@@ -55,7 +55,7 @@ inline Floats slopes(const Floats& own, const Floats& before, const Floats& afte
   return next_bends + shuffled<across<kBit>>(bends, bends) - 2.0F * bends;
 }
 
-// 1 for each bit that is set.
+// Vectors with 1 in the lanes of set bits.
 struct BitVectors {
   float lanes[256][kPlateVertices] = {};
 
@@ -101,7 +101,7 @@ void sweep(const PlateSweep& plates, std::int64_t begin, std::int64_t end) {
 void pull(const PlatePlaces& places, const float* distances_m, float* pulls_m, std::int64_t begin, std::int64_t end) {
   for (std::int64_t cell = begin; cell < end; ++cell) {
     const std::int32_t* corners = places.corners + 8 * cell;
-    // By way of memory, the load of all would wait for eight stores.
+    // Through memory, the vector load would wait for eight stores.
     const Floats distances = {distances_m[corners[0]], distances_m[corners[1]], distances_m[corners[2]],
                               distances_m[corners[3]], distances_m[corners[4]], distances_m[corners[5]],
                               distances_m[corners[6]], distances_m[corners[7]]};
@@ -112,7 +112,7 @@ void pull(const PlatePlaces& places, const float* distances_m, float* pulls_m, s
       const Floats pairs = products + shuffled<across<4>>(products, products);
       const Floats fours = pairs + shuffled<across<1>>(pairs, pairs);
       const float target_m = places.targets_m[k];
-      pulls += (fours + shuffled<across<2>>(fours, fours) - target_m) * shares;  // all lanes have the same sum
+      pulls += (fours + shuffled<across<2>>(fours, fours) - target_m) * shares;  // every lane holds the full sum
     }
     float of_corners[kPlateVertices];
     store_vector(of_corners, pulls);

@@ -15,16 +15,16 @@ constexpr int kVectorBytes = 32, kRows = 4;
 constexpr int kVectorBytes = 16, kRows = 4;
 #endif
 constexpr int kVectors =
-    2;  // side by side. Two multipliers with a latency of four need eight sums at once: kRows · kVectors or more
+    2;  // per row. Two FMA units with a latency of four need eight independent sums: at least kRows · kVectors
 
-// Loops over a block's sums: left as loops, they would keep the sums in memory.
+// Loops over a block's sums must be unrolled: otherwise the sums stay in memory.
 #if defined(__GNUC__) && !defined(__clang__)
 #define RADARSDF_UNROLL _Pragma("GCC unroll 16")
 #else
 #define RADARSDF_UNROLL
 #endif
 
-// A block of c, whose sums stay in registers.
+// Computes a block of c with its sums in registers.
 template <int kBlockRows, int kBlockVectors, typename T>
 inline void block(const Product<T>& p, std::int64_t row, std::int64_t column) {
   constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
@@ -32,7 +32,7 @@ inline void block(const Product<T>& p, std::int64_t row, std::int64_t column) {
   const T* a = p.a + row * p.a_row;
   const T* b = p.b + column;
   T* c = p.c + row * p.c_row + column;
-  // Copies: a store into c could change the product itself.
+  // Copies, since a store to c could alias the product.
   const std::int64_t c_row = p.c_row, positive_row = p.positive_row;
   const T* positive = p.positive ? p.positive + row * positive_row + column : nullptr;
   const bool rectify = p.rectify;

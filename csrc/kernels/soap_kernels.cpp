@@ -29,7 +29,7 @@ void scale(T* numbers, T factor, std::int64_t count) {
 
 constexpr int kLanes = 8;
 
-// Of whole vectors, in several sums, since a single one would wait for each addition.
+// Dot product of full vectors in several accumulators: a single one would be bound by the latency of additions.
 template <typename T>
 T dot(const T* a, const T* b, std::int64_t count) {
   using Vector = typename VectorOf<T, kLanes>::Type;
@@ -44,7 +44,7 @@ template <typename T>
 bool orthonormalise(T* rows, std::int64_t count, std::int64_t stride) {
   for (std::int64_t i = 0; i < count; ++i) {
     T* row = rows + i * stride;
-    for (int pass = 0; pass < 2; ++pass) {  // the second removes what rounding left of the first
+    for (int pass = 0; pass < 2; ++pass) {  // the second pass removes rounding errors of the first
       for (std::int64_t j = 0; j < i; ++j) {
         const T* before = rows + j * stride;
         const T share = dot(row, before, stride);

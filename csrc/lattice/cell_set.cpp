@@ -40,9 +40,9 @@ class LatticeOf {
     if (!inside) throw std::invalid_argument(kOutside);
   }
 
-  std::uint64_t key(const T* point) const {  // of a point that it holds
+  std::uint64_t key(const T* point) const {  // requires holds(point)
     std::int32_t cell[3];
-    for (int axis = 0; axis < 3; ++axis) {  // std::floor is a call where the baseline has no instruction for it
+    for (int axis = 0; axis < 3; ++axis) {  // std::floor is a function call in the baseline
       const T u = point[axis] * inverse_;
       cell[axis] = static_cast<std::int32_t>(u);
       cell[axis] -= u < static_cast<T>(cell[axis]) ? 1 : 0;
@@ -52,7 +52,7 @@ class LatticeOf {
 
  private:
   T inverse_;
-  // Leaves room for the far vertex of the last cell of every level.
+  // The far vertex of the last cell must be inside at every level.
   static constexpr T limit_ = static_cast<T>(kAxisBias - (1 << kMaxLevels));
 };
 
@@ -72,7 +72,7 @@ void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uin
   });
 }
 
-// By bits of the hash that FlatMap does not use. With the same bits, all keys of a partition would lie in one part of
+// Uses bits of the hash that FlatMap does not. With the same bits, all keys of a partition would cluster in one part of
 // its slots.
 std::size_t CellSet::partition_of(std::uint64_t block) {
   return static_cast<std::size_t>((hash_key(block) >> 16) % kPartitions);
@@ -82,7 +82,7 @@ class CellSet::Marks {
  public:
   void add(std::uint64_t key) {
     const std::uint64_t block = CellBlocks::block_key(key);
-    if (block != block_) {  // points along one ray often share a block
+    if (block != block_) {  // consecutive points along a ray often share a block
       finish();
       block_ = block;
     }
@@ -111,7 +111,7 @@ class CellSet::Marks {
 
 template <typename Mark>
 void CellSet::insert_marks(std::int64_t count, int num_threads, const Mark& mark) {
-  constexpr std::int64_t kAtOnce = 1 << 16;  // the marks of all would be much memory
+  constexpr std::int64_t kAtOnce = 1 << 16;  // bounds the memory for marks
   const std::int64_t num_parts = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
   std::vector<Marks> parts(static_cast<std::size_t>(num_parts));
   for (std::int64_t first = 0; first < count; first += kAtOnce) {

@@ -20,11 +20,11 @@
 namespace radarsdf {
 namespace {
 
-// The bits of a key that hold the coordinate along an axis.
+// Bits of a key that encode the coordinate along an axis.
 constexpr std::uint64_t key_bits(int axis) { return std::uint64_t{0x1249249249249249} << axis; }
 
-// The corners of a cell that carry features of their own: on one plane of the tri-quadtree (the axis that the plane
-// leaves out is zero in every key, so cells of one column share vertices), or in space.
+// A group of corners of a cell with features: on one plane of the tri-quadtree (keys are zero along the normal of the
+// plane, so the cells of a column share vertices), or in space.
 struct VertexGroup {
   std::array<bool, 3> uses_axis;
   int num_corners;
@@ -37,7 +37,7 @@ struct VertexGroup {
     return key;
   }
 
-  // The corners of a projected cell: bit i of a corner's number steps along the i-th axis that is used.
+  // Corners of a projected cell: bit i of a corner's number is a step along the i-th used axis.
   void corners(std::uint64_t projected_key, std::uint64_t* keys) const {
     keys[0] = projected_key;
     int count = 1;
@@ -56,8 +56,8 @@ const std::vector<VertexGroup>& vertex_groups(Encoding encoding) {
   return encoding == Encoding::kTriQuadtree ? planes : space;
 }
 
-// Cells or vertices by blocks of 4 x 4 x 4: a bit for each. What is in a block, and its vertices, are a few operations
-// on one number.
+// Bit masks of cells or vertices by block of 4 x 4 x 4, so that set operations on a block are a few instructions on one
+// word.
 class BlockMasks {
  public:
   explicit BlockMasks(std::size_t expected_blocks) : numbers_(expected_blocks) {}
@@ -73,8 +73,8 @@ class BlockMasks {
     blocks_[static_cast<std::size_t>(found)].parts.mask |= mask;
   }
 
-  // Sorts the blocks, numbers what is there from `first_row` on, in the order of the keys, and returns how much that
-  // is.
+  // Sorts the blocks, assigns rows to their occupied parts from `first_row` on in the order of keys, and returns the
+  // number of rows.
   std::int64_t number(std::int64_t first_row) {
     std::sort(blocks_.begin(), blocks_.end(), [](const VertexBlock& a, const VertexBlock& b) { return a.key < b.key; });
     numbers_.clear();
@@ -101,8 +101,8 @@ class BlockMasks {
   std::vector<VertexBlock> blocks_;
 };
 
-// A block and the vertices after it, in a cube of 5 x 5 x 5, x slowest: the places of the block's parts, and for the
-// block itself and each of the seven after it which of its parts are in the cube.
+// Cube of 5 x 5 x 5 vertices of a block of cells, x slowest: positions of the parts of a block, and masks of the parts
+// in the cube for the block and the next seven.
 struct Corners {
   std::uint8_t places[64] = {};
   std::uint64_t masks[8] = {};
@@ -126,8 +126,8 @@ struct Corners {
 };
 constexpr Corners kCorners;
 
-// Gives every vertex of the group at this level a row, from next_row on, and writes the rows into the cells at
-// slot `first_corner`. Returns the vertices.
+// Assigns a row to every vertex of the group at this level, from next_row on, and writes the rows to the cells at slot
+// `first_corner`. Returns the vertices.
 std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector<std::uint64_t>& keys, Cell* cells,
                                      int first_corner, std::int64_t& next_row, int num_threads) {
   const auto count = static_cast<std::int64_t>(keys.size());
@@ -142,10 +142,10 @@ std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector
 
   check_interrupt();
   const int num_corners = group.num_corners;
-  int axes[8] = {};  // of the corners, bit `axis` for each that they step along
+  int axes[8] = {};  // by corner: bit `axis` is a step along the axis
   BlockMasks vertices(2 * columns.blocks().size());
   for (const VertexBlock& block : columns.blocks()) {
-    // Parts of the block itself and of those after it, numbered as the corners of a cell are.
+    // Masks of the block and of the next ones, numbered like the corners of a cell.
     std::uint64_t masks[8] = {block.parts.mask}, block_keys[8];
     group.corners(block.key, block_keys);
     int bit = 1;
@@ -191,7 +191,7 @@ std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector
   return std::move(vertices.blocks());
 }
 
-// Cells of the next coarser level.
+// Keys of the next coarser level.
 std::vector<std::uint64_t> parents_of(const std::vector<std::uint64_t>& keys) {
   std::vector<std::uint64_t> parents;
   for (const std::uint64_t key : keys) {
@@ -220,7 +220,7 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
   if (num_levels < 1 || num_levels > kMaxLevels) throw std::invalid_argument("num_levels must be 1 to 12");
   for (std::size_t i = 0; i < leaf_keys_.size(); ++i) {
     for (int axis = 0; axis < 3; ++axis) {
-      // The far vertex of a cell, at every level, must fit its key.
+      // The far vertex of a cell must fit its key at every level.
       const std::uint64_t last = key_bits(axis) >> (3 * num_levels) << (3 * num_levels);
       if (leaf_keys_[i] >> 63 || (leaf_keys_[i] & last) == last)
         throw std::invalid_argument("leaf_keys holds a cell outside the lattice");
@@ -249,7 +249,7 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
       corner += group.num_corners;
     }
     if (&level_keys != &keys.back()) {
-      // Children of one parent are neighbours in Morton order, and parents follow each other as their children do.
+      // Children of a parent are consecutive in Morton order, and parents are in the order of their children.
       Cell* parent = level_cells + level_keys.size();
       for (std::size_t i = 0; i < level_keys.size(); ++i) {
         if (i > 0 && level_keys[i] >> 3 != level_keys[i - 1] >> 3) ++parent;
@@ -268,7 +268,7 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
   const std::int32_t first_root = num_levels_ == 1 ? 0 : static_cast<std::int32_t>(num_cells() - roots_.size());
   const T inverse = static_cast<T>(1.0 / leaf_size_m_), limit = static_cast<T>(kAxisBias);
   const int coarsest = num_levels_ - 1;
-  // In stages over a block that stays in the first-level cache, so that the misses of many points overlap.
+  // In stages over blocks that fit the L1 cache, so that the cache misses of many points overlap.
   constexpr std::int64_t kBlock = 64;
   std::uint32_t leaf[kBlock][3];
   std::uint64_t root_key[kBlock];
@@ -338,7 +338,7 @@ LeafVertices leaf_vertices(const VertexTable& table, int num_threads) {
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int32_t* rows = table.cells()[static_cast<std::size_t>(i)].rows;
       std::int32_t* to = vertices.of_cells.data() + 8 * i;
-      // The table's corners step along x first, those in C order along z.
+      // x is the fastest axis of the table's corners, z that of corners in C order.
       for (int c = 0; c < 8; ++c) to[c] = rows[(c & 1) << 2 | (c & 2) | c >> 2];
     }
   });

@@ -35,7 +35,7 @@ void subtract_times(const double* a, const double* b, double* c) {
   }
 }
 
-// The lower triangle of a becomes its Cholesky factor, the rest 0.
+// Replaces the lower triangle of a by its Cholesky factor, the rest by 0.
 bool factor_block(double* a) {
   for (int j = 0; j < kPose; ++j) {
     double pivot = a[kPose * j + j];
@@ -53,7 +53,7 @@ bool factor_block(double* a) {
   return true;
 }
 
-// Rows of a (6, 6) become those of a l^-T, or of a l^-1, of the lower triangle l.
+// Replaces a (6, 6) by a l^-T, or by a l^-1, with the lower triangle l.
 void divide_by_transposed(double* a, const double* l) {
   for (int i = 0; i < kPose; ++i) {
     double* row = a + kPose * i;
@@ -133,7 +133,7 @@ void BlockBand::solve(double* x) const {
 
 BlockBand BlockBand::inverse() const {
   BlockBand z(rows_, width_);
-  // Column by column from the last: Z_ij is the sum over k > j of -Z_ik Y_kj, with Y_kj = L_kj L_jj^-1.
+  // Columns in reverse order: Z_ij is the sum over k > j of -Z_ik Y_kj, with Y_kj = L_kj L_jj^-1.
   std::vector<double> y(static_cast<std::size_t>(kBlock * (width_ + 1)));
   for (std::int64_t j = rows_ - 1; j >= 0; --j) {
     check_interrupt();

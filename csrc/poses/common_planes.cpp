@@ -12,15 +12,15 @@
 namespace radarsdf {
 namespace {
 
-constexpr double kMedianOfSquare = 0.4549;  // of a standard normal deviate
-constexpr double kSigmas2 = 4;              // where the weight of Geman and McClure is a quarter: two deviations
-constexpr double kLeastM2 = 1e-10;          // of a variance, to divide by
+constexpr double kMedianOfSquare = 0.4549;  // of a standard normal variate
+constexpr double kSigmas2 = 4;              // squared scale of the Geman-McClure weight: 1/4 at two standard deviations
+constexpr double kLeastM2 = 1e-10;          // lower bound of variances, which are divisors
 constexpr int kPlane = 3;                   // unknowns of a plane
 constexpr int kCoupling = kPlane * kPose;
 
 std::size_t size(std::int64_t i) { return static_cast<std::size_t>(i); }
 
-// Two unit vectors across n and each other.
+// Completes the unit vector n to an orthonormal basis.
 void across(const double* n, double* e1, double* e2) {
   const double axis[3] = {std::abs(n[0]) < 0.9 ? 1.0 : 0.0, std::abs(n[0]) < 0.9 ? 0.0 : 1.0, 0.0};
   cross3(n, axis, e1);
@@ -41,7 +41,7 @@ void add_transposed_product(const double* block, const double* x, double* y) {
   }
 }
 
-// Sums over the returns of a plane, or of some scans of it.
+// Normal equations over the returns of a plane, or of some scans of it.
 struct PlaneSums {
   double a[kPlane][kPlane] = {};  // w t t^T
   double u[kPlane] = {};          // w t r
@@ -60,7 +60,7 @@ struct PlaneSums {
     }
   }
 
-  // a becomes its Cholesky factor. What the returns do not tell, a tilt across a line of them say, stays as it is.
+  // Replaces a by its Cholesky factor. Unobservable parameters, such as a tilt about a line of returns, stay fixed.
   void factor() {
     const double small = 1e-9 * (a[0][0] + a[1][1] + a[2][2]) + 1e-30;
     for (int j = 0; j < kPlane; ++j) {
@@ -75,7 +75,7 @@ struct PlaneSums {
     }
   }
 
-  // L^-1 of `columns` columns, in place.
+  // Multiplies `columns` columns by L^-1, in place.
   void divide(double* b, int columns) const {
     for (int c = 0; c < columns; ++c) {
       for (int k = 0; k < kPlane; ++k) {
@@ -93,15 +93,15 @@ struct CommonPlanes::Input {
   const PlanesOfScans& planes;
   const ReturnVariances& noise;
   std::vector<std::int64_t> first = {};  // (planes + 1), in `rows`
-  std::vector<std::int32_t> rows = {};  // of returns, plane by plane; those of a plane stay in the order of their scans
-  std::vector<float> weights = {};      // of each return, 0 where only one scan sees its plane
-  std::vector<double> taken = {};       // (clusters, 6), what the unknowns of planes take of the gradient
+  std::vector<std::int32_t> rows = {};   // indices of returns by plane, in the order of scans
+  std::vector<float> weights = {};       // by return; 0 if only one scan observes its plane
+  std::vector<double> taken = {};        // (clusters, 6), reduction of the gradient by marginalising planes
 
   struct Residual {
     double value;            // distance from the plane, m
     double variance;         // of its noise, m^2
-    double along[kPlane];    // how it falls with the offset and the tilts of the plane
-    double jacobian[kPose];  // how it grows with the increment of the pose
+    double along[kPlane];    // minus the derivative by offset and tilts of the plane
+    double jacobian[kPose];  // derivative by the increment of the pose
   };
 
   Residual residual(std::int64_t i) const {
@@ -158,7 +158,7 @@ void CommonPlanes::find_clusters(Input& input) {
   first_of_plane_.assign(1, 0);
   for (std::int64_t p = 0; p < num_planes; ++p) {
     const std::int64_t begin = input.first[size(p)], end = input.first[size(p + 1)];
-    if (begin < end && scan(begin) != scan(end - 1)) {  // or only one scan sees the plane, which tells nothing
+    if (begin < end && scan(begin) != scan(end - 1)) {  // a plane of one scan constrains no pose
       for (std::int64_t k = begin; k < end; ++k) {
         if (k > begin && scan(k) == scan(k - 1)) continue;
         plane_of_cluster_.push_back(static_cast<std::int32_t>(p));
@@ -224,7 +224,7 @@ void CommonPlanes::eliminate_plane(Input& input, std::int64_t plane) {
       for (int a = 0; a < kPose; ++a) c[kPose * l + a] += w * found.along[l] * found.jacobian[a];
     }
   }
-  // In the band, each group of neighbouring scans has the plane for itself.
+  // Within the band, each group of neighbouring scans has its own copy of the plane.
   for (std::size_t group = base, end = base; group < last; group = end) {
     while (end < last && scan_of_cluster_[end] - scan_of_cluster_[group] <= width_) ++end;
     PlaneSums own;
@@ -282,12 +282,12 @@ void CommonPlanes::sum_scans(const Input& input, int num_threads) {
 
 void CommonPlanes::subtract_planes(BlockBand& band, int num_threads) const {
   const std::vector<double>& coupling = band_coupling_.empty() ? coupling_ : band_coupling_;
-  // Every scan has its own row.
+  // Scans write to disjoint rows.
   parallel_blocks(num_scans_, 1, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t s = begin; s < end; ++s) {
       for (std::int64_t k = first_of_scan_[size(s)]; k < first_of_scan_[size(s + 1)]; ++k) {
         const auto own = size(order_[size(k)]);
-        // Backwards over the clusters of the group: those with the same end.
+        // Backwards over the clusters of the group, which share its end.
         for (std::size_t other = own + 1; other-- > 0;) {
           if (group_end_[other] != group_end_[own]) break;
           const double *a = &coupling[kCoupling * own], *b = &coupling[kCoupling * other];

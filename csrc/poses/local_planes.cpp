@@ -11,16 +11,16 @@
 namespace radarsdf {
 namespace {
 
-constexpr int kAxisBits = 21;  // of a key
+constexpr int kAxisBits = 21;  // bits of a key
 constexpr std::int64_t kHalf = std::int64_t{1} << (kAxisBits - 1);
 constexpr std::uint64_t kAxisMask = (std::uint64_t{1} << kAxisBits) - 1;
-constexpr double kQuanta = 1 << 12;       // in the edge of a cell
-constexpr double kNeighbourWeight = 0.7;  // as of surfels: with a face in common; an edge has its square
-constexpr double kMinReturns = 8;         // weighted. A plane's variance says how little it is known
-constexpr double kMaxFlatness = 0.5;      // as of surfels
-constexpr double kSigmas2 = 4;            // where the weight of Geman and McClure is a quarter: two deviations
+constexpr double kQuanta = 1 << 12;       // per cell edge
+constexpr double kNeighbourWeight = 0.7;  // as for surfels: across a common face; its square across an edge
+constexpr double kMinReturns = 8;         // weighted; the variance of a plane expresses its uncertainty
+constexpr double kMaxFlatness = 0.5;      // as for surfels
+constexpr double kSigmas2 = 4;            // squared scale of the Geman-McClure weight: 1/4 at two standard deviations
 constexpr double kMedianOfSquare = 0.4549;
-constexpr double kLeastM2 = 1e-10;  // of a variance, to divide by
+constexpr double kLeastM2 = 1e-10;  // lower bound of variances, which are divisors
 constexpr int kFirstProduct = 4;
 
 std::int64_t axis_of(std::uint64_t key, int axis) {
@@ -63,7 +63,7 @@ std::optional<std::uint64_t> LocalPlanes::key(const double* point) const {
   std::int64_t cell[3];
   for (int axis = 0; axis < 3; ++axis) {
     const double place = std::floor(point[axis] / cell_size_m_) + static_cast<double>(kHalf);
-    if (!(place >= 1 && place < static_cast<double>(kAxisMask))) return std::nullopt;  // neighbours have keys, too
+    if (!(place >= 1 && place < static_cast<double>(kAxisMask))) return std::nullopt;  // neighbours need valid keys
     cell[axis] = static_cast<std::int64_t>(place);
   }
   return key_of(cell);
@@ -102,7 +102,7 @@ void LocalPlanes::add(const double* points, std::int64_t count, int sign) {
 }
 
 LocalPlanes::Plane LocalPlanes::plane_of(std::uint64_t key) const {
-  // Round the middle of the cell, where products of coordinates are small.
+  // Moments about the middle of the cell, where products of coordinates are small.
   double count = 0, sum[3] = {}, products[6] = {};
   std::int64_t cell[3];
   for (int axis = 0; axis < 3; ++axis) cell[axis] = axis_of(key, axis);
@@ -143,7 +143,7 @@ LocalPlanes::Plane LocalPlanes::plane_of(std::uint64_t key) const {
   for (int a = 0; a < 3; ++a) {
     const double middle = static_cast<double>(cell[a] - kHalf) + 0.5;
     found.centre[a] = cell_size_m_ * (middle + sum[a] / count);
-    // Three unknowns were fitted to these returns.
+    // Degrees of freedom: three parameters were fitted to these returns.
     found.variances[a] = std::max(cell_size_m_ * cell_size_m_ * found.variances[a] * count / (count - 3), kLeastM2);
     for (int axis = 0; axis < 3; ++axis) found.axes[a][axis] = vectors[3 * axis + a];
   }
@@ -164,7 +164,7 @@ std::optional<LocalPlanes::Residual> LocalPlanes::residual(const double* point, 
   if (!here.flat) return std::nullopt;
   double off[3];
   for (int axis = 0; axis < 3; ++axis) off[axis] = point[axis] - here.centre[axis];
-  // Of a regression at this place: its mean, and its two slopes.
+  // Variance factor of the regression at this point: of its mean and its two slopes.
   double spread = 1;
   for (int a = 1; a < 3; ++a) {
     const double along = dot3(off, here.axes[a]);
@@ -180,7 +180,7 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
   const Beams beams(points, count);
   const double up[3] = {pose[2], pose[6], pose[10]};
   struct Row {
-    double value, variance, jacobian[3][kPose];  // the normal first, then how it may be tilted
+    double value, variance, jacobian[3][kPose];  // rows: the normal, then its two tilts
   };
   std::vector<Row> rows;
   std::vector<double> squares;

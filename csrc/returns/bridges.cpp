@@ -17,7 +17,7 @@ namespace {
 constexpr std::int32_t kEdge = 1 << kRegionBits;
 static_assert(kMostBridgeCells + 1 < kEdge, "the other end lies in a region next to that of the first");
 
-// The 27 regions round one, the last coordinate fastest: cells are found in them without a hash.
+// A region and its 26 neighbours, last coordinate fastest: look-ups of their cells need no hash.
 class RegionsRound {
  public:
   explicit RegionsRound(const CellBlocks& cells) : cells_(&cells) {}
@@ -33,7 +33,7 @@ class RegionsRound {
     }
   }
 
-  // The row of the cell at these coordinates, counted from the middle region's first cell; -1 where there is none.
+  // Row of the cell at these coordinates relative to the first cell of the central region, or -1.
   std::int32_t row(const std::int32_t* at) const {
     const auto region = [](std::int32_t v) { return (v + kEdge) >> kRegionBits; };
     const Occupancy* found = regions_[9 * region(at[0]) + 3 * region(at[1]) + region(at[2])];
@@ -57,7 +57,7 @@ struct Direction {
   std::int32_t step[3];
 };
 
-// One of each two opposite ones.
+// One direction of each opposite pair.
 std::vector<Direction> directions() {
   std::vector<Direction> found;
   for (std::int32_t i = 14; i < 27; ++i) found.push_back({{i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1}});
@@ -72,14 +72,14 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
   if (max_cells > kMostBridgeCells) throw std::invalid_argument("bridges are too long");
   const CellBlocks cells(ends, num_ends);
   const std::vector<Direction> ways = directions();
-  constexpr std::int64_t kEnds = 1 << 13;  // a task
+  constexpr std::int64_t kEnds = 1 << 13;  // per task
   std::vector<std::vector<std::uint64_t>> parts(static_cast<std::size_t>((num_ends + kEnds - 1) / kEnds));
   parallel_tasks(static_cast<std::int64_t>(parts.size()), num_threads, [&](std::int64_t task) {
     std::vector<std::uint64_t>& found = parts[static_cast<std::size_t>(task)];
     RegionsRound round(cells);
     for (std::int64_t i = task * kEnds; i < std::min(num_ends, (task + 1) * kEnds); ++i) {
       round.move_to(CellBlocks::region_key(ends[i]));
-      std::int32_t cell[3], own[3];  // absolute, and from the region's first cell
+      std::int32_t cell[3], own[3];  // absolute, and relative to the region's first cell
       for (int axis = 0; axis < 3; ++axis) {
         cell[axis] = static_cast<std::int32_t>(morton_coordinate(ends[i], axis));
         own[axis] = cell[axis] & (kEdge - 1);

@@ -14,12 +14,12 @@
 namespace radarsdf {
 namespace {
 
-constexpr double kDirectionOffset = 0.37;  // or axes of the world would be edges of bins
-constexpr double kFarthestCell = 1e15;     // where all lies that is farther, or no number
-constexpr int kViewsPerCell = 8;           // about; where they are fewer, the table grows
-constexpr double kCauchyMedians = 2.0;     // where a value has weight 1/sqrt(2), in median absolute values
+constexpr double kDirectionOffset = 0.37;  // keeps bin edges off the axes of the world
+constexpr double kFarthestCell = 1e15;     // index of all farther coordinates and of NaN
+constexpr int kViewsPerCell = 8;           // estimate; with fewer views the table grows
+constexpr double kCauchyMedians = 2.0;     // scale of the Cauchy weight, in median absolute values
 
-// Of the 64 bits, 63 are used: no key is kEmptyKey. Two of a million cells share one with a probability of 1e-7.
+// Keys use 63 bits, so none equals kEmptyKey. Among a million cells, a collision has a probability of 1e-7.
 std::uint64_t mixed(std::uint64_t hash, std::uint64_t number) {
   hash = (hash ^ number) * 0x9e3779b97f4a7c15;
   return hash ^ hash >> 32;
@@ -28,11 +28,11 @@ std::uint64_t mixed(std::uint64_t hash, std::uint64_t number) {
 std::uint64_t cell_of(double place) {
   if (!(std::abs(place) < kFarthestCell)) place = kFarthestCell;
   auto cell = static_cast<std::int64_t>(place);
-  cell -= static_cast<double>(cell) > place;  // std::floor is a call where the baseline has no instruction for it
+  cell -= static_cast<double>(cell) > place;  // std::floor is a function call in the baseline
   return static_cast<std::uint64_t>(cell);
 }
 
-// One number of three: different for cells that are less than 2^20 from the origin.
+// Packs three coordinates into one number, unique for cells less than 2^20 from the origin.
 std::uint64_t cell_of(const float* vector, double per_unit, double offset) {
   const std::uint64_t x = cell_of(vector[0] * per_unit + offset);
   const std::uint64_t y = cell_of(vector[1] * per_unit + offset);
@@ -40,7 +40,7 @@ std::uint64_t cell_of(const float* vector, double per_unit, double offset) {
   return x + (y << 21) + (z << 42);
 }
 
-// From views to keys of the cells of a kind in a tiling.
+// Maps views to keys of the cells of one kind in one tiling.
 class Tiles {
  public:
   Tiles(const CellKind& kind, int number, double offset)
@@ -57,7 +57,7 @@ class Tiles {
     }
     if (per_rad_ > 0) {
       const double angle = views.incidence_rad[i];
-      hash = mixed(hash, cell_of(std::isnan(angle) ? -2.0 : angle * per_rad_ + offset_));  // no angle has bin -2
+      hash = mixed(hash, cell_of(std::isnan(angle) ? -2.0 : angle * per_rad_ + offset_));  // no angle is in bin -2
     }
     return hash >> 1;
   }
@@ -72,12 +72,12 @@ Tiles tiles_of(const CellKind& kind, std::size_t kind_number, std::size_t num_ki
   return {kind, number, static_cast<double>(tiling) / num_tilings};
 }
 
-// Numbers the cells of the views as they first occur, from 0, and appends their keys.
+// Numbers the cells of the views from 0 in order of first occurrence, and appends their keys.
 std::int64_t number_cells(const Tiles& tiles, const Views& views, std::int32_t* rows,
                           std::vector<std::uint64_t>* keys) {
   FlatMap numbers(static_cast<std::size_t>(views.count / kViewsPerCell));
   std::int32_t next = 0;
-  // Of millions of views, almost every look-up waits for memory: a run of them waits together.
+  // With millions of views, almost every look-up is a cache miss: prefetching in batches overlaps them.
   std::uint64_t run[64];
   constexpr std::int64_t size = std::size(run);
   for (std::int64_t first = 0; first < views.count; first += size) {
@@ -108,9 +108,9 @@ double median_absolute(const std::vector<double>& values) {
   return *middle;
 }
 
-// All that is known of a cell in one place: of millions, each is a wait for memory.
+// State of a cell in one struct: with millions of cells, each access is a cache miss.
 struct Cell {
-  double sum = 0;  // of weighted values; then what the last mean takes less than the one before
+  double sum = 0;  // weighted sum; then the decrease of the mean in this sweep
   float mass = 0, mean = 0;
 };
 
@@ -120,7 +120,7 @@ CellMeans fit_tiling(const std::vector<CellKind>& kinds, int tiling, int num_til
   const int rounds = options.rounds;
   CellMeans result;
   std::vector<std::int32_t> rows(kinds.size() * count);
-  std::vector<std::size_t> firsts;  // of each kind's cells, and the end
+  std::vector<std::size_t> firsts;  // index of the first cell of each kind, and the end
   for (std::size_t k = 0; k < kinds.size(); ++k) {
     check_interrupt();
     firsts.push_back(result.keys.size());

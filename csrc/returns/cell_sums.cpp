@@ -21,12 +21,12 @@ constexpr std::int32_t kEdge = 1 << kBlockBits;
 
 constexpr std::int32_t kWide = kEdge + 2;
 
-constexpr int kFewColumns = 4;  // the choice depends on nothing else, or bits would depend on which keys are asked for
+constexpr int kFewColumns = 4;  // the only criterion, so that results do not depend on the set of requested keys
 
 constexpr std::int32_t part_coordinate(int part, int axis) { return (part >> axis & 1) | (part >> (axis + 2) & 2); }
 
-// Of the 27 blocks round one: which of their cells touch it; and where the cells of the one itself lie in the cube of
-// kWide cells round it.
+// For the 27 blocks of a neighbourhood: masks of the cells that touch the central block. `places`: positions of the
+// cells of the central block in the cube of kWide cells per side, which includes the halo.
 struct NextTo {
   std::uint64_t masks[27] = {};
   std::int32_t places[64] = {};
@@ -48,7 +48,7 @@ struct NextTo {
 };
 constexpr NextTo kNextTo;
 
-// The 27 blocks round one, the last coordinate fastest.
+// A block and its 26 neighbours, last coordinate fastest.
 class BlocksRound {
  public:
   explicit BlocksRound(const CellBlocks& cells) : cells_(&cells) {}
@@ -64,7 +64,7 @@ class BlocksRound {
     for (int i = 0; i < 27; ++i) {
       const std::uint64_t key = parts[0][i / 9] | parts[1][i / 3 % 3] | parts[2][i % 3];
       const std::uint64_t region_key = key >> (3 * (kRegionBits - kBlockBits));
-      if (region_key != region_key_) {  // often it is the same
+      if (region_key != region_key_) {  // often unchanged
         region_key_ = region_key;
         region_ = cells_->region(region_key);
       }
@@ -72,8 +72,8 @@ class BlocksRound {
     }
   }
 
-  // Calls visit(row, place) for the cells of the middle block and those next to it; place is the position in a cube of
-  // 6 x 6 x 6 cells, the last coordinate fastest.
+  // Calls visit(row, place) for the cells of the central block and its halo; place is the position in a cube of
+  // 6 x 6 x 6 cells, last coordinate fastest.
   template <typename Visit>
   void for_each(const Visit& visit) const {
     for (int n = 0; n < 27; ++n) {
@@ -93,8 +93,8 @@ class BlocksRound {
   const Occupancy* blocks_[27] = {};
 };
 
-// Sums of some columns over the cells near each of a block's, axis after axis, (64, columns) in Morton order. Of few
-// columns this is less work than near each key. `cube` is scratch.
+// Separable neighbourhood sums for all cells of a block, axis by axis: (64, columns) in Morton order. With few columns
+// this is less work than a sum for each key. `cube` is scratch.
 class SumsOfBlock {
  public:
   SumsOfBlock(const double* values, int columns, double weight)
@@ -131,7 +131,7 @@ class SumsOfBlock {
   std::vector<double> sums_;
 };
 
-// The same sums from a corner that lies `steps` before: of (a + x)(b + y) that of xy + a y + b x + a b.
+// Moves the origin of the sums `steps` back: (x + a)(y + b) sums to xy + a y + b x + a b.
 template <typename T>
 void move_moments(const T* steps, T* sums) {
   T* product = sums + 4;
@@ -147,9 +147,9 @@ void move_moments(const T* steps, T* sums) {
 void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std::int64_t num_cells, double quantum_m,
                  std::int64_t* sums, int num_threads) {
   std::fill(sums, sums + kSums * num_cells, std::int64_t{0});
-  const double quanta = 1 / quantum_m;  // in 1 m
-  // Every thread reads all returns and adds those of its own cells. These are scattered, since returns are denser in
-  // some places than in others.
+  const double quanta = 1 / quantum_m;  // per metre
+  // Every thread reads all returns and adds those of its own cells. Groups of cells are interleaved among threads to
+  // balance the uneven density of returns.
   const std::int64_t threads = returns.count > (1 << 14) ? resolve_num_threads(num_threads) : 1;
   parallel_tasks(threads, num_threads, [&](std::int64_t task) {
     for (std::int64_t i = 0; i < returns.count; ++i) {
@@ -173,7 +173,7 @@ Moments merge_sums(const std::uint64_t* keys, const std::int64_t* sums, std::int
     const std::uint64_t parent = keys[i] >> 3;
     std::fill(total, total + kColumns, std::int64_t{0});
     for (; i < count && keys[i] >> 3 == parent; ++i) {
-      // Moved to the corner that the cells share: in integers, which is exact.
+      // Shift to the corner of the parent cell: exact in integers.
       std::int64_t own[kColumns], steps[3];
       std::copy_n(sums + kSums * i, kColumns, own);
       for (int axis = 0; axis < 3; ++axis) steps[axis] = static_cast<std::int64_t>(keys[i] >> axis & 1) * kQuanta;
@@ -199,7 +199,7 @@ Moments merge_sums(const std::uint64_t* keys, const std::int64_t* sums, std::int
 
 void mean_rays(const std::uint64_t* keys, const std::int64_t* sums, std::int64_t count, double leaf_size_m,
                const MeanRays& means, int num_threads) {
-  constexpr double kLeast = 1e-6;  // length of a mean of unit directions. A shorter one has no meaningful direction
+  constexpr double kLeast = 1e-6;  // length of a mean of unit directions below which its direction is meaningless
   const double quantum_m = leaf_size_m / static_cast<double>(kQuanta);
   parallel_blocks(count, 1 << 13, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
@@ -274,7 +274,7 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
     for (std::int64_t i = begin; i < end; ++i) {
       float share[3];
       std::int32_t lower[3];
-      std::uint64_t parts[3][2];  // of keys
+      std::uint64_t parts[3][2];  // key bits of the lower and the upper cell along each axis
       for (int axis = 0; axis < 3; ++axis) {
         const float u = points[3 * i + axis] / size_m - 0.5F;
         if (!(std::abs(u) < static_cast<float>(kAxisBias - (1 << kMaxLevels)))) {

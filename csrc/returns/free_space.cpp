@@ -17,13 +17,13 @@
 namespace radarsdf {
 namespace {
 
-// A ray is followed towards the sensor until others of its scan have passed so many cells on end: they go there, too.
+// A ray is traversed towards the sensor until it has crossed this many consecutive cells already marked by its scan.
 constexpr int kPassedCells = 8;
 constexpr int kBlockBits = 3 * kFreeSpaceLevels;
-using Bits = std::array<std::uint64_t, kFreeSpaceWords>;  // of the leaf cells of a block
+using Bits = std::array<std::uint64_t, kFreeSpaceWords>;  // one bit per leaf cell of a block
 using Planes = std::array<std::uint64_t, kFreeSpaceStride>;
 
-// Blocks by key, in the order in which they came.
+// Blocks by key, in order of insertion.
 template <typename Block>
 class Blocks {
  public:
@@ -48,17 +48,17 @@ class Blocks {
   FlatMap rows_;
 };
 
-// What one scan sees of a block.
+// Leaf cells of a block observed by one scan.
 struct Seen {
   Bits passed, returns;
 };
 
-// Adds one scan to the counts of a block, 64 leaf cells at a time: bit planes are numbers upright.
+// Adds one scan to the bit-sliced counters of a block, 64 leaf cells at a time.
 void add_scan(const Seen& seen, Planes& block) {
   for (std::size_t word = 0; word < kFreeSpaceWords; ++word) {
     std::uint64_t &ones = block[word], &twos = block[kFreeSpaceWords + word],
                   &fours = block[2 * kFreeSpaceWords + word];
-    const std::uint64_t more = seen.passed[word] & ~(ones & twos & fours);  // those at 7 stay
+    const std::uint64_t more = seen.passed[word] & ~(ones & twos & fours);  // saturates at 7
     const std::uint64_t carry = ones & more, carry2 = twos & carry;
     ones ^= more;
     twos ^= carry;
@@ -67,7 +67,7 @@ void add_scan(const Seen& seen, Planes& block) {
   }
 }
 
-// Adds what other scans saw.
+// Adds the counts of other scans.
 void add_counts(const std::uint64_t* other, std::uint64_t* block) {
   for (std::size_t word = 0; word < kFreeSpaceWords; ++word) {
     std::uint64_t carry = 0;
@@ -132,7 +132,7 @@ class Walker {
   }
 
  private:
-  // Neighbours along a ray are mostly of one block: only at its border is another looked up.
+  // Consecutive cells of a ray mostly share a block, so only a change of block needs a look-up.
   void mark(Blocks<Seen>& scan, CellWalk cell, Bits Seen::* which) const {
     std::uint64_t block_key = kEmptyKey;
     Bits* bits = nullptr;
@@ -164,7 +164,7 @@ class Walker {
   std::int64_t first_[3], last_[3];
 };
 
-// Where the part begins that holds whole scans.
+// First ray of a part; parts hold whole scans.
 std::int64_t begin_of(const Rays& rays, std::int64_t part, std::int64_t parts) {
   const std::int64_t near = rays.count * part / parts;
   if (near == 0 || near == rays.count) return near;

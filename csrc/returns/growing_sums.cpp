@@ -16,11 +16,11 @@ constexpr const char* kNeverAdded = "a scan that was never added cannot be taken
 
 std::uint64_t block_of(std::uint64_t leaf_key) { return leaf_key >> (3 * kVisibilityLevels); }
 
-// Where the cell's bit is: the word of the mask, and the bit in it.
+// Word of the block's mask and bit in the word that represent a leaf cell.
 std::size_t word_of(std::uint64_t leaf_key) { return (leaf_key & (kCellsOfBlock - 1)) >> 6; }
 std::uint64_t bit_of(std::uint64_t leaf_key) { return std::uint64_t{1} << (leaf_key & 63); }
 
-// Numbers of places in a vector, of which those that became free are used first.
+// Allocates an index in a vector; free indices are reused first.
 template <typename T>
 std::int32_t place_for(std::vector<T>& places, std::vector<std::int32_t>& free) {
   if (free.empty()) {
@@ -33,7 +33,7 @@ std::int32_t place_for(std::vector<T>& places, std::vector<std::int32_t>& free) 
   return place;
 }
 
-// Makes room for so many more, as much as push_back would: a little at a time would copy all each time.
+// Reserves capacity with geometric growth, as push_back does: exact reserves would copy all elements each time.
 template <typename T>
 void make_room(std::vector<T>& places, std::size_t more) {
   if (places.size() + more > places.capacity()) places.reserve(std::max(2 * places.capacity(), places.size() + more));
@@ -104,7 +104,7 @@ ChangedBlocks GrowingSums::apply(const SumsChange& change) {
     if (there + visibility.visibility < 0) throw std::invalid_argument(kNeverAdded);
     new_blocks += place < 0 ? 1 : 0;
   }
-  // From here on nothing fails: a change is made whole, or not at all.
+  // Nothing below this line throws: a change is applied completely or not at all.
   ChangedBlocks changed;
   changed.returns.reserve(change.cells_.size());
   changed.visibility.reserve(change.visibility_.size());
@@ -256,7 +256,7 @@ void GrowingSums::drop_if_empty(std::uint64_t block_key) {
   number_of_block_.erase(block_key);
 }
 
-// Lists of free places have room for all places: to free one needs no memory.
+// The free lists have capacity for all indices, so that freeing one needs no allocation.
 void GrowingSums::reserve(std::int64_t cells, std::int64_t blocks) {
   const auto more_cells = static_cast<std::size_t>(cells), more_blocks = static_cast<std::size_t>(blocks);
   if (cells_.size() + more_cells > static_cast<std::size_t>(std::numeric_limits<std::int32_t>::max())) {

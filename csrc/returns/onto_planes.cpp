@@ -11,19 +11,19 @@
 namespace radarsdf {
 namespace {
 
-constexpr double kMinRangeM = 1e-6;  // to divide by
+constexpr double kMinRangeM = 1e-6;  // lower bound of a divisor
 
 }  // namespace
 
 void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnVariances& noise, const MovedRays& moved,
                       int num_threads) {
-  // Of a return's position along the plane's normal.
+  // Variance of a return's position along the plane's normal.
   const auto variance_m2 = [&](std::int64_t i, const double* normal) {
     return variance_along(normal, rays.directions + 3 * i, rays.ranges_m[i],
                           rays.up_of_scan + 3 * std::int64_t{rays.scans[i]}, noise);
   };
 
-  // Every thread reads all returns and adds those of its own planes, in their order.
+  // Every thread reads all returns in order and adds those of its own planes.
   std::vector<double> roughness_m2(static_cast<std::size_t>(planes.count));
   std::vector<std::int32_t> counts(static_cast<std::size_t>(planes.count));
   const std::int64_t threads = rays.count > (1 << 14) ? resolve_num_threads(num_threads) : 1;

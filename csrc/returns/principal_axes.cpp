@@ -11,9 +11,9 @@
 namespace radarsdf {
 namespace {
 
-constexpr int kMaxSweeps = 30;  // four or five are enough, since each squares what is left
+constexpr int kMaxSweeps = 30;  // four or five suffice: convergence is quadratic
 
-// One rotation in the plane of the axes p and q, which makes a[p][q] zero (Golub and Van Loan, Matrix
+// Jacobi rotation in the plane of the axes p and q that annihilates a[p][q] (Golub and Van Loan, Matrix
 // Computations, 8.5).
 void rotate(double (&a)[3][3], double (&v)[3][3], int p, int q) {
   if (a[p][q] == 0) return;

@@ -8,7 +8,7 @@
 namespace radarsdf {
 namespace {
 
-constexpr double kLeast_m = 1e-6;  // range of a return that is where its ray begins, to divide by
+constexpr double kLeast_m = 1e-6;  // lower bound of ranges, which are divisors
 
 double length(double x, double y, double z) { return std::sqrt(x * x + y * y + z * z); }
 

@@ -23,10 +23,10 @@
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kBlocks = 1 << 11, kCells = 1 << 12, kPlacesOfThread = 1 << 13;  // of a thread, at least
-constexpr int kPlaces = 3;       // of a plane where its distance is known
-constexpr double kBend = 2;      // leaf cells: second difference of a distance whose slope turns from -1 to 1
-constexpr double kClear = 0.25;  // leaf cells: least distance of a vertex whose side is known
+constexpr std::int64_t kBlocks = 1 << 11, kCells = 1 << 12, kPlacesOfThread = 1 << 13;  // minimum per thread
+constexpr int kPlaces = 3;       // points of a plane with known distance
+constexpr double kBend = 2;      // leaf cells: second difference where the slope of a distance changes from -1 to 1
+constexpr double kClear = 0.25;  // leaf cells: least distance of a vertex with known side
 class Plates {
  public:
   Plates(const VertexTable& table, const KnownPlanes& planes, int num_threads)
@@ -37,7 +37,7 @@ class Plates {
   }
 
   void relax(const std::int8_t* sides, int iterations, float* distances_m) {
-    // Errors whose eigenvalues are in [least, 1] shrink to 1 / cosh(4). No eigenvalue is above 1: see `stiffness`.
+    // Chebyshev iteration: errors with eigenvalues in [least, 1] shrink to 1 / cosh(4). connect_block: none exceeds 1.
     const float least = 4 / std::max(4.1F, static_cast<float>(iterations) * static_cast<float>(iterations));
     const float middle = (1 + least) / 2, half = (1 - least) / 2;
     const std::size_t size = kPlateVertices * num_blocks_;
@@ -77,8 +77,8 @@ class Plates {
  private:
   using Range = std::pair<std::int64_t, std::int64_t>;
 
-  // Rows are numbered in Morton order, so those of a block follow each other, as do the eight blocks of one of the
-  // table.
+  // Rows are numbered in Morton order, so the rows of a block are consecutive, as are the eight blocks within one of
+  // the table.
   void number() {
     const std::vector<VertexBlock>& of_table = table_->leaf_vertex_blocks();
     numbers_ = FlatMap(of_table.size());
@@ -139,7 +139,7 @@ class Plates {
                     });
   }
 
-  // Of a plane, one leaf cell behind it, on it and before it.
+  // Points of a plane: one leaf cell behind it, on it, and one leaf cell before it.
   void place_of(const KnownPlanes& planes, std::int64_t place, float* point) const {
     const std::int64_t plane = place / kPlaces;
     const auto before_m = static_cast<float>(static_cast<double>(place % kPlaces - 1) * table_->leaf_size_m());
@@ -147,7 +147,7 @@ class Plates {
       point[axis] = planes.points[3 * plane + axis] + before_m * planes.normals[3 * plane + axis];
   }
 
-  // The places in the order of their cells, in each in the order of the planes.
+  // Sorts the points by cell, stable in the order of the planes.
   void place(const KnownPlanes& planes) {
     const std::int64_t count = kPlaces * planes.count;
     if (count > std::numeric_limits<std::int32_t>::max()) throw std::invalid_argument("too many planes");
@@ -167,7 +167,7 @@ class Plates {
     });
     drop_beyond_thin_walls(planes, cells);
     const std::vector<std::uint64_t>& keys = table_->leaf_keys();
-    std::vector<std::int32_t> next(keys.size(), 0);  // of each cell: how many places, then where the next one goes
+    std::vector<std::int32_t> next(keys.size(), 0);  // counting sort by cell: counts, then insertion index
     for (const std::int32_t cell : cells)
       if (cell >= 0) ++next[static_cast<std::size_t>(cell)];
     std::int32_t num_places = 0;
@@ -202,7 +202,7 @@ class Plates {
                     });
   }
 
-  // lower: corner of the cell of place i, in cells. k: where its shares go.
+  // lower: corner of the cell of point i, in cells. k: index of its shares.
   void share(const KnownPlanes& planes, std::int32_t i, const double* lower, double scale, std::size_t k) {
     const double size_m = table_->leaf_size_m();
     const auto root = static_cast<float>(std::sqrt(scale * static_cast<double>(planes.information[i / kPlaces])));
@@ -210,7 +210,7 @@ class Plates {
     place_of(planes, i, point);
     for (int axis = 0; axis < 3; ++axis)
       upper[axis] = static_cast<float>(std::clamp(point[axis] / size_m - lower[axis], 0.0, 1.0));
-    for (std::size_t c = 0; c < 8; ++c) {  // bit `axis` of a corner: whether it is the upper one
+    for (std::size_t c = 0; c < 8; ++c) {  // bit `axis` of a corner: set if upper
       float product = root;
       for (int axis = 0; axis < 3; ++axis) product *= (c >> axis & 1) != 0 ? upper[axis] : 1 - upper[axis];
       shares_[8 * k + c] = product;
@@ -218,9 +218,9 @@ class Plates {
     targets_m_[k] = root * static_cast<float>((i % kPlaces - 1) * size_m);
   }
 
-  // Cells come by regions of 16 x 16 x 16. Regions whose coordinates have the same parities share no vertex, so threads
-  // add the pulls of several at once. A vertex gets its pulls in the same order with any number of threads, and where
-  // only a part of the cells is given.
+  // Cells are grouped by regions of 16 x 16 x 16. Regions with equal parities of all coordinates share no vertex, so
+  // threads add their pulls in parallel. The order of pulls at a vertex depends neither on the number of threads nor on
+  // the other cells present.
   void begin_cell(std::uint64_t key, std::int32_t cell, std::int32_t first_place) {
     const std::uint64_t region = CellBlocks::region_key(key);
     const auto number = static_cast<std::int64_t>(cells_.size());
@@ -232,7 +232,7 @@ class Plates {
     cells_.push_back(cell);
   }
 
-  // Calls body(begin, end) for the cells of regions, at once for those that share no vertex.
+  // Calls body(begin, end) for the cells of each region, in parallel for regions that share no vertex.
   template <typename Body>
   void of_cells(const Body& body) const {
     std::size_t num_regions = 0;
@@ -250,7 +250,7 @@ class Plates {
     }
   }
 
-  // cells: of the places, -1 for those that do not count.
+  // cells: cell of each point; set to -1 for points to ignore.
   void drop_beyond_thin_walls(const KnownPlanes& planes, UninitialisedVector<std::int32_t>& cells) const {
     std::vector<std::int32_t> plane_of(table_->leaf_keys().size(), -1);
     for (std::int32_t i = 0; i < planes.count; ++i) {
@@ -266,7 +266,7 @@ class Plates {
     }
   }
 
-  // Neighbours are vertices of the same cell. A distance is bent where there are some on both sides.
+  // Neighbours share a cell. A distance is bent along an axis if its vertex has neighbours on both sides.
   void connect() {
     std::vector<Edges> edges(blocks_.size());
     const std::vector<std::uint64_t>& keys = table_->leaf_keys();
@@ -310,7 +310,7 @@ class Plates {
     std::uint64_t before[3] = {}, after[3] = {};
   };
 
-  // Of cells of a block, bit by bit. Their vertices lie in it and in the blocks after it, numbered as corners are.
+  // Connects the cells of a block by bit masks. Their vertices lie in it and in the next blocks, numbered like corners.
   void connect_cells(std::uint64_t block, std::uint64_t cells, std::vector<Edges>& edges) const {
     std::uint64_t keys[8] = {block};
     for (int axis = 0; axis < 3; ++axis)
@@ -318,7 +318,7 @@ class Plates {
     std::int32_t numbers[8];
     for (int c = 0; c < 8; ++c) numbers[c] = numbers_.find(keys[c]);
     for (int axis = 0; axis < 3; ++axis) {
-      std::uint64_t lower[8] = {cells};  // corners of the cells
+      std::uint64_t lower[8] = {cells};  // lower corners of cells along the axis
       for (const int other : {(axis + 1) % 3, (axis + 2) % 3}) {
         for (int c = 0; c < 8; ++c) {
           if (lower[c] == 0 || (c >> other & 1) != 0) continue;
@@ -337,9 +337,9 @@ class Plates {
     }
   }
 
-  // The matrix is at most a diagonal: (sum of a x)^2 <= (sum of |a|) (sum of |a| x^2), row by row.
+  // A diagonal bounds the matrix, row by row: (sum of a x)^2 <= (sum of |a|) (sum of |a| x^2).
   void connect_block(std::size_t block) {
-    constexpr unsigned kLower[3] = {0x55, 0x33, 0x0f};  // vertices
+    constexpr unsigned kLower[3] = {0x55, 0x33, 0x0f};  // masks of the lower vertices along each axis
     std::uint8_t* is_bent = is_bent_.data() + 6 * block;
     float* stiffness = compliance_.data() + kPlateVertices * block;
     std::fill_n(stiffness, kPlateVertices, 0.0F);
@@ -360,18 +360,18 @@ class Plates {
 
   const VertexTable* table_;
   int num_threads_;
-  UninitialisedVector<std::int32_t> vertices_;  // position of each row in the blocks
+  UninitialisedVector<std::int32_t> vertices_;  // position in the blocks of each row
   std::size_t num_blocks_ = 0;
-  FlatMap numbers_;                // of the table's blocks
-  std::vector<Occupancy> blocks_;  // of each of them
+  FlatMap numbers_;                // index of the table's blocks by key
+  std::vector<Occupancy> blocks_;  // by block of the table
   UninitialisedVector<std::int32_t> neighbours_;
   LargeVector<std::uint8_t> is_bent_;
-  UninitialisedVector<float> compliance_;  // while it is set up, the stiffness
-  std::vector<std::int32_t> cells_;        // with places
-  std::vector<std::int32_t> first_;        // place of each of them
+  UninitialisedVector<float> compliance_;  // stiffness during setup
+  std::vector<std::int32_t> cells_;        // cells with points
+  std::vector<std::int32_t> first_;        // first point of each such cell
   UninitialisedVector<std::int32_t> corners_;
   UninitialisedVector<float> shares_, targets_m_;
-  std::array<std::vector<Range>, 8> regions_;  // of cells, by the parities of the coordinates
+  std::array<std::vector<Range>, 8> regions_;  // ranges of cells, by parities of the region's coordinates
   std::uint64_t last_region_ = 0;
 };
 

@@ -12,7 +12,7 @@
 namespace radarsdf {
 namespace {
 
-constexpr float kSlack = 0.25F;  // of a cell: planes of neighbours do not quite meet at their common face
+constexpr float kSlack = 0.25F;  // cells: planes of neighbours do not meet exactly at their common face
 
 }  // namespace
 
@@ -28,10 +28,10 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
                                 int num_threads) const {
   const double slack_m = kSlack * cell_size_m_;
   const double limit_m = (kAxisBias - (1 << kMaxLevels)) * cell_size_m_;  // NaN fails the comparison too
-  // A ray ends at least so far behind a plane that it crosses, see below, whatever the angle between them.
+  // Upper bound of crossings along a ray, from its end, at any angle of incidence: see below.
   const double last_m = slack_m - margin_m - sigmas * noise.range_m;
 
-  // Whether the ray i crosses the surfel's plane between begin_m and end_m, from its end, and ends well behind it.
+  // Whether ray i crosses the surfel's plane between begin_m and end_m from its end, and ends well behind it.
   const auto crosses = [&](std::int64_t i, const Surfel& surfel, double begin_m, double end_m) {
     const float *p = points + 3 * i, *d = directions + 3 * i, *n = surfel.normal, *c = surfel.centre;
     const float cosine = -(n[0] * d[0] + n[1] * d[1] + n[2] * d[2]);
@@ -51,7 +51,7 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
     return depth_m > margin_m + sigmas * std::sqrt(variance);
   };
 
-  constexpr std::int64_t kRays = 1 << 12;  // a task: few enough for a long walk to be interrupted
+  constexpr std::int64_t kRays = 1 << 12;  // per task: few, so that a long traversal can be interrupted
   parallel_tasks((count + kRays - 1) / kRays, num_threads, [&](std::int64_t task) {
     NearbyRows rows(cells_);
     const std::int64_t end = std::min(count, (task + 1) * kRays);

@@ -15,8 +15,8 @@
 namespace radarsdf {
 namespace {
 
-// Calls count(begin, end, counts) for parts of the returns that hold whole scans, and adds the counts of `places` up.
-// Integers: the sums do not depend on the number of threads.
+// Calls count(begin, end, counts) for parts of the returns that hold whole scans, and sums their counts (places,):
+// integers, independent of the number of threads.
 template <typename Count>
 std::vector<std::uint32_t> count_by_scans(const std::int32_t* scans, std::int64_t size, std::int64_t places,
                                           int num_threads, const Count& count) {
@@ -70,7 +70,7 @@ void count_visibility(const std::uint64_t* leaf_keys, std::int64_t num_leaves, d
   check_whole_rays(points, directions, ranges_m, count, leaf_size_m);
   const auto of_rays = [&](std::int64_t begin, std::int64_t end, std::vector<std::uint32_t>& counts) {
     NearbyRows rows(cubes);
-    FlatMap passed;  // cubes, by rays of this scan
+    FlatMap passed;  // cubes crossed by rays of the current scan
     for (std::int64_t i = begin; i < end; ++i) {
       if (i % (1 << 12) == 0) check_interrupt();
       if (i > begin && scans[i] != scans[i - 1]) passed.clear();
@@ -92,7 +92,7 @@ void count_scans(const std::int32_t* cells, const std::int32_t* scans, std::int6
                  std::uint32_t* scans_of_cell, int num_threads) {
   check_scans(scans, count);
   const auto of_returns = [&](std::int64_t begin, std::int64_t end, std::vector<std::uint32_t>& counts) {
-    std::vector<std::int32_t> last_scan(counts.size(), -1);  // that was counted in each cell
+    std::vector<std::int32_t> last_scan(counts.size(), -1);  // last scan counted in each cell
     for (std::int64_t i = begin; i < end; ++i) {
       const auto cell = static_cast<std::size_t>(cells[i]);
       counts[cell] += last_scan[cell] != scans[i] ? 1 : 0;

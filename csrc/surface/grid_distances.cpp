@@ -13,9 +13,9 @@
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kCorners = 1 << 13;  // of a thread, at least
+constexpr std::int64_t kCorners = 1 << 13;  // minimum per thread
 
-// Exact at both ends, so that cells agree on their common faces.
+// Linear interpolation, exact at both ends, so that cells agree on common faces.
 inline float between(float before, float after, float share) { return (1 - share) * before + share * after; }
 
 }  // namespace
@@ -28,7 +28,7 @@ void grid_distances(const VertexTable& table, const float* distances_m, const st
     NearbyRows rows(table.leaves());
     for (std::int64_t i = begin; i < end; ++i) {
       std::int32_t cell[3];
-      int part[3], on_border = 0;  // bit `axis`: the cell before has the corner, too
+      int part[3], on_border = 0;  // bit `axis`: the previous cell has the corner, too
       bool is_near = true;
       for (int axis = 0; axis < 3; ++axis) {
         const std::int32_t corner = corners[3 * i + axis];

@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// The derivatives of marching cubes' vertices by the samples. A vertex depends on two samples, and up to six vertices
-// depend on a sample. Each sample collects its own sum, in the order of the vertices: no two threads write to one
-// sample, and the bits do not depend on the number of threads.
+// Derivatives of the vertices of marching cubes by the samples. A vertex depends on two samples, and up to six vertices
+// depend on a sample. Each sample gathers its own sum in the order of the vertices: threads write to disjoint samples,
+// and results do not depend on the number of threads.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -29,14 +29,14 @@ struct EdgeGradient {
   double upper = 0;
 };
 
-// By the samples a and b of an edge, given the derivative `grad` by the fraction of the way between them. With
-// fraction = (level - a) / (b - a), the fraction's derivatives are -(1 - fraction) / (b - a) and -fraction / (b - a).
+// Gradient by the samples a and b of an edge, given the derivative `grad` by the fraction (level - a) / (b - a), which
+// has the derivatives -(1 - fraction) / (b - a) and -fraction / (b - a).
 inline EdgeGradient edge_gradient(double a, double b, double level, double grad) {
   const double fraction = edge_fraction(a, b, level);
   const double difference = b - a;
   const bool follows = fraction > min_edge_fraction && fraction < 1 - min_edge_fraction && std::isfinite(difference);
   if (!follows) return {};
-  const double pull = -grad / difference;  // 0 of a gradient of 0, however small the difference
+  const double pull = -grad / difference;  // 0 if the gradient is 0, at any difference
   return {(1 - fraction) * pull, fraction * pull};
 }
 
@@ -44,8 +44,8 @@ inline EdgeGradient edge_gradient(double a, double b, double level, double grad)
 
 }  // namespace
 
-// The edges of a plane's vertices end in this plane or, along x, in the next one. So a plane of samples collects from
-// its own vertices and from those of the plane before.
+// Edges of a plane's vertices end in this plane or, along x, in the next one. A plane of samples therefore gathers from
+// its own vertices and from those of the previous plane.
 template <typename T>
 void marching_cubes_dense_backward(const T* volume, const std::array<int64_t, 3>& shape, const int64_t* edges,
                                    const double* vertices_grad, int64_t num_vertices,
@@ -66,7 +66,7 @@ void marching_cubes_dense_backward(const T* volume, const std::array<int64_t, 3>
     return edge_gradient(static_cast<double>(volume[lower]), static_cast<double>(volume[lower + strides[axis]]), level,
                          grad);
   };
-  // To wake threads takes longer than a few thousand samples.
+  // Waking threads takes longer than a few thousand samples.
   const int threads = shape[0] * plane < min_parallel_samples ? 1 : num_threads;
   parallel_tasks(shape[0], threads, [&](int64_t i) {
     const int64_t begin = i * plane;

@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: MIT
 //
 // Dense marching cubes in three passes, as in flying edges: signs, counts, output. The first reads the volume once and
-// keeps one bit per sample; from then on 32 cells are dealt with at a time, and the volume itself is read again only at
-// the cut edges. Each pass runs over planes of constant x, whose places in the output are known from the counts.
+// keeps one bit per sample; later passes process 32 cells at a time, and read the volume again only at cut edges. Each
+// pass runs over planes of constant x; counts determine their offsets in the output.
 #include <algorithm>
 #include <vector>
 
@@ -24,24 +24,24 @@ using std::size_t;
 using std::uint32_t;
 using std::uint64_t;
 
-// What is cut among 32 samples of row (i, j): the edges that start there, and the cells whose lower corner they are.
+// Signs at 32 samples of row (i, j), cut edges that start there, and cells that have their lower corner there.
 struct CutWindow {
-  int64_t first;                  ///< the first sample's k
+  int64_t first;                  ///< k of the first sample
   std::array<uint64_t, 4> signs;  ///< of rows (i, j), (i, j + 1), (i + 1, j), (i + 1, j + 1)
-  std::array<uint32_t, 3> edges;  ///< along each axis, those of cells in use
-  uint32_t cells;                 ///< in use
+  std::array<uint32_t, 3> edges;  ///< cut edges of used cells along each axis
+  uint32_t cells;                 ///< used cells
 
-  // Two bits from each row, in the order of the corners.
+  // Two bits of each row, in the order of the corners.
   size_t pattern(int bit) const {
     return static_cast<size_t>((signs[0] >> bit & 3) | (signs[1] >> bit & 3) << 2 | (signs[2] >> bit & 3) << 4 |
                                (signs[3] >> bit & 3) << 6);
   }
 };
 
-// Drops the edges that belong to no cell in use, and the cells that are not.
+// Drops unused cells, and edges without a used cell.
 void keep_used(const VolumeSigns& signs, int64_t i, int64_t j, int64_t m, CutWindow& cut) {
   const auto cells = [&](int64_t ci, int64_t cj) { return ci < 0 || cj < 0 ? 0 : signs.cells.row(ci, cj)[m]; };
-  // An edge across the row touches cell k and also cell k - 1.
+  // An edge across the row touches cells k - 1 and k.
   const auto cells_around = [&](int64_t ci, int64_t cj) {
     if (ci < 0 || cj < 0) return uint32_t{0};
     const uint32_t* row = signs.cells.row(ci, cj);
@@ -53,11 +53,11 @@ void keep_used(const VolumeSigns& signs, int64_t i, int64_t j, int64_t m, CutWin
   cut.cells &= cells(i, j);
 }
 
-// Calls visit(cut) for each CutWindow of row (i, j) in which signs differ.
+// Calls visit(cut) for each CutWindow of row (i, j) with both signs.
 template <typename Visit>
 void for_each_cut_window(const VolumeSigns& signs, int64_t i, int64_t j, const Visit& visit) {
   const auto [nx, ny, nz] = signs.shape;
-  // A row beyond the volume is taken to be the last one, which cuts no edge; there are no cells.
+  // Clamping the next row to the volume cuts no edge; there are no cells beyond it.
   const int64_t next_i = std::min(i + 1, nx - 1);
   const int64_t next_j = std::min(j + 1, ny - 1);
   const bool has_cells = i < next_i && j < next_j;
@@ -70,7 +70,7 @@ void for_each_cut_window(const VolumeSigns& signs, int64_t i, int64_t j, const V
     const uint64_t any = cut.signs[0] | cut.signs[1] | cut.signs[2] | cut.signs[3];
     const uint64_t all = cut.signs[0] & cut.signs[1] & cut.signs[2] & cut.signs[3];
     if ((any & concerned) == 0 || (all & concerned) == concerned) continue;
-    const int64_t followed = std::min(nz - 1 - cut.first, word_bits);  // samples that have another after them
+    const int64_t followed = std::min(nz - 1 - cut.first, word_bits);  // samples with a successor
     const auto in_row = static_cast<uint32_t>((uint64_t{1} << followed) - 1);
     cut.edges = {static_cast<uint32_t>(cut.signs[0] ^ cut.signs[2]), static_cast<uint32_t>(cut.signs[0] ^ cut.signs[1]),
                  static_cast<uint32_t>(cut.signs[0] ^ cut.signs[0] >> 1) & in_row};
@@ -80,7 +80,7 @@ void for_each_cut_window(const VolumeSigns& signs, int64_t i, int64_t j, const V
   }
 }
 
-// Of a plane of samples and of the slab of cells above it: counts, then (as running sums) places in the output.
+// Counts, then by prefix sums output offsets, of a plane of samples and the slab of cells above it.
 struct PlaneOffsets {
   int64_t vertices = 0;
   int64_t faces = 0;
@@ -101,8 +101,8 @@ PlaneOffsets count_plane(const VolumeSigns& signs, int64_t i) {
   return count;
 }
 
-// The output of a run of slabs. A slab of cells needs the vertices of the two planes around it, and no others are kept.
-// Edge 3 * k + axis of a row starts at sample k; edge 3 * (j * nz + k) + axis of a plane likewise.
+// Writes the output of consecutive slabs. A slab of cells needs only the vertices of the planes below and above it.
+// Edge 3 * k + axis of a row starts at sample k; edge 3 * (j * nz + k) + axis of a plane at sample (j, k).
 template <typename T>
 class SlabWriter {
  public:
@@ -120,8 +120,8 @@ class SlabWriter {
         edges_(new int32_t[static_cast<size_t>(3 * strides_[0])]),
         first_edge_(static_cast<size_t>(signs.shape[1]) + 1) {}
 
-  // Writes the triangles of slabs [begin, end) and the vertices of the planes below them. The last plane of all has no
-  // slab above it.
+  // Writes the triangles of slabs [begin, end) and the vertices of the planes below them. The last plane of the volume
+  // has no slab above it.
   void write(int64_t begin, int64_t end) {
     number_vertices(begin, lower_.get());
     write_plane(begin);
@@ -134,7 +134,7 @@ class SlabWriter {
   }
 
  private:
-  // Lists the cut edges of a plane, row by row, and notes the vertex of each. The rest of `vertices` stays unset.
+  // Lists the cut edges of a plane by row, and stores the vertex of each. Other elements of `vertices` stay unset.
   void number_vertices(int64_t i, int32_t* vertices) {
     auto vertex = static_cast<int32_t>(offsets_[static_cast<size_t>(i)].vertices);
     int32_t* next_edge = edges_.get();
@@ -149,7 +149,7 @@ class SlabWriter {
             const int64_t edge = 3 * k + static_cast<int64_t>(axis);
             row_vertices[edge] = vertex++;
             *next_edge++ = static_cast<int32_t>(edge);
-            // By now the volume has left the caches; waiting for it in write_vertices took a fifth of all time.
+            // The volume is no longer cached; without prefetching, write_vertices took a fifth of the time.
             prefetch(row + k);
             prefetch(row + k + strides_[axis]);
           }
@@ -159,7 +159,7 @@ class SlabWriter {
     first_edge_.back() = next_edge - edges_.get();
   }
 
-  // Of the plane numbered last.
+  // Writes the plane numbered last.
   void write_plane(int64_t i) {
     write_vertices(i);
     if (mesh_.edges) write_edges(i);
@@ -194,7 +194,7 @@ class SlabWriter {
     const auto& table = marching_cubes_table();
     int32_t* faces = mesh_.faces.get() + 3 * offsets_[static_cast<size_t>(i)].faces;
     for (int64_t j = 0; j + 1 < signs_.shape[1]; ++j) {
-      std::array<const int32_t*, 12> vertices{};  // on each edge of the row's first cell
+      std::array<const int32_t*, 12> vertices{};  // vertices on the edges of the row's first cell
       for (int edge = 0; edge < 12; ++edge) {
         const auto [corner, axis] = cell_edge(edge);
         const int64_t sample = (j + ((corner >> 1) & 1)) * strides_[1] + (corner & 1);
@@ -218,10 +218,10 @@ class SlabWriter {
   double level_;
   Mesh& mesh_;
   std::array<int64_t, 3> strides_;    ///< in samples, along each axis
-  std::unique_ptr<int32_t[]> lower_;  ///< the vertex on each cut edge of a plane; entries of other edges are unset
+  std::unique_ptr<int32_t[]> lower_;  ///< vertex of each cut edge of a plane; other elements are unset
   std::unique_ptr<int32_t[]> upper_;
-  std::unique_ptr<int32_t[]> edges_;  ///< cut edges of the plane numbered last, each within its row
-  std::vector<int64_t> first_edge_;   ///< of each row in edges_, and the end
+  std::unique_ptr<int32_t[]> edges_;  ///< cut edges of the plane numbered last, numbered by row
+  std::vector<int64_t> first_edge_;   ///< index in edges_ of each row's first edge, and the end
 };
 
 }  // namespace
@@ -231,7 +231,7 @@ Mesh marching_cubes_dense(const T* volume, const std::array<int64_t, 3>& shape, 
                           const Lattice& lattice, double level, int num_threads, bool with_edges) {
   check_lattice(lattice, level);
   const auto [nx, ny, nz] = shape;
-  if (nx < 2 || ny < 2 || nz < 2) return allocate_mesh(0, 0, with_edges);  // samples without a cell
+  if (nx < 2 || ny < 2 || nz < 2) return allocate_mesh(0, 0, with_edges);  // no cells
   if (nz > std::numeric_limits<int32_t>::max() / 3) throw std::invalid_argument("the volume's rows are too long");
   const VolumeSigns signs = read_signs(volume, shape, mask, level, num_threads);
 
@@ -243,7 +243,7 @@ Mesh marching_cubes_dense(const T* volume, const std::array<int64_t, 3>& shape, 
   }
   Mesh mesh = allocate_mesh(offsets.back().vertices, offsets.back().faces, with_edges);
 
-  // More runs than threads even out the load; each numbers the first plane of its successor again, so not many more.
+  // More parts than threads balance the load; each numbers the first plane of the next again, so not many more.
   const int64_t num_slabs = nx - 1;
   const int64_t threads = resolve_num_threads(num_threads);
   const int64_t num_runs = threads == 1 ? 1 : std::min(num_slabs, 8 * threads);

@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Marching cubes on a list of cells. An edge is named by its lower corner and its axis, so a plain array with three
-// entries per corner takes the place of a map from edges to vertices. Passes run over blocks of fixed size, whose
-// places in the output follow from their counts: the result does not depend on the number of threads.
+// Marching cubes on a list of cells. An edge is indexed by its lower corner and its axis, so a plain array with three
+// elements per corner replaces a map from edges to vertices. Passes run over blocks of fixed size; counts determine
+// their offsets in the output, so results do not depend on the number of threads.
 #include <atomic>
 #include <vector>
 
@@ -31,7 +31,7 @@ void for_each_block(int64_t size, int num_threads, const Task& task) {
   });
 }
 
-// Counts per block, at index block + 1; sum_up() turns them into the first place of each block, and the total.
+// Counts per block, at index block + 1; sum_up() converts them to the offset of each block, and the total.
 std::vector<int64_t> block_counts(int64_t size) {
   return std::vector<int64_t>(static_cast<size_t>((size + block_size - 1) / block_size) + 1);
 }
@@ -40,7 +40,7 @@ void sum_up(std::vector<int64_t>& counts) {
   for (size_t i = 1; i < counts.size(); ++i) counts[i] += counts[i - 1];
 }
 
-// The corners' signs, or 0 (a pattern without triangles) where a value is NaN.
+// Signs of the corners, or 0 (a pattern without triangles) if a value is NaN.
 template <typename T>
 std::uint8_t sign_pattern(const T* values, const int32_t* cell, double level) {
   unsigned pattern = 0;
@@ -85,8 +85,8 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
   }
   const auto& table = marching_cubes_table();
 
-  // For each edge that is cut: first its upper corner, then its vertex. Cells that share an edge write the same
-  // number, so which one comes last does not matter; atomics only make that well defined, at no cost.
+  // By cut edge: first its upper corner, then its vertex. Cells that share an edge write the same value, so the order
+  // does not matter; relaxed atomics only avoid a data race, at no cost.
   const int64_t num_edges = 3 * num_corners;
   const auto edges = large_array<std::atomic<int32_t>>(num_edges);
   for_each_block(num_edges, num_threads, [&](size_t, int64_t begin, int64_t end) {

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Two properties make the meshes closed and manifold, and the code below is nothing but these two:
+// Two properties make the meshes closed and manifold, and the code below implements exactly these:
 //  1. Where the surface crosses a cell's face depends on the four signs of that face alone, so the two cells that
 //     share it draw the same segments. The segments chain into loops; each cut edge lies on exactly one of them.
 //  2. No diagonal of a loop's triangulation joins two edges of one face. Two cells share nothing beyond a face, so
@@ -31,7 +31,7 @@ int edge_between(int corner_a, int corner_b) {
   throw std::logic_error("two corners of a cell that no edge joins");
 }
 
-// The corners of a face, counter-clockwise seen from outside the cell.
+// Corners of a face, counter-clockwise seen from outside the cell.
 std::array<int, 4> face_corners(int axis, bool upper) {
   const int u = axis_bit((axis + 1) % 3);
   const int v = axis_bit((axis + 2) % 3);
@@ -40,10 +40,10 @@ std::array<int, 4> face_corners(int axis, bool upper) {
   return {side, side | v, side | u | v, side | u};
 }
 
-// Adds the segments on one face to `next`, which maps each cut edge to the one that follows it in its loop.
-// Going round the face, a segment starts where the walk leaves the positive corners and ends where it had entered
-// them, so its cell's triangles face the positive side. On a face with two positive corners across the diagonal this
-// cuts off each positive corner by itself, the rule of property 1.
+// Adds the segments on one face to `next`, which maps each cut edge to its successor in its loop. In the order of the
+// corners, a segment starts where a run of positive corners ends and ends where that run starts, so the triangles face
+// the positive side. On a face with two diagonally opposite positive corners this separates the positive corners, the
+// rule of property 1.
 void trace_face(int pattern, const std::array<int, 4>& corners, std::array<int, num_edges>& next) {
   const auto corner = [&](int i) { return corners[static_cast<std::size_t>((i + 4) % 4)]; };
   const auto positive = [&](int i) { return ((pattern >> corner(i)) & 1) != 0; };
@@ -92,7 +92,7 @@ Point edge_middle(int edge) {
   return middle;
 }
 
-// How far a triangle is from equilateral: its squared sides over its area, infinite where it is a line.
+// Deviation from an equilateral triangle: squared sides over area, infinite if degenerate.
 double shape_cost(int edge_a, int edge_b, int edge_c) {
   const Point a = edge_middle(edge_a), b = edge_middle(edge_b), c = edge_middle(edge_c);
   const Point ab{b[0] - a[0], b[1] - a[1], b[2] - a[2]}, ac{c[0] - a[0], c[1] - a[1], c[2] - a[2]};
@@ -101,8 +101,8 @@ double shape_cost(int edge_a, int edge_b, int edge_c) {
   return (dot(ab, ab) + dot(ac, ac) - dot(ab, ac)) / double_area;  // |ab|²+|ac|²+|bc|² is twice the numerator
 }
 
-// The best triangulation of the part of a loop from `first` to `last`, closed by the line between these two: every
-// choice of the third corner on that line is tried. An infinite cost says that property 2 allows none.
+// Optimal triangulation of the part of a loop from `first` to `last`, closed by the line between them, over all choices
+// of the third corner of the triangle at that line. An infinite cost means that property 2 allows none.
 struct Triangulation {
   double cost = 0;
   std::vector<int> edges;

@@ -17,7 +17,7 @@ using std::int64_t;
 
 constexpr int64_t faces_between_checks = 1 << 16;
 
-// Union-find; halving the path on the way keeps the chains short.
+// Union-find with path halving.
 int32_t find_root(int32_t* parents, int32_t vertex) {
   while (parents[vertex] != vertex) vertex = parents[vertex] = parents[parents[vertex]];
   return vertex;

@@ -12,21 +12,21 @@ using std::int64_t;
 using std::size_t;
 
 constexpr int kRays = RayPacket::kRays;
-constexpr int kStack = 64;                 // boxes: a path down the tree is shorter
-constexpr float kLeastDirection = 1e-30F;  // along an axis: 1 / it is finite
-constexpr float kBoxSlack = 1 + 2e-5F;     // of the range at which a ray leaves a box: rounding hides none
-// Rays that pass an edge so near hit it, so none slips through between two triangles. With a third of that none did of
-// 10^7 rays that aimed at edges.
+constexpr int kStack = 64;                 // boxes: more than the depth of the tree
+constexpr float kLeastDirection = 1e-30F;  // component along an axis: its reciprocal is finite
+constexpr float kBoxSlack = 1 + 2e-5F;     // factor of the exit range of a box: no hit is lost by rounding
+// Rays this close to an edge hit it, so that none passes between two triangles. With a third of it, none of 10^7 rays
+// aimed at edges did.
 constexpr float kEdgeSlack_rad = 1e-7F;
-constexpr float kLeastSlope = 1e-6F;  // of a ray to a triangle's plane: a triangle that is seen edge-on is not hit
+constexpr float kLeastSlope = 1e-6F;  // between ray and plane: triangles seen edge-on are not hit
 
-// Compilers make vectors of these, not of std::min, which returns a reference.
+// Compilers vectorise these, but not std::min, which returns a reference.
 inline float least(float a, float b) { return a < b ? a : b; }
 inline float most(float a, float b) { return a > b ? a : b; }
 
 using Directions = float[3][kRays];
 
-// Whether any ray comes through a box before its hit. low, high: from the origin, m.
+// Whether any ray enters a box before its hit. low, high: relative to the origin, m.
 bool any_through(const RayPacket& packet, const Directions& inverse, const float* low, const float* high) {
   int any = 0;
   for (int i = 0; i < kRays; ++i) {
@@ -41,11 +41,11 @@ bool any_through(const RayPacket& packet, const Directions& inverse, const float
   return any != 0;
 }
 
-// Moeller and Trumbore 1997: what does not depend on the direction is common to the rays.
+// Moeller and Trumbore 1997; terms independent of the direction are shared by the rays.
 void meet(const TreeTriangle& triangle, std::int32_t row, const double* origin, bool front_only, RayPacket& packet) {
   const float *a = triangle.edges[0], *b = triangle.edges[1];
   float corner[3], normal[3], across_a[3], across_b[3], distance = 0, length = 0;
-  double height = 0;  // of the origin over the triangle's plane, times the length of `normal`
+  double height = 0;  // height of the origin above the triangle's plane, times the length of `normal`
   for (int axis = 0; axis < 3; ++axis) {
     const int next = (axis + 1) % 3, last = (axis + 2) % 3;
     const double from_origin = triangle.corner[axis] - origin[axis];
@@ -92,7 +92,7 @@ void meet(const TreeTriangle& triangle, std::int32_t row, const double* origin, 
 void trace(const TriangleTree& tree, const double* origin, bool front_only, RayPacket& packet) {
   Directions inverse;
   float towards[3] = {};
-  double lower[3];  // of the tree, from the origin
+  double lower[3];  // lower bound of the tree, relative to the origin
   for (int axis = 0; axis < 3; ++axis) {
     lower[axis] = tree.lower[axis] - origin[axis];
     for (int i = 0; i < kRays; ++i) {
@@ -119,7 +119,7 @@ void trace(const TriangleTree& tree, const double* origin, bool front_only, RayP
       continue;
     }
     const TreeBox *left = &tree.boxes[static_cast<size_t>(2 * i)], *right = left + 1;
-    float way = 0;  // from the left one to the right one, along the rays
+    float way = 0;  // from the left to the right box, along the rays
     for (int axis = 0; axis < 3; ++axis) {
       way += towards[axis] * (right->low[axis] + right->high[axis] - left->low[axis] - left->high[axis]);
     }

@@ -22,11 +22,11 @@ using std::size_t;
 using std::uint64_t;
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
-constexpr int64_t kSortedRays = int64_t{1} << 22;  // at a time: 16 bytes each
-constexpr int64_t kTaskRays = int64_t{1} << 12;    // few enough for a call to be interrupted
-constexpr double kFarther = 1.0001;                // than max_range_m rays go: their ranges are exact at the end only
+constexpr int64_t kSortedRays = int64_t{1} << 22;  // per pass: 16 bytes each
+constexpr int64_t kTaskRays = int64_t{1} << 12;    // few, so that a call can be interrupted
+constexpr double kFarther = 1.0001;                // margin beyond max_range_m: ranges become exact only at the end
 
-// Rows of directions (count, 3), below 2^32, in Morton order: neighbours go about the same way.
+// Rows of directions (count, 3), below 2^32, in Morton order, so that neighbours have similar directions.
 class ByDirection {
  public:
   ByDirection(const float* directions, int64_t count, int num_threads) : keys_(static_cast<size_t>(count)) {
@@ -36,8 +36,7 @@ class ByDirection {
       }
     });
     std::vector<uint64_t> sorted(keys_.size());
-    for (int shift = 32; shift < 32 + 3 * kBits;
-         shift += kBits) {  // by counting, since std::sort takes longer than rays
+    for (int shift = 32; shift < 32 + 3 * kBits; shift += kBits) {  // radix sort: std::sort takes longer than the rays
       const auto digit = [&](uint64_t own) { return static_cast<size_t>(own >> shift & ((1 << kBits) - 1)); };
       std::array<size_t, (1 << kBits) + 1> firsts{};
       for (const uint64_t own : keys_) ++firsts[digit(own) + 1];
@@ -49,7 +48,7 @@ class ByDirection {
   int64_t row(int64_t i) const { return static_cast<int64_t>(keys_[static_cast<size_t>(i)] & 0xffffffff); }
 
  private:
-  static constexpr int kBits = 10;  // an axis
+  static constexpr int kBits = 10;  // per axis
 
   static uint64_t key(const float* direction) {
     constexpr float kHalf = 1 << (kBits - 1);
@@ -63,7 +62,7 @@ class ByDirection {
   std::vector<uint64_t> keys_;
 };
 
-// From the origin to the plane of a triangle, m.
+// Distance from the origin to the plane of a triangle along the ray, m.
 double range_to(const TreeTriangle& triangle, const double* origin, const float* direction) {
   const float *a = triangle.edges[0], *b = triangle.edges[1];
   double height = 0, slope = 0;
@@ -113,7 +112,7 @@ void SurfaceTracer::first_hits(const double* origin, const float* directions, in
       for (int64_t first = task * kTaskRays; first < std::min(size, (task + 1) * kTaskRays);
            first += RayPacket::kRays) {
         std::array<int64_t, RayPacket::kRays> rows;
-        for (int64_t i = 0; i < RayPacket::kRays; ++i) {  // the last packet is filled with its last ray
+        for (int64_t i = 0; i < RayPacket::kRays; ++i) {  // the last packet is padded with its last ray
           rows[static_cast<size_t>(i)] = begin + order.row(std::min(first + i, size - 1));
         }
         trace_packet(rows);

@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// A lattice point becomes one 64-bit key, x then y then z from the top. A step along an axis then adds a constant to
-// the key, so the sorted cells shifted by such a step are sorted too: the corners are unions of sorted lists, in
-// linear time and in the order of memory, and no hash table is needed.
+// A lattice point is packed into a 64-bit key, x, y, z from the top. A step along an axis adds a constant to the key,
+// so sorted cells stay sorted when shifted by a step: corners are unions of sorted lists, computed in linear time with
+// sequential memory access and without a hash table.
 #include "surface/sparse_lattice.hpp"
 
 #include <algorithm>
@@ -24,12 +24,12 @@ using std::size_t;
 using std::uint64_t;
 
 using Keys = UninitialisedVector<uint64_t>;
-constexpr int64_t min_block = 1 << 14;  // below that a thread costs more than it does
+constexpr int64_t min_block = 1 << 14;  // smaller blocks do not repay a thread
 
 struct KeyFormat {
   std::array<int64_t, 3> lowest{};
-  std::array<int, 3> shift{};  ///< of each axis; z has none
-  int bits = 0;                ///< of a whole key
+  std::array<int, 3> shift{};  ///< position of each axis; 0 for z
+  int bits = 0;                ///< bits of a key
 
   uint64_t step(size_t axis) const { return uint64_t{1} << shift[axis]; }
 
@@ -71,7 +71,7 @@ KeyFormat key_format(const int32_t* cells, int64_t num_cells) {
   return format;
 }
 
-// Least significant digit first; 2048 counters stay in the first-level cache.
+// Least significant digit first; 2048 counters fit the L1 cache.
 void radix_sort(Keys& keys, int bits) {
   constexpr int digit_bits = 11;
   constexpr uint64_t digit_mask = (1 << digit_bits) - 1;
@@ -86,7 +86,7 @@ void radix_sort(Keys& keys, int bits) {
   }
 }
 
-// The union of a and b + step, both strictly increasing. Blocks are cut at keys of `a`, so they meet without overlap.
+// Union of a and b + step, both strictly increasing. Blocks are split at keys of `a`, so they do not overlap.
 Keys merge_shifted(const Keys& a, const Keys& b, uint64_t step, int num_threads) {
   const auto size = static_cast<int64_t>(a.size());
   const int64_t num_blocks = std::clamp<int64_t>(size / min_block, 1, resolve_num_threads(num_threads));
@@ -103,7 +103,7 @@ Keys merge_shifted(const Keys& a, const Keys& b, uint64_t step, int num_threads)
     const uint64_t *end_a = cut(block + 1), *end_b = cut_b(block + 1);
     Keys part(static_cast<size_t>((end_a - ia) + (end_b - ib)));
     uint64_t* out = part.data();
-    while (ia != end_a && ib != end_b) {  // without a branch on the keys, which would be mispredicted
+    while (ia != end_a && ib != end_b) {  // branch-free: comparisons of keys are unpredictable
       const uint64_t key_a = *ia, key_b = *ib + step;
       *out++ = std::min(key_a, key_b);
       ia += key_a <= key_b;
@@ -119,7 +119,7 @@ Keys merge_shifted(const Keys& a, const Keys& b, uint64_t step, int num_threads)
   return merged;
 }
 
-// Each thread sorts a part; a set has one sorted order, however it was split.
+// Each thread sorts a part; the sorted set does not depend on the partition.
 Keys sorted_set(const int32_t* cells, int64_t num_cells, const KeyFormat& format, int num_threads) {
   const int64_t num_parts = std::clamp<int64_t>(num_cells / min_block, 1, resolve_num_threads(num_threads));
   std::vector<Keys> parts(static_cast<size_t>(num_parts));
@@ -170,8 +170,8 @@ SparseLattice sparse_lattice(const int32_t* cells, int64_t num_cells, int num_th
   lattice.corners = decode_all(corner_keys, format, num_threads);
   lattice.cell_corners = large_array<int32_t>(8 * lattice.num_cells);
   parallel_blocks(lattice.num_cells, min_block, num_threads, [&](int64_t begin, int64_t end) {
-    // The corner above another along z is the next in order. The other four of a cell are found by walking on from
-    // those of the cell before.
+    // The next corner along z is the next key. The lower corners of the four columns are found by advancing from the
+    // previous cell.
     const std::array<uint64_t, 4> steps{0, format.step(1), format.step(0), format.step(0) + format.step(1)};
     const uint64_t* const keys = corner_keys.data();
     std::array<const uint64_t*, 4> found{};

@@ -16,17 +16,17 @@ using std::int32_t;
 using std::int64_t;
 using std::size_t;
 
-constexpr int64_t kLeafTriangles = 4;  // at most
+constexpr int64_t kLeafTriangles = 4;  // maximum
 constexpr int64_t kMinBlock = 1 << 10;
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr TreeBox kNothing{{kInfinity, kInfinity, kInfinity}, {-kInfinity, -kInfinity, -kInfinity}};
 
 struct Centre {
-  float at[3];  // sum of the corners, m from the tree's `lower`
+  float at[3];  // sum of the corners, m, relative to the tree's `lower`
   int32_t face;
 };
 
-// The axis along which centres are farthest apart.
+// Axis of the largest extent of centres.
 int widest_axis(const Centre* begin, const Centre* end) {
   TreeBox box = kNothing;
   for (const Centre* centre = begin; centre != end; ++centre) {
@@ -75,7 +75,7 @@ TriangleTree::TriangleTree(const double* vertices, int64_t num_vertices, const i
   });
   leaves = 1;
   for (; leaves * kLeafTriangles < num_faces; leaves *= 2) {
-    parallel_tasks(leaves, num_threads, [&](int64_t i) {  // halves each part
+    parallel_tasks(leaves, num_threads, [&](int64_t i) {  // halves each part at the median
       const auto at = [&](int64_t half) { return centres.data() + num_faces * half / (2 * leaves); };
       const int axis = widest_axis(at(2 * i), at(2 * i + 2));
       std::nth_element(at(2 * i), at(2 * i + 1), at(2 * i + 2),

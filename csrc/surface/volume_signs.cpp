@@ -17,7 +17,7 @@ using std::size_t;
 using std::uint32_t;
 using std::uint64_t;
 
-// flags: word_bits bytes that are 0 or 1. The product gathers the lowest bits of eight bytes in its top byte.
+// flags: word_bits bytes, 0 or 1. The product gathers the lowest bits of eight bytes in its top byte.
 inline uint32_t pack_flags(const std::uint8_t* flags) {
   uint32_t word = 0;
   for (int group = 0; group < word_bits; group += 8) {
@@ -28,7 +28,7 @@ inline uint32_t pack_flags(const std::uint8_t* flags) {
   return word;
 }
 
-// Writes test(k) for k in [0, size) as bits, and the word of zeros. Bytes come first since compilers vectorise that.
+// Writes test(k) for k in [0, size) as bits, and the word of zeros. Bytes first, because compilers vectorise them.
 template <typename Test>
 void write_bits(int64_t size, uint32_t* words, const Test& test) {
   std::uint8_t flags[word_bits];
@@ -45,7 +45,7 @@ void write_bits(int64_t size, uint32_t* words, const Test& test) {
   *words = 0;
 }
 
-// The largest T that is <= level, so that the samples > level are those > it: float samples need no conversion.
+// Largest T <= level, so that sample > level is equivalent to sample > T: float samples need no conversion.
 template <typename T>
 T round_down(double level) {
   constexpr T infinity = std::numeric_limits<T>::infinity();
@@ -60,7 +60,7 @@ T round_down(double level) {
 template <typename T>
 VolumeSigns read_signs(const T* volume, const std::array<int64_t, 3>& shape, const bool* mask, double level,
                        int num_threads) {
-  // Not a structured binding: C++17 lets no lambda capture one, which gcc forgives and clang does not.
+  // Not a structured binding: a C++17 lambda cannot capture one, which clang rejects.
   const int64_t nx = shape[0], ny = shape[1], nz = shape[2];
   VolumeSigns signs{shape, BitVolume(shape), {}};
   const T threshold = round_down<T>(level);

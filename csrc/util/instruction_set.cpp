@@ -10,7 +10,7 @@ namespace radarsdf {
 namespace {
 
 InstructionSet choose_at_load() {
-  // An unknown name is not an error here: a library must not fail to load for an environment variable.
+  // Unknown names are ignored: an environment variable must not prevent the library from loading.
   if (const char* name = std::getenv("RADARSDF_ISA")) {
     for (const InstructionSet isa : available_instruction_sets()) {
       if (instruction_set_name(isa) == std::string(name)) return isa;

@@ -28,7 +28,7 @@ thread_local bool ignores_interrupts = false;
 
 int resolve_num_threads(int num_threads) {
 #ifdef _OPENMP
-  // Where the system refuses a thread, OpenMP ends the whole program.
+  // OpenMP aborts the program if the system cannot create a thread.
   constexpr int kMaxThreads = 1024;
   if (forks > 0) return 1;
   return num_threads > 0 ? std::min(num_threads, kMaxThreads) : omp_get_max_threads();

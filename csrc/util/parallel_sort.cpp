@@ -12,7 +12,7 @@ void parallel_sort(std::vector<std::uint64_t>& keys, int num_threads) {
   const auto size = static_cast<std::int64_t>(keys.size());
   std::int64_t blocks = 1;
   const std::int64_t threads = resolve_num_threads(num_threads);
-  // Many keys make more blocks than threads: an interrupt waits for the end of a block.
+  // Large inputs have more blocks than threads: an interrupt is handled only at the end of a block.
   while (size / blocks > (blocks * 2 <= threads ? 1 << 15 : 1 << 22)) blocks *= 2;
   const auto at = [&](std::int64_t i) { return keys.begin() + size * i / blocks; };
   parallel_tasks(blocks, num_threads, [&](std::int64_t i) { std::sort(at(i), at(i + 1)); });

@@ -18,7 +18,7 @@ constexpr int kDigits = (64 + kDigitBits - 1) / kDigitBits;
 constexpr std::uint64_t kDigitMask = (1 << kDigitBits) - 1;
 
 struct Entry {
-  std::uint32_t low, high;  // of the key: with its halves apart an entry has 12 bytes instead of 16
+  std::uint32_t low, high;  // halves of the key: 12 bytes per entry instead of 16
   std::int32_t position;
 
   std::uint64_t digit(int number) const {
@@ -39,7 +39,7 @@ std::vector<std::int32_t> stable_order(const std::uint64_t* keys, std::int64_t c
   }
   for (int number = 0; number < kDigits; ++number) {
     auto& places = counts[static_cast<std::size_t>(number)];
-    if (std::find(places.begin(), places.end(), count) != places.end()) continue;  // all have the same digit
+    if (std::find(places.begin(), places.end(), count) != places.end()) continue;  // constant digit
     check_interrupt();
     std::int32_t next = 0;
     for (std::int32_t& place : places) {

@@ -16,8 +16,8 @@
 namespace radarsdf {
 namespace {
 
-// As long as it takes to wake a thread: whoever looks so long loses at most as much again. A fit of `hugin`
-// takes 2.5, 2.7, 2.7, 2.7 s with 1000, 250, 60 and 0 us, and next to a busy program 4.8, 4.1, 3.9, 3.8.
+// The time it takes to wake a thread: spinning this long at most doubles the latency. A fit of `hugin` takes 2.5, 2.7,
+// 2.7, 2.7 s with 1000, 250, 60 and 0 us, and 4.8, 4.1, 3.9, 3.8 s next to a busy program.
 constexpr std::chrono::microseconds kLook{100};
 
 inline void pause() {
@@ -28,7 +28,7 @@ inline void pause() {
 #endif
 }
 
-// Until `ready` or for a moment.
+// Spins until `ready` returns true or kLook has passed.
 template <typename Ready>
 void look(const Ready& ready) {
   const auto until = std::chrono::steady_clock::now() + kLook;

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The calibration experiment, with maps whose answers are known to be right, too small, or missing."""
+"""The calibration experiment, with uncertainties that are known to be correct, too small, or missing."""
 
 import numpy as np
 import pytest
@@ -19,18 +19,18 @@ def scene():
 
 @pytest.fixture(scope="module")
 def surface(scene):
-    """Points of the wall's front, moved along its normal by Gaussian errors of known deviations."""
+    """Points of the wall's front with Gaussian errors of known standard deviations along its normal."""
     rng = np.random.default_rng(0)
     y, z = rng.uniform(-6, 6, 6000), rng.uniform(0.6, 2.5, 6000)
     x = np.column_stack([np.zeros(6000), y, z])
     normals = np.tile([1.0, 0.0, 0.0], (6000, 1))
-    # Windows stand out, and the reflector.
+    # Exclude windows and the reflector, which stand out.
     x -= along_normals(scene.simulation.scene, x + 0.2 * normals, normals)[:, None] * normals - 0.2 * normals
     sigma_m = rng.uniform(0.01, 0.1, 6000)
     return x + (sigma_m * rng.standard_normal(6000))[:, None] * normals, normals, sigma_m
 
 
-def test_a_right_map_is_right(scene, surface):
+def test_a_calibrated_map_has_nominal_coverage(scene, surface):
     x, normals, sigma_m = surface
     row = compared(scene, x, normals, sigma_m, np.ones(len(x)), 0.2)
     assert row["coverage_95"] == pytest.approx(0.95, abs=0.01)
@@ -48,19 +48,19 @@ def test_false_surface_and_unknown_points_are_shares(scene, surface):
     row = compared(scene, x, normals, sigma_m, np.where(np.arange(6000) < 600, 0.05, 0.95), 0.2)
     assert row["false_share"] == pytest.approx(0.1, abs=0.02)  # some reach the ground or the reflector
     assert row["unobserved_share"] == pytest.approx(0.05)
-    assert row["coverage_95"] == pytest.approx(0.95, abs=0.01)  # of the rest
+    assert row["coverage_95"] == pytest.approx(0.95, abs=0.01)  # of the other points
     assert row["num_points"] + row["num_unknown"] == 6000
     assert row["confidence_auc"] > 0.95
 
 
-def test_samples_lie_on_the_mesh_with_its_normals():
+def test_samples_lie_on_the_mesh_and_have_its_normals():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=2.0)
     x, normals = sampled(ball, 20_000, None)
     assert len(x) == 20_000
     np.testing.assert_allclose(np.linalg.norm(x, axis=1), 2, atol=0.03)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
     assert (np.einsum("ij,ij->i", normals, x) / 2 > 0.98).all()
-    assert np.abs(x.mean(axis=0)).max() < 0.05  # as much on each side
+    assert np.abs(x.mean(axis=0)).max() < 0.05  # balanced
     upper, _ = sampled(ball, 20_000, np.array([[-3.0, -3, 0], [3, 3, 3]]))
     assert upper[:, 2].min() >= 0
     assert len(upper) == pytest.approx(10_000, rel=0.05)

@@ -19,7 +19,7 @@ from bench.speed import packages_of
 @pytest.mark.parametrize(
     ("count", "size_m", "frames"), [(1000, 50.0, 5), (20_001, 50.0, 5), (1000, 500.0, 50)]
 )
-def test_a_street_has_its_returns_and_its_length(count, size_m, frames):
+def test_a_street_has_the_requested_returns_and_length(count, size_m, frames):
     scans = street(count, size_m)
     assert sum(map(len, scans.points)) == sum(map(len, scans.intensities)) == count
     assert len(scans.points) == len(scans.poses) == frames
@@ -33,7 +33,7 @@ def test_a_street_has_its_returns_and_its_length(count, size_m, frames):
     assert np.abs(scans.hit_intensities - (100 - 40 * np.log10(range_m))).max() < 6.01
 
 
-def test_a_map_of_another_street_is_refused():
+def test_a_map_of_another_street_is_rejected():
     scans = street(10_000, 50.0)
     config = FitConfig(
         training={"sdf_iterations": 60, "intensity_iterations": 1}, networks={"reflectance": "network"}
@@ -55,7 +55,7 @@ def surface(places, kinds):
     return ChangedSurface(vertices, faces, np.repeat(np.array(kinds, np.int8), 3), nothing, nothing, nothing)
 
 
-def test_recall_is_on_the_cube_and_false_area_away_from_it():
+def test_recall_counts_the_cube_and_false_area_the_rest():
     cube = Change("taken out", 1.0, Box(np.zeros(3), np.full(3, 0.5), 0.0, CONCRETE), None)
     before = surface([[0.5, 0, 0], [-0.5, 0, 0], [0.7, 0, 0], [5, 0, 0]], [GONE, SAME, GONE, SAME])
     after = surface([[9, 0, 0], [8, 0, 0], [7, 0, 0]], [2, SAME, SAME])
@@ -92,11 +92,11 @@ fn=(4)
 """
 
 
-def test_a_call_does_not_count_for_the_caller():
+def test_costs_of_callees_are_exclusive():
     assert by_object(_CALLGRIND) == {"libm.so.6": 70, "_core.so": 18, "libc.so.6": 9}
 
 
-def test_what_is_too_much_is_named():
+def test_counts_above_the_limit_are_named():
     expected = {"quick fit": 1000, "joint": 100}
     assert faults({"quick fit": 1100, "joint": 50, "new": 9}, expected, 1.01) == []
     found = faults({"quick fit": 1200, "joint": 116}, expected, 1.2)
@@ -106,7 +106,7 @@ def test_what_is_too_much_is_named():
     ]
 
 
-def test_a_checkout_without_a_core_is_refused(tmp_path):
+def test_a_checkout_without_a_core_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="neither a wheel nor a checkout"):
         packages_of(tmp_path, tmp_path / "out")
     (tmp_path / "python" / "radarsdf").mkdir(parents=True)

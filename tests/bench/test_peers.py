@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Peers run in processes of their own, alike for all, and say why they cannot."""
+"""Peers run in separate processes with the same interface, and report why they cannot run."""
 
 import importlib.util
 
@@ -19,14 +19,14 @@ def scans():
 
 
 def queries_of(points, poses):
-    """All returns, and where they were seen from, in the world."""
+    """All returns and their sensor positions, world frame."""
     at = [scan @ pose[:3, :3].T + pose[:3, 3] for scan, pose in zip(points, poses, strict=True)]
     return np.concatenate(at), np.repeat(poses[:, :3, 3], [len(scan) for scan in points], axis=0)
 
 
 @pytest.fixture(scope="module")
 def usual(scans):
-    """Ours for surfaces alone, although intensities and queries are given."""
+    """Our surface without intensities, although intensities and queries are given."""
     queries = queries_of(scans.points, scans.poses)
     return reconstruct(OURS, scans.points, scans.poses, scans.intensities, queries=queries)
 
@@ -38,7 +38,7 @@ def test_a_peer_for_surfaces_predicts_no_intensities(usual):
     assert usual.intensity is None
 
 
-def test_far_from_the_origin_mesh_and_intensities_are_in_the_world(scans):
+def test_far_from_the_origin_results_are_in_the_world_frame(scans):
     peer = PEERS["radarsdf, intensities"].with_changes(
         training={"sdf_iterations": 60, "intensity_iterations": 300}, mesh={"min_component_triangles": 20}
     )
@@ -73,14 +73,14 @@ def test_far_from_the_origin_mesh_and_intensities_are_in_the_world(scans):
         ),
     ],
 )
-def test_a_peer_that_cannot_run_says_why(scans, peer, why_not):
+def test_a_peer_that_cannot_run_reports_the_reason(scans, peer, why_not):
     done = reconstruct(peer, scans.points, scans.poses)
     assert done.mesh is None
     assert why_not in done.why_not
 
 
 @pytest.mark.parametrize("name", ["α-shapes", "BPA", "VDBFusion"])
-def test_the_surface_is_where_the_returns_are(scans, name):
+def test_the_surface_is_near_the_returns(scans, name):
     peer = PEERS[name]
     done = reconstruct(peer, scans.points, scans.poses)
     if done.mesh is None and (

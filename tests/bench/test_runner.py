@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The runner writes the rows of each experiment, and tables of them; what has no result says why."""
+"""The runner writes rows and tables of each experiment, with the reason for missing results."""
 
 import json
 from functools import partial
@@ -21,7 +21,7 @@ from bench.settings import parsed, words_of
 
 @pytest.fixture
 def peers(monkeypatch):
-    """A peer that answers at once with a surface of its own, and one that cannot."""
+    """A peer that immediately returns its own surface, and one that fails."""
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
 
     def reconstruct(peer, points, poses, *_args, **_ranges):
@@ -54,12 +54,12 @@ SCORES = [
 F = {"f": Column("F, %", 100, 1, "highest"), "absent": Column("absent")}
 
 
-def test_repetitions_are_a_mean_and_a_deviation():
+def test_repetitions_have_a_mean_and_a_standard_deviation():
     assert shown(SCORES, columns=F)[2:] == ["| x | 60.0 ± 14.1 |", "| y | **65.0 ± 7.1** |"]
     assert shown(SCORES, columns=F, median=True)[2] == "| x | 60.0 |"
 
 
-def test_values_side_by_side_have_their_best_in_each_line_and_a_mean_of_complete_lines():
+def test_compared_values_mark_the_best_per_row_and_average_complete_rows():
     rows = [
         *SCORES,
         {"kind": "c", "method": "x", "f": 0.1},
@@ -87,7 +87,7 @@ def test_json_has_no_infinity(tmp_path):
     assert json.loads((tmp_path / "x.json").read_text()) == {"a": [1.0, None], "b": 0.1, "c": 3}
 
 
-def test_settings_are_words():
+def test_settings_are_parsed_from_words():
     changes = parsed(["networks.normals=True", "encoding.kind=octree", "mesh.voxel_size=0.2", "seed=3"])
     assert changes == {
         "networks": {"normals": True},
@@ -132,7 +132,7 @@ def test_map_size_of_the_octree_is_the_reference(tmp_path):
 
 
 @pytest.mark.usefixtures("peers")
-def test_curve_has_budgets_settings_and_peers_by_turns(tmp_path):
+def test_curve_alternates_budgets_settings_and_peers(tmp_path):
     words = ("curve", "wall", "--peers", "BPA", "radarsdf", "--repetitions", "2", "--samples", "1000")
     _, values = run(tmp_path, *words, "--set", "encoding.kind=octree", "encoding.bridge_cells=2")
     methods = [
@@ -187,7 +187,7 @@ def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("peers")
-def test_a_scene_without_intensities_or_truth_stays_in_the_tables(tmp_path):
+def test_tables_keep_scenes_without_intensities_or_ground_truth(tmp_path):
     scans = load_scene("wall", frames=4)
     frame = np.repeat(np.arange(4), [len(p) for p in scans.points])
     path = tmp_path / "bare.npz"

@@ -22,7 +22,7 @@ def wall():
     return load_scene("wall", frames=6, seed=3)
 
 
-def test_every_nth_takes_the_simulation_along(wall):
+def test_every_nth_subsamples_the_simulation(wall):
     third = wall.every_nth(3)
     assert len(third) == 2
     assert_array_equal(third.points[1], wall.points[3])
@@ -38,14 +38,14 @@ def test_every_nth_takes_the_simulation_along(wall):
 
 
 @pytest.mark.parametrize("spec", ["hugo", "scans.csv", "absent.npz"])
-def test_what_is_no_scene(spec, tmp_path):
+def test_paths_that_are_no_scenes_are_rejected(spec, tmp_path):
     (tmp_path / "scans.csv").touch()
     with pytest.raises(ValueError, match=r"hugin.*\.npz"):
         load_scene(spec if spec == "hugo" else str(tmp_path / spec))
 
 
 def scans_with_lidar(frames):
-    """Each scan sees a point 2 m, one 10 m and one 70 m ahead; lidar points are beside them and elsewhere."""
+    """Each scan has points 2 m, 10 m and 70 m ahead; lidar points are near them and elsewhere."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 1, 3] = 0.01 * np.arange(frames)
     points = [np.array([[2, 0, 0], [10, 0, 0], [70, 0, 0]], np.float32)] * frames
@@ -77,7 +77,7 @@ def ranges_up(simulation):
     return simulation.scene.raycast(at, np.tile([0.0, 0.0, 1.0], (len(at), 1)), 100.0).range_m
 
 
-def test_returns_labelled_surface_are_near_one_and_others_are_not(scenes):
+def test_labels_of_returns_agree_with_distances_to_surfaces(scenes):
     for name, simulation in scenes.items():
         surface = simulation.is_surface()
         distance_m = np.abs(simulation.scene.signed_distance(simulation.world_points()))
@@ -87,13 +87,13 @@ def test_returns_labelled_surface_are_near_one_and_others_are_not(scenes):
             assert np.median(distance_m[~surface]) > 2 * np.median(distance_m[surface]), name
 
 
-def test_what_is_enclosed_has_a_roof(scenes):
+def test_enclosed_kinds_have_a_roof(scenes):
     roofed = {name for name, simulation in scenes.items() if np.isfinite(ranges_up(simulation)).all()}
     assert {"hall", "tunnel"} <= roofed
     assert not roofed & {"yard", "slope", "facade", "car_park", "fences"}
 
 
-def test_a_seed_gives_the_same_bits_and_another_seed_another_scene(scenes):
+def test_scenes_are_deterministic_by_seed(scenes):
     again, other = (KINDS["hall"](seed=seed, frames=2) for seed in (3, 4))
     assert_array_equal(again.world_points(), scenes["hall"].world_points())
     assert_array_equal(again.ground_truth, scenes["hall"].ground_truth)
@@ -108,7 +108,7 @@ def flat_ground():
 
 
 def wall_world():
-    """A wall whose front is x = 0 and whose back is x = -0.3, on ground at z = 0 and reaching below it."""
+    """A wall with the front x = 0 and the back x = -0.3, on ground at z = 0 and extending below it."""
     wall = Box(np.array([-0.15, 0.0, 1.0]), np.array([0.15, 5.0, 2.0]), 0.0, materials.BRICK)
     pole = Pole(np.array([4.0, 0.0, 0.0]), 0.1, 3.0, materials.METAL)
     return World([wall, pole], flat_ground())
@@ -121,13 +121,13 @@ def errors(points, normal):
 
 def test_errors_are_positive_in_front_and_negative_behind():
     points = [[0.2, 0, 1.5], [0.01, 1, 1], [0, 1, 1], [-0.1, 2, 1], [-0.29, 2, 1], [-0.5, 2, 1]]
-    # The last three are nearer to the back, which faces the other way.
+    # The last three are nearer to the back, which has the opposite normal.
     np.testing.assert_allclose(errors(points, X), [0.2, 0.01, 0, -0.1, -0.29, -0.5], atol=1e-6)
     np.testing.assert_allclose(errors([[-0.5, 2, 1], [-0.1, 2, 1]], -X), [0.2, -0.2], atol=1e-6)
 
 
-def test_ground_under_things_and_foundations():
-    # Beside the wall; and 5 cm below the ground, 10 cm in front of the foundation, which is not the surface.
+def test_ground_near_walls_and_foundations_is_the_surface():
+    # Next to the wall; and 5 cm below the ground, 10 cm in front of the foundation, which is no surface.
     np.testing.assert_allclose(errors([[0.1, 0, 0.1], [0.1, 0, -0.05]], Z), [0.1, -0.05], atol=1e-6)
     np.testing.assert_allclose(errors([4.0 - 0.15, 0, 1.0], -X), [0.05], atol=1e-6)
 
@@ -146,12 +146,12 @@ def test_planes_through_noisy_points(offset):
     ).all()
 
 
-def test_beyond_an_edge_there_is_no_error():
+def test_points_beyond_an_edge_have_no_error():
     scene = load_scene("wall", frames=2)
     assert scene.simulation is not None
     simulation = dataclasses.replace(scene.simulation, scene=wall_world())
     scene = dataclasses.replace(scene, simulation=simulation)
-    # Above the wall, whose top is at 3 m; beside it, with the normal up; and on the ground, 60 cm under that.
+    # Above the wall, which is 3 m high; next to it, with the normal up; and on the ground, 60 cm below that.
     x = np.array([[-0.1, 0, 3.05], [0.05, 0, 0.6], [0.7, 0, 0.02]])
     truth = truth_of(scene, x, np.broadcast_to(Z, x.shape))
     np.testing.assert_allclose(truth.error_m, [0.05, np.nan, 0.02], atol=1e-6)

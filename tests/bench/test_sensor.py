@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The simulated `astyx` is as noisy as the recorded drives, and would not be without any part of its noise."""
+"""The simulated `astyx` is as noisy as the recorded drives, and each part of its noise is needed for that."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 
 from bench.sensor import Drive, deviation, figures, plane_errors, with_lidar
 
-SEED = 2  # a scene that by itself agrees with the drives; others do so in the median
+SEED = 2  # a scene that agrees with the drives on its own; other seeds agree in the median
 
 
 class Expected(NamedTuple):
-    """A figure of the recorded drives, and the factor up to which a simulated one may differ."""
+    """A statistic of the recorded drives, and the factor by which a simulated one may differ."""
 
     value: float
     factor: float
@@ -64,7 +64,7 @@ EXPECTED = {
 
 
 def misfits(found: dict[str, float]) -> dict[str, float]:
-    """Simulated over expected figure, of those figures that differ by more than their factor or that are missing."""
+    """Ratios of simulated to expected statistics that are missing or differ by more than their factor."""
     ratios = {name: found[name] / expected.value for name, expected in EXPECTED.items()}
     return {
         name: ratio
@@ -106,8 +106,8 @@ def test_each_part_of_the_noise_is_needed(simulation, drive, changes, what_fails
     assert (wrong[what_fails] > 1) == is_too_large
 
 
-def test_plane_errors_are_those_along_the_normal_of_a_plane():
-    """A wall 20 m ahead, whose normal is the beam, far from the origin of the world."""
+def test_plane_errors_are_residuals_along_the_normal():
+    """A wall 20 m ahead, normal to the beam, far from the world origin."""
     rng = np.random.default_rng(0)
     aside = np.array([4e5, 5e6, 100.0])
     wall = np.column_stack([np.full(4000, 20.0), rng.uniform(-3, 3, (4000, 2))]) + aside

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Drives past a wall, before and after something beside it changed."""
+"""Drives past a wall, before and after changes next to it."""
 
 import pytest
 import radarsdf
@@ -23,11 +23,11 @@ def drives_past(before, after):
 
 @pytest.fixture(scope="module")
 def maps(drives):
-    """Of the `drives` of a module."""
+    """Maps of the `drives` of a module."""
     return [radarsdf.fit(drive.points, drive.poses, drive.intensities, config=QUICK) for drive in drives]
 
 
 @pytest.fixture(scope="module")
 def changes(maps):
-    """From the first to the last."""
+    """Changes from the first map to the last."""
     return radarsdf.compare(maps[0], maps[2])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Two drives through one place, between which a box goes and another one comes."""
+"""Two drives through one place: in between, one box is removed and another is added."""
 
 import re
 from dataclasses import replace
@@ -33,7 +33,7 @@ def drives():
 
 
 def shares(surface, kind, center):
-    """Share of the area on a box that is of a kind, and area of that kind elsewhere, m²."""
+    """Share of a box's area of a kind of change, and area of that kind elsewhere, m²."""
     kinds, areas = surface.of_faces()
     away = np.linalg.norm(surface.vertices[surface.faces].mean(axis=1)[:, :2] - center[:2], axis=1)
     on = away < 1.0
@@ -42,7 +42,7 @@ def shares(surface, kind, center):
     return areas[there & (kinds == kind)].sum() / areas[there].sum(), areas[~on & (kinds > 0)].sum()
 
 
-def test_what_went_is_gone_what_came_appeared_and_nothing_else_did(changes):
+def test_removed_and_added_objects_are_the_only_changes(changes):
     gone, beside = shares(changes.before, GONE, TAKEN)
     appeared, beside_after = shares(changes.after, APPEARED, PUT)
     assert gone > 0.6
@@ -52,13 +52,13 @@ def test_what_went_is_gone_what_came_appeared_and_nothing_else_did(changes):
     assert {region.kind for region in first} == {"gone", "appeared"}
 
 
-def test_nothing_changed_between_two_drives_through_one_scene(maps):
+def test_repeated_drives_through_a_scene_have_no_changes(maps):
     same = radarsdf.compare(maps[0], maps[1])
     assert sum(same.report["areas_m2"].values()) < 0.005 * same.report["compared_m2"]
 
 
-def test_what_the_later_drive_did_not_see_is_not_gone(drives, maps):
-    # The drive after the change, without any ray that comes near the place of the box.
+def test_surfaces_unobserved_by_the_later_drive_are_not_gone(drives, maps):
+    # The drive after the change, without rays near the place of the box.
     drive = drives[2]
     scans = [
         scan[_clear_of(TAKEN, T, scan @ T[:3, :3].T + T[:3, 3])]
@@ -74,7 +74,7 @@ def test_what_the_later_drive_did_not_see_is_not_gone(drives, maps):
 
 
 def _clear_of(center, T, ends):
-    """Which rays keep 1.3 m away from a place."""
+    """Mask of rays that stay at least 1.3 m away from a place."""
     rays, to_center = ends - T[:3, 3], center - T[:3, 3]
     share = np.clip(rays @ to_center / (rays**2).sum(axis=1), 0, 1)
     return np.linalg.norm(share[:, None] * rays - to_center, axis=1) > 1.3
@@ -86,20 +86,20 @@ def test_maps_of_different_frames_are_aligned_first(drives, maps):
     found = radarsdf.compare(maps[0], drive.points, apart @ drive.poses, drive.intensities)
     assert "moved" in found.report["alignment"]
     x = np.append(PUT, 1)
-    # The wall tells nothing along itself.
+    # The offset along the wall is unobservable.
     assert np.abs(found.T_before_after @ apart @ x - x)[[0, 2]].max() < 0.1
 
 
 @pytest.fixture(scope="module")
 def wall_alone(maps):
-    """Two maps of a wall and the ground, the later one without what faces along the wall."""
+    """Two maps of a wall and the ground, the later one without surfaces that face along the wall."""
     before, after = (PlacedMap.of(radar_map) for radar_map in maps[:2])
     along = np.abs(after.normals[after.faces, 1]).max(axis=1)
     return before, replace(after, faces=after.faces[along < 0.15])
 
 
 @pytest.mark.parametrize("shift_m", [(0.3, 0.15, 0.03), (-0.7, 0.5, 0.1)], ids=str)
-def test_a_wall_is_aligned_along_its_normal_and_left_along_itself(wall_alone, shift_m):
+def test_a_wall_is_aligned_only_along_its_normal(wall_alone, shift_m):
     before, after = wall_alone
     found = align(before, replace(after, vertices=after.vertices + shift_m))
     assert found.improved
@@ -108,14 +108,14 @@ def test_a_wall_is_aligned_along_its_normal_and_left_along_itself(wall_alone, sh
 
 
 @pytest.mark.parametrize("shift_m", [(0, 0, 0), (0, 0.3, 0)], ids=str)
-def test_frames_are_kept_that_surfaces_do_not_show_to_be_apart(wall_alone, shift_m):
+def test_frames_without_a_significant_offset_are_kept(wall_alone, shift_m):
     before, after = wall_alone
     found = align(before, replace(after, vertices=after.vertices + shift_m))
     assert not found.improved
     np.testing.assert_array_equal(found.T_before_after, np.eye(4))
 
 
-def test_a_map_without_a_surface_is_refused_by_name(maps):
+def test_a_map_without_a_surface_is_named_in_the_error(maps):
     two = [np.array([[5.0, 0, 0], [5.0, 0.3, 0.1]])]
     with pytest.raises(ValueError, match="after has no surface"):
         radarsdf.compare(maps[0], two, [np.eye(4)])
@@ -129,14 +129,14 @@ def test_a_map_without_a_surface_is_refused_by_name(maps):
     [(np.pi / 9, 0, "of the steep surfaces"), (0, 200, "no surface in common")],
     ids=["turned", "elsewhere"],
 )
-def test_maps_that_do_not_fit_together_are_refused(drives, maps, turn_rad, shift_m, said):
+def test_incompatible_maps_are_rejected(drives, maps, turn_rad, shift_m, said):
     apart = transform(np.array([0.0, 0.0, turn_rad]), np.array([shift_m, 0.0, 0.0]))
     with pytest.raises(ValueError, match=said):
         radarsdf.compare(maps[0], drives[1].points, apart @ drives[1].poses, align_frames=False)
 
 
-def test_a_box_round_a_change_has_nothing_but_the_change(changes, maps):
-    """Although most of what is in it changed: maps are judged as a whole."""
+def test_a_box_around_a_change_has_only_that_change(changes, maps):
+    """Although most of its contents changed: change rates are estimated from whole maps."""
     around = np.stack([TAKEN - [0.7, 0.7, 0.1], TAKEN + 0.7])
     found = radarsdf.compare(maps[0], maps[2], box=around)
     assert {region.kind for region in found.regions(0.1)} == {"gone"}
@@ -145,7 +145,7 @@ def test_a_box_round_a_change_has_nothing_but_the_change(changes, maps):
     assert 0 < found.report["compared_m2"] < 0.1 * changes.report["compared_m2"]
 
 
-def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
+def test_files_contain_the_changes(changes, maps, tmp_path, capsys):
     for number, name in ((0, "a"), (2, "b")):
         maps[number].save(tmp_path / f"{name}.safetensors")
     out = tmp_path / "changes.ply"
@@ -164,7 +164,7 @@ def test_files_hold_what_was_found(changes, maps, tmp_path, capsys):
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) >= 3
 
 
-def test_maps_without_free_space_and_poses_of_maps_are_refused(maps, drives):
+def test_maps_without_free_space_and_bad_poses_are_rejected(maps, drives):
     drive = drives[0]
     blind = radarsdf.fit(drive.points[:4], drive.poses[:4], config=radarsdf.FitConfig.quick())
     with pytest.raises(ValueError, match="after has no free-space crossings"):

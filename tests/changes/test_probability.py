@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Probabilities of changes against numeric integrals, draws, and searches of all pairs."""
+"""Probabilities of changes against numerical integrals, random draws, and brute-force searches."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -38,7 +38,7 @@ from scipy.stats import beta, norm
 from scipy.stats import t as student
 
 
-def test_odds_and_the_share_that_explains_them():
+def test_odds_and_the_estimated_share_of_changes():
     rng = np.random.default_rng(0)
     sigma, reach = rng.uniform(0.5, 2, 20_000), 30.0
     changed = rng.random(20_000) < 0.1
@@ -53,7 +53,7 @@ def test_odds_and_the_share_that_explains_them():
     assert share_of_changes(np.full(9, 30.0)) == 0.5
 
 
-def test_rays_that_pass_are_those_of_a_beta_binomial():
+def test_free_space_crossings_are_beta_binomial():
     own = SimpleNamespace(hits=np.array([10.0, 4, 2]), passes=np.array([0.0, 6, 16]))
     other = SimpleNamespace(hits=np.array([0.0, 1, 8]), passes=np.array([6.0, 19, 0]))
 
@@ -104,7 +104,7 @@ def test_odds_of_distances_are_ratios_of_their_densities():
     assert np.isneginf(shifted[3:]).all()
 
 
-def test_errors_of_distances_are_found_besides_changes():
+def test_errors_of_distances_are_estimated_despite_changes():
     rng = np.random.default_rng(1)
     sigmas = rng.uniform(0.005, 0.01, 20_000)
     distances = np.where(
@@ -144,14 +144,14 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
             shifted if kind == MOVED and distance_m < 0 else max(absent, shifted) if kind == MOVED else absent
         )
         assert found.probability[0] == pytest.approx(1 / (1 + np.exp(-probable)))
-    # A surface that hardly is one has not changed.
+    # Surfaces of low probability have not changed.
     unsure = dataclasses.replace(
         of_side, own=evidence([0.0], confidence=0.4), other=evidence([distance_m], normals)
     )
     assert _classify(unsure, *odds, 0.5, GONE).kind[0] in (SAME, UNSEEN)
 
 
-def test_means_near_a_place_are_weighted():
+def test_means_of_a_neighbourhood_are_weighted():
     rng = np.random.default_rng(2)
     means = _Means(rng.uniform(0, 3, (200, 3)), rng.normal(0, 5, 200), rng.uniform(0.5, 4, 200))
     x = np.concatenate([rng.uniform(0, 3, (20, 3)), [[90.0, 0, 0]]])
@@ -169,8 +169,8 @@ def test_means_near_a_place_are_weighted():
         assert freedom == near.sum() - 1
 
 
-def test_reflectance_changes_where_all_views_say_so():
-    """Nine views of each of five places: alike, stronger, stronger but at odds, at odds on a day, near another change."""
+def test_reflectance_changes_only_if_all_views_agree():
+    """Nine views of five places: equal, stronger, stronger but contradictory, contradictory on a day, near a change."""
     rng = np.random.default_rng(3)
     places = 10.0 * np.arange(5)[:, None] * [1, 0, 0]
     points = np.repeat(places, 9, axis=0)
@@ -193,7 +193,7 @@ def test_reflectance_changes_where_all_views_say_so():
 
 
 def squares(*kinds):
-    """Apart, of 1, 2, 3 m and so on; numbers of vertices count up."""
+    """Disjoint squares of 1, 2, 3 m and so on, with consecutive vertices."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     vertices = np.concatenate([corners * (i + 1) + [0, 0, i] for i in range(len(kinds))])
     faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * i for i in range(len(kinds))])
@@ -203,9 +203,9 @@ def squares(*kinds):
 
 def test_regions_areas_and_colours_of_changes():
     before, after = squares(GONE, SAME, MOVED), squares(MOVED, UNSEEN, REFLECTANCE_CHANGED, APPEARED)
-    before.moved_m[8] = np.nan  # of some vertices it is unknown
+    before.moved_m[8] = np.nan  # unknown for some vertices
     before.kind[4] = GONE  # one vertex of four
-    after.kind[12] = SAME  # the first of both triangles; the other two say what they are
+    after.kind[12] = SAME  # the first vertex of both triangles; the other two decide
     changes = Changes(before, after, np.eye(4), {})
     found = [(r.kind, r.area_m2, r.probability, r.moved_m, r.intensity_change) for r in changes.regions()]
     expected = [
@@ -252,7 +252,7 @@ def test_frames_of_maps_and_their_errors():
     offset = surface.offset(T)
     assert_allclose(surface.pose(offset), T, atol=1e-12)
     assert_allclose(surface.centre + offset[:3], T[:3, :3] @ surface.centre + T[:3, 3])
-    # A rotation about the centre moves places by their distance from its axis.
+    # A rotation about the centre displaces places in proportion to their distance from its axis.
     covariance = np.diag([0.01, 0.04, 0.09, 0, 0, 0.0004])
     alignment = Alignment(covariance=covariance, centre=np.array([1.0, 0, 0]))
     normals = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])

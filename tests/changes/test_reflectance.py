@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Two drives through one place, between which boxes are of changed reflectance."""
+"""Two drives through one place: in between, the reflectance of boxes changes."""
 
 import dataclasses
 
@@ -25,12 +25,12 @@ def box(center, more_db=0.0):
 
 @pytest.fixture(scope="module")
 def drives():
-    """A drive past a wall with three boxes, one without changes, and one after two were of changed reflectance."""
+    """A drive past a wall with three boxes, one without changes, and one after the reflectance of two changed."""
     return drives_past(*([box(STRONGER, more), box(WEAKER, -more), box(KEPT)] for more in (0.0, STRONGER_DB)))
 
 
 def on_box(surface, center):
-    """Share of a box's area that changes its reflectance, and the median change of intensity there."""
+    """Share of a box's area with changed reflectance, and its median change of intensity."""
     kinds, areas = surface.of_faces()
     middle = surface.vertices[surface.faces].mean(axis=1)
     on = (np.abs(box(center).signed_distance(middle)) < 0.15) & (middle[:, 2] > 0.3)
@@ -38,7 +38,7 @@ def on_box(surface, center):
     return areas[on & (kinds == REFLECTANCE_CHANGED)].sum() / areas[on].sum(), change
 
 
-def test_what_was_repainted_is_found_and_nothing_else(changes):
+def test_changed_reflectance_is_the_only_change_found(changes):
     for center, more in ((STRONGER, STRONGER_DB), (WEAKER, -STRONGER_DB)):
         share, change = on_box(changes.after, center)
         assert share > 0.7
@@ -56,7 +56,7 @@ def test_what_was_repainted_is_found_and_nothing_else(changes):
     assert changes.report["areas_m2"]["reflectance_changed"] == pytest.approx(every)
 
 
-def test_nothing_was_repainted_between_two_drives_through_one_scene(maps):
+def test_repeated_drives_have_no_changed_reflectance(maps):
     same = radarsdf.compare(maps[0], maps[1])
     assert same.report["areas_m2"]["reflectance_changed"] < 0.0025 * same.report["compared_m2"]
     assert abs(same.report["intensity_offset"]) < 0.2
@@ -73,7 +73,7 @@ def test_another_gain_and_another_frame_are_no_change(drives, maps):
     assert found.report["areas_m2"]["reflectance_changed"] < 0.0025 * found.report["compared_m2"]
 
 
-def test_without_intensities_none_are_reported(drives, maps):
+def test_without_intensities_no_reflectance_change_is_reported(drives, maps):
     blind = radarsdf.fit(drives[2].points, drives[2].poses, config=QUICK)
     found = radarsdf.compare(maps[0], blind)
     assert len(blind.view_statistics().counts) == 0

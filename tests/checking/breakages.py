@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Ways to break good data, each with the finding of `radarsdf.check` that names it, and good recordings."""
+"""Ways to break good data, each with the finding of `radarsdf.check` that reports it, and good recordings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 _CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 _QUARTER_TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-_TIMES_OF_STEP = 2  # scans by which a clock is off
+_TIMES_OF_STEP = 2  # clock offset in scans
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _quaternions_rolled(poses: FloatArray) -> FloatArray:
 
 
 def _drifted(way_m: float, degrees: float) -> Way:
-    """The position moves off to the side and the heading to the left, at an even rate."""
+    """Position drifts sideways and heading to the left, at a constant rate."""
 
     def drifted(poses: FloatArray) -> FloatArray:
         broken, share = poses.copy(), np.linspace(0, 1, len(poses))
@@ -128,7 +128,7 @@ def _drifted(way_m: float, degrees: float) -> Way:
 
 
 def _there_and_back(data: Data) -> Data:
-    """The same way again, backwards, with poses that are off by 0.4 m in the end."""
+    """The same trajectory again, backwards, with a final error of 0.4 m."""
     rng = np.random.default_rng(0)
 
     def again(arrays: list[NDArray[Any]], sigma: float = 0.0) -> list[NDArray[Any]]:
@@ -155,21 +155,21 @@ def _turned(poses: FloatArray) -> FloatArray:
 
 
 def _moved_on(poses: FloatArray) -> FloatArray:
-    """From halfway on, all is 4 m to the side."""
+    """From halfway on, all poses are shifted sideways by 4 m."""
     broken, middle = poses.copy(), len(poses) // 2
     broken[middle:, :3, 3] += 4 * poses[middle, :3, 1]
     return broken
 
 
 def _one_off(poses: FloatArray) -> FloatArray:
-    """One pose is 4 m to the side."""
+    """One pose is shifted sideways by 4 m."""
     broken, middle = poses.copy(), len(poses) // 2
     broken[middle, :3, 3] += 4 * poses[middle, :3, 1]
     return broken
 
 
 def _copied(data: Data) -> Data:
-    """A scan in the middle is replaced by the one before."""
+    """A scan in the middle is replaced by the previous one."""
     numbers = np.arange(len(data.points))
     numbers[len(numbers) // 2] -= 1
     return data.scans(numbers)
@@ -188,7 +188,7 @@ def _clipped(data: Data) -> Data:
 
 
 def _replaced(share: float, low: float, high: float) -> Way:
-    """A `share` of the intensities, at least one of them, is somewhere from `low` to `high`."""
+    """A `share` of the intensities, at least one, is replaced by values between `low` and `high`."""
 
     def broken(data: Data) -> Data:
         whole = np.concatenate(data.intensities).astype(np.float64)
@@ -303,9 +303,9 @@ def simulated(name: str, frames: int, seed: int = 0) -> Data:
 
 
 def slow(name: str, step_m: float, seed: int = 0, cell: float = 0.0) -> Data:
-    """A simulated place from a sensor that moves `step_m` between 24 scans, after half of them were taken from one position.
+    """A simulated place from a sensor that is stationary for 12 scans and then moves `step_m` between 12 scans.
 
-    `cell`: range, m, and angles, 0.1 rad, that the sensor rounds to; 0: none.
+    `cell`: resolution of ranges, m, and angles, 0.1 rad, 0 for exact values.
     """
     drive = (SCENES | KINDS)[name](seed=seed, frames=12)
     usual_m = np.linalg.norm(np.diff(drive.poses[:2, :3, 3], axis=0))
@@ -320,7 +320,7 @@ def slow(name: str, step_m: float, seed: int = 0, cell: float = 0.0) -> Data:
 
 
 def _rounded(scan: np.ndarray, cell_m: float) -> np.ndarray:
-    """A scan (N, 3) by a sensor with cells, each of which reports one return."""
+    """A scan (N, 3) of a sensor with resolution cells that report one return each."""
     range_m = np.linalg.norm(scan, axis=1)
     angles = np.stack([np.arctan2(scan[:, 1], scan[:, 0]), np.arcsin(scan[:, 2] / range_m)])
     azimuth, elevation = 0.1 * np.round(angles / 0.1)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Each hypothesis moves the scans as its words say, and the agreement of scans against a plain calculation."""
+"""Hypotheses move the scans as described, and the agreement of scans against a plain calculation."""
 
 import re
 
@@ -27,7 +27,7 @@ def with_part(poses, part, values):
 
 
 def read_as(words):
-    """The (4, 4) matrix that reads x y z as "y, -x, z" says."""
+    """The (4, 4) matrix that maps x y z to axes such as "y, -x, z"."""
     found = np.eye(4)
     axes = dict(zip("xyz", np.eye(3), strict=True))
     found[:3, :3] = [-axes[word[1]] if word[0] == "-" else axes[word] for word in words.split(", ")]
@@ -35,7 +35,7 @@ def read_as(words):
 
 
 def expected(what):
-    """Motions under a hypothesis, from its words."""
+    """Motions under a hypothesis, from its description."""
     if words := re.fullmatch(r"the points are read as \((.*)\)", what):
         matrix = read_as(words[1])
         return np.linalg.inv(matrix) @ motions(POSES) @ matrix
@@ -58,7 +58,7 @@ def expected(what):
     return motions(with_part(POSES, slice(3), Rotation.from_quat(quaternions).as_matrix()))
 
 
-def test_hypotheses_move_the_scans_as_their_words_say():
+def test_hypotheses_move_the_scans_as_described():
     found = hypotheses(POSES, PAIRS)
     by_kind = {guess.finding: guess for guess in found}
     np.testing.assert_allclose(by_kind["poses_inverted"].T_j_i, motions(np.linalg.inv(POSES)), atol=1e-12)
@@ -87,8 +87,8 @@ def test_hypotheses_move_the_scans_as_their_words_say():
     [(np.pi / 180, "the angles of the poses are taken for rad, not degrees"),
      (180 / np.pi, "the angles of the poses are taken for degrees, not rad")],
 )  # fmt: skip
-def test_angles_in_another_unit_are_undone(factor, what):
-    """Of a drive that turns by 1 to 3 degrees a scan, from a heading of 40: so many rad are six whole turns and more."""
+def test_angles_in_another_unit_are_converted_back(factor, what):
+    """A drive that turns by 1 to 3 degrees per scan, from a heading of 40: as rad, these are six turns and more."""
     yaws = np.radians(40 + np.cumsum([0, 1, 2, 3, 3, 3]))[:, None]
     true, broken = (np.tile(np.eye(4), (6, 1, 1)) for _ in range(2))
     true[:, :3, :3] = Rotation.from_euler("z", yaws).as_matrix()
@@ -129,7 +129,7 @@ def test_a_gain_has_the_standard_error_of_its_mean():
     assert Comparison.of(given[:1], other[:, :1]).significance[0] == 0  # a single pair is no evidence
 
 
-def test_pairs_are_neighbours_and_scans_between_which_the_sensor_moved():
+def test_pairs_are_neighbours_and_scans_after_a_displacement():
     np.testing.assert_array_equal(pairs_apart(np.array([2, 3, 5, 7, 8]), 2, 2), [[2, 5], [5, 8]])
     scans = [np.full((6, 3), [10.0, 0.0, 0.0])] * 100
     scans[50] = scans[50][:5]  # too few returns

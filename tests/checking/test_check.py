@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The input of a check, errors of poses by noise, and drift."""
+"""Input of a check, pose errors against noise, and drift."""
 
 import dataclasses
 import re
@@ -22,7 +22,7 @@ SCANS = 36
 CONFIG = radarsdf.FitConfig(num_threads=1)
 
 
-def test_scans_are_taken_as_they_are():
+def test_scans_are_accepted_as_input():
     drive = radarsdf.simulate.wall(frames=4)
     constant = [np.full(len(values), 7.0) for values in drive.intensities]
     times_s = np.array([0.0, 0.1, 0.1, 0.2])
@@ -38,7 +38,7 @@ def test_arrays_need_poses():
 
 
 def added_m(points, poses):
-    """What the note says that the poses add, m. None without a note."""
+    """Noise added by the poses according to the note, m. None without a note."""
     findings = check_noise_and_cost(checked_input(points, poses), CONFIG)
     notes = [finding.evidence for finding in findings if finding.name == "poses_disagree"]
     if not notes:
@@ -54,14 +54,14 @@ def test_exact_poses_add_nothing(kind, frames):
     assert added_m(scans.points, scans.poses) is None
 
 
-def test_heights_that_are_off_from_scan_to_scan_are_found_in_metres():
+def test_height_errors_between_scans_are_estimated_in_metres():
     scans = radarsdf.simulate.wall(frames=40, seed=1)
     poses = scans.poses.copy()
     poses[:, :3, 3] += np.random.default_rng(0).normal(0, 0.03, (40, 3))
     assert added_m(scans.points, poses) == pytest.approx(0.03, rel=0.5)
 
 
-def test_a_return_trip_that_has_drifted_is_found():
+def test_a_drifted_return_trip_is_found():
     scans = radarsdf.simulate.wall(frames=20, seed=1)
     points, rng = list(scans.points), np.random.default_rng(0)
     points += [scan + rng.normal(0, 1e-3, scan.shape) for scan in reversed(scans.points)]
@@ -80,7 +80,7 @@ def recording(drive, poses, rows=slice(None)):
     return checked_input(drive.points[rows], poses[rows])
 
 
-def test_a_drift_is_found_with_its_figures(drive):
+def test_a_drift_is_reported_with_its_magnitude(drive):
     (found,) = check_drift(recording(drive, drifted(drive.poses, 0.05, 0.004, 1)), CONFIG)
     assert found.name == "poses_drift"
     assert found.severity == "warning"
@@ -88,7 +88,7 @@ def test_a_drift_is_found_with_its_figures(drive):
     assert "radarsdf poses" in found.fix
 
 
-def test_true_poses_do_not_drift(drive):
+def test_true_poses_have_no_drift(drive):
     assert list(check_drift(recording(drive, drive.poses), CONFIG)) == []
     assert list(check_drift(recording(drive, drive.poses, slice(0, 3)), CONFIG)) == []
 
@@ -100,7 +100,7 @@ def test_a_gain_without_effect_is_no_drift():
     assert list(check_drift(checked_input(points, poses), CONFIG)) == []
 
 
-def test_large_recordings_are_looked_at_in_windows(drive, monkeypatch):
+def test_large_recordings_are_checked_in_windows(drive, monkeypatch):
     asked = []
     refine = noise.refine_poses
 
@@ -118,7 +118,7 @@ def test_large_recordings_are_looked_at_in_windows(drive, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["hugin"])
-def test_a_drift_below_the_noise_of_a_coarse_sensor_is_none(kind):
+def test_a_drift_below_the_noise_of_a_coarse_sensor_is_not_reported(kind):
     creep = slow(kind, 0.02, seed=6, cell=0.5)
     assert list(check_drift(checked_input(creep.points, creep.poses), CONFIG)) == []
 
@@ -150,7 +150,7 @@ NOT_HERE = {
 }
 
 
-# The others are named by what `fit` checks, too, in a tenth of the time.
+# The checks of `fit` also report the others, in a tenth of the time.
 WHOLE_CHECK = {"poses of a vehicle, sensor turned by 15 degrees of pitch", "Doppler with the other sign"}
 
 

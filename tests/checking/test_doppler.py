@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The sensor's velocity from Doppler, against the truth of a simulation and the flags of recorded drives."""
+"""Sensor velocity from Doppler, against the ground truth of a simulation and the flags of recorded drives."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def directions(count, seed=0):
 
 
 def one_scan(moving=0.3, sigma=0.08, count=2000):
-    """Points, Doppler, and which of the returns move."""
+    """Points, Doppler, and mask of moving returns."""
     rng = np.random.default_rng(1)
     points = directions(count) * rng.uniform(3, 60, (count, 1))
     doppler = -directions(count) @ VELOCITY_MPS + rng.normal(0, sigma, count)
@@ -37,7 +37,7 @@ def one_scan(moving=0.3, sigma=0.08, count=2000):
 def drive():
     """Scans along a turn, with Doppler from their poses and a tenth of the returns moving."""
     every = radarsdf.simulate.wall(frames=90)
-    # Uneven speed: else no clock could be distinguished from another.
+    # Varying speed: otherwise clock offsets are unobservable.
     chosen = np.cumsum(np.round(2 + 1.2 * np.sin(np.arange(40) / 4)).astype(int))
     chosen = chosen[chosen < 90]
     points, poses = [every.points[i] for i in chosen], every.poses[chosen]
@@ -67,7 +67,7 @@ def test_the_velocity_is_found_among_moving_returns():
     assert found.static[~moves].mean() > 0.95
 
 
-def test_the_covariance_is_that_of_the_errors():
+def test_the_covariance_matches_the_errors():
     points = directions(300, seed=3)
     errors, sigmas = [], []
     for seed in range(60):
@@ -76,7 +76,7 @@ def test_the_covariance_is_that_of_the_errors():
         errors.append(found.velocity_mps - VELOCITY_MPS)
         sigmas.append(np.diag(found.covariance))
     ratio = np.mean(np.square(errors), axis=0) / np.mean(sigmas, axis=0)
-    # A mean of 60 squares is off by a factor of 1.2, and the cut at three deviations costs a few per cent.
+    # A mean of 60 squares has an error of 20 %, and the cut at three deviations reduces it by a few per cent.
     assert ((ratio > 0.5) & (ratio < 1.8)).all()
 
 
@@ -94,7 +94,7 @@ def test_folded_speeds_are_unfolded():
     [np.random.default_rng(5).uniform(-20, 20, 500), np.full(500, np.nan)],
     ids=["random", "not finite"],
 )
-def test_speeds_of_no_sensor_have_no_velocity(doppler):
+def test_inconsistent_speeds_have_no_velocity(doppler):
     found = sensor_velocity(directions(500), doppler)
     assert not found.found
     assert not found.static.any()
@@ -131,7 +131,7 @@ def test_a_turned_sensor_is_named(drive):
     [(4, 0.35, ("moving_share", "note")), (4, 0.5, ("moving_share", "warning")), (3, 0.35, None),
      (4, 0.9, ("doppler_without_velocity", "warning")), (3, 0.9, None)],
 )  # fmt: skip
-def test_scans_in_which_much_moves_are_named(scans, moving, expected):
+def test_scans_with_many_moving_returns_are_named(scans, moving, expected):
     points, doppler, _ = one_scan(moving=moving, count=600)
     poses = np.tile(np.eye(4), (scans, 1, 1))
     found = list(check_doppler(checked_input([points] * scans, poses, doppler_mps=[doppler] * scans)))
@@ -140,7 +140,7 @@ def test_scans_in_which_much_moves_are_named(scans, moving, expected):
         assert found[0].evidence.startswith(f"In {scans} of {scans} scans")
 
 
-def test_the_velocity_of_poses_is_that_of_their_curve():
+def test_the_velocity_of_poses_is_the_derivative_of_their_curve():
     """On a circle of 5 m radius at 0.5 rad/s, 2.5 m/s ahead."""
     times_s = np.array([0.0, 0.1, 0.3, 0.4, 0.5])
     poses, yaws = np.tile(np.eye(4), (5, 1, 1)), 0.5 * times_s

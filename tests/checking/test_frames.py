@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Good data have no finding worse than a note; broken in one way, the finding is named."""
+"""Good data have no finding worse than a note; each breakage has its finding."""
 
 import numpy as np
 import pytest
@@ -36,16 +36,16 @@ def test_good_data_have_no_finding(good):
 
 
 @pytest.mark.parametrize("how", ["equal", "zero"])
-def test_positions_that_stay_while_the_scans_change_are_named(good, how):
+def test_constant_positions_of_changing_scans_are_named(good, how):
     points, poses = good.points, good.poses
     held = np.repeat(poses[:1], len(poses), axis=0) if how == "equal" else with_positions(poses, 0)
     (found,) = check_still(checked_input(points, held))
-    moved = len(points) >= 24  # so many scans show that the sensor moved
+    moved = len(points) >= 24  # this many scans show that the sensor moved
     assert (found.name, found.severity) == ("poses_stand_still", "error" if moved else "warning")
 
 
 def room_of(poses, rng, returns=250, noise_m=0.1):
-    """Scans of a room of 12 m x 9 m x 5 m, by a sensor that looks 60 degrees to both sides."""
+    """Scans of a room of 12 m x 9 m x 5 m by a sensor with a field of view of ±60 degrees."""
     scans = []
     for pose in poses:
         azimuth, elevation = rng.uniform(-1.0, 1.0, returns), rng.uniform(-0.3, 0.3, returns)
@@ -59,7 +59,7 @@ def room_of(poses, rng, returns=250, noise_m=0.1):
 
 
 @pytest.mark.parametrize("scans", [6, 24])
-def test_a_sensor_that_stands_still_is_no_error(scans):
+def test_a_stationary_sensor_has_no_finding(scans):
     poses = np.repeat(np.eye(4)[None], scans, axis=0)
     found = radarsdf.check(room_of(poses, np.random.default_rng(0)), poses)
     assert worse_than_notes(found) == ["poses_stand_still"]
@@ -78,7 +78,7 @@ def test_a_slow_sensor_with_coarse_cells_has_no_finding():
     assert worse_than_notes(check_cheaply(data.points, data.poses)) == []
 
 
-def test_a_small_gain_is_no_error_however_certain():
+def test_a_small_gain_is_no_error_at_any_significance():
     with np.load(recorded_file("other_simulator/loading_yard.npz")) as yard:
         count = len(yard["poses"])
         points = [yard["points"][yard["frame"] == i] for i in range(count - 40, count)]
@@ -95,7 +95,7 @@ def test_few_sparse_scans_have_no_finding(frames, seed):
     assert worse_than_notes(radarsdf.check(scans.points, scans.poses)) == []
 
 
-def test_a_clock_that_is_off_is_found_where_the_motion_changes():
+def test_a_clock_offset_is_found_if_the_motion_changes():
     scans = radarsdf.simulate.wall(frames=24)
     for rows, poses, times_s, words in (
         (

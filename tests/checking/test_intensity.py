@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Intensities broken in one way, and returns below the ground."""
+"""Broken intensities, and returns below the ground."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def good():
 
 
 def replaced(values, every, value):
-    """Every so many of the intensities is another value, or values."""
+    """Replaces intensities at regular intervals by other values."""
     whole = np.concatenate(values)
     whole[::every] = value
     return np.split(whole, np.cumsum([len(v) for v in values])[:-1])
@@ -44,7 +44,7 @@ def test_intensity_outliers_are_counted_and_named(good):
     whole = np.concatenate(intensities)
     broken = replaced(intensities, 50, -9999.0)
     broken[7][1:8] = 65535
-    broken[3][2] = 1e9  # a single one, in a scan that no sample need hold
+    broken[3][2] = 1e9  # a single one, in a scan that a sample may miss
     found = {finding.name: finding for finding in check_cheaply(points, poses, broken)}
     counts = {
         name: int(found[name].evidence.split()[0]) for name in ("intensity_sentinel", "intensity_outliers")
@@ -66,7 +66,7 @@ def said(*scans):
     return [f"{finding.severity}: {finding.name}: {finding.evidence}" for finding in found]
 
 
-def test_scales_are_described_by_their_steps_offset_and_ends():
+def test_scales_are_described_by_steps_offset_and_limits():
     steps = "note: intensity_steps: Intensities are "
     even = np.repeat(np.arange(10) / 2, 100)
     assert said(even) == [f"{steps}0 to 4.5, in steps of 0.5."]
@@ -80,14 +80,14 @@ def test_scales_are_described_by_their_steps_offset_and_ends():
     assert said(offset - 34)[1:] == []  # the median is 42.5 from 128
     assert said(np.tile(np.arange(60, 140), 10))[1:] == []  # a twentieth is below 64
     for count, severity in ((20, []), (21, ["note"]), (50, ["note"]), (51, ["warning"])):
-        # So many of 1000 at the end, after four at each of the values before.
+        # Some of 1000 intensities at the end, after four at each previous value.
         counts = [1000 - 48 - count, *[4] * 12, count]
         ends = [words for words in said(np.repeat(np.arange(14), counts)) if "clipped" in words]
         what = f"{count / 10:.1f}% of the intensities have the highest value, 13."
         assert ends == [f"{kind}: intensity_clipped: {what}" for kind in severity]
 
 
-def test_constant_intensities_are_told_from_those_constant_in_scans():
+def test_constant_intensities_differ_from_intensities_constant_per_scan():
     assert said(np.ones(3), np.ones(2)) == ["error: intensity_constant: All intensities are 1."]
     held = [np.full(3, float(i)) for i in range(3)]
     constant = "warning: intensity_constant_in_scans: In {} of the scans all returns have the same intensity."
@@ -98,8 +98,8 @@ def test_constant_intensities_are_told_from_those_constant_in_scans():
     ]
 
 
-def test_the_ground_is_where_most_returns_below_the_sensor_are():
-    """Ground 1.4 m below the sensor, 10 m away; from 1 m and a tenth of the distance below it on, returns are reflections."""
+def test_the_ground_is_at_the_mode_of_returns_below_the_sensor():
+    """Ground 1.4 m below the sensor, 10 m away; returns more than 1 m and a tenth of the distance below are reflections."""
     ground, above = np.tile([9.9, 0, -1.4], (800, 1)), np.tile([10.0, 0, 0.5], (160, 1))
     reflected, deep, far = (np.tile(p, (20, 1)) for p in ([9.4, 0, -3.25], [9.4, 0, -3.5], [24.9, 0, -9.0]))
     turned = np.diag([1.0, -1, -1, 1])  # the sensor hangs upside down

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Findings about the poses alone, about copies, and about numbers that are none."""
+"""Findings about poses alone, duplicate scans, and invalid numbers."""
 
 import numpy as np
 import pytest
@@ -27,13 +27,13 @@ def lap():
 
 @pytest.fixture(scope="module")
 def good(lap):
-    """Half of it."""
+    """Half of the data."""
     points, poses = lap
     return points[:30], poses[:30]
 
 
 def along_x(positions_m, range_m=10.0, **arrays):
-    """Scans of ten returns, no two the same, at such ranges, from positions along x."""
+    """Scans of ten distinct returns at the given ranges, from positions along x."""
     poses = np.tile(np.eye(4), (len(positions_m), 1, 1))
     poses[:, 0, 3] = positions_m
     points = [np.tile([range_m, 1e-9 * i, 0], (10, 1)) for i in range(len(positions_m))]
@@ -44,14 +44,14 @@ def along_x(positions_m, range_m=10.0, **arrays):
     ("range_m", "severity"),
     [(399, None), (401, "warning"), (999, "warning"), (1001, "error"), (0.21, None), (0.19, "warning"), (0.019, "error")],
 )  # fmt: skip
-def test_ranges_of_no_radar_are_named(range_m, severity):
+def test_implausible_ranges_are_named(range_m, severity):
     found = list(check_lengths(along_x([0, 1, 2], range_m)))
     assert [(finding.name, finding.severity) for finding in found] == [("units", severity)] * bool(severity)
     assert all(f"are {range_m} m or more" in finding.evidence for finding in found)
 
 
 @pytest.mark.parametrize(("step_m", "found"), [(9.9, []), (10.5, ["error: 105 m/s"])])
-def test_speeds_of_no_vehicle_are_named(step_m, found):
+def test_implausible_speeds_are_named(step_m, found):
     positions_m, times_s = step_m * np.arange(4), 0.1 * np.arange(4)
     said = list(check_lengths(along_x(positions_m, times_s=times_s)))
     assert [f"{finding.severity}: {finding.evidence[-8:-1]}" for finding in said] == found
@@ -65,14 +65,14 @@ def test_speeds_of_no_vehicle_are_named(step_m, found):
      ([0, 0, 2, 2, 4, 4, 6, 6], "warning", "4 of 8 scans have exactly the pose of the scan before, and the step after is 2.0 times the usual one."),
      ([0, 1, 2, 2, 4, 5, 6, 7, 8, 9], "note", "1 of 10 scans have exactly the pose of the scan before.")],
 )  # fmt: skip
-def test_held_poses_leap_and_standing_ones_do_not(positions_m, severity, evidence):
+def test_held_poses_leap_and_stationary_ones_do_not(positions_m, severity, evidence):
     (found,) = check_duplicates(along_x(positions_m), np.arange(len(positions_m)))
     assert (found.name, found.severity, found.evidence) == ("duplicate_poses", severity, evidence)
     for few in ([0, 1, 2], [3, 3, 3]):
         assert list(check_duplicates(along_x(few), np.arange(3))) == []
 
 
-def test_poses_that_are_no_transforms_are_told_apart():
+def test_kinds_of_invalid_transforms_are_distinguished():
     poses = along_x(np.arange(1, 9)).poses
     few, half, columns, left = (poses.copy() for _ in range(4))
     few[[2, 5, 7], 0, 0] = 2
@@ -92,7 +92,7 @@ def names(findings):
     return [finding.name for finding in findings if finding.severity != "note"]
 
 
-def test_a_displacement_from_one_scan_on_is_a_jump(lap):
+def test_a_permanent_displacement_is_a_jump(lap):
     points, poses = lap
     poses = poses.copy()
     poses[30:, :3, 3] += poses[30, :3, 1] * 4
@@ -122,14 +122,14 @@ def test_copies_of_scans_are_named_by_their_numbers_in_the_recording(good):
 
 
 @pytest.mark.parametrize("broken", [lambda poses: poses * np.nan, lambda poses: poses + 1e-2 * np.eye(4)[3]])
-def test_matrices_that_are_no_poses_are_named(good, broken):
+def test_invalid_poses_are_named(good, broken):
     points, poses = good
     found = radarsdf.check(points, broken(poses))
     assert [(finding.name, finding.severity) for finding in found] == [("poses_not_rigid", "error")]
 
 
 @pytest.mark.usefixtures("right_frames")
-def test_what_a_fit_leaves_out_is_noted(good):
+def test_returns_excluded_from_a_fit_are_noted(good):
     points, poses = good
     hole, poses = points[3].copy(), poses.copy()
     hole[::2] = np.nan
@@ -149,7 +149,7 @@ def test_what_a_fit_leaves_out_is_noted(good):
 
 
 @pytest.mark.usefixtures("right_frames")
-def test_utm_coordinates_in_float32_are_named_with_their_steps(good):
+def test_utm_coordinates_in_float32_are_named_with_their_resolution(good):
     points, poses = good
     poses = poses.copy()
     poses[:, :3, 3] += [4.5e5, 5.4e6, 100.0]
@@ -162,14 +162,14 @@ def test_utm_coordinates_in_float32_are_named_with_their_steps(good):
 
 
 @pytest.mark.usefixtures("right_frames")
-def test_times_of_nothing_are_named(good):
+def test_implausible_times_are_named(good):
     assert names(radarsdf.check(*good, times_s=np.zeros(30))) == ["times"]
     (found,) = check_times(along_x([0, 1, 2, 3], times_s=[0, 1, 1, np.nan]))
     assert found.evidence.startswith("2 of 3 times are not later than the one before")
     assert list(check_times(along_x([0, 1, 2], times_s=[0, 1, 2]))) == []
 
 
-def test_shapes_that_do_not_fit_are_refused(good):
+def test_inconsistent_shapes_are_rejected(good):
     points, poses = good
     with pytest.raises(ValueError, match=r"poses must have shape \(30, 4, 4\)"):
         radarsdf.check(points, poses[1:])
@@ -178,7 +178,7 @@ def test_shapes_that_do_not_fit_are_refused(good):
 
 
 @pytest.mark.parametrize("returns", [1, 5])
-def test_a_jump_among_scans_of_few_returns_is_no_crash(good, returns):
+def test_a_jump_among_sparse_scans_does_not_crash(good, returns):
     points, poses = good
     poses = poses.copy()
     poses[15:, :3, 3] += poses[15, :3, 1] * 40
@@ -187,6 +187,6 @@ def test_a_jump_among_scans_of_few_returns_is_no_crash(good, returns):
     assert names(check_cheaply([scan[:returns] for scan in points], poses)) in ([], ["pose_jumps"])
 
 
-def test_a_sensor_that_begins_to_creep_does_not_jump():
+def test_a_sensor_that_starts_slowly_does_not_jump():
     creep = slow("oculii", 0.02, seed=6, cell=0.5)
     assert list(check_jumps(checked_input(creep.points, creep.poses), np.arange(len(creep.points)))) == []

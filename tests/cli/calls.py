@@ -17,7 +17,7 @@ QUICK = ["--quick", "--quiet", "--no-check"]
 
 
 def call(*words):
-    """Exit status of a command. Its words may also be paths or numbers."""
+    """Exit status of a command. Arguments may also be paths or numbers."""
     return main([str(word) for word in words])
 
 
@@ -33,7 +33,7 @@ def files(folder):
 
 
 def refusal(capsys, folder, *words, status=1):
-    """The error of a command that fails as it should: its status, one line, and no file written to the folder."""
+    """The error of a command that must fail: checks its status, a single line, and that no file is written to the folder."""
     before = files(folder)
     capsys.readouterr()
     assert call(*words) == status

@@ -23,7 +23,7 @@ def scans_file(scene, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def map_file(scans_file, tmp_path_factory):
-    """The map of these scans, but for the scans 0 and 3, which are held out."""
+    """The map of these scans, except the held-out scans 0 and 3."""
     path = tmp_path_factory.mktemp("map") / "map.safetensors"
     assert call("fit", scans_file, "-o", path, "--holdout", 3, *FAST) == 0
     return path
@@ -31,7 +31,7 @@ def map_file(scans_file, tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def little_work(monkeypatch):
-    """Most of the time of a command with a picture is that of its pixels, and of the demo that of its samples."""
+    """Fewer pixels and samples, which take most of the time of pictures and of the demo."""
 
     def few_samples(mesh, truth, samples, **options):
         return surface_metrics(mesh, truth, samples=min(samples, 20_000), **options)

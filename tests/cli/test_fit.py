@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf fit`` and ``demo``: the map, what is printed of it, and what happens where it cannot be written."""
+"""``radarsdf fit`` and ``demo``: the map, the printed report, and failures to write."""
 
 import re
 import shutil
@@ -16,14 +16,14 @@ from radarsdf.io import Scans, write_scans
 from .calls import FAST, QUICK, call, files, refusal, values
 
 
-def test_the_map_is_of_these_scans_and_settings(map_file):
+def test_the_map_uses_the_given_scans_and_settings(map_file):
     radar_map = radarsdf.load(map_file)
     assert radar_map.has_intensity
     assert radar_map.report["returns"] == 4 * 1500  # scans 0 and 3 of six are held out
     assert (radar_map.config.training.sdf_iterations, radar_map.config.training.batch_size) == (40, 1024)
 
 
-def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
+def test_geometry_only_combines_with_a_preset(scans_file, tmp_path, capsys):
     path = tmp_path / "map.safetensors"
     assert call("fit", scans_file, "-o", path, "--geometry-only", "--holdout", 3, *QUICK) == 0
     printed = capsys.readouterr().out.splitlines()
@@ -34,7 +34,7 @@ def test_geometry_only_with_a_preset(scans_file, tmp_path, capsys):
     assert radar_map.config == radarsdf.FitConfig.quick()
 
 
-def test_a_fit_reports_the_same_as_text_and_as_json(tmp_path, capsys):
+def test_text_and_json_reports_of_a_fit_agree(tmp_path, capsys):
     scans = radarsdf.simulate.wall(frames=6)
     rng = np.random.default_rng(0)
     doppler = []
@@ -70,7 +70,7 @@ def test_the_checkpoint_is_used_and_removed(scans_file, tmp_path, capsys):
     assert files(tmp_path) == ["map.safetensors"]
 
 
-def test_fits_that_fail(scans_file, tmp_path, capsys, monkeypatch):
+def test_errors_of_a_fit_exit_with_one_line(scans_file, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "garbage.npz").write_bytes(b"\x93 nothing \x00\xff")
     out = ["-o", "map.safetensors"]
@@ -89,7 +89,7 @@ def test_fits_that_fail(scans_file, tmp_path, capsys, monkeypatch):
 
 @pytest.fixture
 def broken_folder(tmp_path, monkeypatch):
-    """A folder that is removed when the fit is done, and the temporary folder."""
+    """A folder that is removed after the fit, and the temporary folder."""
     out, spare = tmp_path / "out", tmp_path / "spare"
     out.mkdir()
     spare.mkdir()
@@ -104,7 +104,7 @@ def broken_folder(tmp_path, monkeypatch):
     return out, spare
 
 
-def test_an_interrupted_map_is_kept(scans_file, tmp_path, monkeypatch, capsys):
+def test_the_map_of_an_interrupted_fit_is_written(scans_file, tmp_path, monkeypatch, capsys):
     fit = radarsdf.fit
 
     def interrupted(*scans, **settings):
@@ -132,7 +132,7 @@ def test_the_demo_writes_everything_and_prints_the_errors(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("screen", [True, False])
-def test_the_viewer_ends_the_demo_where_somebody_looks(screen, tmp_path, monkeypatch):
+def test_the_demo_opens_the_viewer_if_interactive(screen, tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="the extra view is not installed")
     calls = []
     monkeypatch.setattr("radarsdf.view.serving.has_display", lambda: screen)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""``radarsdf live`` replays a recording, says how the map kept up, and writes it."""
+"""``radarsdf live`` replays a recording, reports whether the map kept up, and writes it."""
 
 from unittest.mock import Mock
 
@@ -24,7 +24,7 @@ def recording(tmp_path):
     return tmp_path
 
 
-def test_it_writes_the_map_and_where_scans_were_placed(recording, capsys):
+def test_it_writes_the_map_and_the_poses_of_scans(recording, capsys):
     out, trajectory = recording / "map.safetensors", recording / "way.npy"
     words = ["live", recording / "scans.npz", "--rate", 0, "--quick", "--quiet"]
     said = values(capsys, *words, "-o", out, "--trajectory", trajectory)
@@ -35,7 +35,7 @@ def test_it_writes_the_map_and_where_scans_were_placed(recording, capsys):
 
 
 class Clock:
-    """In place of the module `time`; the map takes `integration_s` of it for a scan."""
+    """Replaces the module `time`; integrating a scan takes `integration_s`."""
 
     def __init__(self, integration_s):
         self.now_s, self.integration_s, self.taken = 100.0, integration_s, []
@@ -60,9 +60,7 @@ class Clock:
      (0.0, 0.03, None, {i: 0.03 * i for i in range(6)}),
      (1.0, 0.01, [7, 8, 8.5, 9, 9.1, 9.2], {0: 0, 1: 1, 2: 1.5, 3: 2, 4: 2.1, 5: 2.2})],
 )  # fmt: skip
-def test_scans_come_at_their_times_and_too_fast_ones_are_dropped(
-    monkeypatch, rate, integration_s, times_s, begun_s
-):
+def test_scans_are_replayed_in_time_and_dropped_if_late(monkeypatch, rate, integration_s, times_s, begun_s):
     clock = Clock(integration_s)
     monkeypatch.setattr("radarsdf.cli.live.time", clock)
     times_s = None if times_s is None else np.array(times_s)
@@ -78,7 +76,7 @@ def test_scans_without_poses_need_times(recording, capsys):
     assert "times" in refusal(capsys, recording, "live", recording / "scans.npz", "--find")
 
 
-def test_rates_are_those_of_the_seconds(capsys):
+def test_rates_are_scans_per_second(capsys):
     _add_rates(Results(), Replay([0, 1, 2, 4], [], [0.01, 0.02, 0.03, 0.06], [3], []), 5)
     assert capsys.readouterr().out.splitlines() == [
         "4 of 5 scans in the map, 1 dropped, 0 lost",
@@ -88,7 +86,7 @@ def test_rates_are_those_of_the_seconds(capsys):
         _add_rates(Results(), Replay(), 5)
 
 
-def test_the_page_shows_the_surface_from_time_to_time():
+def test_the_page_shows_the_surface_periodically():
     page, done = Mock(), Replay(poses=[np.eye(4) + np.eye(4)[:, :1] * np.eye(4)[3]])
     shown = _PeriodicView(Mock(**{"mesh.return_value": "mesh"}), page)
     for due, times in ((True, 1), (False, 1), (True, 2)):

@@ -138,7 +138,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX")
-def test_a_pipe_whose_reader_has_gone_is_no_error():
+def test_a_broken_pipe_is_no_error():
     read, write = os.pipe()
     os.close(read)
     done = subprocess.run(
@@ -152,7 +152,7 @@ def test_a_pipe_whose_reader_has_gone_is_no_error():
     assert done.stderr == b""
 
 
-def test_what_json_lacks(capsys):
+def test_numpy_types_and_infinity_are_converted_to_json(capsys):
     results = Results(json=True)
     results.add("a line for people", number=np.float32(0.5), row=np.arange(2), deep=[np.inf], name="word")
     assert capsys.readouterr().out == ""
@@ -162,7 +162,7 @@ def test_what_json_lacks(capsys):
 
 
 def given(command, *words):
-    """What the words after a command mean."""
+    """Parsed options of a command."""
     return Parser(command).parse_args([str(word) for word in words])
 
 
@@ -170,7 +170,7 @@ def config(*words):
     return load_config(given("config", *words))
 
 
-def test_a_preset_then_a_file_then_single_settings(tmp_path):
+def test_settings_override_a_file_and_a_file_a_preset(tmp_path):
     path = tmp_path / "settings.toml"
     path.write_text("seed = 3\n[training]\nsdf_iterations = 7\nbatch_size = 64\n")
     changes = [
@@ -192,7 +192,7 @@ def test_a_preset_then_a_file_then_single_settings(tmp_path):
 
 
 @pytest.mark.parametrize("preset", [[], ["--quick"], ["--paper"]])
-def test_what_config_prints_is_the_same_configuration(capsys, tmp_path, preset):
+def test_config_prints_a_file_that_reproduces_the_configuration(capsys, tmp_path, preset):
     path = tmp_path / "settings.toml"
     words = [*preset, "--set", "networks.intensity_hidden=(8, 4)"]
     assert call("config", *words) == 0
@@ -214,12 +214,12 @@ def test_what_config_prints_is_the_same_configuration(capsys, tmp_path, preset):
         ("networks.intensity_hidden=wide", "networks.intensity_hidden"),
     ],
 )
-def test_settings_that_make_no_sense(capsys, tmp_path, setting, named):
+def test_invalid_settings_are_rejected(capsys, tmp_path, setting, named):
     assert named in refusal(capsys, tmp_path, "config", "--set", setting)
 
 
 @pytest.mark.parametrize(("text", "named"), [("seed =", "TOML"), ("[training]\nbar = 1", "training.bar")])
-def test_a_file_that_makes_no_sense(capsys, tmp_path, text, named):
+def test_an_invalid_file_is_rejected(capsys, tmp_path, text, named):
     path = tmp_path / "settings.toml"
     path.write_text(text)
     assert named in refusal(capsys, tmp_path, "config", "--config", path)
@@ -243,12 +243,12 @@ def test_options_are_the_parameters_of_read(tmp_path):
         read_scans(given("check", *words, "--extrinsic", poses))
 
 
-def test_negative_numbers_are_no_options():
+def test_negative_numbers_are_not_parsed_as_options():
     words = ("map.safetensors", "-o", "mesh.ply", "--box", "-1e-05", "-.5", "-2", "-1e+00", "5", "6")
     assert given("mesh", *words).box == [[-1e-05, -0.5, -2.0], [-1.0, 5.0, 6.0]]
 
 
-def test_the_help_states_the_defaults_that_hold():
+def test_the_help_states_the_actual_defaults():
     stated = {}
     for name, (kind, words) in OPTIONS.items():
         default = kind.get("default")

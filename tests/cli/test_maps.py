@@ -33,7 +33,7 @@ def test_info(map_file, capsys):
     assert str(of_map["leaf_cells"]) in capsys.readouterr().out
 
 
-def test_a_mesh_of_a_part_in_colour_with_a_picture(map_file, tmp_path, capsys):
+def test_mesh_writes_a_coloured_box_with_a_picture(map_file, tmp_path, capsys):
     ply, png = tmp_path / "mesh.ply", tmp_path / "mesh.png"
     view = ["--viewpoint", 2, 0, 1.5, "--picture", png]
     said = values(capsys, "mesh", map_file, "-o", ply, "--voxel", 0.2, *BOX, *view, "--quiet")
@@ -45,7 +45,7 @@ def test_a_mesh_of_a_part_in_colour_with_a_picture(map_file, tmp_path, capsys):
     assert png.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_mesh_is_smaller_where_more_is_asked(map_file, tmp_path, capsys):
+def test_stricter_limits_make_smaller_meshes(map_file, tmp_path, capsys):
     def triangles(*words):
         out = tmp_path / "mesh.ply"
         return values(capsys, "mesh", map_file, "-o", out, "--voxel", 0.2, *BOX, "--quiet", *words)[
@@ -58,7 +58,7 @@ def test_a_mesh_is_smaller_where_more_is_asked(map_file, tmp_path, capsys):
     assert 0 < triangles("--max-uncertainty", 0.015) < default
 
 
-def test_meshes_that_cannot_be_made(map_file, scans_file, tmp_path, monkeypatch, capsys):
+def test_impossible_meshes_are_rejected(map_file, scans_file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "link.ply").symlink_to(map_file)
     out = ["-o", "mesh.ply"]
@@ -89,7 +89,7 @@ def test_scans_of_several_poses(map_file, tmp_path, capsys):
     assert scans.intensities is not None
 
 
-def test_a_view_as_points_and_as_a_picture(map_file, tmp_path):
+def test_a_view_is_written_as_points_and_as_a_picture(map_file, tmp_path):
     ply, png = tmp_path / "view.ply", tmp_path / "view.png"
     assert call("render", map_file, *POSE, "-o", ply, "--returns", 40, "--noise", "--seed", 3) == 0
     assert 0 < len(trimesh.load(ply).vertices) <= 40
@@ -106,7 +106,7 @@ def test_a_view_as_points_and_as_a_picture(map_file, tmp_path):
         (["--pose", 900, 900, 900], "nothing written"),
     ],
 )
-def test_views_that_make_no_sense(map_file, tmp_path, capsys, words, named):
+def test_invalid_views_are_rejected(map_file, tmp_path, capsys, words, named):
     assert named in refusal(capsys, tmp_path, "render", map_file, "-o", tmp_path / "view.npz", *words)
 
 
@@ -136,7 +136,7 @@ def test_a_map_and_its_mesh_have_the_same_surface_errors(map_file, mesh_file, sc
     assert rows[0] == rows[1]
 
 
-def test_held_out_intensities_without_their_outliers(map_file, scene, tmp_path, capsys):
+def test_errors_of_held_out_intensities_exclude_outliers(map_file, scene, tmp_path, capsys):
     intensities = [np.where(np.arange(len(scan)) % 100, scan, -9999) for scan in scene.intensities]
     path = tmp_path / "scans.npz"
     write_scans(path, Scans(scene.points, scene.poses, intensities))
@@ -150,7 +150,7 @@ def test_held_out_intensities_without_their_outliers(map_file, scene, tmp_path, 
     )
 
 
-def test_files_that_cannot_be_evaluated(map_file, mesh_file, scans_file, tmp_path, capsys):
+def test_unusable_files_are_rejected(map_file, mesh_file, scans_file, tmp_path, capsys):
     garbage, cloud = tmp_path / "garbage.ply", tmp_path / "cloud.ply"
     garbage.write_bytes(b"\x93 nothing \x00\xff")
     trimesh.PointCloud(np.eye(3)).export(cloud)
@@ -194,11 +194,11 @@ def test_a_surface_is_ground_truth_everywhere_on_its_triangles(mesh_file, tmp_pa
     PLANE.export(path)
     printed = values(capsys, "eval", mesh_file, path, *SAMPLES)["surface"]
     assert printed["num_ground_truth"] == 20_000
-    assert printed["completion_ratio"] > 0.9  # of its four vertices, none is near a return
+    assert printed["completion_ratio"] > 0.9  # none of its four vertices is near a return
 
 
 def test_scans_of_other_kinds(map_file, scans_file, tmp_path, capsys):
-    """A folder with poses and lidar points: the same errors as of the .npz file."""
+    """A folder with poses and lidar points has the same errors as the .npz file."""
     scans = read_scans(scans_file)
     (tmp_path / "clouds").mkdir()
     for i, (points, power) in enumerate(zip(scans.points, scans.intensities, strict=True)):

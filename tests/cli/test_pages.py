@@ -58,7 +58,7 @@ def test_a_report_of_a_map_and_scans(map_file, scans_file, tmp_path, capsys):
         (["absent.npz"], "absent.npz"),
     ],
 )
-def test_views_that_cannot_be_shown(map_file, tmp_path, capsys, words, named):
+def test_unusable_views_are_rejected(map_file, tmp_path, capsys, words, named):
     pytest.importorskip("viser", reason="the extra view is not installed")
     assert named in refusal(capsys, tmp_path, "view", map_file, *words, "--no-open", "--quiet")
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""`radarsdf poses`, and fits of scans whose poses are mended or missing."""
+"""`radarsdf poses`, and fits of scans with refined or missing poses."""
 
 import numpy as np
 import pytest
@@ -29,13 +29,13 @@ def drive(simulation):
 
 @pytest.fixture(scope="module")
 def motion(simulation):
-    """What they measure of their motion."""
+    """Measurements of their motion."""
     return measured_motion(simulation)
 
 
 @pytest.fixture
 def drifted_file(drive, motion, tmp_path):
-    """Scans whose poses drift."""
+    """Scans with drifting poses."""
     path = tmp_path / "drive.npz"
     poses = drifted(drive.poses, 0.05, 0.004, 1)
     speeds = motion.doppler_mps
@@ -58,7 +58,7 @@ def unposed(drive, motion, tmp_path):
     return folder
 
 
-def test_poses_that_drift_are_refined(drive, drifted_file, tmp_path, capsys):
+def test_drifting_poses_are_refined(drive, drifted_file, tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     out, picture = tmp_path / "mended.npz", tmp_path / "way.png"
     assert call("poses", drifted_file, "-o", out, "--picture", picture) == 0
@@ -72,7 +72,7 @@ def test_poses_that_drift_are_refined(drive, drifted_file, tmp_path, capsys):
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
 
-def test_scans_without_poses_get_some(drive, unposed, tmp_path, capsys):
+def test_poses_are_estimated_for_scans_without_poses(drive, unposed, tmp_path, capsys):
     out = tmp_path / "poses.tum"
     said = values(capsys, "poses", unposed, "-o", out)
     assert said["poses"]["segments"] == 1

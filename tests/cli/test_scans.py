@@ -28,7 +28,7 @@ def folder(tmp_path_factory):
     return path
 
 
-def test_good_scans_have_notes_alone(folder, capsys):
+def test_good_scans_have_only_notes(folder, capsys):
     assert call("check", folder / "good.npz", "--quick", "--set", "returns.max_range_m=30") == 0
     findings = capsys.readouterr().out.splitlines()
     assert findings
@@ -44,7 +44,7 @@ def test_an_error_is_the_first_line_and_the_status(folder, capsys):
     assert said["findings"][0]["name"] == "poses_inverted"
 
 
-def test_a_fit_of_nonsense_is_refused_unless_it_is_asked_for(folder, tmp_path, capsys):
+def test_a_fit_of_bad_scans_is_rejected_unless_forced(folder, tmp_path, capsys):
     out = tmp_path / "map.safetensors"
     said = refusal(capsys, folder, "fit", folder / "inverted.npz", "-o", out, *FAST)
     assert "poses_inverted" in said
@@ -65,7 +65,7 @@ def clouds(scans_file, tmp_path):
     return tmp_path, scans
 
 
-def test_a_folder_becomes_one_file(clouds, tmp_path_factory, capsys):
+def test_a_folder_is_converted_to_one_file(clouds, tmp_path_factory, capsys):
     path, scans = clouds
     out = tmp_path_factory.mktemp("out") / "scans.npz"
     said = values(capsys, "convert", path, "-o", out)
@@ -77,7 +77,7 @@ def test_a_folder_becomes_one_file(clouds, tmp_path_factory, capsys):
     np.testing.assert_allclose(read.poses, scans.poses, atol=1e-12)
 
 
-def test_scans_become_one_cloud(scans_file, tmp_path, capsys):
+def test_scans_are_converted_to_one_cloud(scans_file, tmp_path, capsys):
     scans = read_scans(scans_file)
     far = scans.poses.copy()
     far[:, :3, 3] += UTM_M
@@ -90,7 +90,7 @@ def test_scans_become_one_cloud(scans_file, tmp_path, capsys):
         np.testing.assert_allclose(found, world, atol=1e-4, rtol=0)
 
 
-def test_a_mesh_in_another_format(tmp_path, capsys):
+def test_a_mesh_is_converted_to_another_format(tmp_path, capsys):
     sphere = trimesh.creation.icosphere(2, 5.0)
     sphere.vertices = sphere.vertices + [900.0, -300.0, 20.0]
     radarsdf.io.write_mesh(tmp_path / "a.ply", sphere)
@@ -101,7 +101,7 @@ def test_a_mesh_in_another_format(tmp_path, capsys):
     np.testing.assert_allclose(read.triangles, sphere.triangles, atol=1e-3, rtol=0)
 
 
-def test_what_cannot_be_written(clouds, scans_file, tmp_path_factory, capsys):
+def test_unsupported_outputs_are_rejected(clouds, scans_file, tmp_path_factory, capsys):
     path, _ = clouds
     out = tmp_path_factory.mktemp("out")
     for words, said in (

@@ -41,7 +41,7 @@ def whole(scans_file, tmp_path_factory):
     return path
 
 
-def test_step_by_step_gives_the_same_mesh(city, scans_file, tmp_path, capsys):
+def test_separate_steps_give_the_same_mesh(city, scans_file, tmp_path, capsys):
     out, ply = tmp_path / "city", tmp_path / "mesh.ply"
     said = values(capsys, "tiles", "plan", scans_file, "-o", out, *PLAN)
     assert said["tiles"] > 2
@@ -94,7 +94,7 @@ def test_the_city_is_the_map(city, whole, scans_file, tmp_path, capsys):
     assert len(read_scans(out).points) == 1
 
 
-def test_folders_and_words_that_are_wrong(city, tmp_path, capsys):
+def test_invalid_folders_and_arguments_are_rejected(city, tmp_path, capsys):
     nothing, planned, ply = tmp_path / "nothing", tmp_path / "planned", tmp_path / "x.ply"
     for folder in (nothing, planned):
         folder.mkdir()

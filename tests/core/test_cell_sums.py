@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Rows of cells by their keys, and sums over returns and over neighbouring cells."""
+"""Rows of cells by key, and sums over returns and over neighbourhoods."""
 
 import itertools
 
@@ -27,14 +27,14 @@ def keys_of(cells):
 
 
 def some_cells(seed=0):
-    """Cells (C, 3) in the order of their keys: crowded, on both sides of the origin, and lonely far away."""
+    """Cells (C, 3) in the order of their keys: dense on both sides of the origin, and isolated far away."""
     rng = np.random.default_rng(seed)
     crowd, far = rng.integers(-6, 7, (700, 3)), rng.integers(-900_000, 900_000, (100, 3))
     cells = np.unique(np.concatenate([crowd, far]), axis=0)
     return cells[np.argsort(keys_of(cells))]
 
 
-def test_rows_are_positions_and_absent_cells_have_none():
+def test_rows_are_positions_of_keys_and_absent_cells_have_none():
     cells = some_cells()
     blocks = CellBlocks(keys_of(cells))
     assert len(blocks) == len(cells)
@@ -48,7 +48,7 @@ def test_rows_are_positions_and_absent_cells_have_none():
 
 @pytest.mark.parametrize("columns", [3, 5])
 @pytest.mark.parametrize("weight", [1.0, 0.7])
-def test_sums_round_a_key(weight, columns):
+def test_neighbour_sums_equal_a_plain_loop(weight, columns):
     cells, asked = some_cells(), some_cells(1)
     values = np.random.default_rng(2).normal(size=(len(cells), columns))
     apart = np.abs(cells[None] - asked[:, None])
@@ -80,7 +80,7 @@ def test_sums_over_the_returns_of_a_cell():
         np.testing.assert_array_equal(sums, expected)
 
 
-def test_values_between_the_centres_of_cells():
+def test_values_are_interpolated_between_the_centres_of_cells():
     rng = np.random.default_rng(0)
     size_m, cells = 0.2, some_cells()
     blocks = CellBlocks(keys_of(cells))
@@ -106,7 +106,7 @@ def test_values_between_the_centres_of_cells():
         blocks.interpolate(size_m, values[1:], points)
 
 
-def test_principal_axes_are_those_of_lapack():
+def test_principal_axes_equal_lapack():
     rng = np.random.default_rng(0)
     a = rng.normal(size=(3000, 3, 3)) * 10.0 ** rng.uniform(-4, 4, (3000, 1, 3))
     matrices = np.concatenate(
@@ -136,7 +136,7 @@ def test_principal_axes_are_those_of_lapack():
         assert all(x.tobytes() == y.tobytes() for x, y in zip(again, (values, vectors), strict=True))
 
 
-def test_axes_of_what_is_not_finite_are_not_numbers():
+def test_axes_of_matrices_that_are_not_finite_are_nan():
     matrices = np.stack([np.eye(3)] * 3)
     matrices[1, 0, 2] = np.nan
     values, vectors = principal_axes(matrices)
@@ -163,8 +163,8 @@ def along(points, directions):
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-@pytest.mark.parametrize("count", [1, 300, 70_000])  # the last: more than are marked at a time
-def test_points_along_rays_mark_the_cells_of_those_points(count, threads):
+@pytest.mark.parametrize("count", [1, 300, 70_000])  # the last exceeds one batch
+def test_points_along_rays_insert_their_cells(count, threads):
     points, directions = rays_of(count)
     expected = np.unique(cell_keys(along(points, directions), LEAF_M))
     for cells, insert in ((CellSet(LEAF_M), "along"), (CellSet(LEAF_M), "points")):
@@ -178,13 +178,13 @@ def test_points_along_rays_mark_the_cells_of_those_points(count, threads):
 
 @pytest.mark.parametrize("highest", [1, 2**9, 2**40, 2**64])
 @pytest.mark.parametrize("count", [0, 1, 5000])
-def test_the_order_of_keys_is_stable(highest, count):
+def test_stable_order_equals_a_stable_sort(highest, count):
     keys = np.random.default_rng(count).integers(0, highest, count, np.uint64)
     np.testing.assert_array_equal(stable_order(keys), np.argsort(keys, kind="stable"))
 
 
 @pytest.mark.parametrize("count", [0, 1, 40_000])
-def test_rows_of_blocks_are_gathered_side_by_side(count):
+def test_gathered_rows_of_blocks_are_concatenated(count):
     generator = np.random.default_rng(0)
     blocks = [generator.normal(size=(50_000, width)).astype(np.float32) for width in (3, 1, 4)]
     order = generator.integers(0, 50_000, count, np.int32)
@@ -196,7 +196,7 @@ def test_rows_of_blocks_are_gathered_side_by_side(count):
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("count", [1, 7, 50_000])
-def test_sparse_lattice_against_numpy(threads, count):
+def test_sparse_lattice_equals_numpy(threads, count):
     rng = np.random.default_rng(count)
     cells = rng.integers([-5, 1000, -(2**31)], [60, 1030, -(2**31) + 40], size=(count, 3), dtype=np.int64)
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=threads)
@@ -222,7 +222,7 @@ def views(count=3000, seed=0):
 
 
 def bins(kind, points, directions, incidence, offset=0.0):
-    """The cell of each view, as numbers that NumPy can compare."""
+    """The cell of each view, as rows of integers."""
     edge, by_direction, by_incidence = kind
     columns = [np.floor(points.astype(float) / edge + offset)]
     if by_direction:
@@ -234,7 +234,7 @@ def bins(kind, points, directions, incidence, offset=0.0):
 
 
 def fitted_slowly(tiling, num_tilings, asked, values, weights, shrinkage, rounds):
-    """What the definition says that the means of one tiling explain."""
+    """The fitted part of the values by the means of one tiling, by definition."""
     rows = [bins(kind, *asked, tiling / num_tilings) for kind in KINDS]
     means = [np.zeros(row.max() + 1) for row in rows]
     left, weight = values.astype(float), weights.astype(float)
@@ -250,7 +250,7 @@ def fitted_slowly(tiling, num_tilings, asked, values, weights, shrinkage, rounds
 
 
 @pytest.mark.parametrize("rounds", [1, 2, 4])
-def test_means_are_those_of_the_definition(rounds):
+def test_means_equal_the_definition(rounds):
     asked = views()
     rng = np.random.default_rng(1)
     values = (asked[0][:, 0] + 3 * np.cos(np.nan_to_num(asked[2])) + rng.normal(size=3000)).astype(np.float32)
@@ -272,7 +272,7 @@ def test_any_number_of_threads_has_the_same_bits():
     assert (cells.sums(*asked, 1) == cells.sums(*asked, 4)).all()
 
 
-def test_small_means_are_left_out_of_what_is_found():
+def test_small_means_are_omitted():
     asked, values = views(), np.random.default_rng(3).normal(size=3000).astype(np.float32)
     arguments = KINDS, 2, *asked, values, np.ones_like(values), 5.0, 2
     keys, means, explained = fit_cell_means(*arguments)
@@ -284,7 +284,7 @@ def test_small_means_are_left_out_of_what_is_found():
     np.testing.assert_array_equal(still_explained, explained)
 
 
-def test_rows_number_the_cells_as_they_occur():
+def test_rows_number_cells_by_first_occurrence():
     asked = views()
     for kind in KINDS:
         rows, count = cell_rows(kind[None], *asked)
@@ -295,7 +295,7 @@ def test_rows_number_the_cells_as_they_occur():
         assert (np.diff(first) > 0).all()
 
 
-def test_far_away_nothing_is_known():
+def test_unobserved_cells_have_no_mean():
     asked, ones = views(), np.ones(3000, np.float32)
     cells = CellMeans(KINDS, 2, *fit_cell_means(KINDS, 2, *asked, ones, ones, 1.0, 2)[:2])
     assert cells.sums(*asked).min() > 0.5

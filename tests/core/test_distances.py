@@ -16,7 +16,7 @@ LEAF_M = 0.2
 
 
 def scene(seed=0, count=300, half_m=1.2, lower=0.0):
-    """A table round a wavy surface, planes on it with noise, and rough distances at its vertices."""
+    """A table around a wavy surface, noisy planes on it, and rough distances at its vertices."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-half_m, half_m, (count, 3))
     points[:, 2] = 0.2 * np.sin(2 * points[:, 0]) + lower
@@ -36,13 +36,13 @@ def scene(seed=0, count=300, half_m=1.2, lower=0.0):
 
 
 def smoothed(table, distances, *planes, **threads):
-    """By ``table.smoothed``, where no vertex has a known side. `planes`: with the iterations."""
+    """Distances by ``table.smoothed`` without known sides. `planes`: including the iterations."""
     *arrays, iterations = planes
     return table.smoothed(distances, *arrays, np.zeros(len(distances), np.int8), iterations, **threads)
 
 
 def system(table, points, normals, information):
-    """Rows A and targets b of the sum of squares |A d - b|² that the core names."""
+    """Rows A and targets b of the sum of squares |A d - b|² minimised by the core."""
     corners, of_cells = table.leaf_vertices()
     leaves = CellBlocks(table.leaf_keys())
     rows, targets = [], []
@@ -69,7 +69,7 @@ def system(table, points, normals, information):
         for step in np.eye(3, dtype=int):
             before, after = (number.get(tuple(corner + way * step)) for way in (-1, 1))
             if {tuple(sorted((i, other))) for other in (before, after) if other is not None} - edges:
-                continue  # two vertices that are neighbours, but of no common cell
+                continue  # two adjacent vertices without a common cell
             if before is not None and after is not None:
                 row = np.zeros(len(corners))
                 row[[before, i, after]] = 1, -2, 1
@@ -78,7 +78,7 @@ def system(table, points, normals, information):
     return np.array(rows), np.array(targets)
 
 
-def test_many_iterations_come_to_the_least_sum_of_squares():
+def test_iterations_converge_to_the_least_squares_solution():
     table, rough, *planes = scene(count=150, half_m=0.8)
     matrix, targets = system(table, *planes)
     least = lstsq(matrix, targets, lapack_driver="gelsy")[
@@ -93,12 +93,12 @@ def test_many_iterations_come_to_the_least_sum_of_squares():
     sums.append(sum_of_squares(again))
     assert sums[0] == sum_of_squares(rough)
     assert sums == sorted(sums, reverse=True)
-    # Errors shrink to 1 / cosh(4), but for those that are hardly seen.
+    # Errors shrink to 1 / cosh(4), except in nearly unobservable directions.
     assert sums[2] - sum_of_squares(least) < (sums[0] - sum_of_squares(least)) / np.cosh(4) ** 2
     assert sums[3] < 1.0001 * sum_of_squares(least)
 
 
-def test_what_is_flat_stays():
+def test_planes_are_unchanged():
     table, _, points, normals, information = scene()
     points[:, 2], normals[:] = 0.03, [0, 0, 1]
     distances = (table.leaf_vertices()[0][:, 2] * LEAF_M - 0.03).astype(np.float32)
@@ -107,7 +107,7 @@ def test_what_is_flat_stays():
     )
 
 
-def test_a_vertex_gets_what_is_in_reach_to_the_bit():
+def test_distances_depend_only_on_data_within_reach():
     iterations = 3
     reach_m = iterations * VertexTable.SMOOTHING_REACH * LEAF_M
     table, rough, points, normals, information = scene(count=900, half_m=3.0)
@@ -122,7 +122,7 @@ def test_a_vertex_gets_what_is_in_reach_to_the_bit():
     number = {tuple(corner): i for i, corner in enumerate(corners.tolist())}
     rows = [number[tuple(corner)] for corner in own.tolist()]
     part = smoothed(half, rough[rows], points[kept], normals[kept], information[kept], iterations)
-    # Cells along a ray reach 0.4 m away from its point, and a place lies a leaf away from it.
+    # Cells along a ray extend 0.4 m from its point, and points of planes are a leaf cell away from it.
     inner = own[:, 0] * LEAF_M < 1.0 - reach_m - 0.4 - 2 * LEAF_M
     assert inner.sum() > 100
     assert part[inner].tobytes() == whole[rows][inner].tobytes()
@@ -137,7 +137,7 @@ def test_any_number_of_threads_gives_the_same_bits():
         assert smoothed(table, rough, *planes, 5, num_threads=num_threads).tobytes() == one.tobytes()
 
 
-def test_without_planes_it_only_bends_less():
+def test_without_planes_smoothing_only_reduces_bending():
     table, rough, *planes = scene()
     found = smoothed(table, rough, *(a[:0] for a in planes), 10)
     matrix, _ = system(table, *(a[:0] for a in planes))
@@ -159,7 +159,7 @@ def test_no_vertex_leaves_its_known_side():
         table.smoothed(rough, *planes, sides[1:], 24)
 
 
-def test_planes_of_the_two_sides_of_a_thin_wall_both_stay():
+def test_planes_of_both_faces_of_a_thin_wall_are_kept():
     x, y = (a.ravel() for a in np.meshgrid(*[np.arange(-0.9, 1, 0.2)] * 2))
     half_m = 0.08
     points = np.float32([[*p, z] for p in zip(x, y, strict=True) for z in (-half_m, half_m)])
@@ -209,7 +209,7 @@ def lattice(key):
     ]
 
 
-def test_cells_along_rays_are_those_that_they_go_through():
+def test_cells_along_rays_are_the_cells_crossed():
     points, directions, *_ = some_rays(60)
     reach_m = 0.7
     for point, direction in zip(points, directions, strict=True):
@@ -218,7 +218,7 @@ def test_cells_along_rays_are_those_that_they_go_through():
         fraction = steps / LEAF_M - np.floor(steps / LEAF_M)
         inside = ((fraction > 1e-4) & (fraction < 1 - 1e-4)).all(axis=1)  # where rounding cannot decide
         assert np.isin(cell_keys(np.ascontiguousarray(steps[inside]), LEAF_M), keys).all()
-        for key in keys:  # and no others: each is met by the piece of line, within rounding
+        for key in keys:  # and no others: the segment crosses each, within rounding
             low = np.array(lattice(key)) * LEAF_M - 1e-5
             with np.errstate(divide="ignore", invalid="ignore"):
                 ends = (np.stack([low, low + LEAF_M + 2e-5]) - point) / direction.astype(np.float64)
@@ -226,7 +226,7 @@ def test_cells_along_rays_are_those_that_they_go_through():
             assert max(ends[0].max(), -reach_m) <= min(ends[1].min(), reach_m)
 
 
-def test_a_longer_reach_meets_all_the_cells_of_a_shorter_one():
+def test_a_longer_reach_crosses_all_cells_of_a_shorter_one():
     points, directions, *_ = some_rays(5000, spread_m=300.0)
     short, far = (keys_along(points, directions, reach_m) for reach_m in (0.4, 0.6))
     assert np.isin(short, far).all()
@@ -246,7 +246,7 @@ def test_vertices_of_leaf_cells(num_levels):
     assert np.array_equal(np.unique(of_cells), np.arange(len(coordinates)))
     if num_levels > 1:
         return
-    # A feature is what is interpolated at its vertex: a hair inside one of its cells.
+    # Interpolation at a vertex, slightly inside one of its cells, gives its feature.
     features = np.random.default_rng(0).normal(size=(table.num_rows, 8)).astype(np.float32)
     inside = (coordinates[of_cells] + np.where(steps > 0, -1e-4, 1e-4)) * LEAF_M
     x = np.ascontiguousarray(inside.reshape(-1, 3), np.float32)
@@ -256,7 +256,7 @@ def test_vertices_of_leaf_cells(num_levels):
 
 
 def reference(table, points, directions, normals, weights, truncation_m):
-    """By vertex, in float64, over the cells that :func:`keys_along` says a ray goes through."""
+    """Averages by vertex, in float64, over the cells of :func:`keys_along`."""
     coordinates, of_cells = table.leaf_vertices()
     leaf_of_key = {int(key): leaf for leaf, key in enumerate(table.leaf_keys())}
     sums = np.zeros((len(coordinates), 2))
@@ -272,7 +272,7 @@ def reference(table, points, directions, normals, weights, truncation_m):
 
 
 @pytest.mark.parametrize("num_levels", [1, 3])
-def test_the_average_is_that_of_the_reference(num_levels):
+def test_the_average_equals_the_reference(num_levels):
     rays = some_rays(400)
     occupied = keys_along(*(np.ascontiguousarray(a[::2]) for a in rays[:2]), 0.4)
     table = VertexTable(occupied, LEAF_M, num_levels, Encoding.OCTREE)
@@ -296,7 +296,7 @@ def test_the_same_bits_for_any_number_of_threads():
     np.testing.assert_allclose(table.average_rays(*backwards, 0.6)[0], one, atol=1e-5)
 
 
-def test_the_side_of_a_vertex_is_known_where_many_rays_passed_it_and_behind_many_more():
+def test_sides_need_many_rays_in_front_and_more_behind():
     x, y = np.meshgrid(*[np.arange(-0.95, 1, 0.1)] * 2)
     points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]).astype(np.float32)
     down = np.tile(np.float32([0, 0, -1]), (x.size, 1))
@@ -304,7 +304,7 @@ def test_the_side_of_a_vertex_is_known_where_many_rays_passed_it_and_behind_many
     corners, _ = table.leaf_vertices()
     inner = (np.abs(corners[:, :2]) < 5).all(axis=1)
     height_m = corners[inner, 2] * LEAF_M - 0.03
-    # 16 rays in the four columns of cells round a vertex, each once or twice.
+    # 16 rays in the four columns of cells at a vertex, each once or twice.
     for weight, in_front, behind in ((1, 0, 0), (8, 1, 0), (64, 1, -1)):
         weights = np.full(x.size, weight, np.float32)
         _, sides = table.average_rays(points, down, -down, weights, 0.6)
@@ -331,7 +331,7 @@ def distances_at(field, corners, parts, num_threads=1):
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_corners_inside_a_cell_have_the_value_of_the_field(parts):
+def test_corners_inside_a_cell_equal_the_field(parts):
     rng = np.random.default_rng(1)
     cells = rng.integers(-6, 6, (200, 3))
     field = grid_field(cells)
@@ -341,7 +341,7 @@ def test_corners_inside_a_cell_have_the_value_of_the_field(parts):
         .astype(np.int32)
     )
     found = distances_at(field, corners, parts)
-    # Moved into the cell by a millionth: outside there may be none.
+    # Moved into the cell by a millionth: there may be no cell outside.
     centres = np.repeat((cells + 0.5) * EDGE_M, (parts + 1) ** 3, axis=0)
     inside = corners * (EDGE_M / parts) + 1e-6 * (centres - corners * (EDGE_M / parts))
     expected = field.sdf(torch.from_numpy(inside.astype(np.float32))).detach().numpy()
@@ -356,7 +356,7 @@ def test_corners_of_cells_have_the_stored_distances():
     np.testing.assert_array_equal(distances_at(field, 3 * stored.corners, 3), stored.distances_m)
 
 
-def test_a_corner_in_no_cell_has_no_distance():
+def test_a_corner_outside_all_cells_is_nan():
     field = grid_field([[0, 0, 0]])
     corners = np.array([[0, 0, 0], [2, 2, 2], [3, 0, 0], [-1, 0, 0], [2**30, 0, 0]], np.int32)
     assert np.isnan(distances_at(field, corners, 2)).tolist() == [False, False, True, True, True]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The core's losses and gradients against what autograd makes of the field and the losses as they are defined."""
+"""Losses and gradients of the core, against autograd of the definitions of field and losses."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class Made:
     batch: Batch
 
     def gradients(self, kind, stage, threads=2, **training):
-        """By a back end with 0.7 of the dropout, on so many threads."""
+        """Gradients by a back end with 0.7 of the dropout, on `threads` threads."""
         config, generator = self.config.override(training=training), torch.Generator().manual_seed(5)
         with ThreadPool(threads) as workers:
             backend = kind(self.field, config, 0.7, generator, workers)
             found, result = backend.of(stage, self.batch, lambda: "meanwhile")
             assert result == "meanwhile"
-            # The back end would write into the arrays again.
+            # Copies, since the back end reuses its arrays.
             return dataclasses.replace(found, by_parameters=[p.clone() for p in found.by_parameters])
 
 
@@ -74,7 +74,7 @@ def make_batch(rays, dtype=torch.float32, batch_size=400, parts=3, **changes):
 
 @pytest.fixture
 def default_dtype(dtype):
-    """What a dropout's factors have."""
+    """Default dtype, which is that of the factors of dropout."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     yield
@@ -85,7 +85,7 @@ def default_dtype(dtype):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize("changes", CONFIGS.values(), ids=CONFIGS)
-def test_same_as_autograd(rays, changes, stage, dtype):
+def test_losses_and_gradients_equal_autograd(rays, changes, stage, dtype):
     batch = make_batch(rays, dtype, **changes)
     found, expected = (
         batch.gradients(kind, stage, optimiser="adam") for kind in (CoreGradients, AutogradGradients)
@@ -106,7 +106,7 @@ def test_same_as_autograd(rays, changes, stage, dtype):
 @pytest.mark.usefixtures("default_dtype")
 @pytest.mark.parametrize("dtype", [torch.float64])
 @pytest.mark.parametrize("stage", ["joint", "intensity"])
-def test_a_label_that_is_nan_has_no_error(rays, stage, dtype):
+def test_nan_labels_have_no_loss(rays, stage, dtype):
     batch = make_batch(rays, dtype)
     whole = batch.gradients(CoreGradients, stage).losses["intensity"]
     for every, share in ((3, 2 / 3), (1, 0)):
@@ -124,7 +124,7 @@ def test_a_label_that_is_nan_has_no_error(rays, stage, dtype):
 @pytest.mark.usefixtures("default_dtype")
 @pytest.mark.parametrize("dtype", [torch.float64])
 @pytest.mark.parametrize("stage", ["sdf", "joint"])
-def test_the_touched_features_get_the_same_gradient(rays, stage, dtype):
+def test_touched_features_have_the_gradient_of_autograd(rays, stage, dtype):
     batch = make_batch(rays, dtype)
     dense, rows = (batch.gradients(CoreGradients, stage, optimiser=name) for name in ("adam", "soap"))
     touched, by_features = rows.touched, torch.zeros_like(batch.field.cells.features)
@@ -137,14 +137,14 @@ def test_the_touched_features_get_the_same_gradient(rays, stage, dtype):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_threads_change_no_bit_and_parts_only_the_rounding(rays, stage):
+def test_threads_change_no_bit_and_parts_only_rounding(rays, stage):
     one, two, seven = (make_batch(rays).gradients(CoreGradients, stage, threads=n) for n in (1, 2, 7))
     for other in (two, seven):
         assert one.losses == other.losses
         for a, b in zip(one.by_parameters, other.by_parameters, strict=True):
             assert torch.equal(a, b)
     whole = make_batch(rays, parts=1).gradients(CoreGradients, stage)
-    if stage != "sdf":  # whose dropout is found by the samples' places, which parts change
+    if stage != "sdf":  # dropout depends on positions of samples, which parts change
         return
     assert whole.losses == pytest.approx(one.losses, rel=1e-6)
     for a, b in zip(one.by_parameters, whole.by_parameters, strict=True):
@@ -152,7 +152,7 @@ def test_threads_change_no_bit_and_parts_only_the_rounding(rays, stage):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_extreme_logits_and_no_samples(rays, stage):
+def test_extreme_logits_and_empty_batches_are_finite(rays, stage):
     made = make_batch(rays)
     batch = made.batch
     with torch.no_grad():
@@ -168,7 +168,7 @@ def test_extreme_logits_and_no_samples(rays, stage):
     assert not any(p.any() for p in found.by_parameters)
 
 
-def test_not_a_number_is_passed_on(rays):
+def test_nan_propagates(rays):
     made = make_batch(rays)
     made.batch.sdf_m[3] = float("nan")
     assert np.isnan(made.gradients(CoreGradients, "sdf").losses["sdf"])

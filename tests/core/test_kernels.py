@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The compiled kernels against plain references, their gradients, and what they promise about bits and threads."""
+"""The compiled kernels against plain references, their gradients, and determinism on threads."""
 
 import math
 
@@ -30,7 +30,7 @@ def make_table(points, num_levels=3, encoding=_core.Encoding.TRI_QUADTREE, num_t
 
 
 class Reference:
-    """Dictionaries and loops: slow, plainly what the method says, and numbered by nothing but its own keys."""
+    """The method as dictionaries and loops: slow, plain, and indexed by its own keys only."""
 
     def __init__(self, points, num_levels, encoding):
         leaf = {tuple(cell) for cell in np.floor(points / LEAF_M).astype(int).tolist()}
@@ -77,7 +77,7 @@ def test_interpolation_equals_the_dictionary_reference(encoding, num_levels):
 
     rng = np.random.default_rng(1)
     queries = np.concatenate([occupied[:100], rng.uniform(-5, 5, (200, 3))])
-    # One-hot features of the rows tell which row each vertex has: the map from vertex to row must be one to one.
+    # One-hot features identify the row of each vertex: the map from vertices to rows must be one-to-one.
     features = rng.normal(size=(table.num_rows, 8))
     out = kernels.interpolate(torch.tensor(features), torch.tensor(queries), table).numpy()
     weights_of_rows = np.zeros((len(queries), num_levels, table.num_rows))
@@ -98,7 +98,7 @@ def test_interpolation_equals_the_dictionary_reference(encoding, num_levels):
             assert sorted(found.values()) == pytest.approx(sorted(expected.values()), abs=1e-12)
             if len(set(np.round(list(expected.values()), 9))) == len(
                 expected
-            ):  # weights tell the vertices apart
+            ):  # distinct weights identify the vertices
                 by_weight = sorted(found, key=found.__getitem__)
                 for vertex, row in zip(sorted(expected, key=expected.__getitem__), by_weight, strict=True):
                     assert row_of.setdefault(vertex, row) == row
@@ -113,8 +113,8 @@ def test_interpolation_equals_the_dictionary_reference(encoding, num_levels):
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("count", [1, 7, 1000])
-def test_float32_is_as_exact_as_its_numbers(encoding, count):
-    """Values and gradients, also second ones, beside those of float64, which other tests compare with definitions."""
+def test_float32_is_accurate_to_its_resolution(encoding, count):
+    """Values and gradients up to second order, against float64, which other tests compare with definitions."""
     points = surface_points(count, dtype=np.float32)
     table = make_table(points, 3, encoding)
     generator = torch.Generator().manual_seed(0)
@@ -140,7 +140,7 @@ def test_float32_is_as_exact_as_its_numbers(encoding, count):
 def test_gradients_of_interpolation(encoding):
     surface = surface_points(40, extent_m=0.6)
     table = make_table(surface[:6], 2, encoding)
-    # Away from the cells' borders, where the gradient by the points jumps; some only in cells of coarse levels.
+    # Away from cell borders, where gradients by points are discontinuous; some only in coarse cells.
     known = (kernels.locate(torch.tensor(surface), table) >= 0).numpy()
     points = np.concatenate([surface[known[:, 0]][:4], surface[known.any(1) & ~known[:, 0]][:2]])
     points = torch.tensor(
@@ -225,7 +225,7 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def test_free_space_above_a_surface_has_no_features():
-    # Every column is occupied on the planes; only the cell in space tells a point above the ground from the ground.
+    # Every column is occupied on the planes; only cells in space distinguish the air from the ground.
     table = make_table(surface_points(5000))
     features = torch.ones(table.num_rows, 8, dtype=torch.float64)
     above = torch.tensor(surface_points(100) + np.array([0, 0, 5.0]))
@@ -243,7 +243,7 @@ def test_points_outside_every_lattice_have_no_cell(value):
     assert len(cells) == 0
 
 
-def test_wrong_arrays_are_refused():
+def test_wrong_arrays_are_rejected():
     table = make_table(surface_points(100))
     located, out = np.zeros((4, 3), np.int32), np.zeros((4, 24))
     with pytest.raises(ValueError, match="features must have shape"):
@@ -275,8 +275,8 @@ def test_a_block_of_columns_is_a_valid_gradient():
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("num_levels", [1, 3, 12])
-def test_values_do_not_jump_at_the_borders_of_cells(dtype, num_levels):
-    # On a vertex, the next number to either side of it, both zeros, and the smallest numbers beside zero.
+def test_values_are_continuous_at_cell_borders(dtype, num_levels):
+    # On a vertex, the adjacent numbers on both sides, both zeros, and the smallest numbers next to zero.
     border = (np.arange(-8, 8, dtype=dtype) * dtype(LEAF_M)).astype(dtype)
     # Scaled to the coarsest of 12 levels, this is still a normal number; below, a sign may be lost to underflow.
     tiny = np.finfo(dtype).smallest_normal * 2**12
@@ -294,7 +294,7 @@ def test_values_do_not_jump_at_the_borders_of_cells(dtype, num_levels):
         out = kernels.interpolate(features, points, table)
         together = np.diff(line.astype(np.float64)) < 1e-5
         assert together.sum() >= 30
-        # Weights change by the step over a cell's size; a point put into the wrong cell jumps by a feature.
+        # Weights change by the step over the cell size; a point in the wrong cell would jump by a feature.
         assert (out[1:] - out[:-1]).abs()[torch.from_numpy(together)].max() < 1e-3
 
 
@@ -305,7 +305,7 @@ def test_cells_are_half_open():
     corners = torch.tensor([[0.0] * 3, [-0.0] * 3, [-1e-300] * 3, [0.2] * 3, [-0.2] * 3], dtype=torch.float64)
     found = (kernels.locate(corners, table)[:, 0] >= 0).tolist()
     assert found == [True, True, True, False, True]
-    # The set of cells and the table agree on who is where.
+    # The set of cells and the table agree on the cells of points.
     keys = _core.cell_keys(corners.numpy(), LEAF_M)
     assert [key in table.leaf_keys() for key in keys] == found
     outside = torch.tensor([[0.1, 0.1, 0.2], [-0.1, -0.1, 1e-300]], dtype=torch.float64)
@@ -325,7 +325,7 @@ def test_the_outermost_cells_of_the_lattice():
 
 
 @pytest.mark.usefixtures("instruction_set")
-def test_empty_batches_of_everything():
+def test_empty_batches_are_accepted():
     table = make_table(surface_points(10))
     features = torch.ones(table.num_rows, 8, dtype=torch.float64, requires_grad=True)
     points = torch.zeros(0, 3, dtype=torch.float64, requires_grad=True)

@@ -31,7 +31,7 @@ def pose(*increment):
     return moved(np.eye(4)[None], np.array([increment], float))[0]
 
 
-def test_what_is_taken_out_was_never_there():
+def test_removal_restores_the_previous_state():
     rng = np.random.default_rng(0)
     scans = [room(seed) + rng.normal(0, 20, 3) for seed in range(6)]
     kept = planes_of(scans[1], scans[4])
@@ -48,7 +48,7 @@ def test_what_is_taken_out_was_never_there():
         np.testing.assert_array_equal(one, other)
 
 
-def test_what_was_never_added_cannot_be_taken_out():
+def test_removing_absent_points_is_rejected():
     planes = planes_of(room(0))
     cells = planes.num_cells
     with pytest.raises(ValueError, match="never added"):
@@ -73,7 +73,7 @@ def test_steps_by_gradient_and_hessian_lead_to_the_pose():
     assert np.linalg.eigvalsh(hessian - doubt).min() > 0
 
 
-def test_along_a_wall_all_is_doubt():
+def test_along_a_wall_the_position_is_unobservable():
     rng = np.random.default_rng(0)
 
     def wall():
@@ -101,12 +101,12 @@ SPREAD = [0.05**2, 0.01**2, 0.02**2]
 
 
 def returns(seed=0, count=600):
-    """Returns near random planes, each of which few scans see."""
+    """Returns near random planes, each observed by few scans."""
     rng = np.random.default_rng(seed)
     scans = np.sort(rng.integers(0, SCANS, count)).astype(np.int32)
     planes = ((scans + rng.integers(0, 5, count)) % PLANES).astype(np.int32)
     planes[rng.random(count) < 0.1] = -1
-    planes[(planes == 0) & (scans > 0)] = -1  # only the first scan sees it
+    planes[(planes == 0) & (scans > 0)] = -1  # observed only by the first scan
     normals = rng.normal(size=(PLANES, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     centres, positions = rng.normal(0, 5, (PLANES, 3)), rng.normal(0, 1, (SCANS, 3))
@@ -130,7 +130,7 @@ def dense(given, scale):
         if len(set(scans[rows])) < 2:
             continue
         n = normals[p]
-        across = np.linalg.svd(n[None])[2][1:]  # any two, for the tilts are eliminated
+        across = np.linalg.svd(n[None])[2][1:]  # any basis, since the tilts are eliminated
         for i in rows:
             d = directions[i].astype(float)
             azimuth = np.cross(up[scans[i]], d)
@@ -164,7 +164,7 @@ def prior(rng):
 
 
 @pytest.mark.parametrize("together", [1, 2, 4, SCANS])
-def test_increments_are_those_of_the_dense_matrix(together):
+def test_increments_equal_the_dense_solution(together):
     given = returns()
     found = CommonPlanes(*given, EXTENT_M, SPREAD, together, 2)
     scans, planes = given[3:5]
@@ -183,11 +183,11 @@ def test_increments_are_those_of_the_dense_matrix(together):
             np.testing.assert_allclose(inverse[s], C[s, :, s], atol=2e-5 * np.abs(C).max())
             if s:
                 np.testing.assert_allclose(inverse_below[s - 1], C[s, :, s - 1], atol=2e-5 * np.abs(C).max())
-        else:  # the band knows less
+        else:  # the band has less information
             assert np.linalg.eigvalsh(inverse[s] - C[s, :, s]).min() > -1e-6 * np.abs(C).max()
 
 
-def test_the_scale_is_that_of_the_residuals():
+def test_the_scale_is_the_median_squared_residual():
     rng = np.random.default_rng(2)
     given = list(returns(count=4000))
     points, _, ranges_m, _, planes, _, _, centres, normals = given
@@ -201,7 +201,7 @@ def test_the_scale_is_that_of_the_residuals():
     np.testing.assert_allclose(scales, [1, 1, 16], rtol=0.1)
 
 
-def test_the_bits_do_not_depend_on_threads():
+def test_results_do_not_depend_on_threads():
     given = returns(3, 40_000)
     diagonal, below, gradient, _ = prior(np.random.default_rng(1))
     answers = [

@@ -39,7 +39,7 @@ from ..reference_marching_cubes import reference_marching_cubes
         (torus, 4 * np.pi**2 * 0.6 * 0.25, 2 * np.pi**2 * 0.6 * 0.25**2, 0),
     ],
 )
-def test_closed_surfaces_have_their_size_and_topology(field, exact_area, exact_volume, characteristic):
+def test_closed_surfaces_have_the_exact_size_and_topology(field, exact_area, exact_volume, characteristic):
     n = 61
     h = 2 / (n - 1)
     vertices, faces = marching_cubes(field(n), spacing=[h] * 3, origin=[-1] * 3)
@@ -77,11 +77,11 @@ def test_gyroid_is_manifold_and_lies_on_the_surface():
         axis=1,
     )
     towards_larger = (normals(vertices, faces) * gradient[faces].mean(axis=1)).sum(axis=1)
-    assert (towards_larger > 0).mean() > 0.999  # slivers next to samples may lean
+    assert (towards_larger > 0).mean() > 0.999  # slivers next to samples may be tilted
 
 
 @pytest.mark.parametrize("pattern", range(256))
-def test_each_pattern_is_closed_by_any_surroundings(pattern):
+def test_each_pattern_is_closed_in_any_neighbourhood(pattern):
     rng = np.random.default_rng(pattern)
     volume = np.where(rng.random((6, 6, 6)) < 0.5, 1.0, -1.0)
     volume[2:4, 2:4, 2:4] = np.array([1.0 if pattern >> c & 1 else -1.0 for c in range(8)]).reshape(2, 2, 2)
@@ -131,7 +131,7 @@ def test_holes_of_a_mask_are_the_only_borders():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_infinite_samples_are_signs(dtype):
+def test_infinite_samples_count_by_sign(dtype):
     volume = np.where(sphere(20) > 0, np.inf, -np.inf).astype(dtype)
     vertices, faces = marching_cubes(volume)
     assert np.isfinite(vertices).all()
@@ -151,7 +151,7 @@ def test_only_samples_above_the_level_are_positive(value, is_positive):
     assert (len(marching_cubes(volume, 1.0)[1]) == 1) == is_positive
 
 
-def test_a_float32_volume_is_compared_with_the_level_in_double():
+def test_float32_volumes_are_compared_with_the_level_in_float64():
     third = np.float32(0.1)  # larger than 0.1
     volume = np.zeros((2, 2, 2), dtype=np.float32)
     volume[1, 1, 1] = third
@@ -163,7 +163,7 @@ def test_a_float32_volume_is_compared_with_the_level_in_double():
 @pytest.mark.parametrize(
     "shape", [(0, 0, 0), (0, 5, 5), (5, 5, 0), (1, 1, 1), (1, 9, 9), (9, 1, 9), (9, 9, 1)]
 )
-def test_volumes_without_a_cell_give_nothing(shape):
+def test_volumes_without_a_cell_give_an_empty_mesh(shape):
     mask = np.ones(shape, dtype=bool)
     for vertices, faces in (marching_cubes(np.zeros(shape)), marching_cubes(np.zeros(shape), mask=mask)):
         assert vertices.shape == (0, 3)
@@ -180,7 +180,7 @@ def test_one_corner_of_one_cell():
 
 
 @pytest.mark.parametrize("n", [31, 32, 33, 65])
-def test_rows_of_any_length_end_right(n):
+def test_rows_of_any_length_are_complete(n):
     volume = np.ones((4, 4, n))
     volume[1:3, 1:3, 1:-1] = -1
     vertices, faces = marching_cubes(volume)
@@ -248,7 +248,7 @@ LEVELS = [0.0, -0.0, 0.5, 1.0, 3.4e38, -3.4e38, 1e39, 1e-45, -1e-45, 5e-324, 1e-
 
 
 def check(volume, level, mask=None):
-    """All that the docstring promises, on the unit lattice."""
+    """Checks all promises of the docstring, on the unit lattice."""
     vertices, faces = mesh = marching_cubes(volume, level, mask=mask)
     used = cells_in_use(volume, mask)
     assert np.isfinite(vertices).all()
@@ -302,7 +302,7 @@ def test_topology_of_any_spacing(field, characteristic, spacing):
     np.testing.assert_allclose(vertices / spacing, unit, rtol=1e-15)
 
 
-def test_positions_that_float64_cannot_hold_are_refused():
+def test_positions_beyond_float64_are_rejected():
     with pytest.raises(ValueError, match="beyond float64"):
         marching_cubes(noise(0), spacing=(1e308, 1, 1))
 
@@ -333,7 +333,7 @@ def test_components_against_scipy():
     assert pairs.shape[1] == count
 
 
-def test_components_of_nothing_and_of_wrong_faces():
+def test_empty_meshes_have_no_components_and_wrong_faces_are_rejected():
     labels, sizes = mesh_components(np.zeros((0, 3), dtype=np.int32), 0)
     assert labels.shape == sizes.shape == (0,)
     for bad in ([[0, 1, 3]], [[-1, 0, 1]]):

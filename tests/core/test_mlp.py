@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The networks' kernel against PyTorch's operations one after the other."""
+"""The kernel of the networks, against a sequence of PyTorch operations."""
 
 import functools
 import itertools
@@ -12,7 +12,7 @@ from radarsdf import _core
 from radarsdf.field.kernels import mlp
 from radarsdf.threads import ThreadPool
 
-# What it has to be cut into: tiles of 64 rows, pieces of 2048, 16 columns.
+# Sizes around its partitions: tiles of 64 rows, chunks of 2048, 16 columns.
 COUNTS = [0, 1, 7, 64, 65, 4100]
 SHAPES = [([24, 60], [32, 32, 1]), ([8], [2, 1]), ([3], [5]), ([17, 1, 16], [33, 16, 7, 18])]
 
@@ -51,7 +51,7 @@ def assert_same(found, expected, dtype, count=1):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_values_and_gradients(shape, count, dtype):
+def test_values_and_gradients_equal_pytorch(shape, count, dtype):
     inputs, layers = make(*shape, count, dtype)
     out, expected = mlp(inputs, layers), plain(inputs, layers)
     assert_same(out, expected, dtype)
@@ -66,7 +66,7 @@ def test_values_and_gradients(shape, count, dtype):
 @pytest.mark.parametrize(
     "chosen", [["inputs", 1], ["weights", 0], ["biases", 1], ["inputs", 0, "weights", 1]], ids=str
 )
-def test_gradients_only_where_they_are_wanted(chosen):
+def test_only_requested_gradients_are_computed(chosen):
     inputs, layers = make([5, 20, 3], [18, 4], 100)
     every = {"inputs": inputs, "weights": [w for w, _ in layers], "biases": [b for _, b in layers]}
     wanted = [every[name][i] for name, i in zip(chosen[::2], chosen[1::2], strict=True)]
@@ -107,8 +107,8 @@ def test_same_bits_for_any_number_of_threads():
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
-def test_what_is_not_a_number_stays_so():
-    # A rectifier that made zero of it would hide that a training has diverged.
+def test_nan_propagates_through_relu():
+    # A ReLU that maps NaN to zero would hide divergence.
     inputs, layers = make([4], [16, 1], 3, torch.float32)
     with torch.no_grad():
         inputs[0][1, 2] = float("nan")
@@ -123,7 +123,7 @@ RATE = 1e-2
 
 
 class Reference:
-    """SOAP as published, with bases that are turned after 1, 2, 4, …, 32, 64, 96, … steps, rows as their vectors."""
+    """SOAP as published, with bases updated after 1, 2, 4, …, 32, 64, 96, … steps, and vectors as rows."""
 
     def __init__(self, rows, columns, longest=512):
         self.sides = [
@@ -163,14 +163,14 @@ def memory_of(weights):
 
 
 def dependent_gradients(rng, rows, columns):
-    """Gradients whose columns depend on each other, as those of a layer do whose inputs are the same features."""
+    """Gradients with correlated columns, as of a layer with correlated inputs."""
     mix = rng.normal(size=(columns, columns)) * np.geomspace(0.1, 1, columns)
     return rng.normal(size=(rows, columns)) @ mix
 
 
 @functools.cache
 def way_of_the_formula(rows, columns):
-    """Weights before all steps, and of each step the gradient and the weights after it; for all instruction sets."""
+    """Initial weights, and gradient and weights of each step; for all instruction sets."""
     rng = np.random.default_rng(0)
     weights, reference, steps = rng.normal(size=(rows, columns)), Reference(rows, columns), []
     expected = weights
@@ -183,7 +183,7 @@ def way_of_the_formula(rows, columns):
 
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize(("rows", "columns"), [(20, 37), (2, 3), (3, 520)])
-def test_steps_are_those_of_the_formula(rows, columns):
+def test_steps_equal_the_formula(rows, columns):
     start, steps = way_of_the_formula(rows, columns)
     weights, memory = start.copy(), memory_of(start)
     for step, (gradient, expected) in enumerate(steps, start=1):
@@ -194,7 +194,7 @@ def test_steps_are_those_of_the_formula(rows, columns):
 
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_it_is_faster_than_adam_where_inputs_depend_on_each_other(dtype):
+def test_it_converges_faster_than_adam_with_correlated_inputs(dtype):
     rng = np.random.default_rng(1)
     inputs = dependent_gradients(rng, 2000, 24).astype(dtype)
     truth = rng.normal(size=(8, 24)).astype(dtype)
@@ -221,19 +221,19 @@ def test_it_is_faster_than_adam_where_inputs_depend_on_each_other(dtype):
 
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_hostile_gradients(dtype):
+def test_degenerate_gradients_give_finite_weights(dtype):
     rng = np.random.default_rng(2)
     for scale in (0.0, 1e-30, 1e-10, 1e12):
         weights = np.zeros((24, 40), dtype)
         memory = memory_of(weights)
         for step in range(1, 100):
             gradient = scale * rng.normal(size=weights.shape)
-            gradient[:, ::3] = 0  # inputs that are never seen
-            gradient[:, 1] = gradient[:, 4]  # and two that are always the same
+            gradient[:, ::3] = 0  # unused inputs
+            gradient[:, 1] = gradient[:, 4]  # two identical inputs
             if step == 50:
                 gradient[:] = 0
             _core.soap_step([weights], [gradient.astype(dtype)], [memory], step, RATE)
         assert np.isfinite(weights).all()
         assert np.isfinite(memory).all()
         assert np.abs(weights).max() < 100 * 20 * RATE
-        assert (np.abs(weights).max() > RATE) == (scale > 1e-15)  # less does not count, as with Adam
+        assert (np.abs(weights).max() > RATE) == (scale > 1e-15)  # smaller: no effect, as with Adam

@@ -15,7 +15,7 @@ def unit_vectors(count, seed=0):
 
 
 def reference(vertices, faces, origin, directions, max_range_m=np.inf, *, front_only=False):
-    """Distance to the nearest triangle of all, in float64."""
+    """Distance to the nearest of all triangles, in float64."""
     first = np.full(len(directions), np.inf)
     for a, b, c in vertices[faces]:
         columns = np.stack(
@@ -38,14 +38,14 @@ def reference(vertices, faces, origin, directions, max_range_m=np.inf, *, front_
 
 
 def soup(count=60, extent=4.0, size=1.0, seed=1):
-    """Triangles that lie anywhere, and face anywhere."""
+    """Triangles of random position and orientation."""
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-extent, extent, (count, 1, 3)) + rng.uniform(-size, size, (count, 3, 3))
     return corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
 
 
 def agree(found, expected):
-    """Rays that graze an edge may differ."""
+    """Equal, except rays that graze an edge."""
     same = np.isclose(found, expected, rtol=1e-5, atol=1e-4) | (np.isinf(found) & np.isinf(expected))
     return same.mean()
 
@@ -53,7 +53,7 @@ def agree(found, expected):
 @pytest.mark.parametrize("size_m", [0.5, 1.0, 3.0])
 @pytest.mark.parametrize("front_only", [False, True])
 @pytest.mark.parametrize("origin", [[0.0, 0.0, 0.0], [-9.0, 3.0, 1.0]])
-def test_the_first_triangle_of_many(size_m, front_only, origin):
+def test_hits_are_on_the_nearest_triangle(size_m, front_only, origin):
     vertices, faces = soup(round(60 / size_m), size=size_m)
     # From outside, towards the triangles.
     directions = unit_vectors(600) + np.float32(0.3) * -np.array(origin, np.float32)
@@ -86,7 +86,7 @@ def test_no_ray_leaves_a_closed_mesh():
     assert np.isinf(found).all()
 
 
-def test_a_plane_at_a_grazing_angle():
+def test_ranges_are_accurate_at_grazing_incidence():
     x, y = np.meshgrid(np.arange(0, 60.5, 0.5), np.arange(-20, 20.5, 0.5), indexing="ij")
     vertices = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
     columns = x.shape[1]
@@ -110,7 +110,7 @@ def test_ranges_end_at_the_limit():
 
 
 @pytest.mark.parametrize("distance_m", [0.0, 4.9, 300.0])
-def test_no_ray_slips_through_between_two_triangles(distance_m):
+def test_no_ray_passes_between_adjacent_triangles(distance_m):
     ball = trimesh.creation.icosphere(subdivisions=5, radius=5.0)
     vertices = np.array(ball.vertices)
     tracer = SurfaceTracer(vertices, np.array(ball.faces, np.int32))
@@ -123,7 +123,7 @@ def test_no_ray_slips_through_between_two_triangles(distance_m):
     ranges_m = np.linalg.norm(away, axis=1)
     seen = (
         np.abs(np.einsum("ni,ni->n", away, target)) > 0.1 * 5 * ranges_m
-    )  # not at the rim, where both sides end
+    )  # not at the boundary, where both sides end
     seen &= (distance_m < 5) | (np.einsum("ni,ni->n", away, target) < 0)
     away, ranges_m = away[seen], ranges_m[seen]
     found, _ = tracer.first_hits(origin, (away / ranges_m[:, None]).astype(np.float32), 1e3)
@@ -170,7 +170,7 @@ def test_far_apart_triangles_need_little_memory():
     ("origin", "direction", "limit"),
     [([np.nan, 0, 0], 1.0, 5.0), ([0, 0, 0], np.inf, 5.0), ([0, 0, 0], 1.0, -1.0)],
 )
-def test_wrong_rays(origin, direction, limit):
+def test_wrong_rays_are_rejected(origin, direction, limit):
     vertices, faces = soup(3)
     with pytest.raises(ValueError, match="must be finite"):
         SurfaceTracer(vertices, faces).first_hits(origin, np.full((1, 3), direction, np.float32), limit)
@@ -198,7 +198,7 @@ def found(rays, num_threads=1, lower=(-LIMIT,) * 3, upper=(LIMIT,) * 3):
 
 
 def searched(points, directions, ranges_m, passed_m, scans):
-    """Scans that passed each cell, by steps of a millimetre, and the cells with returns."""
+    """Numbers of scans that cross each cell, in steps of a millimetre, and cells with returns."""
     passed, returns = np.zeros(SHAPE, int), np.zeros(SHAPE, bool)
     for scan in np.unique(scans):
         seen = np.zeros(SHAPE, bool)
@@ -211,21 +211,21 @@ def searched(points, directions, ranges_m, passed_m, scans):
     return np.minimum(passed, 7), returns
 
 
-def test_crossings_are_those_of_a_plain_search():
+def test_crossings_equal_a_plain_search():
     rays = rays_of(300, 9)
     free_space = found(rays)
     free_space.check()
     passed, returns = free_space.dense(LOWER, SHAPE)
     expected, expected_returns = searched(*rays)
     np.testing.assert_array_equal(returns, expected_returns)
-    # A step misses corners of cells, and rays that come together are not followed on: few cells, of one scan each.
+    # Steps miss corners of cells, and traversals of converging rays end early: few cells, of one scan each.
     wrong = passed != expected
     assert wrong.sum() < 0.03 * (expected > 0).sum()
     assert np.abs(passed.astype(int) - expected)[wrong].max() == 1
     assert expected.max() == 7 == passed.max()
 
 
-def test_threads_make_no_difference_and_a_box_leaves_out_blocks():
+def test_threads_change_no_bit_and_a_box_omits_blocks():
     rays = rays_of(6000, 40)
     one = found(rays)
     for num_threads in (2, 5):
@@ -236,7 +236,7 @@ def test_threads_make_no_difference_and_a_box_leaves_out_blocks():
     assert 0 < len(part.keys) < len(one.keys)
     (passed, returns), (of_all, all_returns) = (kind.dense([-8] * 3, (16,) * 3) for kind in (part, one))
     np.testing.assert_array_equal(returns, all_returns)
-    # What lies outside does not count as passed, so that some rays are followed farther in the box.
+    # Cells outside do not count as crossed, so that some rays are traversed farther in the box.
     assert (passed >= of_all).all()
     assert (passed > of_all).mean() < 0.1
     cells = np.random.default_rng(0).integers(-60, 60, (2000, 3))
@@ -251,7 +251,7 @@ SLACK_M = 0.25 * CELL_M
 
 
 def a_scene(seed):
-    """Surfels in cells that are crowded in places, with nothing in between: keys and rows (M, 8)."""
+    """Surfels in clusters of cells with empty space in between: keys and rows (M, 8)."""
     rng = np.random.default_rng(seed)
     clusters = [
         centre + rng.integers(-4, 5, (300, 3)) for centre in rng.integers(-60, 60, (60, 3)) * [1, 1, 0.2]
@@ -274,12 +274,12 @@ def rays_across(kind, count, seed):
     directions = rng.normal(size=(count, 3)) * [1, 1, 0.2]
     if kind in ("along axes", "along borders"):
         directions = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
-    if kind == "through edges":  # two or three faces are met at once, at every step
+    if kind == "through edges":  # every step crosses two or three faces at once
         directions = rng.choice([-1.0, 0.0, 1.0], (count, 3))
         directions[~directions.any(axis=1)] = [1, 1, -1]
     if kind in ("along borders", "through edges"):
         sensors = np.round(sensors / CELL_M) * CELL_M
-    if kind == "grazing":  # just beside a border
+    if kind == "grazing":  # next to a border
         directions = directions * [1, 1e-7, 1e-6]
         sensors[:, 1:] = np.round(sensors[:, 1:] / CELL_M) * CELL_M
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -290,7 +290,7 @@ def rays_across(kind, count, seed):
 
 
 def first_crossing(row_of_cell, surfels, point, direction, range_m):
-    """A plain walk, cell by cell, of one ray; a face's distance is that from the sensor."""
+    """A plain traversal of one ray, cell by cell, with distances of faces from the sensor."""
     start = (point.astype(np.float64) - float(range_m) * direction.astype(np.float64)) / CELL_M
     speed = direction.astype(np.float64) / CELL_M
     cell, begin_m = np.floor(start).astype(int), 0.0
@@ -298,7 +298,7 @@ def first_crossing(row_of_cell, surfels, point, direction, range_m):
     step = np.where(speed >= 0, 1, -1)
     while begin_m < range_m:
         ends_m = [(cell[k] + (step[k] > 0) - start[k]) * per_cell_m[k] for k in range(3)]
-        axis = int(np.argmin(ends_m))  # the first of those that are equally near
+        axis = int(np.argmin(ends_m))  # the first in case of ties
         row = row_of_cell.get(tuple(cell.tolist()), -1)
         if row >= 0:
             centre, normal = surfels[row, :3], surfels[row, 3:6]
@@ -313,7 +313,7 @@ def first_crossing(row_of_cell, surfels, point, direction, range_m):
 
 
 @pytest.mark.parametrize("kind", ["any", "along axes", "along borders", "through edges", "grazing"])
-def test_skipping_finds_what_a_plain_walk_finds(kind):
+def test_skipping_empty_space_equals_a_plain_traversal(kind):
     keys, surfels = a_scene(seed=len(kind))
     cells = np.floor(surfels[:, :3] / CELL_M).astype(int)
     row_of_cell = {tuple(cell): row for row, cell in enumerate(cells.tolist())}
@@ -330,7 +330,7 @@ def test_rays_from_far_away_and_past_everything():
     surfel_map = SurfelMap(keys, surfels, CELL_M)
     normal, centre = surfels[:1, 3:6], surfels[:1, :3]
     points, ranges_m = centre - 0.3 * normal, np.array([30_000.0], np.float32)
-    # What float32 leaves of such a sensor's position moves the ray by millimetres.
+    # The resolution of float32 at such sensor positions moves the ray by millimetres.
     assert surfel_map.first_crossings(points, -normal, ranges_m, 0.0, 0.0, MARGIN_M, 0.0)[0] >= 0
     beyond = np.array([[0, 0, 500.0]], np.float32)
     along = np.array([[1.0, 0, 0]], np.float32)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How many scans looked at a place, and how many had returns there."""
+"""Visibility counts, and numbers of scans with returns."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ MANY = 10_000  # enough for several threads
 
 
 def sorted_cells(cells):
-    """Different cells (C, 3) in the order of their keys, and these."""
+    """Distinct cells (C, 3) in the order of their keys, and the keys."""
     cells = np.unique(cells, axis=0)
     keys = cell_keys((cells + 0.5) * LEAF_M, LEAF_M)
     order = np.argsort(keys)
@@ -29,7 +29,7 @@ def rays_of(kind, count, seed=0):
     directions = rng.normal(size=(count, 3))
     if kind == "along axes":
         directions = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
-    if kind == "in planes":  # one coordinate stays as it is
+    if kind == "in planes":  # one coordinate is constant
         directions[np.arange(count), rng.integers(0, 3, count)] = 0
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     ranges_m = rng.uniform(0, 25, count)
@@ -43,7 +43,7 @@ def rays_of(kind, count, seed=0):
 
 
 def cells_near(points, seed=0):
-    """A few leaf cells in about every fourth cube where the points are, and some far from them."""
+    """A few leaf cells in about every fourth cube with points, and some far from them."""
     rng = np.random.default_rng(seed)
     middle = np.round(np.median(points, axis=0) / LEAF_M).astype(int)
     near = middle + rng.integers(-80, 80, (1500, 3))
@@ -53,7 +53,7 @@ def cells_near(points, seed=0):
 
 
 def scans_of(count, seed=0):
-    """(N,) int32: scans of a few returns, one of more than half of all, and numbers that no return has."""
+    """(N,) int32: scans of a few returns, one with more than half of all, and numbers without returns."""
     rng = np.random.default_rng(seed)
     scans = rng.integers(0, 400, count) * 3
     scans[rng.random(count) < 0.6] = 600
@@ -61,7 +61,7 @@ def scans_of(count, seed=0):
 
 
 @pytest.mark.parametrize("kind", ["any", "along axes", "in planes", "short", "far"])
-def test_visibility_is_that_of_a_plain_search(kind):
+def test_visibility_equals_a_plain_search(kind):
     rays = rays_of(kind, 3000)
     cells, keys = cells_near(rays[0])
     scans = np.sort(np.random.default_rng(1).integers(0, 30, 3000)).astype(np.int32)
@@ -73,7 +73,7 @@ def test_visibility_is_that_of_a_plain_search(kind):
     np.testing.assert_array_equal(visibility, expected)
 
 
-def test_the_number_of_threads_changes_nothing():
+def test_results_do_not_depend_on_threads():
     rays, scans = rays_of("any", MANY), scans_of(MANY)
     cells, keys = (a[::8] for a in cells_near(rays[0]))
     keys = np.ascontiguousarray(keys)
@@ -84,13 +84,13 @@ def test_the_number_of_threads_changes_nothing():
 
 
 def through(y_m, x_m=0.7, range_m=50.0):
-    """Rays of this range along x, all at the same place across it: points, directions, ranges, float32."""
+    """Identical rays of this range along x: points, directions, ranges, float32."""
     points = np.column_stack([np.full_like(y_m, x_m), y_m, np.full_like(y_m, 0.3)])
     directions = np.tile([1.0, 0, 0], (len(y_m), 1))
     return tuple(a.astype(np.float32) for a in (points, directions, np.full_like(y_m, range_m)))
 
 
-def test_a_scan_counts_once_however_many_rays_it_has():
+def test_a_scan_counts_once_with_any_number_of_rays():
     rays = through(np.linspace(0.1, 1.5, 600))
     _, keys = sorted_cells([[0, 0, 0], [-1, 0, 0], [-5, 7, 7], [-100, 3, 1]])
     for number_of_scans in (1, 2, 600):
@@ -98,7 +98,7 @@ def test_a_scan_counts_once_however_many_rays_it_has():
         assert count_visibility(keys, LEAF_M, *rays, scans).tolist() == [number_of_scans] * 4
 
 
-def test_a_look_is_from_the_sensor_to_the_return():
+def test_visibility_covers_the_ray_from_sensor_to_return():
     """One ray along x from -49.3 m to 0.7 m: the cubes of 1.6 m from -31 to 0."""
     ray, scan = through(np.array([0.5])), np.zeros(1, np.int32)
     cells = np.array([[x, 0, 0] for x in range(-40 * CUBE_CELLS, 10 * CUBE_CELLS)])
@@ -106,7 +106,7 @@ def test_a_look_is_from_the_sensor_to_the_return():
     visibility = count_visibility(keys, LEAF_M, *ray, scan)
     cubes = np.floor_divide(cells[:, 0], CUBE_CELLS)
     np.testing.assert_array_equal(visibility, (cubes >= -31) & (cubes <= 0))
-    # Its neighbours across the ray saw nothing.
+    # Neighbours across the ray are not visible.
     _, beside = sorted_cells([[-50, -1, 0], [-50, 8, 0], [-50, 0, -1], [-50, 0, 8]])
     assert count_visibility(beside, LEAF_M, *ray, scan).tolist() == [0] * 4
 

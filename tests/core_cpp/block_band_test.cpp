@@ -17,7 +17,7 @@ namespace {
 
 constexpr std::int64_t kRows = 9;
 
-// B B^T of a random lower band B, in the band and as a whole matrix. The band of the product is as wide as B's.
+// B B^T of a random lower band matrix B, as a band and as a dense matrix. The product has the bandwidth of B.
 struct Random {
   BlockBand band;
   std::vector<double> whole;  // (6 kRows, 6 kRows)
@@ -45,7 +45,7 @@ struct Random {
 
 }  // namespace
 
-TEST_CASE("a factor of a band solves what the whole matrix says") {
+TEST_CASE("the band factor solves the dense system") {
   for (const std::int64_t width : {0, 1, 3, 20}) {
     Random random(width);
     REQUIRE(random.band.factor());
@@ -59,7 +59,7 @@ TEST_CASE("a factor of a band solves what the whole matrix says") {
   }
 }
 
-TEST_CASE("blocks of the inverse are those of the whole inverse") {
+TEST_CASE("blocks of the inverse equal those of the dense inverse") {
   for (const std::int64_t width : {0, 2, 20}) {
     Random random(width);
     REQUIRE(random.band.factor());
@@ -80,7 +80,7 @@ TEST_CASE("blocks of the inverse are those of the whole inverse") {
   }
 }
 
-TEST_CASE("what is not positive definite is refused") {
+TEST_CASE("a matrix that is not positive definite is rejected") {
   BlockBand band(2, 1);
   for (int a = 0; a < kPose; ++a) band.block(0, 0)[kPose * a + a] = band.block(1, 1)[kPose * a + a] = 1;
   band.block(1, 0)[0] = 1;

@@ -21,7 +21,7 @@ using radarsdf::SumsChange;
 constexpr double kSize = 0.25;
 constexpr std::int64_t kRays = 2000;
 
-// A scan of a sensor in the origin. The rays are one more than are counted: nobody may ask the last.
+// A scan from the origin. It has one ray more than its count: reading that one is an error.
 struct Scan {
   std::vector<float> points, directions, ranges_m;
 
@@ -69,7 +69,7 @@ void check_same(const Contents& one, const Contents& other) {
 
 }  // namespace
 
-TEST_CASE("sums that grow hold the scans that are in them, and nothing of those taken out") {
+TEST_CASE("growing sums equal the sums of the present scans, without a trace of removed ones") {
   const Scan first(1), second(2);
   GrowingSums sums;
   sums.apply(change_by(first, 1));
@@ -91,7 +91,7 @@ TEST_CASE("sums that grow hold the scans that are in them, and nothing of those 
   CHECK((sums.num_cells() == 0 && sums.num_blocks() == 0));
 }
 
-TEST_CASE("contents of blocks go to another table and come back as they were") {
+TEST_CASE("blocks moved to another table and back are unchanged") {
   GrowingSums sums, other;
   sums.apply(change_by(Scan(1), 1));
   const Contents whole = contents_of(sums);

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// What several tests need.
+// Random data for several tests.
 #pragma once
 
 #include <cmath>
@@ -11,7 +11,7 @@
 
 namespace test {
 
-constexpr int kThreads[] = {1, 2, 7};  // results must not depend on them; 7 divides nothing
+constexpr int kThreads[] = {1, 2, 7};  // results must not depend on them; 7 divides no size
 
 template <typename T>
 std::vector<T> normal_numbers(std::int64_t size, double scale, unsigned seed) {

@@ -38,7 +38,7 @@ std::set<std::uint64_t> random_keys(int count, double spread, unsigned seed) {
 
 }  // namespace
 
-TEST_CASE("a Morton key gives its coordinates back, and shifted its parent's") {
+TEST_CASE("a Morton key decodes to its coordinates, and shifted to those of its parent") {
   std::mt19937 generator(1);
   constexpr std::uint32_t kLast = (1u << radarsdf::kAxisBits) - 1;
   for (int i = 0; i < 10000; ++i) {
@@ -54,9 +54,9 @@ TEST_CASE("a Morton key gives its coordinates back, and shifted its parent's") {
   }
 }
 
-TEST_CASE("the flat map is a map") {
+TEST_CASE("FlatMap behaves like std::unordered_map") {
   std::mt19937_64 generator(2);
-  std::vector<std::uint64_t> keys(16000);  // random: the hash gives each of consecutive numbers a place of its own
+  std::vector<std::uint64_t> keys(16000);  // random, for collisions: consecutive numbers have none
   for (std::uint64_t& key : keys) key = generator() >> 1;
   std::map<std::uint64_t, std::int32_t> expected;
   radarsdf::FlatMap map;
@@ -69,7 +69,7 @@ TEST_CASE("the flat map is a map") {
     const auto found = expected.find(key);
     REQUIRE(map.find(key) == (found == expected.end() ? -1 : found->second));
   }
-  for (std::int32_t i = 0; i < 40000; ++i) {  // comes and goes: what is left is found, wherever it was moved to
+  for (std::int32_t i = 0; i < 40000; ++i) {  // after backward shifts, all remaining keys are found
     const std::uint64_t key = keys[generator() % 15000];
     if (generator() % 3 == 0) {
       CHECK(map.insert(key, i) == expected.insert({key, i}).second);
@@ -84,7 +84,7 @@ TEST_CASE("the flat map is a map") {
   }
 }
 
-TEST_CASE("a point that has no cell is refused before anything is stored") {
+TEST_CASE("points outside the lattice are rejected before anything is stored") {
   for (const float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity(), -2e6F}) {
     const float points[] = {0, 0, 0, 0, bad, 0};
     radarsdf::CellSet cells(1.0);
@@ -110,7 +110,7 @@ TEST_CASE("the table numbers the vertices of each level and group in Morton orde
       for (int level = 0; level < kLevels; ++level) {
         for (int group = 0; group < groups; ++group) {
           const auto& used = axes[static_cast<std::size_t>(group)];
-          // A vertex by its coordinates along the axes that the group uses.
+          // Coordinates of a vertex along the axes used by the group.
           const auto vertex = [&](std::uint64_t key, int corner) {
             std::uint32_t at[3] = {};
             for (std::size_t i = 0; i < used.size(); ++i) {
@@ -143,7 +143,7 @@ TEST_CASE("the table numbers the vertices of each level and group in Morton orde
   }
 }
 
-TEST_CASE("a table refuses what it cannot hold") {
+TEST_CASE("a table rejects keys and settings that do not fit") {
   using radarsdf::Encoding;
   using radarsdf::VertexTable;
   CHECK_THROWS_AS(VertexTable({2, 1}, 1, 1, Encoding::kOctree, 1), std::invalid_argument);
@@ -152,7 +152,7 @@ TEST_CASE("a table refuses what it cannot hold") {
   CHECK_THROWS_AS(VertexTable({1}, 1, 0, Encoding::kOctree, 1), std::invalid_argument);
   CHECK_THROWS_AS(VertexTable({1}, 1, radarsdf::kMaxLevels + 1, Encoding::kOctree, 1), std::invalid_argument);
   CHECK_THROWS_AS(VertexTable({std::uint64_t{1} << 63}, 1, 1, Encoding::kOctree, 1), std::invalid_argument);
-  for (std::size_t axis = 0; axis < 3; ++axis) {  // the far vertex of a cell of the coarser level must fit, too
+  for (std::size_t axis = 0; axis < 3; ++axis) {  // the far vertex of a coarse cell must fit, too
     std::uint32_t cell[3] = {};
     const auto key_at = [&](std::uint32_t coordinate) {
       cell[axis] = coordinate;

@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Every parallel function of the core on more threads than there are processors, for ThreadSanitizer
-// (tools/test_core.sh thread), and the same results as on one thread; then from several threads at once, as where each
-// fits a map of its own.
+// Runs every parallel function of the core with more threads than processors, for ThreadSanitizer (tools/test_core.sh
+// thread), and compares the results with one thread; then runs all from several threads concurrently, as if each fitted
+// its own map.
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -44,7 +44,7 @@ using radarsdf::Mesh;
 constexpr std::int64_t kPoints = 20000;  // more than a block of most loops
 constexpr int kLevels = 3;
 
-// Bytes of all results, one after the other.
+// Concatenated bytes of all results.
 class Results {
  public:
   template <typename T>
@@ -101,7 +101,7 @@ void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
   results.add(harmonics.data(), kPoints * 16);
 }
 
-// Two steps of Adam, as a fit makes them.
+// Two steps of Adam, as in a fit.
 template <typename T>
 void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   const auto points = test::normal_numbers<T>(3 * kPoints, 4.0, 1);
@@ -129,7 +129,7 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   results.add(moments.data(), 16 * table.num_rows());
 }
 
-// A network of two layers on two blocks of columns, forward and backward.
+// Forward and backward pass of a network with two layers and two blocks of inputs.
 template <typename T>
 void networks(int threads, Results& results) {
   constexpr std::int64_t kHidden = 20, kWide = 7, kNarrow = 5, kOutputs = 3;
@@ -156,7 +156,7 @@ void networks(int threads, Results& results) {
   }
 }
 
-// Sums over cells, and rays through surfels and through cells.
+// Sums over cells, and rays that cross surfels and cells.
 void sums_and_rays(int threads, Results& results) {
   const auto points = test::normal_numbers<float>(3 * kPoints, 3.0, 9);
   auto directions = test::normal_numbers<float>(3 * kPoints, 1.0, 10);
@@ -226,7 +226,7 @@ void sums_and_rays(int threads, Results& results) {
   results.add(distances.data(), table.num_rows());
 }
 
-// Means in cells, and rays through a soup of triangles.
+// Means in cells, and rays through a triangle soup.
 void means_and_tracing(int threads, Results& results) {
   const auto points = test::normal_numbers<float>(3 * kPoints, 3.0, 11),
              directions = test::normal_numbers<float>(3 * kPoints, 0.6, 12),
@@ -254,7 +254,7 @@ void means_and_tracing(int threads, Results& results) {
   results.add(hits.data(), kPoints);
 }
 
-// Returns moved onto planes, cells along rays, and bridges between some of them.
+// Returns shrunk towards planes, cells along rays, and bridges.
 void before_the_training(int threads, Results& results) {
   const auto points = test::normal_numbers<float>(3 * kPoints, 3.0, 16);
   const auto directions = test::normal_numbers<float>(3 * kPoints, 1.0, 17);
@@ -293,7 +293,7 @@ void before_the_training(int threads, Results& results) {
   results.add(moved.data(), 7 * kPoints);
 }
 
-// An exception of one task ends the others and is the caller's.
+// The exception of a task cancels the others and reaches the caller.
 void failure(int threads) {
   bool caught = false;
   try {

@@ -20,7 +20,7 @@
 #include "util/random_bytes.hpp"
 #include "util/thread_pool.hpp"
 
-TEST_CASE("bits are counted and found as std::bitset does") {
+TEST_CASE("bit counts and positions equal those of std::bitset") {
   std::mt19937_64 generator(1);
   for (int i = 0; i < 10000; ++i) {
     const std::uint64_t bits = (generator() & generator() & generator()) << (i % 64);
@@ -44,14 +44,14 @@ TEST_CASE("each task runs once") {
   }
 }
 
-TEST_CASE("a thread pool runs each task once, job after job") {
+TEST_CASE("a thread pool runs each task once, in consecutive jobs") {
   for (const int threads : {0, 1, 2, 5}) {
     radarsdf::ThreadPool pool(threads);
     std::vector<std::atomic<int>> runs(50);
     for (int job = 1; job <= 300; ++job) {
       const std::int64_t tasks = job % 51;
       pool.begin(tasks, [&](std::int64_t i) { ++runs[static_cast<std::size_t>(i)]; });
-      // Sometimes the others have gone to sleep.
+      // In some jobs, the other threads are asleep.
       if (job % 100 == 0) std::this_thread::sleep_for(std::chrono::milliseconds(20));
       pool.finish();
       REQUIRE(std::all_of(runs.begin(), runs.begin() + tasks, [](const std::atomic<int>& n) { return n == 1; }));
@@ -61,7 +61,7 @@ TEST_CASE("a thread pool runs each task once, job after job") {
   }
 }
 
-TEST_CASE("a thread pool works while its caller does something else") {
+TEST_CASE("a thread pool works while its caller is busy") {
   radarsdf::ThreadPool pool(2);
   std::atomic<bool> done{false};
   pool.begin(1, [&](std::int64_t) { done = true; });
@@ -70,10 +70,10 @@ TEST_CASE("a thread pool works while its caller does something else") {
   CHECK(done);
   CHECK_THROWS_AS(pool.begin(1, [](std::int64_t) {}), std::logic_error);
   pool.finish();
-  pool.finish();  // there is nothing
+  pool.finish();  // no tasks
 }
 
-TEST_CASE("a thread pool hands on what a task throws, and goes on") {
+TEST_CASE("a thread pool rethrows the exception of a task, and stays usable") {
   for (const int threads : {1, 3}) {
     radarsdf::ThreadPool pool(threads);
     for (int job = 0; job < 20; ++job) {
@@ -93,7 +93,7 @@ TEST_CASE("a thread pool hands on what a task throws, and goes on") {
   }
 }
 
-TEST_CASE("a thread pool may end before its tasks") {
+TEST_CASE("a thread pool may be destroyed before its tasks are complete") {
   std::atomic<int> runs{0};
   {
     radarsdf::ThreadPool pool(3);
@@ -108,7 +108,7 @@ TEST_CASE("a thread pool may end before its tasks") {
   CHECK(runs == at_end);
 }
 
-TEST_CASE("random words are SplitMix64's, and rows have their own") {
+TEST_CASE("random words equal SplitMix64, with a sequence for each row") {
   // The first numbers for the seed 1234567 in the authors' implementation.
   CHECK(radarsdf::random_word(1234567, 0) == 6457827717110365317u);
   CHECK(radarsdf::random_word(1234567, 1) == 3203168211198807973u);
@@ -120,7 +120,7 @@ TEST_CASE("random words are SplitMix64's, and rows have their own") {
   CHECK(third == std::vector<std::uint8_t>(random.row(2), random.row(2) + 11));
 }
 
-TEST_CASE("blocks cover a range without overlap and are not too long") {
+TEST_CASE("blocks partition a range and have bounded size") {
   for (const int threads : test::kThreads) {
     for (const std::int64_t size : {0, 1, 511, 512, 100000, 1 << 20}) {
       std::vector<std::atomic<int>> visits(static_cast<std::size_t>(size));
@@ -137,7 +137,7 @@ TEST_CASE("blocks cover a range without overlap and are not too long") {
   }
 }
 
-TEST_CASE("the exception of a task is the caller's, and ends the other tasks") {
+TEST_CASE("the exception of a task reaches the caller and cancels the other tasks") {
   for (const int threads : test::kThreads) {
     std::atomic<int> begun{0};
     const auto run = [&] {
@@ -151,7 +151,7 @@ TEST_CASE("the exception of a task is the caller's, and ends the other tasks") {
   }
 }
 
-TEST_CASE("a check for interrupts may end a call, on the calling thread") {
+TEST_CASE("an interrupt check can cancel a call, on the calling thread") {
   static std::atomic<int> asked;
   for (const int threads : test::kThreads) {
     asked = 0;
@@ -160,7 +160,7 @@ TEST_CASE("a check for interrupts may end a call, on the calling thread") {
       throw std::runtime_error("interrupted");
     });
     const auto run = [&] {
-      // Half a second on one thread: it is asked at most ten times a second.
+      // Half a second on one thread: at most ten checks per second.
       radarsdf::parallel_tasks(500 * threads, threads, [](std::int64_t) {
         std::this_thread::sleep_for(std::chrono::milliseconds(1));
         radarsdf::check_interrupt();
@@ -178,11 +178,11 @@ TEST_CASE("a number of threads is positive and has an upper bound") {
   CHECK(radarsdf::resolve_num_threads(1 << 30) <= 1024);
 }
 
-TEST_CASE("numbers are sorted, whatever the threads") {
+TEST_CASE("parallel_sort sorts with any number of threads") {
   std::mt19937_64 generator(2);
   for (const std::size_t size : {std::size_t{0}, std::size_t{1}, std::size_t{1000}, std::size_t{300001}}) {
     std::vector<std::uint64_t> numbers(size);
-    for (std::uint64_t& number : numbers) number = generator() >> 40;  // some of them equal
+    for (std::uint64_t& number : numbers) number = generator() >> 40;  // with duplicates
     std::vector<std::uint64_t> expected = numbers;
     std::sort(expected.begin(), expected.end());
     for (const int threads : test::kThreads) {
@@ -193,7 +193,7 @@ TEST_CASE("numbers are sorted, whatever the threads") {
   }
 }
 
-TEST_CASE("the baseline is always there, and names are understood") {
+TEST_CASE("the baseline is always available, and names are parsed") {
   const auto available = radarsdf::available_instruction_sets();
   REQUIRE(!available.empty());
   CHECK(available[0] == radarsdf::InstructionSet::kBaseline);
@@ -203,8 +203,8 @@ TEST_CASE("the baseline is always there, and names are understood") {
   CHECK_THROWS_AS(radarsdf::instruction_set_from_name("sse9"), std::invalid_argument);
 }
 
-TEST_CASE("large memory is usable from end to end") {
-  const auto array = radarsdf::large_array<double>(3 << 20);  // 24 MB: huge pages are asked for
+TEST_CASE("large arrays are writable from end to end") {
+  const auto array = radarsdf::large_array<double>(3 << 20);  // 24 MB: huge pages are requested
   std::fill_n(array.get(), 3 << 20, 1.5);
   CHECK(array[(3 << 20) - 1] == 1.5);
   radarsdf::LargeVector<int> numbers;

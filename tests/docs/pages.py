@@ -112,7 +112,7 @@ def _run(command: str) -> tuple[int, str]:
             contextlib.redirect_stderr(printed),
             warnings.catch_warnings(),
         ):
-            warnings.simplefilter("default")  # as in a process of its own: printed, and no error
+            warnings.simplefilter("default")  # as in a separate process: printed, and no error
             status = main(words)
     finally:
         logging.getLogger("radarsdf").removeHandler(handler)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Each example runs as a user runs it, and writes the files that it should."""
+"""Each example runs as for a user, and writes its files."""
 
 import json
 import runpy

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Metrics against values known in closed form and against a plain computation by the definitions."""
+"""Metrics against closed forms and a plain computation by their definitions."""
 
 import json
 import math
@@ -41,7 +41,7 @@ def grid(size=4.0, step=0.02, offset=(0.0, 0.0, 0.0)):
 
 
 def by_definition(samples, ground_truth):
-    """The metrics from all nearest neighbours at once, written without regard to speed."""
+    """The metrics from all nearest neighbours, without regard to speed."""
     accuracy = cKDTree(ground_truth).query(samples)[0]
     completion = np.minimum(cKDTree(samples).query(ground_truth)[0], 2.0)
     kept = accuracy[accuracy <= 0.4]
@@ -63,7 +63,7 @@ def by_definition(samples, ground_truth):
     ("shift", "right", "outlier_ratio"), [(0.1, 1.0, 0.0), (0.3, 0.0, 0.0), (-0.5, 0.0, 1.0)]
 )
 def test_shifted_plane(shift, right, outlier_ratio, offset):
-    # Lidar lies 2 cm apart: a sample is at most 1.4 cm aside, which lengthens its distance by less than 1 %.
+    # Lidar points are 2 cm apart: a lateral offset of at most 1.4 cm adds less than 1 % to distances.
     m = surface_metrics(plane(shift, offset=offset), grid(offset=offset), samples=50_000)
     assert (m["protocol"], m["num_mesh_samples"]) == ("radarsdf-surface-1", 50_000)
     for name in ("accuracy_ratio", "completion_ratio", "precision", "f_score", "f_score_all"):
@@ -92,10 +92,10 @@ def bumpy():
 def test_agrees_with_the_definitions(mesh):
     rng = np.random.default_rng(1)
     truth = trimesh.sample.sample_surface(mesh, 700, seed=2)[0]
-    truth = truth[truth[:, 0] > np.median(truth[:, 0]) - 0.5]  # lidar saw only a part
+    truth = truth[truth[:, 0] > np.median(truth[:, 0]) - 0.5]  # partial ground truth
     truth += rng.normal(0, 0.08, truth.shape)
     truth = np.vstack([truth, rng.uniform(-4, 4, (40, 3)) + mesh.bounds.mean(axis=0)])
-    samples = trimesh.sample.sample_surface(mesh, 200_000, seed=3)[0]  # another sampler, other samples
+    samples = trimesh.sample.sample_surface(mesh, 200_000, seed=3)[0]  # an independent sampler
     m = surface_metrics(mesh, truth, samples=200_000)
     for name, value in by_definition(samples, truth).items():
         tolerance = {"rel": 0.005} if name.endswith("_m") else {"abs": 0.005}
@@ -118,7 +118,7 @@ def test_box_crops_mesh_and_ground_truth():
     assert everything["num_angles"] > m["num_angles"] > 0
 
 
-def test_discarding_hides_what_f_score_all_shows():
+def test_f_score_ignores_outliers_and_f_score_all_counts_them():
     mesh = trimesh.util.concatenate([plane(0.1), plane(1.5), plane(3.0), plane(4.5)])
     m = surface_metrics(mesh, grid(step=0.05), samples=100_000)
     assert m["accuracy_ratio"] == m["f_score"] == 1.0
@@ -172,7 +172,7 @@ def test_angles_without_a_distribution_are_none_not_nan():
         (plane(), np.full((3, 3), np.nan), {}, "finite"),
     ],
 )
-def test_surface_refuses(mesh, truth, kwargs, message):
+def test_wrong_arguments_of_surface_are_rejected(mesh, truth, kwargs, message):
     with pytest.raises(ValueError, match=message):
         surface_metrics(mesh, truth, **{"samples": 1000, **kwargs})
 
@@ -200,7 +200,7 @@ def test_holdout():
 
 
 def scene(num, rng):
-    """Returns from a floor whose intensity is a smooth function of position and of the angle of view."""
+    """Returns from a floor with an intensity that is smooth in position and viewing angle."""
     points = np.column_stack([rng.uniform(-5, 5, (num, 2)), np.zeros(num)])
     sensors = np.array([0.0, 0.0, 8.0]) + rng.uniform(-4, 4, (num, 3))
     view = (points - sensors) / np.linalg.norm(points - sensors, axis=1, keepdims=True)
@@ -224,7 +224,7 @@ def test_knn_is_the_weighted_mean_of_its_neighbours():
     np.testing.assert_allclose(knn.predict(x, at), expected, rtol=1e-9)
 
 
-def test_the_choice_is_that_of_an_inner_hold_out():
+def test_the_number_of_neighbours_is_chosen_by_an_inner_hold_out():
     points, sensors, intensity = scene(360, np.random.default_rng(1))
     number = np.repeat(np.arange(6) * 7 - 3, 60)  # any numbers
     test = np.isin(number, holdout(number, 5)[1])
@@ -272,7 +272,7 @@ def test_the_same_trajectory_in_another_frame_has_no_error():
     assert trajectory_metrics(WHOLE @ true, true, align="none")["absolute_m"] > 10
 
 
-def test_a_turn_that_is_too_sharp_has_the_error_of_its_length():
+def test_errors_of_a_too_sharp_turn_grow_with_the_segment_length():
     true = np.tile(np.eye(4), (101, 1, 1))
     true[:, 0, 3] = np.arange(101)
     found = drifted(true, 0, 0, 0, yaw_rad=0.001)
@@ -280,13 +280,13 @@ def test_a_turn_that_is_too_sharp_has_the_error_of_its_length():
     assert metrics["step_rad"] == pytest.approx(0.001)
     assert metrics["step_m"] == pytest.approx(0, abs=1e-9)
     assert metrics["relative_rad_per_m"] == pytest.approx(0.001)
-    # The sides of an arc: half of its angle, so 5 to 25 thousandths of 10 to 50 m; there are 91 to 51 of each.
+    # Lateral errors of arcs: half of the angle, 5 to 25 thousandths of 10 to 50 m; 91 to 51 segments of each.
     counts, angles = np.arange(91, 50, -10), 0.001 * np.arange(10, 51, 10) / 2 - 0.0005
     assert metrics["relative_ratio"] == pytest.approx(counts @ angles / counts.sum(), rel=0.02)
     assert metrics["length_m"] == pytest.approx(100)
 
 
-def test_segments_of_long_trajectories_are_those_of_kitti():
+def test_long_trajectories_have_kitti_segments():
     true = np.tile(np.eye(4), (802, 1, 1))
     true[:, 0, 3] = np.arange(802)
     found = drifted(true, 0, 0, 0, yaw_rad=1e-5)
@@ -308,7 +308,7 @@ def test_wrong_arguments_are_refused():
         trajectory_metrics(poses[:3], poses)
 
 
-def test_they_are_those_of_evo():
+def test_errors_equal_those_of_evo():
     metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed: pip install evo")
     PoseTrajectory3D = pytest.importorskip("evo.core.trajectory").PoseTrajectory3D
     true = trajectory(200)
@@ -333,7 +333,7 @@ def test_they_are_those_of_evo():
 
 
 def drawn(count=100_000, seed=0):
-    """Uncertainties from 1 cm to 1 m, and errors of exactly these deviations."""
+    """Uncertainties from 1 cm to 1 m, and errors with these standard deviations."""
     rng = np.random.default_rng(seed)
     uncertainty_m = 10 ** rng.uniform(-2, 0, count)
     return uncertainty_m * rng.standard_normal(count), uncertainty_m
@@ -351,13 +351,13 @@ def test_perfect_uncertainties():
 
 
 @pytest.mark.parametrize(("factor", "ence"), [(2.0, 1.0), (0.5, 0.5)], ids=["overconfident", "too careful"])
-def test_wrong_by_two(factor, ence):
+def test_uncertainties_wrong_by_a_factor_of_two(factor, ence):
     error_m, uncertainty_m = drawn()
     m = uncertainty_metrics(error_m, uncertainty_m / factor)
     assert m["ence"] == pytest.approx(ence, abs=0.02)
     assert m["z_rms"] == pytest.approx(factor, rel=0.01)
     assert m["worst_decile_factor"] == pytest.approx(2, rel=0.03)
-    # Of a Gaussian, 1.96 / 2 deviations hold 67.3 %, and 1.96 · 2 hold 99.99 %.
+    # A Gaussian has 67.3 % within 1.96 / 2 standard deviations, and 99.99 % within 1.96 · 2.
     assert m["coverage_95"] == pytest.approx(math.erf(1.959964 / factor / math.sqrt(2)), abs=0.005)
 
 
@@ -394,7 +394,7 @@ def test_auc_agrees_with_all_pairs():
     assert confidence_metrics(confidence, np.ones(200, bool))["auc"] is None
 
 
-def test_bins_of_few_points_do_not_make_the_worst_gap():
+def test_bins_of_few_points_are_ignored_by_the_maximum_gap():
     confidence, truth = np.append(np.full(1000, 0.95), 0.05), np.append(np.arange(1000) >= 50, True)
     m = confidence_metrics(confidence, truth)
     assert m["worst_gap"] == pytest.approx(0, abs=1e-9)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What each block of numbers of an encoding is, and where features are and are not."""
+"""Contents of each part of an encoding, and the support of features."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_planes_or_levels_are_summed(encoding, shape):
     torch.nn.init.ones_(cells.features)
     out = cells(tensor(np.random.default_rng(0).uniform(-0.8, 0.8, (100, 3))))
     assert out.shape == shape
-    # Weights add up to one on each of three planes, or on each of three levels.
+    # Weights sum to one on each of three planes, or on each of three levels.
     np.testing.assert_allclose(out.detach(), 3.0, rtol=1e-6)
 
 
@@ -46,16 +46,16 @@ def test_features_are_continuous_across_the_faces_of_occupied_cells(encoding):
     face[np.arange(300), axis] = rng.integers(-3, 4, 300) * LEAF_M
     step = 1e-5 * np.eye(3)[axis]
     jump = cells(tensor(face + step)) - cells(tensor(face - step))
-    # A slope of a few units of feature a cell is 1e-3 over this step; a wrong neighbour would be of order 1.
+    # A slope of a few feature units per cell is 1e-3 over this step; a wrong neighbour would be of order 1.
     assert jump.abs().max() < 5e-3
 
 
-def test_fourier_frequencies_are_those_asked_for():
+def test_fourier_frequencies_are_the_requested_ones():
     points = tensor(np.random.default_rng(0).uniform(-3, 3, (50, 3)))
     whole = kernels.fourier(points, 4.0, 0, 6).view(-1, 2, 6, 3)
     part = kernels.fourier(points, 4.0, 2, 3)
     assert torch.equal(part.view(-1, 2, 3, 3), whole[:, :, 2:5])
-    # Sines come first and are odd; the slowest wave is two half-widths long.
+    # Sines come first and are odd; the longest wave has a length of two half widths.
     assert torch.equal(kernels.fourier(-points, 4.0, 0, 6).view(-1, 2, 6, 3)[:, 0], -whole[:, 0])
     np.testing.assert_allclose(kernels.fourier(points + 8.0, 4.0, 0, 6).view(-1, 2, 6, 3), whole, atol=1e-4)
     assert kernels.fourier(points, 4.0, 0, 0).shape == (50, 0)
@@ -93,7 +93,7 @@ def inside(field, count=2000):
     return ((cells[rng.integers(0, len(cells), count)] + rng.uniform(0.01, 0.99, (count, 3))) * LEAF_M).astype(np.float32)  # fmt: skip
 
 
-def test_what_is_linear_stays_linear(field):
+def test_linear_functions_are_reproduced(field):
     x = inside(field)
     np.testing.assert_allclose(field.sdf(torch.from_numpy(x)).detach(), x @ SLOPE + 0.1, atol=1e-6)
     np.testing.assert_allclose(field.gradient(torch.from_numpy(x)), np.tile(SLOPE, (len(x), 1)), atol=1e-5)
@@ -107,7 +107,7 @@ def test_the_gradient_is_the_derivative(field):
     assert torch.autograd.gradcheck(field.sdf, (x,), eps=1e-6)
 
 
-def test_corners_are_those_that_are_stored(field):
+def test_corners_equal_the_stored_values(field):
     corners, of_cells, distances_m = field.leaf_corners()
     x = torch.from_numpy(((field.table.leaf_cells() + 0.5) * LEAF_M).astype(np.float32))
     np.testing.assert_allclose(field.sdf(x).detach(), distances_m[of_cells].mean(axis=1), atol=1e-6)
@@ -115,7 +115,7 @@ def test_corners_are_those_that_are_stored(field):
 
 
 @pytest.mark.parametrize("far", [5.0, 1e9, float("inf"), float("nan")])
-def test_outside_there_is_nothing(field, far):
+def test_points_outside_all_cells_are_unobserved(field, far):
     x = torch.full((3, 3), far)
     assert (field.sdf(x) == 0).all()
     assert not field.occupied(x).any()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The networks' inputs and outputs, and which parameters which loss may reach."""
+"""Inputs and outputs of the networks, and the parameters trained by each loss."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -75,7 +75,7 @@ def intensity(field, points, *, frozen=True):
 
 
 @torch.no_grad()
-def test_with_a_closed_form_it_is_within_the_range_of_the_training():
+def test_with_a_closed_form_predictions_stay_in_the_training_range():
     field, points = make_field(FitConfig())
     alone = field.intensity(points, *views(points))
     assert torch.equal(alone, intensity(field, points))
@@ -99,7 +99,7 @@ def test_normals_are_the_normalised_gradient():
 
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("geometry_frozen", [False, True])
-def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geometry_frozen):
+def test_the_intensity_loss_trains_geometry_only_if_enabled(normals, geometry_frozen):
     field, points = make_field(FitConfig(networks={"normals": normals, "geometry_feature_dim": 3}))
     intensity(field, points, frozen=geometry_frozen).sum().backward()
     geometry = [*field.cells.parameters(), *field.sdf_network.parameters()]
@@ -108,7 +108,7 @@ def test_the_intensity_loss_reaches_the_geometry_only_where_it_may(normals, geom
 
 
 def test_the_second_derivative_through_the_normals_is_right():
-    # Double precision: the networks bend at few places.
+    # Double precision: few finite differences cross a kink of a ReLU.
     config = BARE.override(
         networks={"normals": True, "intensity_hidden": (6,)}, encoding={"fourier_count": 2}
     )
@@ -136,7 +136,7 @@ def test_the_sdf_loss_is_lowest_where_the_logit_is_the_label():
     loss = sdf_loss(logit, sdf_m, 0.1)
     (gradient,) = torch.autograd.grad(loss, logit)
     assert gradient.abs().max() < 1e-7
-    # Bits of the entropy of sigmoid(label / sigma): what no prediction can go below.
+    # Entropy of sigmoid(label / sigma), the lower bound of the loss.
     p = torch.sigmoid(sdf_m / 0.1)
     entropy = -(p * p.log() + (1 - p) * (1 - p).log()).mean()
     assert loss.item() == pytest.approx(entropy.item(), rel=1e-5)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Training with extreme settings, and for very long: all numbers of a map stay finite, or a fit raises `Diverged`."""
+"""Training with extreme settings or for very long: a map stays finite, or the fit raises `Diverged`."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ CASES: dict[str, Changes] = {
     "learning rates 1, constant": {
         "training": {"learning_rate": 1.0, "intensity_learning_rate": 1.0, "optimiser": "adam"}
     },
-    # Of 1 mm and 10 m.
+    # 1 mm and 10 m.
     **{f"sigma of {s:g} cells": {"training": {"sigma_cells": s}} for s in (0.005, 50.0)},
-    # Labels of many sigmas, which saturate, and large logits.
+    # Saturated labels of many sigmas, and large logits.
     "saturated": {"training": {"sigma_cells": 0.005, "learning_rate": 0.1}},
     "batches of one": {"training": {"batch_size": 1, "intensity_batch_size": 1}},
     "all of 3QFPI": {
@@ -81,7 +81,7 @@ def fitted(changes: Changes, iterations: int) -> tuple[RadarMap, str]:
 
 
 def free_and_solid(radar_map: RadarMap) -> tuple[float, float]:
-    """Share of points 0.2 m in front of the walls that are free, and of points 0.2 m behind that are solid, seen or not."""
+    """Shares of points 0.2 m before walls that are free, and 0.2 m behind that are solid, observed or not."""
     rng = np.random.default_rng(2)
     rays = rng.normal(size=(2000, 3))
     on_wall = rays * (np.array([4, 4, 1.5]) / np.abs(rays)).min(axis=1, keepdims=True)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Stage 1: exact where rays agree, the mean where they do not, smooth where the surface is."""
+"""Averaged fits: exact for consistent rays, else their mean, and smooth on smooth surfaces."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from ..conftest import ground_and_wall
 
 
 def rays_down(heights, half_m=3.0, spacing_m=0.05):
-    """A sensor high above a grid of returns, so far that its rays are parallel to 1 %; its heights alternate."""
+    """A sensor high above a grid of returns of alternating heights; its rays are parallel to 1 %."""
     x, y = np.meshgrid(*[np.arange(-half_m, half_m, spacing_m)] * 2, indexing="ij")
     z = np.resize(heights, x.shape)
     points = np.column_stack([x.ravel(), y.ravel(), z.ravel() - 300.0])
@@ -39,13 +39,13 @@ def test_a_plane_is_its_own_average():
     np.testing.assert_allclose(fit(*rays_down([0.0])).sdf(x), x[:, 2], atol=0.01)
 
 
-def test_rays_that_differ_are_averaged():
+def test_contradicting_rays_are_averaged():
     x = inner_points()
     expected = x[:, 2] - (0.0 + 0.12 + 0.12) / 3
     np.testing.assert_allclose(fit(*rays_down([0.0, 0.12, 0.12])).sdf(x), expected, atol=0.02)
 
 
-def test_smoothing_brings_it_nearer_to_a_surface_that_bends_little(monkeypatch):
+def test_smoothing_improves_surfaces_of_low_curvature(monkeypatch):
     rng = np.random.default_rng(2)
     points, poses = rays_down([0.0], spacing_m=0.15)
     points = [points[0] + [0, 0, 1] * rng.normal(0, 0.08, (len(points[0]), 1))]
@@ -55,32 +55,32 @@ def test_smoothing_brings_it_nearer_to_a_surface_that_bends_little(monkeypatch):
     assert smoothed < np.square(fit(points, poses).sdf(x) - x[:, 2]).mean() * 2 / 3
 
 
-def test_intensities_are_in_closed_form():
+def test_intensities_have_a_closed_form():
     scene = ground_and_wall()
     config = FitConfig.quick()
     radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
     assert isinstance(radar_map.field, GridField)
     world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
     error = np.abs(radar_map.intensity(world, scene.poses[0, :3, 3]) - scene.intensities[0])
-    assert np.median(error) < 2.0  # of some 20 dB from near to far
+    assert np.median(error) < 2.0  # of about 20 dB from near to far
 
 
-def test_the_mesh_of_stored_corners_is_that_of_the_field():
+def test_the_mesh_of_stored_corners_equals_that_of_the_field():
     scene = ground_and_wall()
     radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(), progress=False)
     everywhere = [[-100.0] * 3, [100.0] * 3]  # a box: corners are looked up one by one
     one, other = radar_map.mesh(0.2), radar_map.mesh(0.2, box=everywhere)
-    # A distance of nearly zero may have another sign there: a triangle more or less.
+    # Distances near zero may change sign: a triangle more or less.
     assert len(one.faces) == pytest.approx(len(other.faces), rel=1e-3)
     assert len(one.faces) > 1000
     for a, b in ((one, other), (other, one)):
         off_m = cKDTree(a.vertices).query(b.vertices)[0]
         assert np.median(off_m) < 1e-4
-        assert np.quantile(off_m, 0.99) < 0.005  # on the border, where the other is evaluated a hair inside
+        assert np.quantile(off_m, 0.99) < 0.005  # on the border, where the other is evaluated slightly inside
     assert one.metadata["leaf_cells"] == one.metadata["leaf_cells_searched"]
 
 
-def test_ghosts_of_a_part_are_those_of_the_whole():
+def test_ghosts_of_a_part_equal_those_of_the_whole():
     scans = radarsdf.simulate.hugin(frames=8, seed=3)
     rays = prepare(scans.points, scans.poses)
     inside = rays.points[:, 0] < np.median(rays.points[:, 0])
@@ -93,7 +93,7 @@ HALF_M, HEIGHT_M = 3.0, 3.0
 
 
 def seen_from_an_arc(sides, thickness_m, clutter, scans=40, returns=1500):
-    """Scans of a wall along y with its faces at ±thickness_m / 2, in turn from x > 0 and, of two `sides`, from x < 0."""
+    """Scans of a wall along y with faces at ±thickness_m / 2, from x > 0 and, with two `sides`, alternately from x < 0."""
     rng = np.random.default_rng(0)
     points, poses = [], []
     for i, angle in enumerate(np.linspace(-1, 1, scans)):
@@ -127,21 +127,21 @@ def live_mesh(points, poses):
 
 
 def off_m(mesh, thickness_m):
-    """(V,) distances of vertices from the nearer face, away from the wall's ends."""
+    """Distances (V,) of vertices from the nearer face, away from the ends of the wall."""
     x, y, z = np.asarray(mesh.vertices).T
     inner = (np.abs(y) < HALF_M - 0.3) & (z > 0.3) & (z < HEIGHT_M - 0.3)
     return np.abs(np.abs(x[inner]) - thickness_m / 2)
 
 
 @pytest.mark.parametrize("mesh_of", [quick_mesh, live_mesh])
-def test_smoothing_puts_no_second_sheet_before_or_behind_a_wall(mesh_of):
+def test_smoothing_adds_no_second_surface_before_or_behind_a_wall(mesh_of):
     found = off_m(mesh_of(*seen_from_an_arc(1, 0.0, 0.01)), 0.0)
     assert len(found) > 300
     assert (found > 0.3).mean() < 0.005
 
 
 @pytest.mark.parametrize("mesh_of", [quick_mesh, live_mesh])
-def test_a_thin_wall_has_two_faces_and_no_more(mesh_of):
+def test_a_thin_wall_has_exactly_two_faces(mesh_of):
     mesh = mesh_of(*seen_from_an_arc(2, 0.2, 0.0, scans=80))
     found = off_m(mesh, 0.2)
     assert len(found) > 600

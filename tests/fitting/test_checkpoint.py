@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A fit that goes on from a checkpoint ends with the bits of one without a stop, and from nothing else."""
+"""Resuming a fit from its checkpoint changes no bit, and other files are rejected."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ from safetensors import safe_open
 from ..conftest import ground_and_wall
 from ..settings import grouped
 
-# Batches of more rays than there are, so that the order is drawn anew, and two stages.
+# Batches larger than the number of rays, so that the order is drawn repeatedly, and two stages.
 QUICK = FitConfig(
     num_threads=2,
     training={
@@ -43,7 +43,7 @@ def fitted(scene, path=None, config=QUICK, intensities=True):
 
 
 def interrupted_after(iterations, monkeypatch, *arguments, **keywords):
-    """Ctrl-C, as the loop sees it, after so many iterations of a fit: what was done by then."""
+    """Interrupts the loop of a fit after some iterations. Returns the iterations done."""
 
     class Deferred:
         def __enter__(self):
@@ -76,7 +76,7 @@ def assert_same_bits(one, other):
 
 
 @pytest.mark.parametrize("changes", [{}, {"optimiser": "adam", "num_threads": 1}])
-def test_stopped_again_and_again_it_ends_with_the_same_bits(scene, tmp_path, monkeypatch, changes):
+def test_repeated_interruptions_change_no_bit(scene, tmp_path, monkeypatch, changes):
     config = QUICK.override(**grouped(**changes))
     whole = fitted(scene, config=config)
     path = tmp_path / "state"
@@ -87,13 +87,13 @@ def test_stopped_again_and_again_it_ends_with_the_same_bits(scene, tmp_path, mon
     assert_same_bits(whole, resumed)
 
 
-def test_on_another_number_of_threads_it_ends_with_the_same_bits(scene, tmp_path, monkeypatch):
+def test_another_number_of_threads_changes_no_bit(scene, tmp_path, monkeypatch):
     whole = fitted(scene)
     interrupted_after(17, monkeypatch, scene, tmp_path / "state")
     assert_same_bits(whole, fitted(scene, tmp_path / "state", QUICK.override(num_threads=3)))
 
 
-def test_a_killed_fit_goes_on_from_what_was_written_last(scene, tmp_path):
+def test_a_killed_fit_resumes_from_the_last_checkpoint(scene, tmp_path):
     if sys.platform == "win32":
         pytest.skip("kills by signal")
     path = tmp_path / "state"
@@ -130,7 +130,7 @@ def state(scene, tmp_path_factory):
 
 
 class TestOtherFiles:
-    """One clear ValueError, and the file stays."""
+    """One clear ValueError, and the file is kept."""
 
     @pytest.fixture
     def path(self, state, tmp_path):
@@ -213,7 +213,7 @@ class TestOtherFiles:
         self.refused(scene, path, "is not a whole checkpoint of this fit")
 
 
-def test_a_full_disk_is_a_warning_and_the_fit_goes_on(scene, tmp_path, monkeypatch):
+def test_a_full_disk_is_a_warning_and_the_fit_continues(scene, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Estimates of memory, size and work hold, and what cannot be done is refused before it is begun."""
+"""Estimates of memory, size and time hold, and impossible fits are rejected before the work."""
 
 import sys
 
@@ -53,15 +53,15 @@ def test_sizes_are_within_a_factor_of_two(scene, config):
     assert 1 / 2 < found.vertices / report["vertices"] < 2
 
 
-def test_a_fit_beyond_the_budget_is_refused_before_anything_is_allocated(scene, monkeypatch):
+def test_a_fit_beyond_the_budget_is_rejected_before_allocation(scene, monkeypatch):
     config = SHORT.override(max_memory_bytes=30_000_000)
     monkeypatch.setattr("radarsdf.fitting.steps.SurfaceReturns.of", lambda *_: pytest.fail("began"))
     with pytest.raises(MemoryError, match=r"0\.03 GB .*9000 returns"):
         radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config)
 
 
-def test_the_quick_bound_is_one(scene):
-    """Just enough for the estimate: then the bound, being above it, must not be what decides."""
+def test_the_quick_bound_is_an_upper_bound(scene):
+    """With a budget just above the estimate, the larger bound must not decide."""
     rays = prepare(scene.points, scene.poses)
     for changes in ({}, {"encoding": {"kind": "octree"}}, {"leaf_size_m": 0.05}, {"train": False}):
         config = SHORT.override(**changes)
@@ -71,7 +71,7 @@ def test_the_quick_bound_is_one(scene):
             estimate.check_fit(rays, config.override(max_memory_bytes=enough - 1))
 
 
-def test_what_a_fit_refuses_is_not_estimated(scene):
+def test_input_rejected_by_fit_is_rejected_by_estimate(scene):
     for function in (radarsdf.fit, radarsdf.estimate):
         with pytest.raises(ValueError, match="are not within a million cells"):
             function(scene.points, scene.poses, scene.intensities, config=FitConfig(leaf_size_m=1e-9))
@@ -94,7 +94,7 @@ def skipped_of(config, with_intensity):
     return schedule, dict(found)
 
 
-def test_each_part_that_was_skipped_has_a_time():
+def test_skipped_parts_have_an_estimated_time():
     parts = {
         "default": ["40% of the samples"],
         "quick": ["training of the surface", "free space", "the intensity network"],

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scenes far away, tiny, huge, flat, dense, empty or spoilt: an answer that means something, or a clear error."""
+"""Scenes far away, tiny, huge, flat, dense, empty or corrupted: a meaningful map, or a clear error."""
 
 import dataclasses
 
@@ -32,10 +32,10 @@ def ground_and_wall(scans=3, returns_per_scan=800):
 
 
 def finite(radar_map, sensor):
-    """All answers at the map's own cells, and a mesh; both are given back."""
+    """Queries at the map's own cells, and a mesh, all finite."""
     cells = radar_map.field.table.leaf_cells()[:2000]
     x = (cells + 0.5) * radar_map.config.leaf_size_m + radar_map.origin
-    assert radar_map.observed(x).mean() > 0.99  # far out, float32 puts some centres into the next cell
+    assert radar_map.observed(x).mean() > 0.99  # far out, float32 rounds some centres into the next cell
     assert np.isfinite(radar_map.sdf(x)).all()
     assert np.isfinite(radar_map.gradient(x)).all()
     assert np.isfinite(radar_map.confidence(x)).all()
@@ -52,7 +52,7 @@ def moved(scene, T_new_world):
 
 
 def wall_error_m(radar_map, T_new_world, scale=1.0):
-    """Median distance of the map's zero from the wall x = 20 m, in units of the scene, between the returns, too."""
+    """Median distance of the zero level set from the wall x = 20 m, in scene units, also between returns."""
     rng = np.random.default_rng(1)
     wall = np.column_stack([np.full(500, 20.0), rng.uniform(-4, 4, 500), rng.uniform(0.5, 3, 500)]) * scale
     world = wall @ T_new_world[:3, :3].T + T_new_world[:3, 3]
@@ -60,7 +60,7 @@ def wall_error_m(radar_map, T_new_world, scale=1.0):
 
 
 @pytest.mark.parametrize("origin", [(5e5, 5.4e6, 300), (1e7, -1e7, 1e7)])
-def test_anywhere(origin):
+def test_scenes_of_any_scale_and_position_are_fitted(origin):
     T = np.eye(4)
     T[:3, 3] = origin
     scene = moved(ground_and_wall(), T)
@@ -88,7 +88,7 @@ def test_very_many_returns_in_one_cell():
 
 
 @pytest.mark.parametrize("distance_m", [1e5, 1e7, 1e11])
-def test_an_outlier_far_away_opens_no_cells_on_its_way(distance_m):
+def test_a_distant_outlier_opens_no_cells_along_its_ray(distance_m):
     scene = ground_and_wall(scans=2, returns_per_scan=600)
     points = [scene.points[0], np.concatenate([scene.points[1], [[distance_m, 0.0, 0.0]]])]
     config = QUICK.override(training={"sdf_iterations": 10})
@@ -107,7 +107,7 @@ def test_an_outlier_far_away_opens_no_cells_on_its_way(distance_m):
 
 
 @pytest.mark.parametrize("name", ["huge", "tiny spread", "of both signs and huge", "nearly constant"])
-def test_intensities_of_any_kind(name):
+def test_intensities_of_any_scale_are_fitted(name):
     scene = ground_and_wall(scans=2, returns_per_scan=600)
     values = {
         "huge": [v * np.float32(1e30) for v in scene.intensities],
@@ -125,7 +125,7 @@ def test_intensities_of_any_kind(name):
     kept = prepare(scene.points, scene.poses, values)
     predicted = radar_map.intensity(*kept.in_world(), extrapolate=True)
     assert np.isfinite(predicted).all()
-    if name in ("huge", "tiny spread"):  # a change of units: as well fitted as without
+    if name in ("huge", "tiny spread"):  # a change of units: equally well fitted
         errors = np.abs(predicted - kept.intensities) / spread
         assert np.median(errors) < 0.1
 
@@ -143,7 +143,7 @@ def scans():
 
 
 def struck(scans, value):
-    """The intensities, every hundredth of them replaced."""
+    """Intensities with every hundredth replaced."""
     whole = np.concatenate(scans.intensities)
     whole[::100] = value
     return np.split(whole, np.cumsum([len(scan) for scan in scans.points])[:-1])
@@ -154,13 +154,13 @@ def tensors(radar_map):
 
 
 def errors(radar_map, scans):
-    """(N,) of all intensities."""
+    """Errors (N,) of all intensities."""
     rays = radarsdf.returns.rays.prepare(scans.points, scans.poses, scans.intensities)
     return np.abs(radar_map.intensity(*rays.in_world(), extrapolate=True) - rays.intensities)
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_their_values_do_not_matter(scans, config):
+def test_values_of_outliers_do_not_matter(scans, config):
     good, low, high = (
         radarsdf.fit(scans.points, scans.poses, values, config=config, progress=False)
         for values in (scans.intensities, struck(scans, -9999.0), struck(scans, 65535.0))
@@ -173,13 +173,13 @@ def test_their_values_do_not_matter(scans, config):
     assert low.sensor == high.sensor
     for name, tensor in tensors(low).items():
         assert tensor.equal(tensors(high)[name]), name
-    # They are few: without them it is as good, also where they were.
+    # They are few: excluding them loses no accuracy, even at their positions.
     assert errors(low, scans).mean() < 1.02 * errors(good, scans).mean()
     assert errors(low, scans)[::100].mean() < 1.3 * errors(good, scans)[::100].mean()
 
 
-def test_all_tiles_leave_out_the_same(scans, tmp_path):
-    """The plan decides for all, also where a tile has no other intensities."""
+def test_all_tiles_exclude_the_same_outliers(scans, tmp_path):
+    """The plan decides for all tiles, even for tiles without other intensities."""
     whole = struck(scans, -9999.0)
     far = scans.poses[0].copy()
     far[0, 3] += 200
@@ -206,7 +206,7 @@ def test_all_tiles_leave_out_the_same(scans, tmp_path):
 
 
 @pytest.mark.parametrize("config", [CONFIGS["quick"], CONFIGS["default"]], ids=["quick", "default"])
-def test_beyond_the_ranges_of_the_returns_an_intensity_is_that_at_their_end(scans, config):
+def test_intensities_beyond_the_ranges_of_returns_are_clamped(scans, config):
     radar_map = radarsdf.fit(scans.points, scans.poses, scans.intensities, config=config, progress=False)
     points, sensors = radarsdf.returns.rays.prepare(scans.points, scans.poses).in_world()
     rays = points - sensors

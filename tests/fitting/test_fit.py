@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A fit finds the surface and the intensities of an analytic scene, says no to bad input, and repeats itself."""
+"""A fit reconstructs surface and intensities of an analytic scene, rejects bad input, and is deterministic."""
 
 import numpy as np
 import pytest
@@ -16,11 +16,11 @@ from ..conftest import ground_and_wall
 QUICK = FitConfig(training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024})
 
 
-def test_surface_and_free_space_are_where_they_should_be(radar_map):
+def test_surface_and_free_space_match_the_scene(radar_map):
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(9, 18, 500), rng.uniform(-4, 4, 500), np.zeros(500)])
     assert abs(np.median(radar_map.sdf(ground))) < 0.02
-    # Rays graze the ground here: distances along them, and so the labels, are several times the height.
+    # Grazing incidence: distances along rays, and thus labels, are several times the height.
     for height_m in (-0.05, 0.05):
         assert (np.sign(radar_map.sdf(ground + [0, 0, height_m])) == np.sign(height_m)).mean() > 0.99
     wall = np.column_stack([np.full(500, 20.0), rng.uniform(-4, 4, 500), rng.uniform(0.5, 3, 500)])
@@ -38,7 +38,7 @@ def test_intensity_follows_the_radar_equation(radar_map):
         assert np.median(np.abs(radar_map.intensity(wall, sensor, extrapolate=True) - expected)) < 0.5
 
 
-def test_same_seed_same_bits_other_seed_other_bits(scene):
+def test_fits_are_deterministic_by_seed(scene):
     maps = [radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK) for _ in range(2)]
     other = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=QUICK.override(seed=1))
     for name, value in maps[0].field.state_dict().items():
@@ -59,7 +59,7 @@ def test_the_number_of_threads_changes_no_bit(scene, config):
             assert torch.equal(value, other.field.state_dict()[name]), name
 
 
-def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
+def test_without_intensities_a_map_has_no_reflectance(scene):
     radar_map = radarsdf.fit(scene.points, scene.poses, config=QUICK)
     assert radar_map.field.intensity_network is None
     assert radar_map.report["iterations"]["intensity"] == 0
@@ -71,7 +71,7 @@ def test_without_intensities_nothing_of_the_reflectance_side_exists(scene):
 
 def test_utm_coordinates_change_nothing():
     offset = np.array([5e5, 5.4e6, 320.0])  # multiples of the block: the lattice is the world's
-    config = QUICK.override(training={"optimiser": "adam"})  # SOAP's first steps make much of roundings
+    config = QUICK.override(training={"optimiser": "adam"})  # SOAP's first steps amplify rounding errors
     near, far = (
         radarsdf.fit((s := ground_and_wall(offset=o)).points, s.poses, s.intensities, config=config)
         for o in (np.zeros(3), offset)
@@ -85,7 +85,7 @@ def test_utm_coordinates_change_nothing():
 
 
 class TestBadInput:
-    """One clear ValueError each, before any work."""
+    """One clear ValueError each, before the work."""
 
     @staticmethod
     def scans():
@@ -103,7 +103,7 @@ class TestBadInput:
         with pytest.raises(ValueError, match=r"scan 0 must have shape \(N, 3\)"):
             radarsdf.fit([p[:, :2] for p in points], poses)
 
-    def test_rows_that_are_no_returns_are_left_out_and_counted(self, caplog):
+    def test_invalid_rows_are_excluded_and_counted(self, caplog):
         points, poses, intensities = self.scans()
         points[1][3:5, 0] = np.nan
         points[0] = np.concatenate([points[0], np.zeros((200, 3))])  # as drivers fill clouds of fixed size
@@ -117,7 +117,7 @@ class TestBadInput:
         assert "402 of 520 returns" in caplog.text
 
     @pytest.mark.parametrize("fault", ["scale", "shear", "mirror", "nan", "row", "zero"])
-    def test_scans_of_poses_that_are_not_rigid_are_left_out(self, fault, caplog):
+    def test_scans_with_poses_that_are_not_rigid_are_excluded(self, fault, caplog):
         points, poses, _ = self.scans()
         match fault:
             case "scale":
@@ -151,7 +151,7 @@ class TestBadInput:
             radarsdf.fit([p * 0.01 for p in points], poses)
 
 
-def test_ghosts_open_no_cells_but_teach_their_intensities(scene, monkeypatch):
+def test_ghosts_open_no_cells_but_train_intensities(scene, monkeypatch):
     is_ghost = np.zeros(0, bool)
 
     def upper_wall(surfels, rays, *_):

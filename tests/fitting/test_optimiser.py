@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Adam is PyTorch's, without what PyTorch's brings along; by rows it is the same where all rows are touched; SOAP."""
+"""Adam equals PyTorch's, without its imports; sparse Adam equals Adam if all rows are touched; SOAP."""
 
 import subprocess
 import sys
@@ -55,7 +55,7 @@ def network_and_gradients(seed):
     return network, [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(50)]
 
 
-def test_soap_goes_on_from_its_state_and_threads_change_no_bit():
+def test_soap_resumes_from_its_state_and_threads_change_no_bit():
     whole, gradients = network_and_gradients(1)
     resumed = [p.detach().clone().requires_grad_() for p in whole]
     soap, first, second = Soap(whole, 1e-2), Soap(resumed, 1e-2), Soap(resumed, 1e-2)
@@ -81,7 +81,7 @@ def cells_and_points(encoding, half_m=1.0, count=500):
 
 
 def steps(cells, batches, threads, learning_rate=1e-2):
-    """Features after one step for each batch, of RowAdam; the loss is the sum of interpolated features times weights."""
+    """Features after one step of RowAdam per batch; the loss is the sum of interpolated features times weights."""
     adam = RowAdam(cells, learning_rate)
     with ThreadPool(threads) as pool:
         for parts in batches:
@@ -95,7 +95,7 @@ def steps(cells, batches, threads, learning_rate=1e-2):
 
 
 @pytest.mark.parametrize("encoding", [Encoding.TRI_QUADTREE, Encoding.OCTREE])
-def test_by_rows_it_is_the_same_where_all_are_touched(encoding):
+def test_sparse_adam_equals_adam_if_all_rows_are_touched(encoding):
     cells, points, generator = cells_and_points(encoding)
     weights = torch.randn(10, len(points), cells.table.num_levels * 8, generator=generator)
     dense = cells.features.detach().clone().requires_grad_()
@@ -113,7 +113,7 @@ def test_by_rows_it_is_the_same_where_all_are_touched(encoding):
     assert (after - before).abs().max() > 0.05
 
 
-def test_what_a_batch_does_not_touch_stays_and_its_momentum_fades():
+def test_untouched_rows_stay_and_their_momentum_decays():
     cells, points, _ = cells_and_points(Encoding.TRI_QUADTREE)
     left, right = points[points[:, 0] < -0.6], points[points[:, 0] > 0.6]
     one = torch.ones(1, 24)
@@ -125,7 +125,7 @@ def test_what_a_batch_does_not_touch_stays_and_its_momentum_fades():
     with torch.no_grad():
         cells.features.copy_(start)
     after = steps(cells, sequence, threads=1)
-    # Rows that only the left batches touch: first a step of the full rate, then one from moments three steps old.
+    # Rows touched only by the left batches: a step of the full rate, then one from moments three steps old.
     with torch.no_grad():
         cells.features.copy_(start)
     only_right = (steps(cells, sequence[1:2], threads=1) != start).any(dim=1)
@@ -133,5 +133,5 @@ def test_what_a_batch_does_not_touch_stays_and_its_momentum_fades():
     mean = 0.9**3 * 0.1 - 0.1
     square = 0.999**3 * 0.001 + 0.001
     second = -1e-2 * (mean / (1 - 0.9**4)) / (square / (1 - 0.999**4)) ** 0.5
-    # Adam does not see the size of a row's gradient, which is the same both times but for its sign.
+    # Adam is invariant to the scale of a row's gradient, which differs only in sign.
     np.testing.assert_allclose((after - start)[own], np.float32(-1e-2 + second), atol=2e-5)

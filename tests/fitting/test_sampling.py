@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Samples along rays: labels are geometry, and every ray has its turn."""
+"""Samples along rays: labels are geometric, and all rays are sampled equally."""
 
 import tracemalloc
 
@@ -31,7 +31,7 @@ def sampler(rays, batch_size=256, seed=0, neighbours=1, **settings):
 
 
 def rows_of(points, samples):
-    """(B,) row of `points` that each sample's return is; no two returns are the same."""
+    """(B,) row in `points` of each sample's return; returns are distinct."""
     rows = {point.tobytes(): row for row, point in enumerate(points)}
     return torch.tensor([rows[point.tobytes()] for point in samples.of_ray[:, :3].numpy()])
 
@@ -51,7 +51,7 @@ def test_labels_are_the_signed_distance_to_the_return(rays, kind):
     returns, sensors = sensors_of(rays, samples)
     points, sdf_m = samples.points.numpy().astype(np.float64), samples.sdf_m.numpy()
     np.testing.assert_allclose(np.linalg.norm(points - returns, axis=1), np.abs(sdf_m), atol=2e-5)
-    # Positive between sensor and return: the sample is nearer to the sensor by just so much.
+    # Positive between sensor and return: the sample is nearer to the sensor by this distance.
     to_sample, to_return = (np.linalg.norm(p - sensors, axis=1) for p in (points, returns))
     np.testing.assert_allclose(to_return - to_sample, sdf_m, atol=2e-5)
     assert (sdf_m > 0).any()
@@ -68,7 +68,7 @@ def test_ranges_of_the_samples(rays):
         from_sensor = range_m - samples.sdf_m[256:]
         free.append((from_sensor - 0.3 * range_m) / (0.7 * range_m + 0.8))
         lowest_share.append((from_sensor / range_m).min())
-    # Uniform over the whole of each interval, and not beyond.
+    # Uniform over each whole interval, and not beyond.
     near, free = torch.cat(near) / NEAR_M, torch.cat(free)
     assert -1 <= near.min() < -0.99
     assert 0.99 < near.max() <= 1
@@ -80,7 +80,7 @@ def test_ranges_of_the_samples(rays):
 
 
 @pytest.mark.parametrize(("batch_size", "neighbours"), [(100, 1), (128, 7), (1000, 1)])
-def test_each_ray_is_seen_equally_often(rays, batch_size, neighbours):
+def test_each_ray_is_sampled_equally_often(rays, batch_size, neighbours):
     draw = sampler(rays, batch_size, neighbours=neighbours)
     seen = np.zeros((2, NUM_RAYS), int)
     batches = 4 * NUM_RAYS * 2 // batch_size
@@ -90,13 +90,13 @@ def test_each_ray_is_seen_equally_often(rays, batch_size, neighbours):
         for kind, part in enumerate((rows[: batch_size // 2], rows[batch_size // 2 :])):
             np.add.at(seen[kind], part.numpy(), 1)
     assert seen.sum() == batches * batch_size
-    # Whole passes, and the begun one.
+    # Complete passes, and the current one.
     whole = batches * (batch_size // 2) // NUM_RAYS
     assert set(np.unique(seen)) <= {whole, whole + 1}
 
 
 @pytest.mark.parametrize("kind", DRAWS)
-def test_memory_of_a_batch_does_not_grow_with_the_rays(rays, kind):
+def test_memory_of_a_batch_is_independent_of_the_number_of_rays(rays, kind):
     many = rays.select(np.arange(300 * NUM_RAYS) % NUM_RAYS)
     draw = sampler(many)
     DRAWS[kind](draw)  # draws the order of all rays
@@ -118,8 +118,8 @@ def test_spread_samples_lie_across_the_beam_as_angular_noise_does(rays):
 
 
 @pytest.mark.parametrize("parts", [1, 3])
-def test_only_so_many_intensities_are_labels(rays, parts):
-    """They are spread over the batch, and over the neighbours that it takes together."""
+def test_the_number_of_intensity_labels_is_limited(rays, parts):
+    """They are distributed over the batch, and over adjacent samples."""
     config = FitConfig(training={"intensity_batch_size": 24})
     generator, unit = torch.Generator().manual_seed(0), torch.linspace(0, 1, NUM_RAYS)
     draw = RaySampler(rays, config, 288, generator, 6, unit)
@@ -133,14 +133,14 @@ def test_only_so_many_intensities_are_labels(rays, parts):
             assert 0 <= part.num_labelled - 24 // parts <= 1
     labelled = torch.cat([part.intensities[: part.num_labelled] for batch in batches for part in batch])
     assert len(torch.unique(labelled)) > 0.9 * NUM_RAYS
-    # All near samples are labelled where there are no intensities, and where free space has a label of its own.
+    # All near samples are labelled without intensities, and if free space has its own label.
     assert RaySampler(rays, config, 288, generator).batch().split()[0].num_labelled == 144
     free = config.override(training={"intensity_in_free_space": True})
     assert RaySampler(rays, free, 288, generator, 1, unit).batch().split()[0].num_labelled == 144
 
 
 @pytest.mark.parametrize("parts", [2, 3])
-def test_parts_are_the_batch_each_with_its_share(rays, parts):
+def test_parts_partition_the_batch(rays, parts):
     (whole,) = sampler(rays, 250).batch().split()
     found = sampler(rays, 250).batch(parts).split()
     sizes, near = [len(part.points) for part in found], [part.num_labelled for part in found]
@@ -164,7 +164,7 @@ def test_parts_are_the_batch_each_with_its_share(rays, parts):
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.3, 0.85])
-def test_dropout_zeroes_its_share_and_keeps_the_mean(dropout):
+def test_dropout_zeroes_its_rate_and_keeps_the_mean(dropout):
     state = torch.get_rng_state()
     factors = Dropout.draw(dropout, torch.Generator().manual_seed(0)).factors(999, 21)
     assert factors.shape == (999, 21)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A fit that ends before its time, by Ctrl-C or by numbers that are not finite, ends soon and hands back what it has."""
+"""A fit stopped by Ctrl-C or by values that are not finite ends promptly and returns its map."""
 
 import math
 import signal
@@ -27,9 +27,9 @@ HUNG_S = 300.0
 
 
 def interrupted_python(code, delay_s=0.0):
-    """Runs code and presses Ctrl-C some time after it prints "ready".
+    """Runs code and sends Ctrl-C some time after it prints "ready".
 
-    Gives what it prints after the line "stopped", and its exit status.
+    Returns its output after the line "stopped", and its exit status.
     """
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     watchdog = threading.Timer(HUNG_S, process.kill)
@@ -47,7 +47,7 @@ def interrupted_python(code, delay_s=0.0):
         process.wait()
 
 
-# Says "ready" when the optimisers, of which a joint fit has two, have made so many steps.
+# Prints "ready" after a number of steps of the optimisers, of which a joint fit has two.
 ANNOUNCED = """
 from radarsdf.fitting.optimiser import Adam
 step, steps = Adam.step, 0
@@ -84,14 +84,14 @@ except KeyboardInterrupt as error:
 )
 
 
-def test_ctrl_c_while_training_hands_back_the_map():
+def test_ctrl_c_while_training_returns_the_map():
     code = FIT.format(steps=400, intensities="scene.intensities", config=LONG | {"num_threads": 2})
     assert interrupted_python(code) == ("a map\n", 0)
 
 
 def test_ctrl_c_ends_a_long_call_of_the_core():
-    """An interrupted call leaves most of its work undone. Work is counted in seconds of this thread on a processor."""
-    # Rays through thousands of cells with a plane each that none of them meets.
+    """An interrupted call skips most of its work, measured as CPU time of this thread."""
+    # Rays through thousands of cells with a plane each, without a crossing.
     cells = (np.stack(np.meshgrid(*[np.arange(-20, 20)] * 3), -1).reshape(-1, 3) * 0.4 + 0.2).astype(
         np.float32
     )
@@ -108,11 +108,11 @@ def test_ctrl_c_ends_a_long_call_of_the_core():
             surfels.first_crossings(
                 5 * directions, directions, np.full(len(directions), 10, np.float32), 0.1, 0.01, 0.1, 2.0, 1
             )
-        except KeyboardInterrupt:  # perhaps only where the call had ended: the work tells
+        except KeyboardInterrupt:  # perhaps only after the call had ended: CPU time decides
             interrupted = True
         return time.thread_time() - started_s, interrupted
 
-    # The timer counts in steps of some milliseconds: the work has to be long beside these on any machine.
+    # The timer has a resolution of some milliseconds: the work must take much longer on any machine.
     while (whole_s := call(directions)[0]) < 0.4:
         directions = np.concatenate([directions, directions])
     before = signal.signal(signal.SIGVTALRM, signal.default_int_handler)
@@ -153,7 +153,7 @@ sys.exit(main())
     assert (tmp_path / "state").exists()
 
 
-def test_a_deferred_interrupt_is_remembered_and_a_second_is_not():
+def test_only_the_first_interrupt_is_deferred():
     usual = signal.getsignal(signal.SIGINT)
     with deferred_interrupts() as pressed:
         assert not pressed()
@@ -166,7 +166,7 @@ def test_a_deferred_interrupt_is_remembered_and_a_second_is_not():
 
 @pytest.fixture
 def poisoned(monkeypatch):
-    """Makes the n-th step see one gradient that is not a number."""
+    """Sets one gradient of the n-th step to NaN."""
     step = Adam.step
 
     def at(n):
@@ -196,10 +196,10 @@ def test_a_gradient_that_is_not_finite_never_reaches_the_map(scene, poisoned):
     assert 229 <= radar_map.report["iterations_done"]["sdf"] <= 300
     assert (
         radar_map.sdf(scene.poses[:, :3, 3], extrapolate=True) > 0
-    ).all()  # as learnt before, not as at the start
+    ).all()  # trained values, not initial ones
 
 
-def test_an_interrupted_fit_is_a_keyboard_interrupt_even_where_nobody_defers(scene, monkeypatch):
+def test_an_interrupted_fit_raises_keyboard_interrupt_without_deferral(scene, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 

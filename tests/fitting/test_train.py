@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Losses of a training: their history, what they show of a divergence, and which parts a batch is divided into."""
+"""Losses of a training: their history, detection of divergence, and the partition of batches."""
 
 import math
 
@@ -28,7 +28,7 @@ def history(config=None, **iterations):
     return found
 
 
-def test_spans_have_the_means_of_all_iterations(monkeypatch):
+def test_loss_history_has_the_means_of_all_iterations(monkeypatch):
     monkeypatch.setattr(train, "_MOST_SPANS", 4)
     losses = history(sdf=10, intensity=0)
     for done in range(1, 11):
@@ -40,7 +40,7 @@ def test_spans_have_the_means_of_all_iterations(monkeypatch):
     assert found["sdf"]["seconds"] == sorted(found["sdf"]["seconds"])
 
 
-def test_the_bound_of_the_distances_is_one():
+def test_the_bound_of_distances_is_an_upper_bound():
     labels = torch.linspace(-30, 30, 500)
     for scale in (0.01, 1.0, 10.0):
         distances_m, config = scale * labels, FitConfig()
@@ -54,7 +54,7 @@ def test_the_bound_of_the_distances_is_one():
         assert "wrong sign" in losses.fault()
 
 
-def test_a_few_bad_iterations_are_no_divergence_and_the_count_goes_on():
+def test_a_few_bad_iterations_are_no_divergence():
     sdf_m = np.full(8, 0.1)  # one sigma: at worst 2
     losses, again = history(), history()
     for i in range(100):
@@ -74,25 +74,25 @@ def test_a_few_bad_iterations_are_no_divergence_and_the_count_goes_on():
 @pytest.mark.parametrize("name", CASES)
 def test_every_number_stays_finite(name):
     _, end = fitted(CASES[name], 40)
-    if name.startswith("learning rates 1"):  # too much: answers beyond all measure
+    if name.startswith("learning rates 1"):  # excessive predictions
         assert "more than if all distances had the wrong sign, at iteration 39 of 40" in end
     else:
         assert end == "done"
 
 
 @pytest.mark.parametrize("rate", ["learning_rate", "intensity_learning_rate"])
-def test_answers_beyond_all_measure_are_a_divergence_although_finite(rate):
+def test_excessive_finite_predictions_are_a_divergence(rate):
     radar_map, end = fitted({"training": {rate: 1e3}}, 40)
     assert "more than" in end
     assert radar_map.sdf([[0.0, 0.0, 0.0]], extrapolate=True)[0] > -1
     assert abs(radar_map.intensity([[4.0, 0.0, 0.0]], [0.0, 0.0, 0.0], extrapolate=True)[0]) < 1000
 
 
-def test_the_default_finds_the_walls():
+def test_the_default_reconstructs_the_walls():
     assert min(free_and_solid(fitted(CASES["default"], 200)[0])) > 0.9
 
 
-STAGES = {  # of one iteration: a step of Adam makes much of a rounding
+STAGES = {  # one iteration: a step of Adam amplifies rounding errors
     "joint": {},
     "joint in free space": {"intensity_in_free_space": True},
 }
@@ -104,7 +104,7 @@ STAGES = {  # of one iteration: a step of Adam makes much of a rounding
 def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
     scene, monkeypatch, autograd, batch_size, stage
 ):
-    """Batches that give the threads parts of different sizes, or none: the loss is the mean over the whole batch."""
+    """With parts of different sizes, or empty ones, the loss is the mean over the whole batch."""
     if autograd:
         monkeypatch.setattr(train, "CoreGradients", AutogradGradients)
     optimiser = {"optimiser": "adam" if autograd else "soap"}  # autograd moves all features
@@ -128,7 +128,7 @@ def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
 
 @pytest.mark.parametrize("batch_size", [1, 5, 101])
 @pytest.mark.parametrize("parts", [1, 3, 16])
-def test_parts_count_by_their_samples(scene, batch_size, parts):
+def test_parts_are_weighted_by_their_samples(scene, batch_size, parts):
     rays = prepare(scene.points, scene.poses)
     draw = RaySampler(rays, FitConfig(), batch_size, torch.Generator().manual_seed(0))
     for batch in (draw.batch(parts).split(), draw.spread(batch_size, parts).split()):
@@ -137,8 +137,8 @@ def test_parts_count_by_their_samples(scene, batch_size, parts):
         assert [part.labelled_share for part in batch] == [count / sum(labelled) for count in labelled]
 
 
-def test_frozen_geometry_does_not_move(scene):
-    # Without dropout, which depends on the number of iterations and reaches the joint beginning.
+def test_frozen_geometry_is_unchanged(scene):
+    # Without dropout, which depends on the number of iterations and affects the joint stage.
     config = FitConfig(
         training={"sdf_iterations": 20, "intensity_iterations": 20, "batch_size": 1024},
         networks={"dropout": False},
@@ -154,7 +154,7 @@ def test_frozen_geometry_does_not_move(scene):
     ]
     assert torch.equal(*(field.cells.features for field in fields))
     change = np.subtract(*(field.intensity_network.layers[0].weight.detach().numpy() for field in fields))
-    # A second stage once inherited the rate that the first had let fall to nothing.
+    # Regression: the second stage inherited the learning rate, decayed to zero by the first.
     assert np.abs(change).max() > config.training.intensity_learning_rate
 
 
@@ -170,21 +170,21 @@ def schedule(returns, vertices=10**9, *, with_intensity=True, **changes):
     [
         (100_000, {}, 180),  # half a pass is nearly enough
         (200_000, {}, 352),  # and here more than enough
-        (50_000, {}, 176),  # a pass is not enough, and still all that the data gives
-        (2_000, {}, 150),  # without so many iterations there is no surface
+        (50_000, {}, 176),  # a pass is not enough, but more would overfit
+        (2_000, {}, 150),  # minimum for a surface
         (2_000, {"effort": 1e-9}, 1),
         (20_000, {"sdf_iterations": 7, "effort": 3.0}, 7),
     ],
 )
-def test_iterations_until_the_surface_is_finished_but_its_noise_not_learnt(returns, changes, expected):
+def test_iterations_converge_the_surface_without_overfitting_noise(returns, changes, expected):
     assert schedule(returns, 10**6, **changes).sdf_iterations == expected
 
 
-def test_without_training_there_are_none():
+def test_averaged_fits_have_no_iterations():
     assert schedule(10**5, train=False).iterations == {"sdf": 0, "intensity": 0}
 
 
-def test_many_returns_in_few_cells_take_no_more_iterations_than_their_vertices_need():
+def test_iterations_are_limited_by_the_number_of_vertices():
     assert schedule(10**6).sdf_iterations == pytest.approx(0.6 * 12e6 / 4096, abs=1)
     assert schedule(10**6, vertices=50_000).sdf_iterations == pytest.approx(20 * 50_000 / 4096, abs=1)
     assert schedule(10**6, vertices=100_000).sdf_iterations == 300
@@ -192,7 +192,7 @@ def test_many_returns_in_few_cells_take_no_more_iterations_than_their_vertices_n
     assert schedule(10**6, vertices=100).sdf_iterations == 150
 
 
-def test_batches_grow_where_iterations_would_be_too_many():
+def test_batches_grow_to_limit_iterations():
     many = schedule(10**7)
     assert many.sdf_iterations == 5000
     assert many.sdf_iterations * many.batch_size == pytest.approx(0.6 * 12e7, rel=1e-3)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Grids of a plane and a wall: what is occupied, free and unknown, and what planners read."""
+"""Grids of a plane and a wall: occupied, free and unknown voxels, and files for planners."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def grid(sharp_map):
     return radarsdf.grid(sharp_map, BOX, 0.2)
 
 
-def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
+def test_surfaces_are_occupied_air_is_free_and_hidden_space_is_unknown(grid):
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(9, 18, 2000), rng.uniform(-4, 4, 2000), np.zeros(2000)])
     assert (grid.at(ground) == 0).mean() < 0.001
@@ -34,8 +34,8 @@ def test_surfaces_are_occupied_air_is_free_and_what_is_behind_is_unknown(grid):
     assert grid.at([[np.nan, 0, 0], [1e9, 0, 0]]).tolist() == [-1, -1]
 
 
-def test_a_voxel_that_a_surface_grazes_is_not_free():
-    """No return is in it, for they were moved onto the surface, and rays pass it above the ground often enough."""
+def test_a_voxel_touched_by_a_surface_is_not_free():
+    """It has no return, since returns were shrunk to the surface, and enough rays cross it above the ground."""
     drive = KINDS["tunnel"](seed=5, frames=12)
     config = radarsdf.FitConfig(num_threads=1)
     radar_map = radarsdf.fit(drive.points, drive.poses, config=config, progress=False)
@@ -46,7 +46,7 @@ def test_a_voxel_that_a_surface_grazes_is_not_free():
     assert grid.free.sum() * 0.2**3 > 190
 
 
-def test_larger_voxels_are_free_only_throughout(sharp_map):
+def test_larger_voxels_are_free_only_if_entirely_free(sharp_map):
     box = [[4.8, -4.8, -1.6], [21.6, 4.8, 4.4]]
     coarse, fine = radarsdf.grid(sharp_map, box, 0.4), radarsdf.grid(sharp_map, box, 0.2)
     x, y, z = coarse.shape
@@ -85,7 +85,7 @@ def test_costs_of_a_ramp_and_a_kerb():
     np.testing.assert_array_equal(costs.cost[:, 3:] == 100, costs.clearance_m[:, 3:] < 1.2)
     assert {True, False} == set((costs.clearance_m[:, 3:] < 1.2).ravel().tolist())
     kerb = ramp(0.0, 0.12)[0].costmap(Wheels(max_slope_rad=1.4, max_step_m=0.1))
-    # Beside the kerb, a plane through 0, 0 and 0.12 m, thrice each, is 0.04 m off.
+    # Next to the kerb, a plane through 0, 0 and 0.12 m, three times each, has a residual of 0.04 m.
     expected = np.zeros(10)
     expected[4:6] = 0.04
     np.testing.assert_allclose(kerb.step_m[:, 2], expected, atol=1e-5)
@@ -99,10 +99,10 @@ def test_costs_where_the_ground_is_unknown():
     grid.distance_m[2, 1], grid.distance_m[5:8, 1] = np.nan, np.nan
     grid.state[5:8, 1] = -1
     costs = grid.costmap(Wheels(max_slope_rad=0.4))
-    assert costs.cost[2, 1] == 100  # something stands there
+    assert costs.cost[2, 1] == 100  # an obstacle
     assert (costs.cost[5:8, 1] == -1).all()
     assert np.isnan(costs.height_m[5:8, 1]).all()
-    np.testing.assert_allclose(costs.slope_rad[3:9, 2], np.arctan(0.2), atol=1e-5)  # by those around
+    np.testing.assert_allclose(costs.slope_rad[3:9, 2], np.arctan(0.2), atol=1e-5)  # from its neighbours
     grid.distance_m[:, :] = np.nan
     grid.distance_m[0, 0], grid.distance_m[0, 1] = ramp(0.2)[0].distance_m[0, :2]
     grid.distance_m[1, 0, 5:7] = grid.distance_m[0, 0, 0]  # no height lies between equal distances
@@ -111,7 +111,7 @@ def test_costs_where_the_ground_is_unknown():
     assert np.isnan(lone.slope_rad).all()  # two columns have no plane
 
 
-def test_a_column_is_free_if_all_between_the_heights_is():
+def test_a_column_is_free_if_all_its_voxels_are():
     grid, _ = ramp(0.0)  # ground at -1 m
     assert (grid.flat(0.1, 1.3).state[:, :3] == 0).all()
     assert (grid.flat(0.1, 1.3).state[:, 3:] == 0).all()  # the beam begins at 1.4 m
@@ -123,7 +123,7 @@ def test_a_column_is_free_if_all_between_the_heights_is():
     flat = grid.flat(0.1, 1.9)
     assert flat.state[3, 1] == flat.state[4, 1] == -1
     assert (flat.origin.tolist(), flat.cell_size) == ([5.0, 7.0], 0.2)
-    grid.distance_m[5, 2] = np.nan  # the ground of the nearest column counts
+    grid.distance_m[5, 2] = np.nan  # the ground of the nearest column is used
     assert grid.flat(0.1, 1.6).state[5, 2] == 0
     for lower_m, upper_m in ((1.0, 1.0), (1.0, 0.5)):
         with pytest.raises(ValueError, match="upper_m must be above lower_m"):
@@ -133,7 +133,7 @@ def test_a_column_is_free_if_all_between_the_heights_is():
         grid.flat()
 
 
-def test_distances_are_those_of_a_search_of_all_voxels():
+def test_distances_equal_a_brute_force_search():
     state = np.random.default_rng(1).choice([-1, 0, 0, 0, 1], (6, 5, 4))
     field, centres = made(state, [1.0, 2.0, 3.0], 0.5).distances(), np.argwhere(np.ones(state.shape)) * 0.5
     of_states = state.ravel()
@@ -150,7 +150,7 @@ def test_distances_are_those_of_a_search_of_all_voxels():
     assert (nothing.not_free_m == 0.5).all()
 
 
-def test_positions_are_in_the_voxel_that_spans_them():
+def test_positions_are_located_in_their_voxel():
     grid = made(np.arange(24).reshape(2, 3, 4) % 3 - 1, [1.0, 2.0, 3.0], 0.5)
     centres = grid.centres()
     np.testing.assert_array_equal(grid.at(centres), grid.state.ravel())
@@ -168,8 +168,8 @@ def test_positions_are_in_the_voxel_that_spans_them():
             grid.at(wrong)
 
 
-def test_a_plane_reaches_into_the_voxels_near_it():
-    """The probability that a plane through a voxel is in another one, against draws of its position."""
+def test_a_plane_occupies_adjacent_voxels_by_its_position_error():
+    """Probability that a plane through a voxel crosses another one, against random positions."""
     normal = np.array([0.48, 0.6, 0.64])
     planes = np.array([0.05, 0.05]), np.stack([normal, normal]), np.array([0.06, 0.1]), np.array([0.8, 0.0])
     voxels, size, step = np.array([[2, 2, 2], [0, 0, 0]]), 0.2, 2
@@ -178,12 +178,12 @@ def test_a_plane_reaches_into_the_voxels_near_it():
     for offset in np.ndindex(3, 3, 3):
         voxel = voxels[0] + (np.array(offset) - 1) * step
         distance_m = drawn + (np.array(offset) - 1) @ normal * step * size
-        share = (np.abs(distance_m) < 0.5 * size * normal.sum()).mean()  # whether the plane is in the cube
+        share = (np.abs(distance_m) < 0.5 * size * normal.sum()).mean()  # whether the plane crosses the cube
         assert found[tuple(voxel)] == pytest.approx(0.8 * share, abs=0.012)
     assert np.count_nonzero(found) <= 27
 
 
-def test_a_surface_is_between_voxels_on_both_sides_of_it():
+def test_a_surface_lies_between_the_voxels_on_both_sides():
     distance_m = np.array([0.4, 0.1, -0.15, -0.2, np.nan, 0.05, 0.3, -0.6, -0.1, 0.12], np.float32)
     expected = [False, True, True, False, False, False, True, False, True, True]
     for axis in range(3):
@@ -205,7 +205,7 @@ def in_map_server(path):
     return state[::-1].T, read["resolution"], read["origin"]  # its first row has the largest y
 
 
-def test_map_server_reads_what_it_should(grid, tmp_path):
+def test_map_server_reads_the_written_states(grid, tmp_path):
     flat = grid.flat(0.3, 1.2)
     flat.save(tmp_path / "it's a map.yaml")
     state, resolution, origin = in_map_server(tmp_path / "it's a map.yaml")
@@ -218,7 +218,7 @@ def test_map_server_reads_what_it_should(grid, tmp_path):
 
 
 def made(state, origin, voxel_size):
-    """A grid of these states."""
+    """Grid with the given states."""
     numbers = np.full(state.shape, 0.5, np.float32)
     return Grid(np.array(origin), voxel_size, state.astype(np.int8), numbers, numbers, 0.0)
 
@@ -237,7 +237,7 @@ def in_octomap(grid, path):
     return tree.getLabels(grid.centres()).reshape(grid.shape), np.array(edges_m)
 
 
-def test_octomap_reads_each_voxel_as_it_is(grid, tmp_path):
+def test_octomap_reads_the_state_of_each_voxel(grid, tmp_path):
     found, _ = in_octomap(grid, tmp_path / "map.bt")
     np.testing.assert_array_equal(found, grid.state)
     state = np.random.default_rng(0).integers(-1, 2, (24, 9, 13))
@@ -250,7 +250,7 @@ def test_octomap_reads_each_voxel_as_it_is(grid, tmp_path):
         np.testing.assert_array_equal(in_octomap(made(state, np.zeros(3), 0.1), tmp_path / "a.bt")[0], state)
 
 
-def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refused(sharp_map, tmp_path):
+def test_grids_are_aligned_to_octomap_and_other_origins_are_rejected(sharp_map, tmp_path):
     for size in (0.13, 0.2, 0.5):
         box = np.array([[9.07, -2.93, -0.71], [14.0, 2.0, 1.2]])
         grid = radarsdf.grid(sharp_map, box, size)
@@ -273,14 +273,14 @@ def test_grids_of_maps_are_on_the_lattice_of_octomap_and_other_origins_are_refus
             made(ends, [first * 0.5, 0, 0], 0.5).save(tmp_path / "far.bt")
 
 
-def test_a_map_without_free_space_is_refused(scene):
+def test_a_map_without_free_space_is_rejected(scene):
     quick = radarsdf.FitConfig.quick()
     radar_map = radarsdf.fit(scene.points, scene.poses, config=quick, progress=False)
     with pytest.raises(ValueError, match=r"returns\.free_space"):
         radarsdf.grid(radar_map, BOX)
 
 
-def test_tiles_have_the_grid_of_their_cells(tmp_path):
+def test_grids_of_tiles_equal_the_grid_of_one_map(tmp_path):
     drive = radarsdf.simulate.wall(seed=5, frames=8)
     scans = radarsdf.io.Scans(drive.points, drive.poses, None, None)
     config = radarsdf.FitConfig.quick(num_threads=1, returns={"free_space": True})
@@ -291,7 +291,7 @@ def test_tiles_have_the_grid_of_their_cells(tmp_path):
     assert (a.occupied == b.occupied).mean() > 0.99
     cells, of_tiles = (radar_map.cells_near(*(whole.extent + 0.05)) for radar_map in (whole, tiles))
     np.testing.assert_allclose(cells.corner, of_tiles.corner)
-    # Which returns are ghosts differs a little from tile to tile.
+    # Ghosts differ slightly between tiles.
     seen = cells.passed > 0
     assert seen.sum() > 10_000
     assert (cells.passed == of_tiles.passed)[seen].mean() > 0.95

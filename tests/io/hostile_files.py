@@ -302,9 +302,9 @@ def _folder(path: Path) -> None:
     folder = path.parent if path.parent.name != "radar" else path.parent.parent
     try:
         scans = read(folder)
-        points, _ = scans.points, scans.ground_truth  # which read the files
+        points, _ = scans.points, scans.ground_truth  # which reads the files
     except ValueError as error:
-        if str(folder) in str(error):  # a valid file is named if it does not fit to the damaged one
+        if str(folder) in str(error):  # a valid file is named if it is inconsistent with the damaged one
             msg = f"{path}: {error}"
             raise ValueError(msg) from error
         raise
@@ -348,7 +348,7 @@ class Outcomes:
 
 
 def damaged(reader: Reader, seed: int) -> Iterator[bytes]:
-    """Endless files, the same for the same seed. First come the valid ones, whole and cut at every boundary."""
+    """Infinite sequence of files, deterministic by seed: first the valid ones, complete and truncated at every boundary."""
     valid = reader.valid()
     for data in valid:
         yield data

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Bags of several sensors: the frame of each message, the topic that has the poses, and messages that are damaged."""
+"""Bags of several sensors: frames of messages, the topic of poses, and damaged messages."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def bag_of(tmp_path, *parts, kind="mcap"):
 
 
 def seen(scans):
-    """What the scans see in the world, in the order of their times."""
+    """Returns of the scans in the world, in the order of time."""
     return [scan.world_points[0].round(3).tolist() for scan in scans]
 
 
@@ -93,8 +93,8 @@ def test_several_topics_are_merged_by_time(tmp_path, poses):
 
 
 @pytest.mark.parametrize("topic", ["/robotGoalPose", "/initialpose", "/mavros/setpoint_position/local"])
-def test_what_somebody_wants_is_no_pose_of_the_sensor(tmp_path, topic):
-    """Though it is as dense as the scans."""
+def test_goals_are_no_poses_of_the_sensor(tmp_path, topic):
+    """Even if they are as dense as the scans."""
 
     def goals(bag):
         for time_s in TIMES_S:
@@ -109,14 +109,14 @@ def test_what_somebody_wants_is_no_pose_of_the_sensor(tmp_path, topic):
         read(bag_of(tmp_path, clouds, goals, kind="ros1"))
 
 
-def test_poses_that_are_rare_or_not_of_the_sensor_are_passed_over(tmp_path):
+def test_sparse_or_unrelated_poses_are_ignored(tmp_path):
     def others(bag):
         for time_s in START_S + np.arange(-2, 5) * 0.5:  # corrections
             bag.write("/amcl_pose", bag.pose_stamped(time_s, pose([70.0, 0, 0])), time_s)
         for time_s in TIMES_S[3:5]:
             bag.write("/short", bag.pose_stamped(time_s, pose([80.0, 0, 0])), time_s)
         for time_s in TIMES_S:
-            bag.write("/tag", bag.pose_stamped(time_s, pose([2.0, 0, 0]), "base"), time_s)  # of a thing seen
+            bag.write("/tag", bag.pose_stamped(time_s, pose([2.0, 0, 0]), "base"), time_s)  # of an object
             bag.write("/person", bag.pose_stamped(time_s, pose([10 * (time_s - START_S), 0, 0])), time_s)
             bag.write("/leader", bag.odometry(time_s, pose([90.0, 0, 0]), "odom", "leader"), time_s)
             plan = {time_s: pose([1.0, 0, 0])}  # without stamps
@@ -133,8 +133,8 @@ def test_poses_that_are_rare_or_not_of_the_sensor_are_passed_over(tmp_path):
 
 
 @pytest.mark.parametrize("which", ["mocap", "path", "odom"])
-def test_poses_that_are_of_the_sensor(tmp_path, which):
-    """A topic that names no frame has the poses of the base, which moves with the radar."""
+def test_topics_without_a_frame_have_poses_of_the_base(tmp_path, which):
+    """They have no frame name; the base moves with the radar."""
 
     def write(bag):
         bag.write("/tf_static", bag.transforms(START_S, {("base", "radar"): MOUNTING}), START_S - 1)
@@ -153,7 +153,7 @@ def test_poses_that_are_of_the_sensor(tmp_path, which):
 
 
 @pytest.mark.parametrize("other", ["as good", "constant", "short"])
-def test_of_two_parents_the_one_with_poses_counts(tmp_path, other):
+def test_the_parent_frame_with_poses_is_used(tmp_path, other):
     times_s = {"as good": TIMES_S, "constant": TIMES_S.repeat(3), "short": START_S + np.arange(50) * 0.002}[
         other
     ]
@@ -171,14 +171,14 @@ def test_of_two_parents_the_one_with_poses_counts(tmp_path, other):
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 @pytest.mark.parametrize("number", [0, 6])
-def test_a_damaged_message_is_left_out_and_named(tmp_path, kind, number):
+def test_a_damaged_message_is_skipped_and_named(tmp_path, kind, number):
     def write(bag):
         odometry(bag)
         for i, time_s in enumerate(TIMES_S[:5].repeat(2)[:10]):
             message = bag.cloud2(time_s + 0.01 * (i % 2), POINT)
             if i == number:
                 message.data = message.data[:5]
-            if i == 8:  # a radar that saw nothing
+            if i == 8:  # a scan without returns
                 message.width, message.data = 0, message.data[:0]
             bag.write("/radar", message, time_s + 0.01 * (i % 2))
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Messages of radars' own types."""
+"""Messages of vendor-specific radar types."""
 
 import numpy as np
 import pytest
@@ -72,7 +72,7 @@ def nebula_list(bag, detections):
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
 @pytest.mark.parametrize("driver", ["nebula", "ars548_messages"])
 def test_ars548(tmp_path, kind, driver):
-    """Azimuth is positive to the left, elevation upwards; what the radar calls invalid is left out."""
+    """Azimuth is positive to the left, elevation upwards; returns flagged as invalid are excluded."""
     path = tmp_path / ("a.bag" if kind == "ros1" else "a")
     with BagWriter(path, kind) as bag:
         odometry(bag)
@@ -112,9 +112,7 @@ def test_ars548(tmp_path, kind, driver):
 def test_an_ars548_as_it_was_recorded():
     """Packets of the radar, and the same scan as its driver decoded it."""
     yaml = pytest.importorskip("yaml", reason="pyyaml is not installed")
-    scans = read(
-        recorded_file("ars548"), UNPOSED
-    )  # a folder whose file has another name than its metadata say
+    scans = read(recorded_file("ars548"), UNPOSED)  # a folder with a file name that differs from its metadata
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     decoded = yaml.load(recorded_file("ars548/ars548_detection.yaml").read_text(), loader)["detections"]
     names = ("range", "azimuth_angle", "elevation_angle", "range_rate", "rcs", "range_std", "azimuth_angle_std", "elevation_angle_std")  # fmt: skip
@@ -130,7 +128,7 @@ def test_an_ars548_as_it_was_recorded():
 
 
 @pytest.mark.parametrize("cloud", ["lidar", "radar by name"])
-def test_a_lidar_does_not_stand_for_a_radar_that_cannot_be_read(tmp_path, cloud):
+def test_a_lidar_does_not_replace_an_unreadable_radar(tmp_path, cloud):
     topic = "/radar/points" if cloud == "radar by name" else "/points"
     path = tmp_path / "a"
     with BagWriter(path, "mcap") as bag:

@@ -48,7 +48,7 @@ def name(folder, kind, stem="drive"):
 
 
 def scans_and(folder, kind, write_poses, cloud=BagWriter.cloud2, times_s=TIMES_S, **options):
-    """A bag of scans in the frame radar, and what `write_poses(bag)` adds. It was recorded 0.02 s after the stamps."""
+    """A bag of scans in the frame radar, and poses from `write_poses(bag)`, recorded 0.02 s after the stamps."""
     path = name(folder, kind)
     with BagWriter(path, kind) as bag:
         write_poses(bag)
@@ -131,7 +131,7 @@ def test_radar_msgs(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_of_paths_the_last_counts(tmp_path, kind):
+def test_the_last_path_message_is_used(tmp_path, kind):
     def write(bag):
         for count in (2, 5):  # the second one is corrected
             poses = {t: moved(t) @ pose([5.0 - count, 0, 0]) for t in TIMES_S[:count]}
@@ -141,7 +141,7 @@ def test_of_paths_the_last_counts(tmp_path, kind):
 
 
 def tree(bag, static_topic="/tf_static", base="base_link"):
-    """map -> odom -> base_link -> mast -> radar: the first is constant but published again and again."""
+    """map -> odom -> base_link -> mast -> radar: the first is constant but published repeatedly."""
     mast = {(base, "mast"): pose([0, 0, 1.0]), ("mast", "radar"): pose([0.5, 0, 0], np.pi / 2)}
     bag.write(static_topic, bag.transforms(START_S - 3, mast), START_S - 3)
     for time_s in START_S + np.arange(-1, 12) * 0.05:
@@ -163,7 +163,7 @@ def test_tree_of_transforms(tmp_path, kind):
 
 
 @pytest.mark.parametrize("stamp_s", [0.0, 12.0])
-def test_stamps_that_are_zero_or_stand_still(tmp_path, stamp_s):
+def test_zero_or_constant_stamps_are_replaced_by_recording_times(tmp_path, stamp_s):
     with BagWriter(tmp_path / "a.bag", "ros1") as bag:
         odometry(bag)
         for i, time_s in enumerate(TIMES_S):
@@ -209,7 +209,7 @@ def test_several_bags(tmp_path, kind):
     check(read(paths[1:], poses=paths[0]))
 
 
-def test_choices_that_are_not_clear(tmp_path):
+def test_ambiguous_choices_are_rejected(tmp_path):
     with BagWriter(tmp_path / "a.bag", "ros1") as bag:
         odometry(bag)
         for topic in ("/left/points", "/right/points"):
@@ -236,7 +236,7 @@ def test_choices_that_are_not_clear(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_bags(tmp_path, kind):
-    """Cut off. Bytes that are others are in test_hostile_files.py."""
+    """Truncated bags. Changed bytes are in test_hostile_files.py."""
     path = scans_and(tmp_path, kind, odometry)
     file = path if kind == "ros1" else next(p for p in path.iterdir() if p.suffix in (".db3", ".mcap"))
     whole = file.read_bytes()

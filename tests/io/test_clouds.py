@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files of one point cloud, in each format, and damaged ones."""
+"""Point cloud files of each format, and damaged ones."""
 
 import struct
 from importlib.util import find_spec
@@ -58,7 +58,7 @@ def test_compressed_pcd(tmp_path):
     ("data", "unpacked"),
     [
         (b"\x02abc", b"abc"),
-        (b"\x00a\x20\x00", b"aaaa"),  # three from one byte back: it overlaps with itself
+        (b"\x00a\x20\x00", b"aaaa"),  # a copy of three bytes from one byte back overlaps itself
         (b"\x01ab\xe0\x09\x01", b"ab" * 10),
         (b"\x02abc\x20\x02", b"abcabc"),
         (bytes([31]) + b"z" * 32 + bytes([31]) + b"y" * 32 + b"\x20\x27", b"z" * 32 + b"y" * 32 + b"zzz"),
@@ -87,8 +87,8 @@ def test_bin(tmp_path):
 
 @pytest.mark.parametrize("dtype", ["<f4", "<f8"])
 @pytest.mark.parametrize("width", [3, 4, 5, 8])
-def test_bin_files_that_are_not_of_kitti_ask_for_their_columns(tmp_path, width, dtype):
-    """One of them is cut off, and some have as many bytes as points of four numbers."""
+def test_bin_files_other_than_kitti_require_columns(tmp_path, width, dtype):
+    """One of them is truncated, and some have the size of points with four columns."""
     rng = np.random.default_rng(0)
     for i in range(5):
         ranges, azimuth, elevation = rng.uniform((2, -1, -0.2), (60, 1, 0.2), (40 + 20 * i, 3)).T
@@ -137,7 +137,7 @@ def test_text(tmp_path, text):
     check(tmp_path / "a.csv")
 
 
-def test_a_pcd_of_another_form_is_refused_with_what_to_do(tmp_path):
+def test_an_unsupported_pcd_is_rejected_with_a_remedy(tmp_path):
     write_pcd(tmp_path / "0.pcd", COLUMNS, DATA="draco")
     with pytest.raises(ValueError, match="its DATA is draco: save it as binary"):
         read_points(tmp_path / "0.pcd")
@@ -238,7 +238,7 @@ def expected(origin):
 
 @pytest.mark.parametrize("suffix", CLOUD_OUT_SUFFIXES)
 @pytest.mark.parametrize("origin", [np.zeros(3), UTM_M], ids=["near", "UTM"])
-def test_the_same_numbers_come_back(tmp_path, suffix, origin):
+def test_written_clouds_are_read_back_unchanged(tmp_path, suffix, origin):
     if suffix in (".las", ".laz") and find_spec("laspy") is None:
         pytest.skip("laspy is not installed")
     scans, reads = lazily(origin)
@@ -256,7 +256,7 @@ def test_the_same_numbers_come_back(tmp_path, suffix, origin):
     np.testing.assert_allclose(read_points(path), world, rtol=0, atol=tolerance_m)
 
 
-def test_columns_that_scans_lack(tmp_path):
+def test_columns_missing_in_some_scans_are_omitted(tmp_path):
     scans, _ = lazily(np.zeros(3), optional=False)
     write_cloud(tmp_path / "cloud.ply", scans)
     assert list(read_columns(tmp_path / "cloud.ply")) == ["x", "y", "z", "scan"]
@@ -265,7 +265,7 @@ def test_columns_that_scans_lack(tmp_path):
     assert "intensity" not in read_columns(tmp_path / "mixed.csv")
 
 
-def test_a_source_that_fails_leaves_the_old_file(tmp_path):
+def test_a_failing_source_leaves_the_old_file(tmp_path):
     path = tmp_path / "cloud.ply"
     path.write_bytes(b"old")
 

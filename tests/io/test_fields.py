@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What fields of radars mean: by their names, whatever their case and order, by their units, or by choice."""
+"""Fields of radars are identified by name, in any case and order, by unit, or by choice."""
 
 import numpy as np
 import pytest
@@ -86,14 +86,14 @@ def test_deviations():
     assert_array_equal(scan_of(Fields.of(names), dict.fromkeys(names, ones)).sigma, np.ones((2, 3)))
 
 
-def test_a_field_of_words():
+def test_a_field_of_strings_is_rejected():
     fields = Fields.of(["x", "y", "z", "power"])
     with pytest.raises(ValueError, match="the field power"):
         scan_of(fields, {name: np.zeros(1) for name in "xyz"} | {"power": np.array(["a"])})
 
 
 def polar(text):
-    """The points of a table in text, and what was said."""
+    """Points of a text table, and notes."""
     names, *rows = [line.split() for line in text.splitlines()]
     columns = dict(zip(names, np.array(rows, np.float64).T, strict=True))
     notes = Notes()

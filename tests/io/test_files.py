@@ -16,7 +16,7 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="links, pipes and per
 
 
 @posix
-def test_a_link_is_followed_and_the_permissions_stay(tmp_path):
+def test_a_link_is_followed_and_permissions_are_kept(tmp_path):
     file, link = tmp_path / "map", tmp_path / "latest"
     file.write_bytes(b"old")
     file.chmod(0o600)
@@ -28,7 +28,7 @@ def test_a_link_is_followed_and_the_permissions_stay(tmp_path):
 
 
 @posix
-def test_a_pipe_is_refused_and_stays(tmp_path):
+def test_a_pipe_is_rejected_and_kept(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for function in (lambda path: write_whole(path, b""), lambda path: check_outputs([path])):
         with pytest.raises(ValueError, match="not a regular file"):
@@ -38,7 +38,7 @@ def test_a_pipe_is_refused_and_stays(tmp_path):
         check_outputs([os.devnull])
 
 
-def test_outputs_that_cannot_be_written(tmp_path):
+def test_outputs_that_cannot_be_written_are_rejected(tmp_path):
     (tmp_path / "folder").mkdir()
     with pytest.raises(FileNotFoundError):
         check_outputs([tmp_path / "absent" / "map"])
@@ -48,7 +48,7 @@ def test_outputs_that_cannot_be_written(tmp_path):
         check_outputs([tmp_path / ("n" * 256)])
 
 
-def test_the_same_file_twice_is_refused(tmp_path):
+def test_duplicate_outputs_are_rejected(tmp_path):
     scans = tmp_path / "scans.npz"
     scans.write_bytes(b"scans")
     with pytest.raises(ValueError, match="same file"):

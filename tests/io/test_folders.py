@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Folders of recorded scans: tiny ones in each layout, whose numbers come back exactly; and damaged ones."""
+"""Folders of recorded scans: tiny ones of each layout are read exactly; and damaged ones."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ KINDS = {"f": "F", "i": "I", "u": "U"}
 
 
 def write_pcd(path, columns, data="binary", **header):
-    """`columns` is {name: (N,) array}; `header` overrides what is true of them."""
+    """`columns` is {name: (N,) array}; `header` overrides its true entries."""
     arrays = [np.asarray(c) for c in columns.values()]
     count = len(arrays[0])
     lines = {
@@ -114,7 +114,7 @@ UTM = np.array([245821.0, 3380553.0, 20.0])
 
 @pytest.fixture
 def snail(tmp_path):
-    """The lidar stands level, its y axis (back) to the south: forward is north. It moves 1 m east in 0.4 s."""
+    """The lidar is level, its y axis (back) points south: forward is north. It moves 1 m east in 0.4 s."""
     folder = tmp_path / "data3"
     clouds = folder / "eagleg7" / "enhanced"
     write_pcd(clouds / stamp(0.0), radar_cloud([[5, 0, 0]], Doppler=[1], Range=[5], Power=[12.5]))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files that are damaged, or made to do damage: read, or refused by an error that names them; nothing in between."""
+"""Damaged and malicious files are read, or rejected by an error that names them."""
 
 import itertools
 import json
@@ -27,7 +27,7 @@ def test_damaged_files_are_read_or_refused(name, tmp_path, monkeypatch):
     reader = files.READERS[name]
     path = files.place(reader, tmp_path)
     outcomes = files.Outcomes()
-    # The long run begins with cuts at every boundary; of these, some.
+    # Samples the truncations at every boundary with which the long run begins.
     cuts = sum(1 + len(files.boundaries(data)) for data in reader.valid())
     stream = files.damaged(reader, seed=0)
     some = list(itertools.islice(stream, 0, cuts, 7)) + list(itertools.islice(stream, FILES))
@@ -37,7 +37,7 @@ def test_damaged_files_are_read_or_refused(name, tmp_path, monkeypatch):
             files.try_file(reader, path, data, outcomes)
     assert outcomes.failures == []
     assert outcomes.counts["read"] > 0
-    # Of a folder, whole scans are read; the damaged one is left out.
+    # In a folder, complete scans are read and the damaged one is skipped.
     assert outcomes.counts["ValueError"] > FILES / 10 or name == "folder: scan"
 
 
@@ -64,7 +64,7 @@ def test_pickles_are_not_executed(tmp_path):
     planted = tmp_path / "executed"
     objects = np.array([Plant(str(planted))] * 2, object)
     pickle.loads(pickle.dumps(objects[0])).close()
-    planted.unlink()  # so this is what an unpickling would have left
+    planted.unlink()  # so unpickling would have created it
 
     path = tmp_path / "scans.npz"
     for name in ("points", "frame", "lidar_points", "static"):
@@ -155,6 +155,6 @@ def test_what_is_no_file(tmp_path, read):
     with pytest.raises(FileNotFoundError, match=r"map\.npz"):
         read(path)
     path.unlink()
-    os.mkfifo(path)  # nobody ever writes to it
+    os.mkfifo(path)  # without a writer
     with pytest.raises(ValueError, match=r"map\.npz is not a regular file"):
         read(path)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Inertial measurements beside scans: of bags, by the clock of the scans, and of our own files."""
+"""Inertial measurements of bags, on the clock of the scans, and of scan files."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Files of poses in each format, what was assumed of them, and interpolation."""
+"""Pose files of each format, notes on assumptions, and interpolation."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_matrices(tmp_path, shape):
 
 
 def test_kitti_with_calibration(tmp_path):
-    """The truth are poses of the sensor in the frame of the first one; KITTI stores those of the camera."""
+    """True poses of the sensor are in the frame of the first one; KITTI stores poses of the camera."""
     truth = np.linalg.inv(POSES[0]) @ POSES
     camera = TR @ truth @ np.linalg.inv(TR)
     path = written(tmp_path / "poses.txt", camera[:, :3].reshape(3, 12))
@@ -139,7 +139,7 @@ def test_one_time_of_many_is_as_all_of_them():
     assert_allclose(trajectory.pose_at(times_s[-1] + 4e-4, 1.0), expected[-1], atol=1e-9)  # times are rounded
     between_s = (times_s[3] + times_s[4]) / 2
     assert trajectory.pose_at(between_s, 0.01) is None
-    assert trajectory.pose_at(between_s, times_s[4] - times_s[3]) is not None  # the longest gap itself counts
+    assert trajectory.pose_at(between_s, times_s[4] - times_s[3]) is not None  # inclusive of the longest gap
     assert trajectory.pose_at(times_s[-1] + 1.1e-3, 1.0) is None
     assert trajectory.pose_at(times_s[0] - 0.9e-3, 1.0) is not None
     assert trajectory.pose_at(np.nan, 1.0) is None
@@ -150,7 +150,7 @@ def test_one_time_of_many_is_as_all_of_them():
 
 
 def test_most_rows_of_a_table_must_be_poses():
-    """A quaternion may be off by a hundredth, for files of three digits; half of the rows may have none, but not wrong ones."""
+    """Quaternions may have errors of 0.01, for files of three digits; half of the rows may lack one, but none be wrong."""
     rows = np.tile([0.0, 1, 2, 3, 0, 0, 0, 1], (4, 1))
     rows[:, 0], rows[:, 7] = np.arange(4), [1.0099, 0.9901, 1.0101, 0.9899]
     assert are_poses(rows[:, 1:]).tolist() == [True, True, False, False]
@@ -160,7 +160,7 @@ def test_most_rows_of_a_table_must_be_poses():
     notes = Notes()
     assert trajectory_of(rows, "x", notes).times_s.tolist() == [0, 1]
     assert notes.lines[0].endswith("the first: pose 2")
-    rows[1, 0] = 0  # of two poses at one time, the first counts
+    rows[1, 0] = 0  # the first of two poses at one time is used
     with pytest.raises(ValueError, match="x holds 1 poses at different times"):
         trajectory_of(rows, "x")
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The one door for files and folders: what comes out, in which order, with which poses, and what is said."""
+"""Reading files and folders: scans, their order, their poses, and notes."""
 
 import logging
 import tracemalloc
@@ -151,7 +151,7 @@ def test_poses_that_are_given_win_over_those_of_an_npz(tmp_path):
     path = tmp_path / "scans.npz"
     write_scans(path, scans)
     others = np.stack([pose([0, i, 0], 0.1 * i) for i in range(3)])
-    # Of the first three, with times that are rounded, beside a gap longer than poses are interpolated over.
+    # Poses of the first three, with rounded times, next to a gap too long for interpolation.
     write_poses(tmp_path / "found.tum", others, times_s[:3] + 4e-4)
     again = read(path, tmp_path / "found.tum")
     assert_allclose(again.poses, others, rtol=0, atol=0.01)

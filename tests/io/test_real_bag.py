@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A real ROS 1 bag of a handheld radar, whose header stamps are all zero, becomes the scans that it holds."""
+"""A real ROS 1 bag of a handheld radar, with header stamps of zero, is read completely."""
 
 import numpy as np
 import pytest
@@ -24,9 +24,9 @@ def test_it_becomes_the_scans_that_it_holds():
         assert_array_equal(np.concatenate(scans.intensities), expected["intensity"])
         assert_array_equal(np.concatenate(scans.doppler_mps), expected["doppler"])
         assert_array_equal([len(p) for p in scans.points], np.bincount(expected["frame"]))
-        # The expected poses were not rounded as those of the text file, and not interpolated.
+        # Unlike those of the text file, the expected poses are not rounded or interpolated.
         assert_allclose(scans.poses, expected["poses"], rtol=0, atol=2e-6)
-        # Of the record time, the expected times are a smooth version.
+        # The expected times are smoothed record times.
         assert_allclose(np.diff(scans.times_s), np.diff(expected["times"]), rtol=0, atol=0.02)
     assert "header stamps of /ti_mmwave/radar_scan_pcl are zero" in scans.notes[0]
     assert scans.notes[1].startswith("197 scans left out")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Text as other programs write it: the same numbers, or an error, and never a line less."""
+"""Text of other programs is read without loss of a line, or rejected."""
 
 import numpy as np
 import pytest
@@ -73,7 +73,7 @@ def test_a_row_that_is_none_is_left_out_of_a_cloud_and_counted(tmp_path, wrong, 
         read_numbers(tmp_path / "a.csv")
 
 
-# What belongs to what in a folder.
+# Association of scans, poses and times in a folder.
 
 POSES = np.tile(np.eye(4), (4, 1, 1))
 POSES[:, 0, 3] = [10, 20, 30, 40]
@@ -81,7 +81,7 @@ POSES[:, 0, 3] = [10, 20, 30, 40]
 
 @pytest.fixture
 def folder(tmp_path):
-    """Four scans, 0.csv to 3.csv, of which number i has its return at x = i + 1, and poses of KITTI at 10 (i + 1)."""
+    """Four scans, 0.csv to 3.csv: scan i has its return at x = i + 1 and its KITTI pose at 10 (i + 1)."""
     for i in range(4):
         (tmp_path / f"{i}.csv").write_text(f"{i + 1} 0 0 {i}\n")
     (tmp_path / "poses.txt").write_text("".join(" ".join(map(str, p[:3].ravel())) + "\n" for p in POSES))
@@ -89,7 +89,7 @@ def folder(tmp_path):
 
 
 def pairs(scans):
-    """The place of the return and of the sensor in each scan."""
+    """Positions of return and sensor in each scan."""
     return [(float(scan.points[0, 0]), float(scan.T_world_sensor[0, 3])) for scan in scans]
 
 

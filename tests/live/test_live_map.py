@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A map that grows is a function of the scans that are in it, however they came, moved and went."""
+"""A live map depends only on its present scans, not on how they were added, moved and removed."""
 
 import errno
 import os
@@ -18,7 +18,7 @@ from ..conftest import ground_and_wall, pose
 
 ORIGIN = (2.0, 0.0, 1.0)
 KNOWN = {"range_noise_m": 0.02, "azimuth_noise_rad": 1e-3, "elevation_noise_rad": 1e-3}
-SETTINGS = FitConfig(num_threads=1, returns=KNOWN)  # a given noise does not depend on what was there before
+SETTINGS = FitConfig(num_threads=1, returns=KNOWN)  # a given noise does not depend on previous scans
 SCENE = ground_and_wall(scans=8, returns_per_scan=800)
 
 
@@ -40,7 +40,7 @@ def map_bits(radar_map):
     return [array.tobytes() for array in [*arrays, found.information, found.hits, found.visibility]]
 
 
-def test_random_operations_leave_a_map_of_what_is_in_it():
+def test_a_map_after_random_operations_equals_one_of_its_scans():
     rng = np.random.default_rng(5)
     live, inside, poses = map_of([], SETTINGS.override(num_threads=3)), {}, SCENE.poses.copy()
     for _ in range(60):
@@ -56,7 +56,7 @@ def test_random_operations_leave_a_map_of_what_is_in_it():
             poses[i] = pose(rng.uniform(-1, 1, 3) + [i, 0, 1.5], rng.uniform(-0.1, 0.1))
             live.move(i, poses[i])
         elif inside:
-            live.mesh()  # what it keeps must not show later
+            live.mesh()  # its cache must not affect later results
     assert 2 < len(inside) < len(SCENE.points)
     fresh = map_of(rng.permutation(sorted(inside)), poses=poses)
     assert state(live) == state(fresh)
@@ -67,7 +67,7 @@ def test_random_operations_leave_a_map_of_what_is_in_it():
     assert len(live.mesh().faces) == 0
 
 
-def test_a_mesh_that_grows_is_that_of_a_quick_fit():
+def test_an_incremental_mesh_equals_that_of_a_quick_fit():
     live = map_of([])
     for i in range(6):
         assert live.integrate(SCENE.points[i], SCENE.poses[i], SCENE.intensities[i]).scan_id == i
@@ -85,7 +85,7 @@ def test_a_mesh_that_grows_is_that_of_a_quick_fit():
     assert triangles(whole).tobytes() == triangles(grown).tobytes()
 
 
-def test_a_change_reaches_the_bridges_that_it_opens_elsewhere():
+def test_a_change_updates_bridges_outside_its_region():
     live, poses = map_of([]), SCENE.poses
     for points, at in zip(SCENE.points, poses, strict=True):
         live.integrate(points[::4], at)
@@ -98,8 +98,8 @@ def test_a_change_reaches_the_bridges_that_it_opens_elsewhere():
     assert grown == mesh_bits(live.mesh())
 
 
-def test_a_change_far_along_a_drive_is_all_that_is_made_anew():
-    """Farther apart than smoothing carries anything, so that most of the map is none of the change's business."""
+def test_only_the_changed_part_of_a_long_drive_is_recomputed():
+    """The distance exceeds the reach of smoothing, so that most of the map is unaffected."""
     poses = SCENE.poses.copy()
     poses[:, :3, 3] += 40.0 * np.arange(len(poses))[:, None] * [1, 0, 0]
     live = map_of(range(7), poses=poses)
@@ -113,7 +113,7 @@ def test_a_change_far_along_a_drive_is_all_that_is_made_anew():
     assert grown == mesh_bits(live.mesh())
 
 
-def test_map_and_finish_are_fits_of_all_scans():
+def test_map_and_finish_equal_fits_of_all_scans():
     config = FitConfig(num_threads=1, training={"sdf_iterations": 3, "intensity_iterations": 3})
     live = map_of([3, 0, 2, 1, 4], config)
     live.remove(3)
@@ -133,7 +133,7 @@ def test_map_and_finish_are_fits_of_all_scans():
         assert found.intensity(*at).tobytes() == fitted.intensity(*at).tobytes()
 
 
-def test_readers_see_the_map_before_or_after_a_scan():
+def test_concurrent_readers_see_the_map_before_or_after_a_scan():
     known = {tuple(mesh_bits(map_of(range(i)).mesh())) for i in range(1, 7)}
     live, seen, done = map_of([0]), [], threading.Event()
 
@@ -153,8 +153,8 @@ def test_readers_see_the_map_before_or_after_a_scan():
     assert set(seen) <= known
 
 
-def test_sizes_are_not_read_while_a_scan_is_added(monkeypatch):
-    """The core changes its tables without Python's lock: what it says of them meanwhile can be anything."""
+def test_sizes_are_not_read_during_integration(monkeypatch):
+    """The core changes its tables without the GIL: sizes read meanwhile are undefined."""
     live, found, during = map_of(range(3)), [], []
     reader = threading.Thread(target=lambda: found.append(repr(live)))
     apply = live._state._apply
@@ -183,7 +183,7 @@ def test_sizes_are_not_read_while_a_scan_is_added(monkeypatch):
         ({"doppler_mps": np.zeros(3)}, "doppler_mps of scan 0 must have shape"),
     ],
 )
-def test_a_bad_scan_leaves_the_map_as_it_was(change, words):
+def test_a_bad_scan_leaves_the_map_unchanged(change, words):
     live = map_of(range(3))
     before, mesh = state(live), mesh_bits(live.mesh())
     scan = {"points": SCENE.points[3], "pose": SCENE.poses[3], "intensities": SCENE.intensities[3]}
@@ -202,7 +202,7 @@ def test_a_scan_without_returns_changes_nothing(points):
     assert mesh_bits(live.mesh()) == mesh
 
 
-def test_scans_move_together_or_not_at_all():
+def test_moving_several_scans_is_atomic():
     live = map_of(range(4))
     before = state(live)
     moved = SCENE.poses.copy()
@@ -223,7 +223,7 @@ def test_scans_move_together_or_not_at_all():
     assert len(live.move_all(dict(enumerate(moved[:4])))) == 0  # nothing changes
 
 
-def test_old_scans_go_to_the_disk_or_are_sealed(tmp_path):
+def test_old_scans_are_stored_on_disk_or_sealed(tmp_path):
     needed = map_of(range(8)).num_bytes
     spilled = map_of(range(8), max_bytes=needed - 60_000, folder=tmp_path / "scans")
     files = list((tmp_path / "scans").glob("scan-*.npz"))
@@ -242,7 +242,7 @@ def test_old_scans_go_to_the_disk_or_are_sealed(tmp_path):
     assert len(sealed.map().mesh(0.2).faces) > 100
 
 
-def test_a_full_disk_leaves_the_map_as_it_was(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_map_unchanged(tmp_path, monkeypatch):
     needed = map_of(range(7)).num_bytes
     live = map_of(range(6), max_bytes=needed - 60_000, folder=tmp_path / "scans")
     before, ids, poses = state(live), live.scan_ids, [live.pose(i) for i in range(6)]
@@ -272,16 +272,16 @@ def test_a_folder_belongs_to_one_map(tmp_path):
     live.remove(0)
     assert state(live) == state(map_of(range(1, 8)))
     del live
-    assert len(LiveMap(folder=folder)) == 0  # files of before are written over
+    assert len(LiveMap(folder=folder)) == 0  # previous files are overwritten
     (folder / "notes.txt").touch()
     with pytest.raises(ValueError, match="other files"):
         LiveMap(folder=folder)
-    (tmp_path / "scan-000000001.npz").touch()  # of somebody else: no map has used this folder
+    (tmp_path / "scan-000000001.npz").touch()  # a foreign file: no map has used this folder
     with pytest.raises(ValueError, match="other files"):
         LiveMap(folder=tmp_path)
 
 
-def test_what_is_far_away_is_forgotten():
+def test_distant_regions_are_dropped():
     live = map_of(range(8))
     live.mesh()
     keys = live._state.sums.block_keys()

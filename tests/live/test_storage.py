@@ -20,7 +20,7 @@ from bench.live.removal import state
 from .test_live_map import SCENE, map_bits, map_of, mesh_bits
 
 
-def test_a_map_goes_on_from_its_file(tmp_path):
+def test_a_map_resumes_from_its_file(tmp_path):
     file = tmp_path / "live.npz"
     live = map_of(range(6), max_bytes=map_of(range(6)).num_bytes - 30_000)
     assert live.sealed_scans > 0
@@ -35,7 +35,7 @@ def test_a_map_goes_on_from_its_file(tmp_path):
     assert mesh_bits(again.mesh()) == mesh_bits(live.mesh())
 
 
-def test_scans_come_back_as_they_were_given(tmp_path):
+def test_saved_scans_are_loaded_unchanged(tmp_path):
     """With float64 and float32 points, with Doppler and without, with moving returns and without."""
     live, rng = LiveMap(), np.random.default_rng(0)
     live.save(tmp_path / "empty.npz")
@@ -59,7 +59,7 @@ def test_scans_come_back_as_they_were_given(tmp_path):
                 assert getattr(other, name) == value
 
 
-def test_damaged_files_are_refused(tmp_path):
+def test_damaged_files_are_rejected(tmp_path):
     file = tmp_path / "live.npz"
     map_of(range(2)).save(file)
     whole = file.read_bytes()
@@ -99,7 +99,7 @@ def put_away(folder):
     return sorted(folder.glob("region-*.npz"))
 
 
-def test_a_map_that_was_put_away_comes_back_where_scans_reach_it(tmp_path):
+def test_stored_regions_are_reloaded_when_scans_reach_them(tmp_path):
     live, other = far_map_of(range(7), folder=tmp_path / "kept"), far_map_of(range(7))
     whole, mesh = state(live), mesh_bits(live.mesh())
     for _ in range(2):
@@ -111,7 +111,7 @@ def test_a_map_that_was_put_away_comes_back_where_scans_reach_it(tmp_path):
         near = live.mesh()
         assert near.vertices[:, 0].min() > 150
         assert len(live.clear_outside(FAR[6][:3, 3], 60.0)) == 0
-        # What needs all of it has all of it, and leaves it where it was.
+        # Operations on the whole map load all regions, and leave them stored.
         assert map_bits(live.map()) == map_bits(other.map())
         assert len(put_away(tmp_path / "kept")) > 1
         assert mesh_bits(live.mesh()) == mesh_bits(near)
@@ -123,13 +123,13 @@ def test_a_map_that_was_put_away_comes_back_where_scans_reach_it(tmp_path):
     assert live.sealed_scans == 0
 
 
-def test_a_state_has_what_is_put_away(tmp_path):
+def test_a_saved_state_includes_stored_regions(tmp_path):
     live = far_map_of(range(7), folder=tmp_path / "kept")
     whole = state(live)
     live.clear_outside(FAR[6][:3, 3], 60.0)
     live.save(tmp_path / "live.npz")
     del live
-    # As after a process was killed: the folder still has files, of which the state knows nothing.
+    # As after a killed process: the folder has files that the state does not reference.
     loaded = LiveMap.load(tmp_path / "live.npz", folder=tmp_path / "kept")
     assert state(loaded) == whole
     loaded.integrate(SCENE.points[7], FAR[0], SCENE.intensities[7])
@@ -165,7 +165,7 @@ def keys_of(cells):
 
 
 @pytest.mark.parametrize("leaves_per_cell", [1, 2])
-def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
+def test_rows_are_stored_in_the_regions_of_their_cells(leaves_per_cell):
     keys = keys_of(CELLS)
     table = RegionTable(leaves_per_cell, number=np.zeros(1))
     regions = np.unique(table.regions_of(keys))
@@ -184,7 +184,7 @@ def test_rows_are_those_of_the_regions_that_their_cells_are_in(leaves_per_cell):
     assert table.num_bytes == 16 * len(left)
 
 
-def test_ghosts_of_a_grown_map_are_those_of_a_fresh_one():
+def test_ghosts_of_an_incremental_map_equal_those_of_a_new_one():
     scans = radarsdf.simulate.oculii(seed=6, frames=16)
     known = {"range_noise_m": 0.09, "azimuth_noise_rad": 0.012, "elevation_noise_rad": 0.02}
     live, fresh = (LiveMap(FitConfig(num_threads=1, returns=known), origin=(0, 0, 0)) for _ in range(2))

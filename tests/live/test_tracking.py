@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans without poses are put where they were taken, or refused."""
+"""Scans without poses are placed at their true poses, or rejected."""
 
 import numpy as np
 import pytest
@@ -34,14 +34,14 @@ def follow(live, scans, motion, rows, sign=1, most_mps=np.inf, **more):
 
 
 def rms_m(live, true):
-    """Of positions, after one rigid motion."""
+    """RMS error of positions after rigid alignment."""
     poses = np.stack([live.pose(i) for i in live.scan_ids])
     off = aligned(poses, true[live.scan_ids]) - true[live.scan_ids]
     return float(np.sqrt(np.square(off[:, :3, 3]).sum(axis=1).mean()))
 
 
 @pytest.mark.parametrize(("sign", "most_mps"), [(1, np.inf), (-1, 4.0)])  # it drives at 7 m/s
-def test_scans_are_put_where_they_were_taken(drive, sign, most_mps):
+def test_scans_are_placed_at_their_true_poses(drive, sign, most_mps):
     scans, motion = drive
     live = LiveMap(SETTINGS)
     follow(live, scans, motion, range(16), sign, most_mps)
@@ -49,8 +49,8 @@ def test_scans_are_put_where_they_were_taken(drive, sign, most_mps):
     assert len(live.mesh().faces) > 2_000
 
 
-def test_a_drive_that_begins_fast_is_placed_as_by_odometry():
-    """3 to 16 m off, or lost, while first scans were not placed again."""
+def test_a_drive_that_starts_fast_is_as_accurate_as_odometry():
+    """Regression: errors of 3 to 16 m, or lost tracking, before first scans were placed again."""
     seed = 11
     scans = first(radarsdf.simulate.oculii, 12, seed=seed, frames=20)
     motion = radarsdf.simulate.measured_motion(scans, seed=seed)
@@ -70,7 +70,7 @@ def _folded(speeds, most_mps):
 
 
 @pytest.mark.parametrize("with_doppler", [True, False])
-def test_scans_go_on_from_given_poses(drive, with_doppler):
+def test_tracking_continues_from_given_poses(drive, with_doppler):
     scans, motion = drive
     live = LiveMap(SETTINGS)
     with pytest.raises(ValueError, match="a pose, or a time"):
@@ -86,7 +86,7 @@ def test_scans_go_on_from_given_poses(drive, with_doppler):
         follow(without_times, scans, motion, [1])
 
 
-def test_what_cannot_be_followed_is_refused_and_leaves_nothing(drive):
+def test_untrackable_scans_are_rejected_without_side_effects(drive):
     scans, motion = drive
     live, other = LiveMap(SETTINGS), LiveMap(SETTINGS)
 
@@ -105,7 +105,7 @@ def test_what_cannot_be_followed_is_refused_and_leaves_nothing(drive):
     assert add(live, 4).pose.tobytes() == add(other, 4).pose.tobytes()
 
 
-def test_motion_along_a_wall_is_not_guessed():
+def test_unobservable_motion_along_a_wall_is_rejected():
     scans = radarsdf.simulate.wall(seed=91, frames=24)
     live = LiveMap(SETTINGS)
 
@@ -122,7 +122,7 @@ def test_motion_along_a_wall_is_not_guessed():
         follow(speeds)
 
 
-def test_a_sensor_that_stands_leaves_the_sign_of_its_doppler_open(drive):
+def test_a_stationary_sensor_leaves_the_doppler_sign_undetermined(drive):
     scans, motion = drive
     live, rng = LiveMap(SETTINGS), np.random.default_rng(0)
     for i in range(6):
@@ -134,7 +134,7 @@ def test_a_sensor_that_stands_leaves_the_sign_of_its_doppler_open(drive):
     assert live._follower._steps[-1].sign == -1
 
 
-def test_the_next_scan_is_placed_where_the_map_has_the_others(drive, tmp_path):
+def test_the_next_scan_is_placed_relative_to_moved_scans(drive, tmp_path):
     scans, motion = drive
     T = np.linalg.inv(scans.poses[0]) @ scans.poses
     shift = np.eye(4)
@@ -159,7 +159,7 @@ def test_a_sensor_moves_if_its_velocity_is_five_deviations_from_zero():
     logged = LoggedScan(np.eye(4), np.zeros((3, 3)), time_s=0.0)
     covariance = np.diag([0.03, 0.04, 1.0]) ** 2 - 0.02**2 * np.eye(
         3
-    )  # each velocity is off by 0.02 m/s more
+    )  # each velocity has an additional error of 0.02 m/s
     for mean, moves in (
         ([0.149, 0, 0], False),
         ([0.151, 0, 0], True),
@@ -171,7 +171,7 @@ def test_a_sensor_moves_if_its_velocity_is_five_deviations_from_zero():
     assert Step(0, logged, None, begun(np.eye(4))).moves
 
 
-def test_a_velocity_of_open_sign_is_none_with_its_speed_as_deviation():
+def test_a_velocity_of_undetermined_sign_is_zero_with_its_speed_as_deviation():
     mean, covariance = np.array([[3.0, 4, 0], [0, 1, 2]]), np.tile(0.01 * np.eye(3), (2, 1, 1))
     velocities = SensorVelocities(mean, covariance, np.ones(3), [], np.ones(2, bool))
     for sign in (1, -1):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The probability that a surface is where a map says: from information, detections, looks, and what all returns tell."""
+"""The probability of a mapped surface: from information, hits, visibility counts, and statistics of all returns."""
 
 import dataclasses
 import itertools
@@ -35,7 +35,7 @@ def radar_map(scene):
 
 
 def confidence(radar_map, information, hits, visibility, clutter_ratio=0.1, returns_per_cell=2.0):
-    """Of places with this evidence, in a map with this clutter ratio, and returns in each cell that has any."""
+    """Confidence of places with this evidence, in a map with this clutter ratio and number of returns per occupied cell."""
     contents = dataclasses.replace(
         radar_map._contents, clutter_ratio=clutter_ratio, returns_per_cell=returns_per_cell
     )
@@ -45,13 +45,13 @@ def confidence(radar_map, information, hits, visibility, clutter_ratio=0.1, retu
 
 
 def at(information, hits, visibility):
-    """The evidence of places."""
+    """Evidence at places."""
     columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in (information, hits, visibility)))
     return EvidenceAt(*(torch.from_numpy(np.atleast_1d(column).copy()) for column in columns))
 
 
 @pytest.mark.parametrize("clutter_ratio", [0.0, 1.0])
-def test_it_is_a_probability_whatever_the_evidence(radar_map, clutter_ratio):
+def test_confidence_is_a_probability_for_any_evidence(radar_map, clutter_ratio):
     counts = [0.0, 1e-6, 1.0, 20.0, LARGEST_COUNT]
     evidence = itertools.product([0.0, SMALLEST, 1.0, 1e4, LARGEST], counts, counts)
     information, hits, visibility = np.array(list(evidence)).T
@@ -61,14 +61,14 @@ def test_it_is_a_probability_whatever_the_evidence(radar_map, clutter_ratio):
     assert (found[information == 0] == 0).all()
     assert (found[information == 1e4] > 0).all()
     assert found.max() > 0.99
-    # Hardly one of very many scans had a return.
+    # Almost none of very many scans had a return.
     assert (found[(information == 1) & (hits <= 1) & (visibility == LARGEST_COUNT)] < 0.1).all()
 
 
-def test_it_is_0_where_nothing_was_observed(radar_map):
+def test_confidence_of_unobserved_places_is_0(radar_map):
     nowhere = radar_map.origin + [[300.0, 0, 0], [0, 0, 500], [1e9, 0, 0], [np.nan, 0, 0]]
     assert radar_map.confidence(nowhere).tolist() == [0, 0, 0, 0]
-    # An open cell without returns in the 27 cells round it knows nothing, too.
+    # So is that of open cells without returns in their neighbourhood.
     unknown = Evidence(*(np.zeros_like(column) for column in dataclasses.astuple(radar_map.evidence)))
     contents = dataclasses.replace(radar_map._contents, evidence=unknown)
     cells = radar_map.field.table.leaf_cells()[:100]
@@ -82,16 +82,14 @@ ERROR_OF_A_CELL = 1 / 0.2**2
 
 
 @pytest.mark.parametrize(("clutter_ratio", "returns_per_cell"), [(0.0, 0.0), (0.1, 2.0), (0.5, 12.0)])
-def test_it_is_the_logistic_function_of_what_is_missing_and_how_rough_the_map_is(
-    radar_map, clutter_ratio, returns_per_cell
-):
+def test_confidence_is_logistic_in_missing_evidence_and_clutter(radar_map, clutter_ratio, returns_per_cell):
     hits, visibility = np.array([4.0, 9, 1]), np.array([16.0, 3, 80])  # 4, 0.75 and 20 are expected
     error_cells = np.array([0.3, 0.2, 1.0])
     deviations = (visibility / 4 - hits) / np.sqrt(visibility / 4 + 1)
     missing = (deviations + np.hypot(deviations, 0.5)) / 2
     rough, crowded = np.tanh(clutter_ratio / 0.27), returns_per_cell / (returns_per_cell + 4)
     logits = 3.29 - 1.25 * np.log(error_cells) - 0.87 * missing - 3.77 * rough - 3.50 * crowded
-    # Where the density of information is low, that of the neighbours holds a surface that bends by at most two cells.
+    # At low density of information, neighbours constrain a surface to a bend of at most two cells.
     smoothed = np.minimum(error_cells, np.sqrt(2 / 8 * np.sqrt(9) * error_cells))
     reach = np.array([math.erf(math.sqrt(0.5) / cells) for cells in smoothed])
     expected = np.minimum(1 / (1 + np.exp(-logits)), reach)
@@ -101,14 +99,14 @@ def test_it_is_the_logistic_function_of_what_is_missing_and_how_rough_the_map_is
 
 
 def test_places_have_the_evidence_of_their_cells(radar_map):
-    """In the middle of a cell, none of its neighbours counts."""
+    """In the middle of a cell, its neighbours have no weight."""
     contents, evidence = radar_map._contents, radar_map.evidence
     centres = (radar_map.field.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
     found = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
     for column, expected in zip(found, dataclasses.astuple(evidence), strict=True):
         assert expected.max() > 0
         np.testing.assert_allclose(column, expected, rtol=1e-3, atol=1e-3 * expected.max())
-    known = evidence.information > 0  # elsewhere a rounded position has a little of the next cell's
+    known = evidence.information > 0  # elsewhere, rounded positions have a small share of the next cell
     assert 0.5 < known.mean() < 1
     np.testing.assert_allclose(
         radar_map.confidence(centres + radar_map.origin)[known],
@@ -133,7 +131,7 @@ CONFIG = FitConfig.quick().override(
 
 
 def floor_m(radar_map):
-    """What repetition does not shrink, m."""
+    """Error that repetition does not reduce, m."""
     return _floor_m(radar_map._contents)
 
 
@@ -159,7 +157,7 @@ def walls():
     return points, radarsdf.fit(points, poses, config=CONFIG, progress=False)
 
 
-def test_it_is_the_standard_error_of_the_returns_round_a_cell(walls):
+def test_uncertainty_is_the_standard_error_of_returns_near_a_cell(walls):
     points, radar_map = walls
     returns = np.concatenate(points)
     local = returns - radar_map.origin
@@ -175,7 +173,7 @@ def test_it_is_the_standard_error_of_the_returns_round_a_cell(walls):
     assert found.dtype == np.float64
 
 
-def test_the_mesh_leaves_out_what_is_uncertain(walls):
+def test_the_mesh_excludes_uncertain_surface(walls):
     _, radar_map = walls
     kept = {"min_confidence": 0, "min_component_triangles": 0}
     everything = radar_map.mesh(max_uncertainty=math.inf, **kept)
@@ -191,8 +189,8 @@ def test_the_mesh_leaves_out_what_is_uncertain(walls):
     np.testing.assert_array_equal(default.faces, everything.faces)
 
 
-def test_the_rougher_the_less_repetition_helps(walls):
-    """Where nothing is rough, many returns give the position to a twentieth of a leaf cell."""
+def test_repetition_reduces_uncertainty_less_on_rough_surfaces(walls):
+    """Without roughness, many returns determine the position to a twentieth of a leaf cell."""
     _, radar_map = walls
     contents = radar_map._contents
     information = np.full_like(radar_map.evidence.information, 1e12)

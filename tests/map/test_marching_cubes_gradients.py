@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Gradients of a mesh's vertices by the samples."""
+"""Gradients of mesh vertices by the samples."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def off_the_level(seed, shape=(4, 5, 6)):
 
 
 def gradient(volume, weights=None, dtype=None, **keywords):
-    """Of a weighted sum over all coordinates of the vertices, by the volume."""
+    """Gradient by the volume of a weighted sum of all vertex coordinates."""
     samples = torch.tensor(volume, dtype=dtype, requires_grad=True)
     vertices, _ = marching_cubes(samples, **keywords)
     if weights is None:
@@ -38,12 +38,12 @@ def check_gradient(volume, **keywords):
     return len(marching_cubes(samples, **keywords)[0])
 
 
-def test_gradients_are_those_of_differences():
+def test_gradients_equal_finite_differences():
     assert check_gradient(off_the_level(0)) > 100
     assert check_gradient(off_the_level(1) + 0.3, level=0.3) > 100
 
 
-def test_gradients_of_float32_are_those_of_float64():
+def test_gradients_of_float32_equal_those_of_float64():
     volume = off_the_level(7)
     np.testing.assert_allclose(gradient(volume, dtype=torch.float32), gradient(volume), rtol=1e-4, atol=1e-4)
 
@@ -67,7 +67,7 @@ def test_vertices_kept_away_from_samples_have_no_gradient():
     volume = off_the_level(3)
     near = np.random.default_rng(3).random(volume.shape) < 0.5
     near &= np.indices(volume.shape).sum(axis=0) % 2 == 0  # none next to another
-    volume[near] *= 1e-4  # closer to the level than a vertex comes, further than the differences' step
+    volume[near] *= 1e-4  # closer to the level than vertices come, farther than the step of differences
     assert check_gradient(volume) > 100
     samples = torch.tensor(volume, requires_grad=True)
     vertices, _ = marching_cubes(samples)
@@ -112,7 +112,7 @@ def test_arrays_give_arrays_with_the_tensors_bits(dtype):
         assert not marching_cubes(samples, mask=mask)[0].requires_grad
 
 
-def test_what_has_no_gradient_is_refused():
+def test_volumes_without_a_gradient_are_rejected():
     samples = torch.tensor(sphere(9), requires_grad=True) * 1
     needed = torch.tensor(1.0, requires_grad=True)
     for keywords in ({"level": needed}, {"spacing": needed.expand(3)}, {"origin": needed.expand(3)}):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Meshes of the plane z = 0 and the wall x = 20: where they are, which way they face, and where they end."""
+"""Meshes of the plane z = 0 and the wall x = 20: position, orientation and extent."""
 
 import functools
 
@@ -45,7 +45,7 @@ def mesh(sharp_map):
 
 @pytest.fixture(scope="module")
 def mesh_of(sharp_map):
-    """A function: the mesh of a size of voxels, made once for all tests."""
+    """A function from voxel size to mesh, cached for all tests."""
     return functools.cache(sharp_map.mesh)
 
 
@@ -54,7 +54,7 @@ def surface_distance(vertices):
 
 
 def inside(mesh):
-    """Triangles well within what the sensor saw, away from the corner of plane and wall."""
+    """Triangles well inside the observed space, away from the corner of plane and wall."""
     x, y, z = mesh.triangles_center.T
     seen = (np.abs(y) < 5) & (x > 9) & (x < 21) & (z < 3.5)
     return seen & ~((x > 19.2) & (z < 0.8))
@@ -85,9 +85,9 @@ def test_any_voxel_size_gives_the_same_surface(sharp_map, mesh_of, voxel_size):
     assert np.median(surface_distance(centres)) < 0.03
     ground = (np.abs(mesh.triangles_center[:, 1]) < 5) & inside(mesh) & (mesh.triangles_center[:, 0] < 19)
     projected = (mesh.area_faces * np.abs(mesh.face_normals[:, 2]))[ground].sum()
-    # x from 9 to 19 and y from -5 to 5: nothing is missing, and not much doubled.
+    # x from 9 to 19 and y from -5 to 5: nothing is missing, and little is duplicated.
     assert 95 < projected < 125
-    # Never further out than a voxel from what was observed.
+    # At most a voxel outside the observed space.
     nearest = np.clip(mesh.vertices, *sharp_map_bounds(sharp_map))
     assert np.abs(mesh.vertices - nearest).max() <= voxel_size + 1e-6
 
@@ -110,7 +110,7 @@ def test_meshes_are_manifold(sharp_map, voxel_size):
 def test_a_utm_origin_gives_the_same_mesh_moved(sharp_map, mesh):
     far = moved(sharp_map, UTM).mesh()
     np.testing.assert_array_equal(far.faces, mesh.faces)
-    np.testing.assert_allclose(far.vertices - UTM, mesh.vertices, atol=2e-9)  # what float64 has left at 5.4e6
+    np.testing.assert_allclose(far.vertices - UTM, mesh.vertices, atol=2e-9)  # resolution of float64 at 5.4e6
 
 
 @pytest.mark.parametrize("offset", [np.zeros(3), UTM])
@@ -138,7 +138,7 @@ def test_small_components_are_dropped():
     cut = patches.mesh(min_component_triangles=50)
     kept = mesh_components(cut.faces.astype(np.int32), len(cut.vertices))[1]
     assert kept.tolist() == sizes[sizes >= 50].tolist()
-    # No vertex is left over, and none is renumbered to another place.
+    # No vertex is unused, and none is renumbered to another position.
     np.testing.assert_array_equal(np.unique(cut.faces), np.arange(len(cut.vertices)))
     np.testing.assert_array_equal(cut.triangles, whole.triangles[sizes[labels] >= 50])
 
@@ -160,18 +160,16 @@ def test_a_viewpoint_gives_intensities_and_colours(sharp_map, mesh):
 
 
 @pytest.mark.parametrize("viewpoint", [None, SENSOR])
-def test_where_there_is_no_surface_the_mesh_is_empty(sharp_map, viewpoint):
+def test_a_box_without_surface_has_an_empty_mesh(sharp_map, viewpoint):
     empty = sharp_map.mesh(box=[[500, 500, 500], [501, 501, 501]], viewpoint=viewpoint)
     assert len(empty.vertices) == len(empty.faces) == 0
     none = sharp_map.mesh(0.2, viewpoint=viewpoint, min_component_triangles=10**9)
     assert len(none.vertices) == len(none.faces) == 0
 
 
-# Voxels that do not divide the cells are moved otherwise at the border: there, a few vertices differ.
+# Voxels that do not divide the cells have other offsets at the border: a few vertices differ there.
 @pytest.mark.parametrize("voxel_size", [0.1, 0.13])
-def test_cells_away_from_the_surface_are_skipped_and_nothing_is_lost(
-    sharp_map, mesh_of, voxel_size, monkeypatch
-):
+def test_skipping_cells_away_from_the_surface_loses_nothing(sharp_map, mesh_of, voxel_size, monkeypatch):
     cells = sharp_map.field.table.leaf_cells()
     searched = crossed(cells, LEAF_M, functools.partial(_corner_distances, sharp_map._contents, LEAF_M))
     assert len(searched) < 0.8 * len(cells)
@@ -207,7 +205,7 @@ def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path)
         ("min_component_triangles", -1),
     ],
 )
-def test_wrong_arguments_are_refused_by_name(sharp_map, name, wrong):
+def test_wrong_arguments_are_named(sharp_map, name, wrong):
     with pytest.raises(ValueError, match=name):
         sharp_map.mesh(**{name: wrong})
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A map answers in kind, in any chunks and from any thread."""
+"""Queries of a map: array types, chunks and threads."""
 
 import threading
 
@@ -14,13 +14,13 @@ SENSOR = np.array([0.5, 0.0, 1.5])
 
 
 def near_surface(count, seed=0):
-    """Points round the surface, of which most are observed."""
+    """Points near the surface, mostly observed."""
     rng = np.random.default_rng(seed)
     return rng.uniform([8, -5, -0.25], [20.2, 5, 0.25], (count, 3))
 
 
 def on_surface(radar_map, count):
-    """Points (N, 3) of which all are observed."""
+    """Observed points (N, 3)."""
     x = near_surface(4 * count)
     return x[radar_map.observed(x)][:count]
 
@@ -39,7 +39,7 @@ def query(request, sharp_map):
     return request.param, queries(sharp_map)[request.param]
 
 
-def test_numpy_in_numpy_out_torch_in_torch_out(query):
+def test_results_have_the_array_type_of_the_arguments(query):
     name, function = query
     x = near_surface(50)
     shape = (50, 3) if name == "gradient" else (50,)
@@ -54,7 +54,7 @@ def test_numpy_in_numpy_out_torch_in_torch_out(query):
         assert not tensor.requires_grad
 
 
-def test_one_sensor_position_or_one_each(sharp_map):
+def test_sensor_positions_broadcast(sharp_map):
     x = on_surface(sharp_map, 30)
     one = sharp_map.intensity(x, SENSOR)
     np.testing.assert_array_equal(sharp_map.intensity(x, np.tile(SENSOR, (30, 1))), one)
@@ -84,7 +84,7 @@ def test_empty_queries(query):
         assert type(answer) is type(empty)
 
 
-def test_a_point_that_is_nowhere_does_not_spoil_its_neighbours(query):
+def test_a_nan_point_does_not_affect_others(query):
     name, function = query
     x = near_surface(9)
     clean = function(x)
@@ -99,7 +99,7 @@ def test_a_point_that_is_nowhere_does_not_spoil_its_neighbours(query):
         assert np.isnan(answer[4]).any()
 
 
-def test_many_threads_at_once_get_the_answers_of_one(sharp_map):
+def test_concurrent_queries_equal_sequential_ones(sharp_map):
     sizes = [10, 9_000, 500, 20_000]
     inputs = [near_surface(size, seed) for seed, size in enumerate(sizes)]
     expected = [{name: f(x) for name, f in queries(sharp_map).items()} for x in inputs]
@@ -135,7 +135,7 @@ def test_gradient_is_the_derivative_of_the_distance(sharp_map):
         ]
     difference = torch.stack([(a - b) * field.sigma_m / (2 * step) for a, b in ends], 1).numpy()
     gradient = sharp_map.gradient(x)
-    # A few steps cross the border of a cell or of a ReLU's linear piece.
+    # A few steps cross a cell border or the kink of a ReLU.
     assert np.quantile(np.abs(difference - gradient).max(axis=1), 0.95) < 1e-3
     assert np.median(gradient[x[:, 0] < 19.5, 2]) > 0.5
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A map's file: whole or not at all, and the same bits again."""
+"""Map files are written atomically and loaded without a changed bit."""
 
 import json
 import math
@@ -51,7 +51,7 @@ def with_description(metadata, change):
 
 @pytest.mark.parametrize("encoding", ["tri-quadtree", "octree"])
 @pytest.mark.parametrize("with_intensity", [True, False])
-def test_a_map_loads_to_the_same_bits(scene, tmp_path, encoding, with_intensity):
+def test_a_loaded_map_is_bit_identical(scene, tmp_path, encoding, with_intensity):
     before = fitted(
         scene,
         with_intensity=with_intensity,
@@ -128,7 +128,7 @@ def test_files_of_other_programs_and_versions(saved, tmp_path):
 
 
 def last(value):
-    """A tensor with another last number."""
+    """A tensor with a changed last element."""
 
     def changed(tensor):
         tensor = tensor.clone()
@@ -167,7 +167,7 @@ TENSORS = [
 
 
 @pytest.mark.parametrize(("name", "change"), TENSORS)
-def test_tensors_that_do_not_fit(saved, tmp_path, name, change):
+def test_inconsistent_tensors_are_rejected(saved, tmp_path, name, change):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "bad.safetensors", tensors | {name: change(tensors[name])}, metadata)
     with pytest.raises(ValueError, match="is not a whole radarsdf map"):
@@ -193,7 +193,7 @@ def test_keys_that_are_read_alone_are_checked(saved, tmp_path):
 @pytest.mark.parametrize(
     "name", ["information", "visibility", "field.sdf_network.layers.2.bias", "free_space.planes"]
 )
-def test_a_tensor_that_is_missing_or_too_many(saved, tmp_path, name):
+def test_missing_and_unknown_tensors_are_rejected(saved, tmp_path, name):
     _, _, tensors, metadata = saved
     for changed in ({n: t for n, t in tensors.items() if n != name}, tensors | {"field.x": torch.zeros(2)}):
         with pytest.raises(ValueError, match="is not a whole radarsdf map"):
@@ -219,7 +219,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_descriptions_that_do_not_fit(saved, tmp_path, damage):
+def test_inconsistent_metadata_are_rejected(saved, tmp_path, damage):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "bad.safetensors", tensors, with_description(metadata, DAMAGE[damage]))
     with pytest.raises(ValueError, match="is not a whole radarsdf map"):
@@ -250,7 +250,7 @@ def test_view_statistics_are_kept_bit_for_bit(saved):
     assert loaded.sigma == expected.sigma > 0
 
 
-def test_what_load_would_refuse_is_not_saved(scene, tmp_path):
+def test_maps_that_load_would_reject_are_not_saved(scene, tmp_path):
     radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(), progress=False)
     path = tmp_path / "map.safetensors"
     radar_map.save(path)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The mesh keeps what is probable enough for the highest expected F-score, and says what that costs."""
+"""The confidence threshold of a mesh maximises its expected F-score, and is reported with its expectations."""
 
 import numpy as np
 import pytest
@@ -15,12 +15,12 @@ MESH = {"min_component_triangles": 0, "progress": False}
 
 
 def plane(rng, x_m, half_m, count):
-    """Returns (N, 3) of a square that faces the sensor."""
+    """Returns (N, 3) of a square facing the sensor."""
     return np.column_stack([rng.normal(x_m, 0.03, count), rng.uniform(-half_m, half_m, (count, 2))])
 
 
 def fit(points):
-    """Seen from the origin."""
+    """Fits scans from the origin."""
     config = FitConfig.quick(num_threads=2)
     poses = np.tile(np.eye(4), (len(points), 1, 1))
     # Wall and patch are in the middle of cells.
@@ -28,7 +28,7 @@ def fit(points):
 
 
 def wall_and_patch(scans):
-    """All scans see a wall, one of them a dense patch before it: the others look through there."""
+    """All scans see a wall, one of them a dense patch before it, which the rays of the others cross."""
     rng = np.random.default_rng(0)
     points = [plane(rng, WALL_X_M, 2.0, 60) for _ in range(scans)]
     points[scans // 2] = np.concatenate([points[scans // 2], plane(rng, PATCH_X_M, 0.6, 400)])
@@ -49,7 +49,7 @@ def of_few():
     return wall_and_patch(4)
 
 
-def test_a_patch_that_one_scan_of_many_saw_is_left_out(of_many):
+def test_a_patch_with_hits_of_one_scan_of_many_is_removed(of_many):
     everything = of_many.mesh(min_confidence=0, **MESH)
     assert triangles_near(everything, PATCH_X_M) > 200
     default = of_many.mesh(**MESH)
@@ -57,7 +57,7 @@ def test_a_patch_that_one_scan_of_many_saw_is_left_out(of_many):
     assert triangles_near(default, WALL_X_M) == triangles_near(everything, WALL_X_M) > 2000
 
 
-def test_a_patch_that_one_scan_of_few_saw_is_kept(of_few):
+def test_a_patch_with_hits_of_one_scan_of_few_is_kept(of_few):
     everything, default = of_few.mesh(min_confidence=0, **MESH), of_few.mesh(**MESH)
     assert triangles_near(default, PATCH_X_M) == triangles_near(everything, PATCH_X_M) > 200
 
@@ -71,22 +71,22 @@ def test_the_mesh_has_its_threshold_and_expectations(of_many):
     everything = of_many.mesh(min_confidence=0, **MESH)
     area = everything.area_faces / 3
     p = everything.vertex_attributes["confidence"][everything.faces].sum(axis=1)
-    # All that is uncertain beyond the limit is left out of this mesh, and counts there.
+    # Surface beyond the limit of uncertainty is removed from this mesh, but is counted there.
     assert threshold.whole_precision == pytest.approx((p * area).sum() / everything.area, abs=0.02)
     assert threshold.expected_precision > threshold.whole_precision
     assert threshold.coverage_of_observed < threshold.whole_coverage_of_observed
 
 
 def tally(area_m2, confidence, covering, existing=1.0, once=0.0, twice=0.0):
-    """Of surface with these confidences (N,); `existing` as a multiple of the true surface that can be found."""
+    """A tally of surface with these confidences (N,); `existing` as a multiple of the true surface that is reachable."""
     area, p = np.array(area_m2, float), np.array(confidence)
     rows = np.round(p * 1000).astype(int)
     sums = (np.bincount(rows, values, 1000).astype(float) for values in (area, area * p, covering))
     return Tally(*sums, existing * float((area * p).sum()), once, twice)
 
 
-def test_the_threshold_is_that_of_the_highest_expected_f_score():
-    # Precisions from the highest on are 0.9, 0.85, 0.7 and coverages 0.5, 0.8, 1: F-scores 0.643, 0.824, 0.824 and less.
+def test_the_threshold_maximises_the_expected_f_score():
+    # Precisions are 0.9, 0.85, 0.7 and recalls 0.5, 0.8, 1 in order: F-scores 0.643, 0.824, 0.824 and less.
     found = tally([1, 1, 1, 10], [0.9, 0.8, 0.4, 0.1], [5, 3, 2, 0]).threshold()
     assert found.min_confidence == 0.8
     assert found.expected_precision == pytest.approx(0.85)
@@ -95,9 +95,9 @@ def test_the_threshold_is_that_of_the_highest_expected_f_score():
     assert found.whole_coverage_of_observed == 1
 
 
-def test_the_less_can_be_reached_the_more_is_kept():
+def test_lower_reachable_recall_keeps_more_surface():
     surface = [1, 1, 1, 10], [0.9, 0.8, 0.4, 0.1], [5, 3, 1, 1]
-    half_seen = tally(*surface, once=3.1, twice=1.55)  # as much again was seen by no scan
+    half_seen = tally(*surface, once=3.1, twice=1.55)  # an equal area was seen by no scan
     assert half_seen.reachable == pytest.approx(0.5)
     assert tally(*surface, existing=2).reachable == pytest.approx(0.5)
     assert tally(*surface).reachable == 1
@@ -106,7 +106,7 @@ def test_the_less_can_be_reached_the_more_is_kept():
     assert unseen.coverage_of_observed == pytest.approx(0.9 / 3)
 
 
-def test_the_sums_of_parts_are_those_of_the_whole(of_many):
+def test_sums_of_parts_equal_those_of_the_whole(of_many):
     surface = Surface.of(of_many._contents, 0.2)
     middle = surface.vertices[surface.faces].mean(axis=1)[:, 1] > 0
 
@@ -133,7 +133,7 @@ def test_a_tally_sums_areas_by_confidence():
     for row, number in zip((100, 250, 999, 999), range(4), strict=True):
         expected[:, row] += area_m2[number] * np.array([1, confidence[number], covering[number]])
     np.testing.assert_allclose([found.area_m2, found.true_m2, found.covering], expected)
-    # What may be anywhere is no more than the surface that was found.
+    # Unlocated surface is no more than the surface that was found.
     assert found.existing_m2 == pytest.approx(2 + 1.5 + 4 * 0.9995 + 5)
     assert (found.once_m2, found.twice_m2) == pytest.approx((0.2 + 4 * 0.9995, 0.75))
     assert tally([1], [0.5], [1], once=1.0).reachable == 0  # nothing was seen twice

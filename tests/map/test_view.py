@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Views of a map of a plane and a wall: returns and beams lie on them, within the sensor's limits."""
+"""Views of a map of a plane and a wall: returns and beams are on the surface, within the limits of the sensor."""
 
 import dataclasses
 import pickle
@@ -44,7 +44,7 @@ def test_beams_fill_the_field_of_view_and_overlap_by_half(monkeypatch):
     assert [len(angles) for angles in _beams(sharp)] == [187, 62]
 
 
-def test_returns_are_spread_as_they_are_expected_with_at_most_one_each():
+def test_returns_follow_their_expectation_with_at_most_one_each():
     rng = np.random.default_rng(0)
     expected = rng.uniform(0, 1, 20_000) * (np.arange(20_000) % 2)
     chosen = np.zeros(20_000)
@@ -53,14 +53,14 @@ def test_returns_are_spread_as_they_are_expected_with_at_most_one_each():
     by_part = [part.sum() for part in np.array_split(chosen, 20)]
     share = [1000 * part.sum() / expected.sum() for part in np.array_split(expected, 20)]
     np.testing.assert_allclose(by_part, share, atol=1.001)
-    assert len(_spread(expected, 10**6)) == 10_000  # all that are expected at all
+    assert len(_spread(expected, 10**6)) == 10_000  # all with an expectation above zero
     assert _spread(np.array([9.0, 1, 1, 1, 1, 9]), 4).tolist()[::3] == [0, 5]
     assert len(_spread(np.zeros(3), 2)) == 0
 
 
 @pytest.mark.parametrize("roughness", [0.0, 1.0, 0.5])
 def test_density_of_returns_on_surfaces(roughness):
-    """Five equal patches over and over: usual, seldom hit, small, oblique, and hidden; those farther away share their beams."""
+    """Five equal patches repeated: usual, rarely hit, small, oblique, and hidden; distant ones share their beams."""
     kinds = np.tile(np.arange(5), 400)
     order = np.argsort(kinds, kind="stable")
     count, kinds = len(kinds), kinds[order]
@@ -129,7 +129,7 @@ def test_beams_meet_the_first_surface(view):
     places = POSE[:3, 3] + directions * view.beam_ranges_m[met, None]
     assert met.mean() > 0.2
     assert (surface_distance(places) < 0.15).mean() > 0.95
-    # Nothing behind the wall, nor under the ground.
+    # Nothing behind the wall or below the ground.
     assert places[:, 0].max() < 20.3
     assert places[:, 2].min() > -0.3
 
@@ -152,13 +152,13 @@ def test_missing_memory_is_reported_before_the_work(sharp_map, monkeypatch):
     monkeypatch.setattr("radarsdf.memory.available_bytes", lambda: 100_000)
     with pytest.raises(MemoryError, match=r"would take about .* GB, of 0.00: ask for fewer"):
         sharp_map.render(POSE)
-    unseen = pickle.loads(pickle.dumps(sharp_map))  # whose surface has yet to be made for rays
+    unseen = pickle.loads(pickle.dumps(sharp_map))  # without a cached surface for rays
     with pytest.raises(MemoryError, match="would take about"):
         unseen.render(POSE)
     assert "_viewed" not in vars(unseen)
 
 
-def test_noise_only_if_asked_and_from_its_own_generator(sharp_map, view):
+def test_noise_is_optional_and_has_its_own_generator(sharp_map, view):
     state = np.random.get_state()[1].copy()  # noqa: NPY002 - the generator that must stay as it is
     noisy = sharp_map.render(POSE, noise=True, seed=1)
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
@@ -173,7 +173,7 @@ def test_noise_only_if_asked_and_from_its_own_generator(sharp_map, view):
         assert abs(errors.mean()) < 0.2 * sigma
 
 
-def test_pickled_and_saved_maps_see_the_same(sharp_map, view, tmp_path):
+def test_pickled_and_saved_maps_have_the_same_views(sharp_map, view, tmp_path):
     path = tmp_path / "map.safetensors"
     sharp_map.save(path)
     for other in (pickle.loads(pickle.dumps(sharp_map)), radarsdf.load(path)):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Trajectories, and errors that add up from step to step."""
+"""Trajectories, and errors that accumulate with steps."""
 
 import dataclasses
 import functools
@@ -38,9 +38,9 @@ def position_error_m(poses, true):
 
 
 def first(drive, count, *given, **named):
-    """Its first scans. A shorter drive of the same kind would go the same way in longer steps.
+    """First scans of a drive. A shorter drive of the same kind would have longer steps on the same trajectory.
 
-    `drive` is one of `radarsdf.simulate`. What it does not scan takes no time.
+    `drive` is a function of `radarsdf.simulate`. Scans that are not used are not simulated.
     """
     scan, nothing = RadarSensor.scan, Scan(np.zeros((0, 3), np.float32), *np.zeros((3, 0), np.float32))
 
@@ -59,7 +59,7 @@ def first(drive, count, *given, **named):
 
 @functools.cache
 def drifting_drive():
-    """48 scans with Doppler and times, and poses that drift; and the true poses."""
+    """48 scans with Doppler, times and drifting poses; and the true poses."""
     street = radarsdf.simulate.oculii(seed=64, frames=48)
     motion = measured_motion(street)
     given = drifted(street.poses, 0.05, 0.004, 1)

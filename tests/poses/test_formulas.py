@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Covariances, derivatives and rates of motions against draws, differences and numbers by hand."""
+"""Covariances, derivatives and rates of motions, against random draws, finite differences and manual values."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -50,7 +50,7 @@ from .drift import trajectory, velocities_of
 
 
 def spread(seed, size):
-    """A covariance of no special axes."""
+    """A covariance with arbitrary axes."""
     root = np.random.default_rng(seed).normal(0, 1, (size, size))
     return root @ root.T
 
@@ -82,7 +82,7 @@ def test_rotation_vectors_of_more_than_half_a_turn(angle):
     assert np.linalg.norm(rotation_vector(rotation(vector))) <= np.pi
 
 
-def test_covariances_of_a_predicted_step_are_those_of_draws():
+def test_covariances_of_a_predicted_step_equal_those_of_draws():
     turn = MotionRate(np.array([0.1, -0.2, 0.4]), 1e-4 * spread(2, 3))
     step = PredictedStep(turn, np.array([8.0, 1, 0]), np.array([7.0, 0, 1]), 1e-3 * spread(3, 3), 0.5)
     rng = np.random.default_rng(0)
@@ -99,7 +99,7 @@ def test_covariances_of_a_predicted_step_are_those_of_draws():
     velocities = step.begin_mps + shares[:, None] * (step.end_mps - step.begin_mps)
     path = np.einsum("nij,nj->ni", rotation(shares[:, None] * turn.mean), velocities).mean(axis=0) * 0.5
     assert_allclose(way(turn.mean, step.begin_mps, step.end_mps, 0.5), path, atol=1e-4)
-    # The candidates of a search are spread likewise; the more, the finer it is.
+    # Candidates of a search have the same distribution, the more the denser.
     drawn_turns, poses = step.candidates(0.2, 20.0)
     left = poses[:, :3, 3] - step.pose(drawn_turns)[:, :3, 3]
     assert_allclose(drawn_turns.mean(axis=0), turn.mean, atol=1e-3)
@@ -139,8 +139,8 @@ def test_spans_and_unsteady_steps():
     assert unsteadiness(poses[:3], None)[0] > 0
 
 
-def test_climbs_are_those_of_a_kalman_update():
-    """Scans whose vertical velocity is known worse than a tenth of the speed are updated by one of 0 with that deviation."""
+def test_climbs_equal_a_kalman_update():
+    """Scans with a vertical deviation above a tenth of the speed are updated by a velocity of 0 with that deviation."""
     mean = np.array([[10.0, 0, 3.0], [10, 0, 0.2], [10, 0, -4]])
     covariance = np.stack([spread(4, 3), 1e-3 * np.eye(3), spread(5, 3)])
     covariance[[0, 2], 2, 2] += 40
@@ -153,14 +153,14 @@ def test_climbs_are_those_of_a_kalman_update():
         assert_allclose(left[i], P - np.outer(gain, P[2]))
     assert_array_equal(found[1], mean[1])
     assert_array_equal(left[1], covariance[1])
-    # The climb that is measured where it is known may be larger.
+    # Well-measured climbs may be larger.
     steep = np.array([[10.0, 0, 4], [10, 0, 4]])
     known = np.stack([1e-3 * np.eye(3), np.diag([1.0, 1, 20])])
     gain = 20 / (20 + 16)
     assert_allclose(upright(steep, known)[0][1], [10, 0, 4 - 4 * gain], atol=1e-3)
 
 
-def test_velocities_between_scans_that_have_one():
+def test_missing_velocities_are_interpolated():
     rng = np.random.default_rng(6)
     scans = [rng.normal(0, 9, (60, 3)) for _ in range(6)]
     true = np.array([[5.0, 0, 1], [6, 0, 1], [0, 0, 0], [9, 0, 1], [8, 0, 1], [8, 0, 1]])
@@ -173,7 +173,7 @@ def test_velocities_between_scans_that_have_one():
     assert_allclose(found.mean_mps[2], [7, 0, 1], atol=1e-3)  # a third of the way
     assert_array_equal(found.static[0], ~np.isin(np.arange(60), [4, 5, 6, 7]))
     assert found.static[2].all()
-    # Changes of 1, 3 and 1 m/s in 1, 3 and 1 s; the gap of 10 s is left out.
+    # Changes of 1, 3 and 1 m/s in 1, 3 and 1 s; the gap of 10 s is excluded.
     assert_allclose(found.change, [11 / 5, 0, 0] + np.full(3, 0.02**2), atol=1e-3)
     own = found.covariance[found.found].mean(axis=0)
     assert_allclose(found.covariance[2], np.diag(found.change) + own, atol=1e-6)  # 1 s away
@@ -241,7 +241,7 @@ def test_a_gyroscope_learns_from_turns_with_the_covariance_of_their_rates(monkey
     assert_allclose(covariance[0], 0.25 * rate.covariance)
 
 
-def test_what_returns_remove_and_what_errors_add():
+def test_returns_reduce_and_errors_increase_covariances():
     prior, left = np.diag([4.0, 4, 4]), np.diag([1.0, 3, 0.4])
     assert _removed_share(prior, left) == pytest.approx(0.25)
     assert _removed_share(prior, 5 * prior) == 0
@@ -255,7 +255,7 @@ def test_what_returns_remove_and_what_errors_add():
     assert [len(thinned(np.zeros((n, 3)), 10)) for n in (0, 10, 11, 20, 21)] == [0, 10, 6, 10, 7]
 
 
-def test_returns_within_their_ranges_and_cells_as_large_as_they_are_apart():
+def test_returns_are_selected_by_range_and_cells_match_their_spacing():
     line = np.outer([0.0, 1, 2, 3, 4], [0.6, 0, 0.8])
     returns = SensorReturns.of([line, line[:3], line[4:]], 1.0, 3.0)
     assert returns.scans.tolist() == [0, 0, 0, 1, 1]
@@ -288,7 +288,7 @@ def test_a_gain_is_significant_by_students_t():
     assert "by +50.00%, by chance and overlap alone up to 0.10%" in Verdict(0.5, 0.0, 2).words
 
 
-def test_deviations_of_poses_become_settings_of_the_returns():
+def test_standard_deviations_of_poses_become_settings_of_returns():
     covariance = np.stack([np.diag([1.0, 4, 4, 0.01, 0.01, 0.04])] * 3 + [np.eye(6)] * 2)
     assert pose_sigmas(covariance) == pytest.approx((np.sqrt(3), np.sqrt(0.02)))
     poses = np.tile(np.eye(4), (5, 1, 1))
@@ -304,8 +304,8 @@ def test_deviations_of_poses_become_settings_of_the_returns():
     assert dataclasses.replace(posed, sigmas=(0.1, 7.0)).config(FitConfig()).returns.pose_sigma_rad == 1.0
 
 
-def test_common_errors_of_steps_are_those_of_one_inverse():
-    """Poses and biases, which have a prior deviation of one, together."""
+def test_common_errors_of_steps_equal_the_joint_inverse():
+    """Joint inverse of poses and biases, with a prior deviation of one."""
     hessian, by = spread(8, 12) + 3 * np.eye(12), np.random.default_rng(9).normal(0, 0.3, (2, 12))
     gradient, own = np.ones(12), np.array([3.0, 5])
     motions = [SimpleNamespace(by_bias=lambda _, k=k: (by[[k]].reshape(1, 2, 6), own[[k]])) for k in (0, 1)]
@@ -350,8 +350,8 @@ def test_motions_of_a_tracked_drive():
     assert_allclose(moving.steps[0, :3, 3], path)
 
 
-def test_information_that_returns_have_anywhere_is_taken_away():
-    """Of 100 along x at the pose and 40 on average beside it, 60 are left."""
+def test_information_independent_of_the_pose_is_subtracted():
+    """Of 100 along x at the pose and 40 on average near it, 60 remain."""
     tracker = Tracker(0.4, FitConfig().returns, 1)
     tracker._planes, asked = [None, None], []
 
@@ -370,7 +370,7 @@ def test_information_that_returns_have_anywhere_is_taken_away():
     assert tracker._without_chance(None, pose, sure * prior, covariance) is covariance
 
 
-def test_gains_are_those_of_a_search_of_all_returns():
+def test_gains_equal_a_brute_force_search():
     rng = np.random.default_rng(11)
     before = drifted(trajectory(4), 0.1, 0.01, 3)
     returns = SensorReturns.of([rng.normal(0, 3, (60, 3)) for _ in before], 0.1, None)

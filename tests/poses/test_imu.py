@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How an IMU sits on a radar, which way is up, and what time is between their clocks: found from the drive."""
+"""Rotation of an IMU on a radar, up direction, and clock offset, estimated from the drive."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def speeds_at(t):
 
 @pytest.fixture(scope="module")
 def ride():
-    """A walk of 30 s that turns, tilts, and goes up and down."""
+    """A walk of 30 s with turns, tilts and climbs."""
     t = np.arange(300) * 0.1
     xyz = np.column_stack([3 * np.sin(0.5 * t), 2 * np.cos(0.4 * t), 0.3 * np.sin(0.9 * t)])
     turns = np.column_stack([1.5 * np.sin(0.5 * t), 0.3 * np.sin(1.1 * t), 0.3 * np.cos(1.3 * t)])
@@ -60,7 +60,7 @@ def angle(one, other):
 
 
 def tilt(poses, up):
-    """Degrees by which `up` is off, at worst."""
+    """Largest error of `up`, degrees."""
     z = np.einsum("fij,fj->fi", poses[:, :3, :3], up)[:, 2]
     return float(np.degrees(np.arccos(np.clip(z, -1, 1))).max())
 
@@ -103,14 +103,14 @@ def test_windows_end_after_four_seconds_and_at_gaps():
     np.testing.assert_array_equal(rows, np.r_[:60, 62:103])  # two scans between gaps are too few
     np.testing.assert_array_equal(window, np.repeat([0, 1, 2], [41, 19, 41]))
     slow = _windows(np.arange(30.0))[1]
-    np.testing.assert_array_equal(slow, np.repeat([0, 1, 2], [11, 11, 8]))  # of ten intervals, then
+    np.testing.assert_array_equal(slow, np.repeat([0, 1, 2], [11, 11, 8]))  # then of ten intervals
 
 
 @pytest.mark.parametrize(
     ("rate_rad_s", "speed_mps", "is_used"),
     [(5.9, 0, True), (6.1, 0, False), (2, 14.9, True), (2, 15.1, False)],
 )
-def test_rates_that_nothing_turns_at_are_not_used(rate_rad_s, speed_mps, is_used):
+def test_implausible_rates_are_not_used(rate_rad_s, speed_mps, is_used):
     times_s = np.arange(5.0)
     rates = rate_rad_s * np.array([[0.6, 0, 0.8]] * 3 + [[0, 0, 0]] * 2)
     means = np.tile([0.6 * speed_mps, 0.8 * speed_mps, 0], (5, 1))
@@ -122,7 +122,7 @@ def test_rates_that_nothing_turns_at_are_not_used(rate_rad_s, speed_mps, is_used
         assert across in found.notes[0]
 
 
-def test_axes_that_are_given_stay(ride, imu):
+def test_given_axes_are_kept(ride, imu):
     times_s, poses, velocities = ride
     given = dataclasses.replace(imu, R_sensor_imu=R_SENSOR_IMU)
     found = ImuAlignment.of(given, velocities, times_s)
@@ -132,7 +132,7 @@ def test_axes_that_are_given_stay(ride, imu):
     assert tilt(poses, found.up) < 1.5
 
 
-def test_another_motion_is_not_used(ride, imu):
+def test_an_imu_of_another_motion_is_not_used(ride, imu):
     times_s, _, velocities = ride
     for other in (
         dataclasses.replace(
@@ -143,7 +143,7 @@ def test_another_motion_is_not_used(ride, imu):
         assert ImuAlignment.of(other, velocities, times_s) is None
 
 
-def test_a_sensor_that_goes_straight_on_leaves_it_open():
+def test_straight_motion_leaves_the_rotation_undetermined():
     times_s = np.arange(200) * 0.1
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, 0, 3] = times_s
@@ -161,14 +161,14 @@ def test_two_windows_of_scans_are_the_fewest(ride, imu, monkeypatch, scans, enou
     assert bool(asked) == enough
 
 
-def test_a_rotation_that_nothing_determines_is_asked_for(ride, imu):
+def test_an_unobservable_rotation_is_requested_from_the_user(ride, imu):
     times_s, _, velocities = ride
     found = Inertial.of(dataclasses.replace(imu, specific_force=None), velocities, times_s, 0.0)
     assert found.gyroscope is None
     assert "give R_sensor_imu" in found.notes[0]
 
 
-def test_a_bias_is_found_by_turns(ride):
+def test_a_bias_is_estimated_from_rotations(ride):
     times_s, poses, _ = ride
     steps = Rotation.from_matrix(poses[:-1, :3, :3]).inv() * Rotation.from_matrix(poses[1:, :3, :3])
     turns = steps.as_rotvec() + np.random.default_rng(3).normal(0, 0.005, (len(steps), 3))
@@ -178,7 +178,7 @@ def test_a_bias_is_found_by_turns(ride):
     found = Gyroscope.of(rates.angular_velocity, rates.times_s, times_s).learnt(turns, covariance)
     off = np.degrees(np.linalg.norm(found.turns - found.bias.mean * 0.1 - steps.as_rotvec(), axis=1))
     assert np.median(off) < 0.1
-    # Three deviations of the mean of 299 turns of 0.1 s, each known to 0.005 rad.
+    # Three deviations of the mean of 299 rotations in 0.1 s, each with an error of 0.005 rad.
     np.testing.assert_allclose(found.bias.mean, bias, atol=3 * 0.05 / np.sqrt(299))
     with pytest.raises(UnusableGyroscopeError):
         Gyroscope.of(np.degrees(rates.angular_velocity), rates.times_s, times_s).learnt(turns, covariance)
@@ -216,7 +216,7 @@ def test_a_walk_ends_where_it_began():
     way = found.poses[-1, :3, 3] - found.poses[0, :3, 3]
     assert np.linalg.norm(way) < 0.01 * found.report["length_m"]
     imu = found.report["imu"]
-    # The trigger of the radar says the same, which is not read: scans are recorded 0.115 s after they were taken.
+    # Agrees with the radar's trigger, which is not read: scans are recorded 0.115 s after measurement.
     assert imu["time_offset_s"] == pytest.approx(0.115, abs=0.01)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The motion prior, and motions that sources measured."""
+"""The motion prior, and measured motions."""
 
 import dataclasses
 import itertools
@@ -40,7 +40,7 @@ def test_the_prior_has_the_derivatives_of_its_cost(times):
     assert crossed == pytest.approx(below[2, 1, 1], rel=0.02)
 
 
-def test_deviations_and_bias_are_learnt_from_poses_that_are_known():
+def test_standard_deviations_and_bias_are_estimated_from_known_poses():
     true = trajectory(400)
     given = drifted(true, 0.03, 0.004, 3, yaw_rad=0.01)
     nothing = np.zeros((400, 6, 6)), np.zeros((399, 6, 6))
@@ -55,7 +55,7 @@ MOVES = MotionPrior(np.array([20.0, 10.0, 5.0]), np.array([2.0, 1.0, 0.5]), Fals
 RATE = MotionRate(np.array([0.3, -0.2, 0.1]), np.diag([0.01, 0.02, 0.03]))
 
 
-def test_turns_come_to_what_is_usual_and_moves_stay():
+def test_predicted_turn_rates_decay_to_the_mean_and_velocities_persist():
     late = TURNS.after(RATE, 1e3)
     np.testing.assert_allclose(late.mean, 0, atol=1e-9)
     np.testing.assert_allclose(late.covariance, np.diag(TURNS.usual))
@@ -64,7 +64,7 @@ def test_turns_come_to_what_is_usual_and_moves_stay():
 
 
 @pytest.mark.parametrize("habits", [TURNS, MOVES], ids=["turns", "moves"])
-def test_habits_are_learnt_from_a_drive_that_has_them(habits):
+def test_the_motion_prior_is_estimated_from_a_drive(habits):
     rng = np.random.default_rng(0)
     durations_s = rng.choice([0.05, 0.15], 8000)
     rates = [MotionRate(np.sqrt(habits.usual) * rng.normal(size=3), np.zeros((3, 3)))]
@@ -73,10 +73,10 @@ def test_habits_are_learnt_from_a_drive_that_has_them(habits):
         noise = np.sqrt(np.diag(observed.covariance)) * rng.normal(size=3)
         rates.append(MotionRate(observed.mean + noise, np.zeros((3, 3))))
     usual = np.square([rate.mean for rate in rates]).mean(axis=0)
-    rates[4000:4002] = None, None  # it was lost there
+    rates[4000:4002] = None, None  # tracking was lost there
     first = MotionPrior(np.full(3, 1.0), np.full(3, 1.0), habits.settles)
     found = first.learnt(rates, durations_s)
     np.testing.assert_allclose(found.usual, usual, rtol=0.02)
-    # Of 8000 squares; turns settle within 4 s, so that a step of 0.1 s changes them by 2.5 % less.
+    # Mean of 8000 squares; turn rates decay within 4 s, so that their changes in 0.1 s are 2.5 % smaller.
     np.testing.assert_allclose(found.change, habits.change, rtol=4 * np.sqrt(2 / 8000) + 0.025)
     assert first.learnt([None, None], durations_s[:2]) == first

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses of simulated drives, from nothing but what a radar and a gyroscope measure."""
+"""Poses of simulated drives, from measurements of radar and gyroscope alone."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def length_m(poses):
 
 
 def errors(poses, true):
-    """Of positions, m, and rotations, rad, root mean square, without a motion of the whole."""
+    """RMS errors of positions, m, and rotations, rad, after rigid alignment."""
     at = aligned(poses, true)
     return position_error_m(at, true), float(np.sqrt((turned_by(at, true) ** 2).mean()))
 
@@ -53,7 +53,7 @@ def only(drive, rows):
 
 
 def test_returns_alone_are_not_counted_twice():
-    """Steps that were tracked by the same returns are no evidence beside them: NEES / 3 was 8 and more."""
+    """Steps tracked by the same returns are not independent evidence: NEES / 3 was 8 and more."""
     street = first(radarsdf.simulate.oculii, 20, seed=6, frames=30)
     found = radarsdf.odometry(street.points, times_s=measured_motion(street).times_s)
     T = street.poses[10] @ np.linalg.inv(found.poses[10])
@@ -63,7 +63,7 @@ def test_returns_alone_are_not_counted_twice():
     assert 0.1 < np.median(nees) < 3
 
 
-def test_doppler_and_returns_find_the_poses(drive, found):
+def test_poses_are_estimated_from_doppler_and_returns(drive, found):
     position_m, turn_rad = errors(found.poses, drive.poses)
     assert position_m < 0.003 * length_m(drive.poses)
     assert turn_rad < 0.02
@@ -84,7 +84,7 @@ def test_errors_agree_with_the_covariance(drive, found):
     assert 0.2 < np.mean(normalised) < 5
 
 
-def test_a_gyroscope_turns_and_its_bias_is_found(drive, motion, found):
+def test_a_gyroscope_measures_rotations_and_its_bias_is_estimated(drive, motion, found):
     with_it = radarsdf.odometry(
         drive.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s, imu=gyroscope(motion)
     )
@@ -114,7 +114,7 @@ def test_a_gap_is_bridged(drive, motion):
     assert errors(found.poses, true)[0] < 0.005 * length_m(true)
 
 
-def test_a_drive_that_goes_on_elsewhere_has_two_segments(drive):
+def test_a_discontinuous_drive_has_two_segments(drive):
     other = first(radarsdf.simulate.hugin, 10, seed=63, frames=20)
     motions = [measured_motion(scene) for scene in (drive, other)]
     found = radarsdf.odometry(
@@ -128,14 +128,14 @@ def test_a_drive_that_goes_on_elsewhere_has_two_segments(drive):
     assert errors(found.poses[12:], other.poses)[0] < 0.1
 
 
-def test_scans_alone_are_enough_where_they_observe_the_motion(drive, motion):
+def test_scans_suffice_if_they_observe_the_motion(drive, motion):
     points, true = only(drive, range(20))
     found = radarsdf.odometry(points, times_s=motion.times_s[:20])
     assert not found.report["doppler"]
     assert errors(found.poses, true)[0] < 0.01 * length_m(true)
 
 
-def test_a_wall_alone_is_refused():
+def test_a_single_wall_is_rejected():
     wall = first(radarsdf.simulate.wall, 14, seed=5, frames=40)
     with pytest.raises(ValueError, match="returns alone do not observe"):
         radarsdf.odometry(wall.points, times_s=np.arange(14) / 10)
@@ -144,7 +144,7 @@ def test_a_wall_alone_is_refused():
     assert errors(found.poses, wall.poses)[0] < 0.05
 
 
-def test_hardly_any_returns_of_a_turning_sensor_are_refused(drive, motion):
+def test_too_few_returns_of_a_turning_sensor_are_rejected(drive, motion):
     few = [scan[:: max(1, len(scan) // 20)] for scan in drive.points]
     speeds = [v[:: max(1, len(v) // 20)] for v in motion.doppler_mps]
     with pytest.raises(ValueError, match="how the sensor turned"):
@@ -168,7 +168,7 @@ def test_the_bits_do_not_depend_on_threads(drive, motion):
 
 
 @pytest.mark.parametrize("counts", [[40], [1, 1], [3, 200, 1]])
-def test_hardly_any_returns_have_poses_as_well(counts):
+def test_very_few_returns_give_finite_poses_or_a_clear_error(counts):
     rng = np.random.default_rng(1)
     scans = [rng.normal(0, 3, (n, 3)) for n in counts]
     speeds = [rng.normal(0, 1, n) for n in counts]
@@ -181,7 +181,7 @@ def test_hardly_any_returns_have_poses_as_well(counts):
         assert found.covariance.shape == (len(counts), 6, 6)
 
 
-def test_refined_poses_with_doppler_are_better(drive, motion):
+def test_doppler_improves_refined_poses(drive, motion):
     given = drifted(drive.poses[:24], 0.05, 0.004, 1)
     plain, by_doppler = (
         radarsdf.refine_poses(drive.points[:24], given, times_s=motion.times_s[:24], doppler_mps=speeds)
@@ -244,7 +244,7 @@ def road(seed, rate_rad_s=0.0, speed_mps=25.0, elevation_deg=5.0, scans=40):
 
 
 def deviations(found, true):
-    """(F, 3) errors of the positions seen from the middle scan, in its axes and in their standard deviations."""
+    """Errors (F, 3) of positions relative to the middle scan, in its axes and in standard deviations."""
     middle = len(true) // 2
     at, of = (between(np.tile(poses[middle], (len(true), 1, 1)), poses) for poses in (found.poses, true))
     R = found.poses[middle, :3, :3]
@@ -254,13 +254,13 @@ def deviations(found, true):
 
 
 def end_error_m(found, true):
-    """Horizontal, m, where the first poses are brought together."""
+    """Horizontal error at the end, m, after alignment of the first poses."""
     ends = [between(poses[:1], poses[-1:])[0, :2, 3] for poses in (found.poses, true)]
     return float(np.linalg.norm(ends[0] - ends[1]))
 
 
 @pytest.mark.parametrize("name", ["F_LRR_C", "B_LRR_C"])
-def test_radars_on_a_motorway_find_their_poses(name):
+def test_poses_of_radars_on_a_motorway_are_estimated(name):
     with np.load(recorded_file("aimotive_motorway/radar.npz")) as data:
         borders = np.cumsum(data[f"{name}_counts"])[:-1]
         points, doppler_mps = (
@@ -277,7 +277,7 @@ def test_radars_on_a_motorway_find_their_poses(name):
 
 @pytest.mark.parametrize("rate_rad_s", [0.0, 0.15])
 def test_errors_of_a_narrow_radar_are_in_its_covariance(rate_rad_s):
-    """Its returns say nothing of how it turns, so that a bend is known as well as assumed: 0.15 rad/s are two deviations."""
+    """Its returns do not observe rotations, so that bends have the prior's errors: 0.15 rad/s are two deviations."""
     points, doppler_mps, times_s, true = road(1, rate_rad_s)
     found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
     assert found.report["segments"] == 1
@@ -286,7 +286,7 @@ def test_errors_of_a_narrow_radar_are_in_its_covariance(rate_rad_s):
         assert end_error_m(found, true) < 0.5
 
 
-def test_a_radar_without_elevation_is_assumed_to_climb_little():
+def test_a_radar_without_elevation_has_a_prior_of_small_climbs():
     points, doppler_mps, times_s, true = road(2, elevation_deg=0.0, scans=24)
     assert all((scan[:, 2] == 0).all() for scan in points)
     found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
@@ -295,7 +295,7 @@ def test_a_radar_without_elevation_is_assumed_to_climb_little():
     assert np.abs(deviations(found, true)[:, :2]).max() < 4
 
 
-def test_a_refusal_names_what_is_missing():
+def test_errors_name_the_missing_measurements():
     points, doppler_mps, times_s, _ = road(4, speed_mps=10.0, scans=20)
     with pytest.raises(ValueError, match="how the sensor turned") as refused:
         radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)

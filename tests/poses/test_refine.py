@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Poses that returns mend, and those that they leave alone."""
+"""Poses that returns refine, and poses that they keep."""
 
 import json
 
@@ -33,7 +33,7 @@ def refined(street):
     return radarsdf.refine_poses(street.points, drifted(street.poses, 0.05, 0.004, 1))
 
 
-def test_a_drift_is_mended(street, refined):
+def test_drift_is_removed(street, refined):
     given = drifted(street.poses, 0.05, 0.004, 1)
     assert refined.improved
     before, after = (
@@ -60,7 +60,7 @@ def test_a_bias_is_no_noise(street):
     assert found.report["sigma_rad"] < 0.003
 
 
-def test_true_poses_come_back_to_the_bit(street):
+def test_true_poses_are_returned_unchanged(street):
     found = radarsdf.refine_poses(street.points, street.poses)
     assert not found.improved
     np.testing.assert_array_equal(found.poses, street.poses)
@@ -127,12 +127,12 @@ def test_along_a_corridor_poses_stay():
     off = (aligned(mended.poses, true) - true)[:, :3, 3]
     assert np.abs(off[:, 1:]).max() < 0.03
     along_given, along = ((aligned(p, true) - true)[:, 0, 3] for p in (given, mended.poses))
-    # Turned steps lead elsewhere, along the corridor, too.
+    # Rotated steps also change the position along the corridor.
     assert np.abs(along - along_given).max() < 0.05
 
 
 @pytest.mark.parametrize("counts", [[50], [0, 5], [1, 1], [5, 5, 0]])
-def test_hardly_any_returns_keep_their_poses(counts):
+def test_poses_with_too_few_returns_are_kept(counts):
     rng = np.random.default_rng(1)
     scans = [rng.normal(0, 3, (max(n, 1), 3)) for n in counts]
     given = np.tile(np.eye(4), (len(counts), 1, 1))
@@ -153,7 +153,7 @@ def test_wrong_arguments_are_refused(street):
         radarsdf.refine_poses(points, poses, times_s=[0.0, 2, 1])
 
 
-def test_scans_that_cannot_be_used_are_left_out():
+def test_unusable_scans_are_excluded():
     scans = radarsdf.simulate.wall(frames=12)
     motion = radarsdf.simulate.measured_motion(scans)
     points, speeds, poses = list(scans.points), list(motion.doppler_mps), scans.poses.copy()
@@ -166,7 +166,7 @@ def test_scans_that_cannot_be_used_are_left_out():
     assert "1 scans without returns (the first is scan 2)" in found.report["notes"][0]
 
 
-def test_zeros_for_doppler_do_not_draw_true_poses_together():
+def test_zero_doppler_does_not_contract_true_poses():
     drive = radarsdf.simulate.hugin(seed=8, frames=16)
     motion = radarsdf.simulate.measured_motion(drive)
     speeds = [0 * v for v in motion.doppler_mps]
@@ -175,7 +175,7 @@ def test_zeros_for_doppler_do_not_draw_true_poses_together():
     assert "100%" in found.report["notes"][0]
 
 
-def test_doppler_that_contradicts_the_given_poses_is_left_out(street):
+def test_doppler_contradicting_given_poses_is_excluded(street):
     motion = radarsdf.simulate.measured_motion(street)
     speeds = [0.2 * v for v in motion.doppler_mps]
     found = radarsdf.refine_poses(street.points, street.poses, doppler_mps=speeds, times_s=motion.times_s)
@@ -183,7 +183,7 @@ def test_doppler_that_contradicts_the_given_poses_is_left_out(street):
     assert "contradicts 64%" in found.report["notes"][0]
 
 
-def test_covariance_of_kept_poses_spans_those_that_were_not_excluded(street):
+def test_covariances_of_kept_poses_span_the_refined_ones(street):
     one = [street.points[i] if i == 10 else points[:9] for i, points in enumerate(street.points)]
     given = drifted(street.poses, 0.05, 0.004, 1)
     found = radarsdf.refine_poses(one, given)
@@ -192,30 +192,30 @@ def test_covariance_of_kept_poses_spans_those_that_were_not_excluded(street):
     assert variances[[0, -1]].min() > found.report["moved_m"] ** 2 / 4
 
 
-def test_one_thing_that_moves_does_not_call_poses_improved():
-    # The gain of each scan is the same, so that scans alone would be sure of it.
+def test_one_moving_object_does_not_count_as_improvement():
+    # The gain of each scan is the same, so that scans alone would make it significant.
     one, many = _verdict(1), _verdict(60)
     assert one.gain > 0
     assert not one.improved
     assert many.improved
 
 
-def test_scans_on_top_of_each_other_do_not_agree_better():
+def test_contracted_scans_have_no_better_agreement():
     drive = KINDS["tunnel"](seed=8, frames=16)
     returns = SensorReturns.of(drive.points, 0.1, None)
     held = np.random.default_rng(0).random(len(returns)) < 0.2
-    for share in (0.0, 0.5):  # of the distance driven
+    for share in (0.0, 0.5):  # fraction of the distance driven
         after = drive.poses.copy()
         after[:, :3, 3] *= share
         verdict = Verdict.of(
             returns.select(held), returns.select(~held), drive.poses, after, SensorNoise(0.1, 0.01, 0.01)
         )
-        assert verdict.gain > 0  # their density alone says so
+        assert verdict.gain > 0  # caused by density alone
         assert not verdict.improved
 
 
 def _verdict(things: int) -> Verdict:
-    """Of poses 0.3 m a scan off the given ones, where a share of all returns lies on so many things that stay only with these."""
+    """Verdict on poses with errors of 0.3 m per scan, if a share of returns is on objects consistent only with them."""
     rng, frames = np.random.default_rng(0), 12
     before = np.tile(np.eye(4), (frames, 1, 1))
     after = before.copy()
@@ -238,7 +238,7 @@ def refined_of(scans):
     return RefinedPoses(poses, covariance, True, {"verdict": "Better.", "sigma_m": 0.1, "sigma_rad": 0.02})
 
 
-def test_it_is_kept_with_the_map():
+def test_the_verdict_is_saved_with_the_map():
     found = refined_of(1201)
     given = found.poses + 0.0
     given[:, 1, 3] = 1
@@ -253,7 +253,7 @@ def test_it_is_kept_with_the_map():
 
 
 def surfels_of(points):
-    """Of returns (N, 3) around the sensor."""
+    """Surfels of returns (N, 3) around the sensor."""
     returns = SensorReturns.of([points], 0.0, None)
     return Surfels.of(returns.posed(np.eye(4)[None]), 0.2)
 
@@ -280,7 +280,7 @@ def test_scans_that_move_together_cost_nothing():
     weak = np.tile(np.eye(6), (3, 1, 1))
     pull = np.zeros((3, 6))
     for k, direction in enumerate(np.eye(3)):
-        # A pull that would move all scans together by one metre if they were free.
+        # A gradient that would move all scans by one metre without planes.
         pull[:] = 0
         pull[:, :3] = -direction
         free = planes.solve(weak, np.zeros((2, 6, 6)), pull, 1e-9, 200, False, 1)[0]
@@ -289,7 +289,7 @@ def test_scans_that_move_together_cost_nothing():
 
 
 @pytest.mark.parametrize("height_m", [-2.05, -1.95])
-def test_a_noisy_scan_is_as_high_as_others(height_m):
+def test_a_noisy_scan_has_an_unbiased_height(height_m):
     # Noise reaches over the borders of cells, 0.4 m high.
     rng = np.random.default_rng(3)
     poses = np.tile(np.eye(4), (10, 1, 1))
@@ -305,4 +305,4 @@ def test_a_noisy_scan_is_as_high_as_others(height_m):
     moved = planes.solve(weak, np.zeros((9, 6, 6)), np.zeros((10, 6)), 1e-6, 100, False, 1)[0][:, 2]
     assert (
         abs(moved[::2].mean() - moved[1::2].mean()) < 0.01
-    )  # 0.02, if returns belonged to the cell that they lie in
+    )  # 0.02 if returns were assigned to the cell of their position

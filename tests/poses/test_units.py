@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Times, ranges, speeds and rates in wrong units, signs and axes are named, and long gaps end a segment."""
+"""Times, ranges, speeds and rates in wrong units, signs and axes are reported, and long gaps end a segment."""
 
 import dataclasses
 
@@ -32,14 +32,14 @@ def motion(drive):
 
 @pytest.mark.parametrize("factor", [1e3, 1e9, 1 / 60])
 @pytest.mark.parametrize("with_doppler", [True, False])
-def test_times_in_other_units_are_refused_at_once(drive, motion, factor, with_doppler):
+def test_times_in_other_units_are_rejected_early(drive, motion, factor, with_doppler):
     speeds = motion.doppler_mps if with_doppler else None
     with pytest.raises(ValueError, match="give times in s"):
         radarsdf.odometry(drive.points, times_s=motion.times_s * factor, doppler_mps=speeds)
 
 
 @pytest.mark.parametrize("factor", [1e2, 1e3])
-def test_ranges_in_other_units_are_refused_at_once(drive, motion, factor):
+def test_ranges_in_other_units_are_rejected_early(drive, motion, factor):
     points = [factor * scan for scan in drive.points]
     with pytest.raises(ValueError, match=r"median range of .*mm"):
         radarsdf.refine_poses(points, drive.poses)
@@ -47,14 +47,14 @@ def test_ranges_in_other_units_are_refused_at_once(drive, motion, factor):
         radarsdf.odometry(points, times_s=motion.times_s)
 
 
-def test_speeds_in_other_units_are_left_out(drive, motion):
+def test_speeds_in_other_units_are_excluded(drive, motion):
     checked = CheckedScans.of(drive.points, [100 * speeds for speeds in motion.doppler_mps], motion.times_s)
     assert checked.velocities is None
     assert "Doppler in m/s" in checked.notes[0]
 
 
-def test_speeds_that_returns_contradict_are_left_out(drive, motion):
-    """Poses with half the steps had a standard deviation of centimetres."""
+def test_speeds_contradicting_returns_are_excluded(drive, motion):
+    """Regression: poses with steps of half the length had a standard deviation of centimetres."""
     speeds = [0.5 * speeds for speeds in motion.doppler_mps]
     found = radarsdf.odometry(drive.points, doppler_mps=speeds, times_s=motion.times_s)
     assert not found.report["doppler"]
@@ -64,7 +64,7 @@ def test_speeds_that_returns_contradict_are_left_out(drive, motion):
 
 
 def test_speeds_that_returns_cannot_contradict_are_kept():
-    """Scans drawn together by a fifth agree as well."""
+    """Scans contracted by a fifth agree equally well."""
     yard = KINDS["yard"](seed=2, frames=24)
     motion = measured_motion(yard, seed=2)
     checked = CheckedScans.of(yard.points, motion.doppler_mps, motion.times_s)
@@ -79,7 +79,7 @@ def test_speeds_that_returns_cannot_contradict_are_kept():
     [np.degrees, lambda rates: -rates, lambda rates: rates[:, [2, 0, 1]]],
     ids=["degrees", "sign", "axes"],
 )
-def test_a_gyroscope_that_contradicts_the_returns_is_left_out(drive, motion, wrong):
+def test_a_gyroscope_contradicting_returns_is_excluded(drive, motion, wrong):
     imu = Imu(motion.times_s, wrong(motion.angular_velocity), R_sensor_imu=np.eye(3))
     found = radarsdf.odometry(drive.points, times_s=motion.times_s, doppler_mps=motion.doppler_mps, imu=imu)
     assert not found.report["gyroscope"]
@@ -89,7 +89,7 @@ def test_a_gyroscope_that_contradicts_the_returns_is_left_out(drive, motion, wro
 
 
 @pytest.mark.parametrize(("bias_rad_s", "named"), [(0.02, None), (1.0, "bias of 1.0")])
-def test_a_bias_that_no_gyroscope_has_is_named(bias_rad_s, named):
+def test_an_implausible_gyroscope_bias_is_named(bias_rad_s, named):
     rng = np.random.default_rng(0)
     turns = 0.02 * rng.standard_normal((40, 3))
     rates = Gyroscope.of(np.zeros((41, 3)), np.arange(41) / 10, np.arange(41) / 10)
@@ -102,7 +102,7 @@ def test_a_bias_that_no_gyroscope_has_is_named(bias_rad_s, named):
         measured.learnt(turns, covariance)
 
 
-def test_after_a_day_a_new_segment_begins(drive, motion):
+def test_a_gap_of_a_day_starts_a_new_segment(drive, motion):
     times_s = motion.times_s + 86400.0 * (np.arange(16) >= 8)
     found = radarsdf.odometry(drive.points, times_s=times_s, doppler_mps=motion.doppler_mps)
     assert found.segments.tolist() == [0] * 8 + [1] * 8

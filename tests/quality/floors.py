@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""How good a fit must be, measured on small scenes that no default was chosen on.
+"""Least quality of a fit, measured on small scenes that were not used to choose defaults.
 
 These are tests, and no bench, so that plain `pytest` runs them and a recorded drive that is not here skips with a
 reason. `python -m tests.quality.floors` measures MEASURED anew, after a change that is meant to change the quality, and
@@ -32,14 +32,14 @@ SIMULATED = ("hugin", "oculii", "wall")
 RECORDED = ("r0144_0167", "r0309_0320")
 KINDS = ("default", "quick")
 SCENE_SEED = 7  # the figures of BENCHMARK.md, by which the defaults were chosen, are of seed 0
-# With 20 frames of the wall, one quick fit in six is far off at the first frame, which is held out and at the path's end.
+# With 20 frames of the wall, one quick fit in six has large errors at the held-out first frame.
 FRAMES = {"hugin": 20, "oculii": 20, "wall": 40}
 MESH_SAMPLES = 100_000
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What one fit is worth. The surface is that of the frames fitted, the intensity that of the frames held out."""
+    """Quality of one fit: surface of the fitted frames, intensity of the held-out frames."""
 
     f_score: float
     """F-score at 0.2 m with nothing discarded, %: `f_score_all` of `surface_metrics`."""
@@ -65,19 +65,19 @@ MEASURED: dict[tuple[str, str], tuple[tuple[float, ...], tuple[float, ...]]] = {
     ("r0309_0320", "quick"): ((40.42, 15.63, 3.717), (0.26, 0.97, 0.020)),
 }
 
-# The quick fit's surface does not depend on the seed, but on roundings: no margin is smaller than these.
+# The surface of quick fits depends on rounding, not on the seed: lower bounds of the margins.
 MARGIN_DEVIATIONS = 3.0
 LEAST_MARGIN = Quality(f_score=0.5, outliers=0.3, mae=0.1)
 
 
 def limits(mean: tuple[float, ...], deviation: tuple[float, ...]) -> Quality:
-    """The worst that is accepted: the mean less (for errors: plus) the margin."""
+    """Worst accepted values: the mean minus (for errors plus) the margin."""
     margins = np.maximum(MARGIN_DEVIATIONS * np.array(deviation), dataclasses.astuple(LEAST_MARGIN))
     return Quality(*(np.array(mean) + [-1, 1, 1] * margins).tolist())
 
 
 def failures(quality: Quality, limit: Quality) -> list[str]:
-    """The names of the numbers that are worse than their limit, or are no numbers."""
+    """Names of metrics that are worse than their limit, or NaN."""
     passed = {
         "f_score": quality.f_score >= limit.f_score,
         "outliers": quality.outliers <= limit.outliers,
@@ -87,14 +87,14 @@ def failures(quality: Quality, limit: Quality) -> list[str]:
 
 
 def load(name: str) -> Scene:
-    """A scene by its name; a recorded one that is not here skips the test."""
+    """A scene by name; skips the test if a recorded one is missing."""
     if name in SIMULATED:
         return load_scene(name, frames=FRAMES[name], seed=SCENE_SEED)
     return load_scene(str(recorded_scans(name)))
 
 
 def config_of(kind: str, scene: Scene, seed: int = 0) -> FitConfig:
-    """The configuration under test, with nothing changed but the scene's ranges and the seed."""
+    """The configuration under test, with the ranges of the scene and the seed."""
     return scene.config(kind, seed=seed)
 
 
@@ -107,7 +107,7 @@ def measure(
     intensities: bool = True,
     **of_the_mesh: Any,
 ) -> Quality:
-    """Fits all frames but those held out, and compares with the ground truth and with those.
+    """Fits all frames except the held-out ones, and compares with these and with the ground truth.
 
     Without `intensities`, which takes a tenth of the time, `mae` is 0. A mesh without triangles has the worst numbers.
     """
@@ -136,7 +136,7 @@ def measure(
 
 
 def jittered(kind: str, scene: Scene, sigma_m: float) -> Quality:
-    """With a normal error of the sensor's positions, along each axis."""
+    """With Gaussian errors of sensor positions along each axis."""
     poses = scene.poses.copy()
     poses[:, :3, 3] += np.random.default_rng(0).normal(0, sigma_m, (len(poses), 3))
     scene = dataclasses.replace(scene, poses=poses)
@@ -144,14 +144,14 @@ def jittered(kind: str, scene: Scene, sigma_m: float) -> Quality:
 
 
 def with_ghosts(kind: str, scene: Scene) -> Quality:
-    """With all that mirrors and clutter bring, and every piece of surface."""
+    """With ghosts and clutter, and all components of the surface."""
     config = config_of(kind, scene).override(returns={"drop_ghosts": False})
     everything = {"min_confidence": 0.0, "max_uncertainty": math.inf, "min_component_triangles": 0}
     return measure(scene, config, VOXEL_M[kind], intensities=False, **everything)
 
 
 def untrained(kind: str, scene: Scene) -> Quality:
-    """With a training that ends almost at once. The quick fit has none."""
+    """With very few iterations of training. Quick fits have none."""
     config = config_of(kind, scene)
     if kind != "quick":
         config = config.override(training={"intensity_iterations": 1, "sdf_iterations": 5})
@@ -159,7 +159,7 @@ def untrained(kind: str, scene: Scene) -> Quality:
 
 
 def swapped(kind: str, scene: Scene) -> Quality:
-    """With every third intensity of a scan in the place of another one, as one reads a file wrongly."""
+    """With every third intensity of a scan permuted, as by a faulty reader."""
     assert scene.intensities is not None
     own = [values.copy() for values in scene.intensities]
     for values in own[1::2]:
@@ -168,7 +168,7 @@ def swapped(kind: str, scene: Scene) -> Quality:
 
 
 def report(name: str, kind: str, quality: Quality, limit: Quality) -> None:
-    """Prints what was measured beside what is accepted, and which numbers are not."""
+    """Prints measured and accepted values, and marks failures."""
     print(
         f"{name}, {kind}: F-score {quality.f_score:.2f} % (at least {limit.f_score:.2f}),"
         f" outliers {quality.outliers:.2f} % (at most {limit.outliers:.2f}),"
@@ -179,7 +179,7 @@ def report(name: str, kind: str, quality: Quality, limit: Quality) -> None:
 
 
 def main() -> None:
-    """Prints the lines of MEASURED, or with the word `spoilt` what becomes of the fits that are bad on purpose."""
+    """Prints the lines of MEASURED, or with the argument `spoilt` the results of deliberately bad fits."""
     for name in (*SIMULATED, *RECORDED):
         try:
             scene = load(name)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The default fit and the quick one are no worse than they were, beyond what chance explains; and worse is noticed."""
+"""Default and quick fits are not significantly worse than before, and degradations are detected."""
 
 import functools
 import math
@@ -58,7 +58,7 @@ def test_a_fit_is_no_worse_than_its_floor(name, kind):
     ],
     ids=["jitter of 10 cm", "ghosts", "untrained", "swapped"],
 )
-def test_a_fit_that_is_bad_on_purpose_fails(spoilt, kind, what_fails):
+def test_deliberately_bad_fits_fail(spoilt, kind, what_fails):
     quality = spoilt(kind, scene_of("oculii"))
     assert failures(quality, limits(*MEASURED["oculii", kind])) == what_fails
 
@@ -73,7 +73,7 @@ def test_a_fit_that_is_bad_on_purpose_fails(spoilt, kind, what_fails):
         (Quality(math.nan, math.nan, math.nan), ["f_score", "outliers", "mae"]),
     ],
 )
-def test_each_number_can_fail_alone(quality, names):
+def test_each_metric_can_fail_alone(quality, names):
     assert failures(quality, limits((91.0, 4.0, 4.2), (1.0, 1.0, 0.2))) == names
 
 
@@ -95,7 +95,7 @@ def job(request):
     return radar_map, train, test
 
 
-def test_held_out_intensities_are_better_than_the_neighbours(job):
+def test_held_out_intensities_are_more_accurate_than_nearest_neighbours(job):
     radar_map, train, test = job
     x, sensors, measured = rays_of(test)
     ours = intensity_metrics(radar_map.intensity(x, sensors, extrapolate=True), measured)
@@ -105,7 +105,7 @@ def test_held_out_intensities_are_better_than_the_neighbours(job):
     assert ours["mae"] < neighbours["mae"]
 
 
-def test_the_mesh_covers_what_radar_and_lidar_saw(job, tmp_path):
+def test_the_mesh_covers_radar_and_lidar_returns(job, tmp_path):
     radar_map, train, test = job
     viewpoint = train.poses[len(train.poses) // 2, :3, 3]
     extracted = radar_map.mesh(viewpoint=viewpoint, progress=False)
@@ -114,12 +114,12 @@ def test_the_mesh_covers_what_radar_and_lidar_saw(job, tmp_path):
     mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
     assert len(mesh.faces) == len(extracted.faces)
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) > 10
-    # Lidar sees all round; only what lies within 1 m of a static return can be asked of a radar map.
+    # Lidar sees all directions; a radar map can only cover points within 1 m of a static return.
     returns = np.concatenate([rays_of(scans)[0] for scans in (train, test)])
     lidar = train.ground_truth
     seen = lidar[cKDTree(returns).query(lidar, distance_upper_bound=1.0)[0] <= 1.0]
     in_place = surface_metrics(mesh, seen, samples=100_000)["completion_ratio"]
-    # The same mesh put a metre aside covers what a mesh of this size covers by chance.
+    # The same mesh shifted by a metre gives the coverage by chance.
     for aside in ([1.0, 0, 0], [0, 1.0, 0]):
         moved = mesh.copy()
         moved.vertices = moved.vertices + aside

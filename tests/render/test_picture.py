@@ -42,8 +42,8 @@ def test_color_map_limits_and_nan():
 
 
 @pytest.mark.parametrize("cells", [1, 7, 150])
-def test_a_square_fills_its_place_without_holes(cells):
-    mesh = square((5e6, 3e5, 40.0), size=2.3, cells=cells)  # so far out that float32 would bend it
+def test_a_square_is_drawn_without_holes(cells):
+    mesh = square((5e6, 3e5, 40.0), size=2.3, cells=cells)  # so far out that float32 would distort it
     color = (200, 40, 40)
     image = render(mesh, one_color(mesh, color), width=300, height=200, viewpoint=(5e6, 3e5 - 10.0, 40.0))
     assert image.shape == (200, 300, 3)
@@ -58,7 +58,7 @@ def test_a_square_fills_its_place_without_holes(cells):
 
 
 def test_the_nearer_surface_hides_the_farther():
-    # Two crossing walls: each hides the other on one side of the picture.
+    # Two crossing walls: each occludes the other on one side of the picture.
     a, b = square((0.0, 0.0, 0.0), size=4.0), square((0.0, 0.0, 0.0), size=4.0)
     a.apply_transform(trimesh.transformations.rotation_matrix(0.5, [0, 0, 1]))
     b.apply_transform(trimesh.transformations.rotation_matrix(-0.5, [0, 0, 1]))
@@ -70,7 +70,7 @@ def test_the_nearer_surface_hides_the_farther():
     assert image[100, 140, 0] > image[100, 140, 1]
 
 
-def test_what_lies_behind_the_viewer_is_not_drawn():
+def test_objects_behind_the_viewer_are_not_drawn():
     room = trimesh.creation.box((10.0, 10.0, 4.0)).subdivide().subdivide().subdivide()
     image = render(room, width=160, height=100, viewpoint=(0.0, -4.0, 0.5))
     assert (image != WHITE).any(axis=-1).mean() > 0.5
@@ -85,7 +85,7 @@ def test_what_lies_behind_the_viewer_is_not_drawn():
 
 
 def test_from_straight_above_north_is_at_the_top():
-    """Four squares on the ground, to the east, north, west and south; and a viewer in their middle, who looks north."""
+    """Four squares on the ground, to the east, north, west and south, and a viewer in the middle who looks north."""
     squares = [square((0, 0, 0)) for _ in range(4)]
     for number, tile in enumerate(squares):
         tile.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
@@ -135,7 +135,7 @@ def test_without_matplotlib_the_error_names_what_to_install(tmp_path, monkeypatc
         save_picture(tmp_path / "map.png", square((0.0, 0.0, 0.0)))
 
 
-def test_refuses_what_it_cannot_draw():
+def test_inputs_that_cannot_be_drawn_are_rejected():
     mesh = square((0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="no triangles"):
         render(trimesh.Trimesh())
@@ -166,7 +166,7 @@ def test_the_last_trajectory_places_the_returns(tmp_path):
     assert "#1b6ca8" not in colors({"found": poses})
 
 
-def test_a_grid_is_drawn_in_its_place(tmp_path, monkeypatch):
+def test_a_grid_is_drawn_at_its_position(tmp_path, monkeypatch):
     """A floor with a block on it: heights, costs, occupancy and clearance, x to the right and y up, NaN where unknown."""
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     from radarsdf.grids.grid import Grid  # noqa: PLC0415

@@ -33,7 +33,7 @@ def small_pictures():
 
 @pytest.fixture(scope="session")
 def written(subject, tmp_path_factory):
-    """The path of the report, and its page."""
+    """Path of the report, and its page."""
     from radarsdf.report.writing import write_report  # noqa: PLC0415
 
     path = tmp_path_factory.mktemp("report") / "report.html"

@@ -39,7 +39,7 @@ class Page(HTMLParser):
         return [found for name, found in self.elements if name == tag]
 
     def addresses(self):
-        """What the attributes of the page and of its frames refer to."""
+        """Addresses in attributes of the page and its frames."""
         names = ("src", "href", "srcset", "poster", "data", "action")
         own = [found[name] for _, found in self.elements for name in names if found.get(name)]
         return own + [address for frame in self.frames for address in frame.addresses()]

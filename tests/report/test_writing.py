@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The report of a map: every section has its figures, and the page neither loads nor executes anything it reads."""
+"""The report of a map: all sections have figures, and the page neither loads nor executes its contents."""
 
 import dataclasses
 import re
@@ -39,7 +39,7 @@ POSES = {
 
 
 def write(path, subject, report=None, **changes):
-    """The page of a subject with changes, some of them to its map's report."""
+    """The page of a subject with changed fields, some of them of the report of its map."""
     from radarsdf.report.writing import write_report  # noqa: PLC0415
 
     if report is not None:
@@ -51,7 +51,7 @@ def write(path, subject, report=None, **changes):
 
 
 def marks(page):
-    """Marks of the conclusion by what they are about."""
+    """Marks of the conclusion by subject."""
     names = "Sensor noise|Scans and poses|Poses|Surface|Uncertainty|Intensity"
     found = re.findall(f"(good|warning|error|note) ({names}) ", page.sections["conclusion"])
     return {name: mark for mark, name in found}
@@ -75,14 +75,14 @@ def test_the_page_loads_nothing_and_executes_nothing_that_it_reads(written):
     sources = {word for rule in policy.split("; ") for word in rule.split()[1:]}
     assert sources <= {"'none'", "'unsafe-inline'", "'unsafe-eval'", "'wasm-unsafe-eval'", "data:", "blob:"}
     assert policy.startswith("default-src 'none'")
-    assert page.all("script") == []  # only the frame has some, which has no access to this page
+    assert page.all("script") == []  # only in the frame, which cannot access this page
     assert page.all("iframe")[0]["sandbox"] == "allow-scripts"
     assert "<b>1 of 2</b> Repair <i>it</i>." in page.sections["check"]
     assert len(page.all("b")) == len(page.all("li"))
     assert page.sections[""].count(HOSTILE) == 2  # title and heading
 
 
-def test_figures_are_those_of_the_evaluation(written, subject, scene):
+def test_figures_equal_the_evaluation(written, subject, scene):
     _, page = written
     metrics = surface_metrics(subject.mesh, subject.scans.ground_truth, samples=20_000)
     for name, text in page.sections.items():
@@ -92,7 +92,7 @@ def test_figures_are_those_of_the_evaluation(written, subject, scene):
     assert f_score in page.sections["errors"]
     share = re.search(r"([\d.]+ %) of them are within one standard error", page.sections["uncertainty"])[1]
     assert f"{share} of the errors" in page.sections["conclusion"]
-    # Errors along the normal, against the nearest point of the truth, where there is one within 0.4 m.
+    # Errors along the normal from the nearest point of the ground truth within 0.4 m.
     truth, vertices = subject.scans.ground_truth, np.asarray(subject.mesh.vertices)
     distance_m, nearest = cKDTree(truth).query(vertices)
     error_m = np.einsum("ni,ni->n", truth[nearest] - vertices, subject.mesh.vertex_normals)
@@ -166,7 +166,7 @@ def test_a_large_mesh_is_drawn_thinned_and_evaluated_whole(subject, tmp_path, mo
     assert f"{len(large.shown[0].faces):,} of {faces:,} triangles" in page.sections["surface"]
 
 
-def test_the_truth_and_the_viewpoint_are_those_of_the_scans_in_the_box(subject, radar_map):
+def test_ground_truth_and_viewpoint_are_of_the_scans_in_the_box(subject, radar_map):
     scans, corner = subject.scans, subject.scans.ground_truth[0]
     np.testing.assert_array_equal(subject.viewpoint, scans.poses[2, :3, 3])  # the middle one of five
     alone = dataclasses.replace(subject, scans=None)
@@ -180,12 +180,12 @@ def test_the_truth_and_the_viewpoint_are_those_of_the_scans_in_the_box(subject, 
 
 @pytest.mark.skipif(why_no_browser() is not None, reason=str(why_no_browser()))
 @pytest.mark.parametrize("width", [380, 1200])
-def test_a_browser_shows_it_without_a_network(written, width):
+def test_a_browser_shows_the_report_offline(written, width):
     path, _ = written
     with open_page(path.as_uri(), width, 700) as page:
         frame = page.tab.frame_locator("iframe")
         canvas = frame.locator("canvas").first
-        page.tab.locator("iframe").scroll_into_view_if_needed()  # a frame that is not seen draws nothing
+        page.tab.locator("iframe").scroll_into_view_if_needed()  # frames outside of the view are not drawn
         canvas.wait_for(state="visible")
         page.wait_until(lambda: drawn(page.screenshot_of("iframe")) > 2_000)
         box = canvas.bounding_box()

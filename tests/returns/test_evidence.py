@@ -28,7 +28,7 @@ VARIANCE_M2 = 0.04
 
 
 def a_scene():
-    """Scans of a wall at x = 5.1: of one, six returns in a cell before it; of another, the last is false."""
+    """Scans of a wall at x = 5.1: one has six returns in a cell before it, and the last of another is false."""
     rng = np.random.default_rng(0)
     scans = []
     for scan in range(SCANS):
@@ -53,7 +53,7 @@ def is_false(rays):
 
 
 def cells_of(points):
-    """(N, 3) lattice coordinates, as the core finds them."""
+    """Lattice coordinates (N, 3), as in the core."""
     return lattice_of(cell_keys(np.ascontiguousarray(points), LEAF_M))
 
 
@@ -62,13 +62,13 @@ def keys_of(cells):
 
 
 def keys_round(points):
-    """Keys of the cells of these points, and of all those within two cells."""
+    """Keys of the cells of points, and of all cells within a distance of two."""
     steps = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3), -1).reshape(-1, 3)
     return keys_of((np.unique(cells_of(points), axis=0)[:, None] + steps).reshape(-1, 3))
 
 
 def returns_of(rays, variances_m2):
-    """What these returns tell, counted with dictionaries."""
+    """Evidence of returns, counted with dictionaries."""
     keys = cell_keys(np.ascontiguousarray(rays.points), LEAF_M).tolist()
     scans_of_cell, information = {}, {}
     for key, scan, variance_m2 in zip(keys, rays.scans.tolist(), variances_m2.tolist(), strict=True):
@@ -79,17 +79,17 @@ def returns_of(rays, variances_m2):
         keys=np.array(found, np.uint64),
         information=np.array([information[key] for key in found], np.float32),
         scans=np.array([len(scans_of_cell[key]) for key in found], np.uint32),
-        counts=np.ones(len(found)),  # evidence does not ask for them
+        counts=np.ones(len(found)),  # not used by evidence
     )
 
 
 def within_a_cell(points, leaf_keys):
-    """(C, N) bool, whether each point is in a leaf cell or in one of the 26 round it."""
+    """(C, N) bool, whether each point is in the neighbourhood of a leaf cell."""
     return (np.abs(lattice_of(leaf_keys)[:, None] - cells_of(points)[None]) <= 1).all(axis=2)
 
 
 def scans_round(rays, leaf_keys):
-    """(C,) number of scans with returns, added up over each leaf cell and the 26 round it."""
+    """Numbers (C,) of scans with returns, summed over the neighbourhood of each leaf cell."""
     pairs = np.unique(np.column_stack([cells_of(rays.points), rays.scans]), axis=0)
     return within_a_cell((pairs[:, :3] + 0.5) * LEAF_M, leaf_keys).sum(axis=1)
 
@@ -99,12 +99,12 @@ def visibility(rays, leaf_keys):
 
 
 def at(evidence, leaf_keys, point):
-    """Information, detections and visibility counts of the leaf cell of a point."""
+    """Information, hits and visibility counts of the leaf cell of a point."""
     row = np.searchsorted(leaf_keys, cell_keys(point[None], LEAF_M)[0])
     return tuple(column[row].item() for column in dataclasses.astuple(evidence))
 
 
-def test_sums_over_27_cells_and_scans_that_looked(rays):
+def test_sums_over_neighbourhoods_and_visibility_counts(rays):
     variances_m2 = np.random.default_rng(1).uniform(0.01, 1, len(rays))
     leaf_keys = keys_round(rays.points)
     evidence = Evidence.of(returns_of(rays, variances_m2), rays, leaf_keys, LEAF_M)
@@ -121,7 +121,7 @@ def test_sums_over_27_cells_and_scans_that_looked(rays):
             assert a.tobytes() == b.tobytes()
 
 
-def test_a_false_return_is_no_evidence_but_its_scan_looked(rays):
+def test_a_false_return_is_no_evidence_but_counts_as_visibility(rays):
     leaf_keys = keys_round(rays.points)
     real = rays.select(~is_false(rays))
     assert len(real) == len(rays) - 1
@@ -136,7 +136,7 @@ STARTS = {"average": FitConfig.quick(), "noise": FitConfig(training={"sdf_iterat
 @pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize("drop_ghosts", [False, True])
 def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeypatch):
-    """With a noise that does not grow with the range: each return tells as much."""
+    """With noise independent of range, so that all returns have equal information."""
 
     def cells_of_ghosts(surfels, *_):
         cells = surfels.cells_at(rays.points)
@@ -171,11 +171,11 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
 
 
 def rays_to(cells, count=1):
-    """`count` returns in the middle of each cell, seen from afar."""
+    """`count` returns in the middle of each cell, from a distant sensor."""
     points = (np.repeat(np.asarray(cells, float), count, axis=0) + 0.5) * LEAF_M
     pose = np.eye(4)
     pose[:3, 3] = [0, 0, 30]
-    # The local frame's zero is the sensor, a whole number of cells away.
+    # The origin of the local frame is the sensor, a whole number of cells away.
     return prepare([points - pose[:3, 3]], pose[None], min_range_m=1.0, max_range_m=None)
 
 
@@ -201,7 +201,7 @@ def added(rays, max_cells, leaf_keys=None):
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (1, 1, 0), (-1, 0, 1), (1, -1, -1)])
 @pytest.mark.parametrize("gap", [1, 2, 3])
-def test_the_cells_between_two_returns_and_no_others(direction, gap):
+def test_only_the_cells_between_two_returns_are_opened(direction, gap):
     start, step = np.array([3, -2, 0]), np.array(direction)
     rays = rays_to([start, start + (gap + 1) * step])
     between = {key_of(rays, start + i * step) for i in range(1, gap + 1)}
@@ -220,7 +220,7 @@ def test_badly_supported_and_dense_ends_are_not_bridged():
 
 
 @pytest.mark.parametrize("max_cells", [1, 2, 4])
-def test_as_a_search_of_all_pairs(max_cells):
+def test_bridges_equal_a_search_of_all_pairs(max_cells):
     rng = np.random.default_rng(max_cells)
     rays = rays_to(rng.integers(-6, 6, (150, 3)))
     leaf_keys = leaf_keys_of(rays)

@@ -23,7 +23,7 @@ QUICK = {"training": {"sdf_iterations": 3, "intensity_iterations": 3}}
 
 @pytest.fixture(scope="module")
 def drive():
-    """Scans with Doppler, and which of their returns move: a tenth."""
+    """Scans with Doppler, and masks of the tenth of returns that move."""
     scans = radarsdf.simulate.wall(frames=12)
     velocities = velocity_of_poses(scans.poses, 0.1 * np.arange(12))
     rng = np.random.default_rng(0)
@@ -36,9 +36,9 @@ def drive():
     return scans, doppler, moves
 
 
-def test_what_moves_is_found(drive):
+def test_moving_returns_are_found(drive):
     scans, doppler, moves = drive
-    for sign in (1, -1):  # sensors differ in it
+    for sign in (1, -1):  # the sign differs between sensors
         found = MovingReturns.of(scans.points, [sign * values for values in doppler])
         assert found.why_none is None
         found_moving, true = np.concatenate(found.masks), np.concatenate(moves)
@@ -47,7 +47,7 @@ def test_what_moves_is_found(drive):
         assert found.count == found_moving.sum()
 
 
-def test_a_fit_leaves_moving_returns_out_and_counts_them(drive):
+def test_a_fit_excludes_and_counts_moving_returns(drive):
     scans, doppler, _ = drive
     expected = MovingReturns.of(scans.points, doppler).count
     for given in (
@@ -92,11 +92,11 @@ def _too_near(scans, doppler):
     return sum(int((np.linalg.norm(points, axis=1) < 2.5).sum()) for points in left)
 
 
-def test_doppler_that_is_not_understood_leaves_nothing_out(drive):
+def test_inconsistent_doppler_excludes_no_returns(drive):
     scans, doppler, _ = drive
     rng = np.random.default_rng(1)
     noise = [rng.uniform(-20, 20, len(v)) for v in doppler]
-    # In half of the returns, what the sensor measured is lost: they would all seem to move.
+    # Half of the returns have lost their Doppler, and would all be classified as moving.
     mostly = [np.where(rng.random(len(v)) < 0.5, v, 37.0 + rng.uniform(-20, 20, len(v))) for v in doppler]
     for values, why in ((noise, "scans agree on a velocity"), (mostly, "of the returns disagree")):
         found = MovingReturns.of(scans.points, values)
@@ -140,7 +140,7 @@ def speeds_of(directions, velocity_mps, step_mps):
 
 @pytest.mark.parametrize("filler", [0.0, -128.0])
 @pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
-def test_fillers_are_left_out(directions, filler, share):
+def test_placeholder_values_are_excluded(directions, filler, share):
     rng = np.random.default_rng(9)
     speeds = speeds_of(directions, np.array([8.0, 1.0, 0.0]), 1e-3)
     filled = [np.where(rng.random(len(v)) < share, filler, v) for v in speeds]
@@ -155,7 +155,7 @@ def test_fillers_are_left_out(directions, filler, share):
 
 
 @pytest.mark.parametrize("velocity_mps", [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)])
-def test_equal_speeds_of_a_slow_sensor_stay(directions, velocity_mps):
+def test_equal_speeds_of_a_slow_sensor_are_kept(directions, velocity_mps):
     rng = np.random.default_rng(9)
     speeds = speeds_of(directions, np.array(velocity_mps), 0.125)
     speeds = [np.where(rng.random(len(v)) < 0.2, rng.uniform(-5, 5, len(v)), v) for v in speeds]
@@ -165,7 +165,7 @@ def test_equal_speeds_of_a_slow_sensor_stay(directions, velocity_mps):
         np.testing.assert_array_equal(v, given)
 
 
-def test_a_velocity_is_the_least_squares_solution_of_the_returns_that_agree(directions):
+def test_a_velocity_is_the_least_squares_solution_of_inliers(directions):
     rng = np.random.default_rng(3)
     true = np.array([8.0, -2.0, 0.5])
     x = directions[0] * [1, 1, 0.2]
@@ -180,14 +180,14 @@ def test_a_velocity_is_the_least_squares_solution_of_the_returns_that_agree(dire
     np.testing.assert_allclose(found.velocity_mps, solution, atol=1e-5)
     variance = squares[0] / (len(a) - 3)
     np.testing.assert_allclose(found.covariance, variance * np.linalg.inv(a.T @ a), rtol=1e-3)
-    # Nine returns determine no velocity, ten do; nor do they if seven of ten move on their own.
+    # Ten returns determine a velocity; nine do not, nor ten if seven of them move.
     few = np.flatnonzero(found.static)[:10]
     assert sensor_velocity(x[few], speeds[few]).found
     assert not sensor_velocity(x[few[:9]], speeds[few[:9]]).found
     assert not sensor_velocity(x[few], speeds[few] + np.r_[np.zeros(3), 5.0 * 1.7 ** np.arange(7)]).found
 
 
-def test_a_component_that_no_return_measures_is_zero_with_a_deviation_of_100_mps(directions):
+def test_an_unobserved_component_is_zero_with_a_deviation_of_100_mps(directions):
     x = directions[0] * [1, 1, 0]
     speeds = -x @ [8.0, -2.0, 5.0] / np.linalg.norm(x, axis=1) + np.random.default_rng(4).normal(0, 0.04, 80)
     found = sensor_velocity(x, speeds)

@@ -9,7 +9,7 @@ from ..conftest import pose
 
 
 def tilted_pose(seed, position):
-    """A rotation about all three axes, so that a transposed matrix or a swapped axis shows."""
+    """A rotation about all three axes, which exposes transposed matrices and swapped axes."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q *= np.sign(np.diag(r))
     q[:, 0] *= np.linalg.det(q)
@@ -45,7 +45,7 @@ def test_rays_lead_from_the_sensors_to_the_returns():
     assert len(rays) == sum(map(len, points))
 
 
-def test_ranges_are_measured_from_the_sensor_and_take_the_intensities_along():
+def test_returns_and_intensities_are_selected_by_range_from_the_sensor():
     points = [
         np.array([[1.0, 0, 0], [0, 2.5, 0], [0, 0, -7]]),
         np.array([[60, 0, 0], [61.0, 0, 0], [0, 3, 4]]),
@@ -56,7 +56,7 @@ def test_ranges_are_measured_from_the_sensor_and_take_the_intensities_along():
     assert rays.scans.tolist() == [0, 0, 1, 1]
     assert prepare(points, poses).scans.tolist() == [0, 0, 0, 1, 1, 1]
     assert rays.select(np.array([3, 0])).scans.tolist() == [1, 0]
-    # Both bounds belong to what is kept.
+    # Both bounds are inclusive.
     assert rays.intensities.tolist() == [2, 3, 4, 6]
     sensors = rays.points - rays.directions * rays.ranges_m[:, None] + rays.origin
     np.testing.assert_allclose(sensors, poses[[0, 0, 1, 1], :3, 3], atol=1e-4)
@@ -67,7 +67,7 @@ def test_accumulated_scans_are_seen_from_the_middle_one():
     points, poses = scans(count=8)
     rays = prepare(points, poses, accumulate_scans=5)
     single = prepare(points, poses)
-    # Scans 0 to 4 are seen from 2; of the last, incomplete group, 5 to 7, from 6.
+    # The origin of scans 0 to 4 is that of scan 2; of the last, incomplete group 5 to 7 that of scan 6.
     middle = np.array([2, 2, 2, 2, 2, 6, 6, 6])
     scan = np.repeat(np.arange(8), [len(p) for p in points])  # of each return
     sensors = poses[middle[scan], :3, 3] - rays.origin

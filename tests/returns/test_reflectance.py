@@ -52,8 +52,8 @@ def test_it_is_better_than_nearest_neighbours(rays):
     assert error < 0.99 * np.abs(knn.predict(*test.in_world()) - test.intensities).mean()
 
 
-def test_with_a_network_the_answer_is_the_mean_of_two(rays):
-    """That of the network, and of half of it with what that leaves in closed form."""
+def test_with_a_network_the_prediction_is_the_mean_of_two(rays):
+    """That of the network, and half of it plus the closed form of the residual."""
     answers = np.linspace(0.2, 0.6, len(rays), dtype=np.float32)
     surfels = Surfels.of(rays, LEAF_M, 1)
     found = Reflectance.of(rays, unit(rays), surfels, LEAF_M, lambda *_: answers)
@@ -87,7 +87,7 @@ def test_any_number_of_threads_has_the_same_bits(rays, monkeypatch, most):
         np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
 
 
-def test_answers_are_numbers_everywhere(rays):
+def test_predictions_are_finite_everywhere(rays):
     found = learnt(rays, unit(rays))
     points = np.array([[0, 0, 0], [1e7, -1e7, 1e7], [1e30, 0, 0]], np.float32)
     directions = np.tile(np.float32([1, 0, 0]), (3, 1))
@@ -99,7 +99,7 @@ COUNT = 6000
 
 
 def views(seed=0, kinds=(LEVEL, STEEP), count=COUNT):
-    """Directions, ranges, incidences and kinds of surfaces of random returns, as :meth:`Response.at` takes them."""
+    """Directions, ranges, incidences and kinds of surfaces of random returns, as arguments of :meth:`Response.at`."""
     rng = np.random.default_rng(seed)
     elevation, azimuth = rng.uniform(-0.4, 0.4, count), rng.uniform(-1, 1, count)
     directions = np.stack(
@@ -116,7 +116,7 @@ def views(seed=0, kinds=(LEVEL, STEEP), count=COUNT):
 
 
 def error(values, seen, asked=None, truth=None):
-    """Mean absolute error of what `values` of returns tell."""
+    """Mean absolute error of predictions from `values` of returns."""
     asked, truth = (seen, values) if asked is None else (asked, truth)
     return float(np.abs(Response.of(values, *seen).at(*asked) - truth).mean())
 
@@ -134,8 +134,8 @@ def test_level_and_steep_surfaces_have_their_own_incidence():
     assert error(truth(seen), seen, asked, truth(asked)) < 0.005
 
 
-def test_where_no_scan_was_the_ground_is_known_by_its_height():
-    """A sum of functions of range and elevation cannot tell what is 1.5 m below the sensor."""
+def test_ground_between_scans_is_predicted_by_its_height():
+    """A sum of functions of range and elevation cannot represent a plane 1.5 m below the sensor."""
 
     def truth(seen):
         directions, ranges_m = seen[:2]
@@ -145,7 +145,7 @@ def test_where_no_scan_was_the_ground_is_known_by_its_height():
     assert error(truth(seen), seen, asked, truth(asked)) < 0.03
 
 
-def test_a_kind_is_that_of_the_plane():
+def test_the_kind_of_surface_follows_the_plane():
     normals = np.array([[0, 0, 1], [0.6, 0, -0.8], [0.8, 0, 0.6], [1, 0, 0]], np.float32)
     found = kinds_of(normals, np.array([0, 1, 2, 3, -1], np.int32))
     assert found.tolist() == [LEVEL, LEVEL, STEEP, STEEP, NO_SURFACE]
@@ -156,7 +156,7 @@ N = 20_000
 
 
 def decibels(rng):
-    """In steps of half a decibel above a threshold, as automotive radars give them."""
+    """Intensities in steps of half a decibel above a threshold, as of automotive radars."""
     return np.round(2 * (45 + rng.gamma(1.2, 6, N))) / 2
 
 
@@ -178,7 +178,7 @@ USUAL = {
 
 
 @pytest.mark.parametrize("values", USUAL.values(), ids=USUAL)
-def test_all_of_one_kind_belong_together(values):
+def test_homogeneous_intensities_have_no_outliers(values):
     for seed in range(5):
         intensities = values(np.random.default_rng(seed)).astype(np.float32)
         assert Plausible.of(intensities).holds(intensities).all()
@@ -199,7 +199,7 @@ WILD = {
 
 
 @pytest.mark.parametrize("case", WILD.values(), ids=WILD)
-def test_only_outliers_are_left_out(case):
+def test_only_outliers_are_excluded(case):
     share, values = case
     rng = np.random.default_rng(1)
     intensities = decibels(rng).astype(np.float32)
@@ -210,10 +210,10 @@ def test_only_outliers_are_left_out(case):
 
 
 @pytest.mark.parametrize("most", [1 << 15, 2000], ids=["all", "some"])
-def test_parts_have_the_limits_of_the_whole(monkeypatch, most):
+def test_limits_of_parts_equal_those_of_the_whole(monkeypatch, most):
     monkeypatch.setattr(plausible, "_MOST", most)
     intensities = decibels(np.random.default_rng(0)).astype(np.float32)
-    intensities[12_345] = 1e9  # those that stand for all need not hold it
+    intensities[12_345] = 1e9  # a sample may miss it
     parts = Intensities()
     for part in np.split(intensities, [10, 10, 3000, 9001]):
         parts.add(part)

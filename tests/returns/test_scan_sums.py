@@ -33,7 +33,7 @@ def rays():
     return prepare(scene.points, scene.poses)
 
 
-def test_scans_one_after_another_in_any_order_are_all_scans_at_once(rays):
+def test_incremental_sums_in_any_order_equal_batch_sums(rays):
     parts = [sums_of(rays.select(rays.scans == scan)) for scan in np.unique(rays.scans)]
     order = np.random.default_rng(0).permutation(len(parts))
     whole = sums_of(rays)
@@ -41,7 +41,7 @@ def test_scans_one_after_another_in_any_order_are_all_scans_at_once(rays):
     assert same(functools.reduce(operator.add, [parts[i] for i in order]), whole)
 
 
-def test_a_scan_that_is_taken_out_was_never_there(rays):
+def test_removing_a_scan_restores_the_sums(rays):
     gone = rays.scans == 2
     without = sums_of(rays.select(~gone))
     found = sums_of(rays) - sums_of(rays.select(gone))
@@ -49,7 +49,7 @@ def test_a_scan_that_is_taken_out_was_never_there(rays):
     assert same(found, without)
 
 
-def test_means_are_those_of_the_returns(rays):
+def test_means_equal_those_of_the_returns(rays):
     cells, sums = ReturnCells.of(rays, LEAF_M), sums_of(rays)
     quantum_m, counts = LEAF_M / QUANTA, sums.counts
 
@@ -68,7 +68,7 @@ def test_means_are_those_of_the_returns(rays):
     assert np.array_equal(found.counts, counts)
 
 
-def test_moments_are_those_of_the_returns_in_cells_twice_as_large(rays):
+def test_moments_equal_those_of_returns_in_parent_cells(rays):
     cells = ReturnCells.of(rays, 2 * LEAF_M)
     points = rays.points.astype(np.float64)
     products = [points[:, i] * points[:, j] for i, j in UPPER]
@@ -86,7 +86,7 @@ def test_moments_are_those_of_the_returns_in_cells_twice_as_large(rays):
 
 @pytest.mark.parametrize("size_m", [0.1, 0.2, 0.37])
 @pytest.mark.parametrize("extent_m", [1.0, 30.0, 9e4])
-def test_merged_cells_are_those_of_twice_the_size(size_m, extent_m):
+def test_merged_cells_equal_cells_of_twice_the_size(size_m, extent_m):
     points = np.random.default_rng(0).uniform(-extent_m, extent_m, (2000, 3))
     rays = prepare([points], np.eye(4)[None])
     leaves, found = ReturnCells.of(rays, size_m), ReturnCells.of(rays, 2 * size_m)

@@ -21,7 +21,7 @@ NOISE = SensorNoise(0.1, 0.01, 0.02)
 
 
 def scans(counts=(300, 500, 700), seed=0):
-    """Returns within 60° to both sides, 10° down and 20° up, 3 to 40 m away; intensities above 50 - range / 2."""
+    """Returns at azimuths of ±60°, elevations from -10° to 20° and ranges from 3 to 40 m; intensities above 50 - range / 2."""
     rng = np.random.default_rng(seed)
     points, intensities = [], []
     for count in counts:
@@ -109,7 +109,7 @@ def noise_of(rays, **known):
 
 
 @pytest.mark.parametrize(("range_m", "angle_rad"), [(0.05, 0.004), (0.05, 0.012), (0.1, 0.008)])
-def test_the_noise_is_found_in_the_data(range_m, angle_rad):
+def test_the_noise_is_estimated_from_the_data(range_m, angle_rad):
     points, poses, _ = a_wall(range_m, angle_rad)
     noise = noise_of(prepare(points, poses))
     assert noise.range_m == pytest.approx(range_m, rel=0.35)
@@ -118,7 +118,7 @@ def test_the_noise_is_found_in_the_data(range_m, angle_rad):
 
 @pytest.mark.parametrize("roll_rad", [0.0, 0.5 * np.pi])
 def test_elevation_noise_is_separated_from_azimuth_noise(roll_rad):
-    """A sensor that lies on its side has its azimuth where others have their elevation."""
+    """The azimuth of a sensor rolled by 90 degrees is the elevation of others."""
     points, poses, _ = a_wall(0.05, 0.004, noise_elevation_rad=0.012, scans=16)
     roll = np.eye(4)
     roll[1:3, 1:3] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
@@ -130,7 +130,7 @@ def test_elevation_noise_is_separated_from_azimuth_noise(roll_rad):
     assert horizontal < 0.7 * vertical
 
 
-def test_what_the_user_knows_stays():
+def test_given_noise_is_kept():
     points, poses, _ = a_wall(0.05, 0.008)
     rays = prepare(points, poses)
     noise = noise_of(rays, range_noise_m=0.07)
@@ -140,7 +140,7 @@ def test_what_the_user_knows_stays():
     assert dataclasses.astuple(noise_of(rays, **known)) == pytest.approx((0.5, 0.2, 0.1))
 
 
-def test_few_returns_give_a_guess():
+def test_few_returns_fall_back_to_the_default():
     few = ground_and_wall(scans=2, returns_per_scan=20)
     assert dataclasses.astuple(noise_of(prepare(few.points, few.poses))) == pytest.approx((0.1, 0.01, 0.01))
 

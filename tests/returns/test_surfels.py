@@ -37,7 +37,7 @@ def test_ghosts_are_found_and_the_surface_is_kept():
     np.testing.assert_array_equal(dropped, ghosts_of(rays, surfels, num_threads=3))
 
 
-def test_clutter_is_what_lies_on_no_flat_surfel():
+def test_clutter_lies_on_no_flat_surfel():
     points, poses, _ = a_wall()
     surfels = Surfels.of(prepare(points, poses), LEAF_M)
     flat = surfels.variances[:, 0] < 0.5 * surfels.variances[:, 1]
@@ -49,7 +49,7 @@ def test_clutter_is_what_lies_on_no_flat_surfel():
     assert (lone.clutter_ratio(), lone.returns_per_cell(), len(lone.cell_of_plane)) == (0, 1, 0)
 
 
-def test_a_fit_drops_and_counts_them():
+def test_a_fit_excludes_and_counts_ghosts():
     points, poses, is_ghost = a_wall(ghosts=40)
     config = FitConfig(training={"sdf_iterations": 5}, returns={"min_range_m": 0.0})
     with_ghosts, without = (
@@ -64,8 +64,8 @@ def test_a_fit_drops_and_counts_them():
     assert without.observed(behind).sum() < with_ghosts.observed(behind).sum()
 
 
-def test_a_hedge_that_rays_pass_is_no_mirror():
-    """A plane that most rays go through: what is behind it is real."""
+def test_a_permeable_hedge_is_no_mirror():
+    """Most rays cross its plane, so that returns behind it are real."""
     points, poses, _ = a_wall()
     rng = np.random.default_rng(1)
     passed = [np.concatenate([p[-750:] * rng.uniform(1.3, 1.9, (750, 1)) for _ in range(5)]) for p in points]
@@ -95,7 +95,7 @@ def test_crossings_of_one_surfel():
     assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2]) == [0]
     assert crossed(one_surfel(), sensor, [9.5, 0.2, 0.2]) == [-1]  # ends in front
     assert crossed(one_surfel(), sensor, [10.1, 0.2, 0.2]) == [-1]  # within the margin
-    assert crossed(one_surfel(), sensor, [11.0, 3.0, 0.2]) == [-1]  # passes beside
+    assert crossed(one_surfel(), sensor, [11.0, 3.0, 0.2]) == [-1]  # misses the cell
     assert crossed(one_surfel(reach_m=0.1), sensor, [11.0, 0.3, 0.2]) == [0]  # 0.09 m off its centre
     assert crossed(one_surfel(reach_m=0.1), sensor, [11.0, 0.2, 0.33]) == [-1]  # 0.12 m off
     assert crossed(one_surfel([1, 0, 0]), sensor, [11.0, 0.2, 0.2]) == [-1]  # comes from behind
@@ -111,7 +111,7 @@ def test_crossings_of_one_surfel():
 
 
 def test_the_shift_is_the_best_linear_estimate():
-    """As in plain NumPy, one return after another."""
+    """Against plain NumPy, return by return."""
     points, poses, _ = a_wall(noise_range_m=0.1, noise_angle_rad=0.01, scans=2)
     noise = SensorNoise(0.1, 0.012, 0.02)
     rays = prepare(points, poses)
@@ -149,4 +149,4 @@ def test_a_rough_surface_keeps_its_shape():
         for sigma_m in (0.01, 0.1)
     }
     assert kept[0.01] > 0.95
-    assert kept[0.1] < 0.3  # a sensor with so much noise would not tell the grooves
+    assert kept[0.1] < 0.3  # the grooves are below the noise of this sensor

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Echoes: means of returns that are close and seen alike."""
+"""View statistics of intensity: means of returns that are close and have similar views."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def view_statistics(rays):
     return ViewStatistics.of(rays, (rays.intensities / 100).astype(np.float32), LEAF_M)
 
 
-def test_they_are_the_means_of_their_returns(rays, view_statistics):
+def test_view_statistics_are_means_of_their_returns(rays, view_statistics):
     rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, LEAF_M)
     found = view_statistics.in_world(rays.origin, 0.0, 100.0)
     assert found.counts.sum() == len(rays)
@@ -37,7 +37,7 @@ def test_they_are_the_means_of_their_returns(rays, view_statistics):
     )
     np.testing.assert_allclose(found.ranges_m[largest], rays.ranges_m[of_it].mean(), rtol=1e-3)
     np.testing.assert_allclose(found.directions[largest], rays.directions[of_it].mean(axis=0), atol=0.02)
-    # They are close and seen alike.
+    # They are close and have similar views.
     assert np.ptp(rays.points[of_it], axis=0).max() <= 3 * LEAF_M + 1e-5
     assert np.ptp(rays.directions[of_it], axis=0).max() <= 0.25 + 1e-5
     assert count == len(found.counts)
@@ -58,7 +58,7 @@ def test_wrong_arrays_are_refused(view_statistics):
             dataclasses.replace(view_statistics, **change).check(LEAF_M)
 
 
-def test_parts_are_joined_with_the_mean_of_their_variances(view_statistics):
+def test_merged_parts_have_the_mean_of_their_variances(view_statistics):
     one = view_statistics.in_world(np.array([1.0, 2, 3]), 10.0, 30.0)
     assert one.sigma == pytest.approx(20 * view_statistics.sigma)
     few = dataclasses.replace(one.select(np.arange(len(one.counts)) < 5), sigma=3.0)
@@ -69,7 +69,7 @@ def test_parts_are_joined_with_the_mean_of_their_variances(view_statistics):
     assert ViewStatisticsAt.together([few.select(np.zeros(5, bool))]).sigma == 3
 
 
-def test_the_deviation_is_that_of_single_returns_from_their_means(rays, view_statistics):
+def test_the_deviation_is_of_single_returns_from_their_means(rays, view_statistics):
     rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, LEAF_M)
     values = rays.intensities / 100
     means = np.bincount(rows, values) / np.bincount(rows)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Scans of a wall, for tests of what is known of the returns."""
+"""Scans of a wall, for tests of returns."""
 
 import numpy as np
 

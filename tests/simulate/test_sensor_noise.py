@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Noise that depends on axis, range and strength, and the false returns: each as its setting says."""
+"""Noise by axis, range and strength, and false returns, each according to its setting."""
 
 from dataclasses import replace
 
@@ -92,16 +92,14 @@ def test_phantoms_lie_behind_surfaces_at_depths_that_grow_with_the_range():
         assert len(depth_m) == pytest.approx(3000, rel=0.06)
         assert (depth_m > 0).all()
         assert depth_m.mean() == pytest.approx(0.02 * distance_m, rel=0.06)
-    assert (
-        len(phantoms(sensor.scan(sim.Scene([]), np.eye(4)))) == 0
-    )  # there is nothing that they could be behind
+    assert len(phantoms(sensor.scan(sim.Scene([]), np.eye(4)))) == 0  # without surfaces there are no phantoms
 
 
 @pytest.mark.parametrize(
     ("share", "seed", "least", "most"), [(1.0, 0, 0.6, 1.0), (0.5, 0, 0.3, 0.55), (0.0, 0, 0.0, 0.01), (1.0, 1, 0.0, 0.05)]
 )  # fmt: skip
-def test_lasting_phantoms_stay_at_their_places_in_the_world(share, seed, least, most):
-    """From scan to scan, whatever the pose. Another seed has other places."""
+def test_persistent_phantoms_are_fixed_in_the_world(share, seed, least, most):
+    """In all scans, independent of the pose. Another seed has other positions."""
     sensor = replace(
         QUIET,
         azimuth_fov_rad=1.0,
@@ -134,8 +132,8 @@ def circle():
     return times_s, poses
 
 
-def test_an_imu_with_axes_and_lever_of_its_own(circle):
-    """Steady on a circle: the rate is 1 rad/s about z, and the force is gravity and the pull to the centre."""
+def test_an_imu_measures_in_its_own_axes_at_its_lever_arm(circle):
+    """Uniform on a circle: the rate is 1 rad/s about z, and the specific force is gravity plus the centripetal part."""
     times_s, poses = circle
     R_sensor_imu = Rotation.from_euler("ZYX", [0.7, -0.2, 0.4]).as_matrix()
     lever_m = np.array([0.5, -0.3, 0.2])  # of the sensor in the axes of the IMU
@@ -155,13 +153,13 @@ def test_an_imu_with_axes_and_lever_of_its_own(circle):
     np.testing.assert_allclose(
         imu.specific_force[near].mean(axis=0), force + BIAS_MPS2, atol=4 * 0.05 / 50**0.5
     )
-    middle = slice(200, 1800)  # splines swing at their ends
+    middle = slice(200, 1800)  # splines oscillate at their ends
     np.testing.assert_allclose(imu.angular_velocity[middle].std(axis=0), 0.005, rtol=0.1)
     np.testing.assert_allclose(imu.specific_force[middle].std(axis=0), 0.05, rtol=0.1)
 
 
-def test_doppler_and_rates_have_the_noise_that_is_stated():
-    """Along a straight line at 2 m/s, turning at 0.1 rad/s. A tenth of the returns move by themselves."""
+def test_doppler_and_rates_have_the_documented_noise():
+    """Along a straight line at 2 m/s, turning at 0.1 rad/s. A tenth of the returns move."""
     times_s = np.arange(0, 4, 0.2)
     poses = np.tile(np.eye(4), (len(times_s), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("z", 0.1 * times_s[:, None]).as_matrix()
@@ -191,7 +189,7 @@ def test_doppler_and_rates_have_the_noise_that_is_stated():
     np.testing.assert_allclose(turns, np.round(turns), atol=1e-5)
 
 
-def test_drift_adds_up_from_step_to_step():
+def test_drift_accumulates():
     poses = np.tile(np.eye(4), (4001, 1, 1))
     poses[:, 0, 3] = np.arange(4001)
     found = sim.drifted(poses, 0.02, 0.003, seed=1, yaw_rad=0.01)

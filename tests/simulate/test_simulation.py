@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The simulator against its own claims: exact geometry, the radar equation, and labels that tell the truth."""
+"""The simulator: exact geometry, the radar equation, and correct labels."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def rays(rng, count):
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def test_hits_lie_on_the_surface_and_nothing_lies_before_them(mixed_scene):
+def test_hits_are_the_first_points_on_the_surface(mixed_scene):
     rng = np.random.default_rng(0)
     origin, directions = np.array([0.0, 0.0, 2.0]), rays(rng, 4000)
     hits = mixed_scene.raycast(origin, directions, 40.0)
@@ -70,13 +70,13 @@ def test_normals_are_the_gradient_of_the_distance(mixed_scene):
     seen = hits.primitive >= 0
     points = origin + hits.range_m[seen, None] * directions[seen]
     outside = mixed_scene.signed_distance(points + 1e-3 * hits.normals[seen])
-    # Within a millimetre of an edge another face may be nearer.
+    # Within a millimetre of an edge, another face may be nearer.
     assert np.mean(np.abs(outside - 1e-3) < 1e-5) > 0.98
 
 
 @pytest.mark.parametrize("part", range(4))
 def test_distance_against_brute_force(mixed_scene, part):
-    """Whoever samples the surface densely finds nothing nearer, and something about as near."""
+    """Dense samples of the surface are never nearer, and some are about as near."""
     rng = np.random.default_rng(2)
     primitive = mixed_scene.parts[part]
     if part == 3:
@@ -116,7 +116,7 @@ def test_poses_are_rigid_and_smooth(simulation, monkeypatch):
 
 
 def test_true_returns_lie_near_the_surface(simulation):
-    """Nearer than the position noise of each return allows: 5 sigma along, and across the beam."""
+    """Within 5 sigma of the position noise of each return, along and across the beam."""
     sensor, surface = simulation.sensor, simulation.is_surface()
     distance = np.abs(simulation.scene.signed_distance(simulation.world_points()[surface]))
     range_m = np.linalg.norm(np.concatenate(simulation.points)[surface], axis=1)
@@ -143,7 +143,7 @@ def test_intensities_respect_the_sensor(simulation):
     assert 1.5 < simulation.intensity_noise_floor() < 4.0
 
 
-def test_lidar_lies_on_what_the_radar_could_see(simulation):
+def test_lidar_points_are_on_surfaces_visible_to_the_radar(simulation):
     truth, sensor = simulation.ground_truth, simulation.sensor
     assert len(truth) > 20_000
     distance = np.abs(simulation.scene.signed_distance(truth))
@@ -187,7 +187,7 @@ def summary(one):
 
 
 @pytest.mark.parametrize("name", sorted(sim.SCENES))
-def test_same_seed_same_bits_other_seed_other_layout(name):
+def test_simulations_are_deterministic_by_seed(name):
     one, again = (sim.SCENES[name](seed=3, frames=2) for _ in range(2))
     other = sim.SCENES[name](seed=4, frames=1)
     for value, expected, atol in zip(
@@ -244,7 +244,7 @@ def test_clutter_does_not_change_the_other_returns():
 
 
 def test_incidence_lobe():
-    """Noiseless power over a wide wall, range taken out, is the material's lobe of the known angle."""
+    """Noiseless power over a wide wall, corrected for range, equals the material's lobe at the known angle."""
     material = sim.Material("shiny", 2.0, specular=0.9, lobe_width_rad=0.3)
     sensor = replace(QUIET, azimuth_fov_rad=2.4, elevation_fov_rad=0.01)
     scan = sensor.scan(wall_ahead(5.0, material), np.eye(4))
@@ -268,7 +268,7 @@ def test_threshold_censors():
 
 
 def test_ghosts_lie_behind_the_mirror_at_the_length_of_the_path():
-    """A mirror across the lane, tilted by 45 degrees, shows a wall at its left as if it stood straight on."""
+    """A mirror across the lane, tilted by 45 degrees, shows a wall on its left as if it were straight ahead."""
     shiny = replace(FACING, mirror_loss_db=3.0)
     mirror = sim.Box(np.array([10.0, 0.0, 0.0]), np.array([3.0, 0.05, 3.0]), np.pi / 4, shiny)
     target = sim.Box(np.array([10.0, 20.5, 0.0]), np.array([9.0, 0.5, 9.0]), 0.0, FACING)
@@ -279,7 +279,7 @@ def test_ghosts_lie_behind_the_mirror_at_the_length_of_the_path():
     assert ghosts.sum() == (~ghosts).sum() == sensor.beams
     # Mirrored at the plane x - y = 10 - 0.05·√2, the target's face y = 20 appears at this x.
     np.testing.assert_allclose(scan.points[ghosts, 0], 30.0 - 0.05 * np.sqrt(2), atol=1e-3)
-    # The radar equation over the whole path, less the mirror's loss on both ways. Fading has the median 0.
+    # The radar equation over the whole path, minus the two-way loss of the mirror. Fading has the median 0.
     expected_db = sensor.gain_db - 40 * np.log10(30.0) - 2 * 3.0
     assert np.median(scan.intensities[ghosts]) == pytest.approx(expected_db, abs=0.3)
     ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1)
@@ -288,7 +288,7 @@ def test_ghosts_lie_behind_the_mirror_at_the_length_of_the_path():
 
 
 def test_reflector_lobe_in_the_wall_scene():
-    """On its axis the reflector outshines the wall by far; 70 degrees off, the lobe has gone."""
+    """On its axis the reflector is much stronger than the wall; 70 degrees off, its lobe has no effect."""
     scene = sim.wall(seed=0, frames=1)
     reflector = scene.scene.solids[-1]
     sensor = replace(scene.sensor, threshold_db=0.0, saturation_db=300.0, beams=40_000, azimuth_fov_rad=0.3,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A cluster of dask.distributed whose scheduler and workers are processes of their own, as on many machines."""
+"""A cluster of dask.distributed with scheduler and workers in separate processes, as on many machines."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Cluster:
 
     @staticmethod
     def _start(*words: Any) -> subprocess.Popen[bytes]:
-        """In a session of its own, so that a worker can be killed together with the nanny that would start it again."""
+        """Starts a new session, so that a worker can be killed together with the nanny that would restart it."""
         command = [sys.executable, "-m", "distributed.cli.dask_" + words[0], *map(str, words[1:])]
         return subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
@@ -50,14 +50,14 @@ class Cluster:
 
 
 def kill(process: subprocess.Popen[bytes]) -> None:
-    """Kills a process and its children without a word to them."""
+    """Kills a process and its children without notice."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
 
 
 @contextmanager
 def cluster_in(folder: Path) -> Iterator[Cluster]:
-    """A cluster that ends with the block."""
+    """A cluster that is closed at the end of the block."""
     folder.mkdir()
     cluster = Cluster(folder)
     try:

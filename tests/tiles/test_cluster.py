@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Tiles on dask.distributed: the same bits, and what was done is kept."""
+"""Tiles on dask.distributed: no bit changes, and finished tiles are kept."""
 
 from concurrent.futures import Future
 
@@ -19,12 +19,12 @@ from .conftest import CONFIG, TILE_M
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     with cluster_in(tmp_path_factory.mktemp("cluster") / "first") as found:
-        with distributed.Client(found.address) as client:  # its workers come a moment later
+        with distributed.Client(found.address) as client:  # workers connect later
             client.wait_for_workers(1, timeout=60)
         yield found
 
 
-def test_fits_have_the_bits_of_one_process(cluster, drive, folder, tmp_path):
+def test_fits_on_a_cluster_change_no_bit(cluster, drive, folder, tmp_path):
     with cluster_executor(cluster.address, 0) as executor:
         city = radarsdf.fit_tiles(
             drive,
@@ -39,7 +39,7 @@ def test_fits_have_the_bits_of_one_process(cluster, drive, folder, tmp_path):
     assert bits_of(tmp_path / "city") == bits_of(folder)
 
 
-def test_a_tile_that_no_worker_can_hold_is_refused(cluster):
+def test_a_tile_beyond_the_memory_of_all_workers_is_rejected(cluster):
     with (
         pytest.raises(MemoryError, match="make the plan with smaller tiles"),
         cluster_executor(cluster.address, 10**15),
@@ -54,7 +54,7 @@ def test_an_address_without_a_cluster(monkeypatch):
 
 
 class CutOff:
-    """What dask.distributed gives after its scheduler is gone: futures that are never done, and a closed client."""
+    """A client of dask.distributed without a scheduler: futures that never complete, and a closed client."""
 
     class _client:
         status = "running"
@@ -68,7 +68,7 @@ class CutOff:
         return future
 
 
-def test_without_a_scheduler_it_ends_and_keeps_what_was_done(drive, folder, tmp_path):
+def test_a_lost_scheduler_is_an_error_and_finished_tiles_are_kept(drive, folder, tmp_path):
     out = tmp_path / "city"
     arguments = {"tile_size": TILE_M, "halo": 6.4, "config": CONFIG, "progress": False}
     city = radarsdf.fit_tiles(drive, out, executor=CutOff(), **arguments)

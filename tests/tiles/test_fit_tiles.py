@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Fits in tiles: the same steps as one fit, whatever runs them and whatever goes wrong."""
+"""Fits in tiles: the same steps as one fit, with any executor and after failures."""
 
 import dataclasses
 import errno
@@ -46,10 +46,10 @@ def tiles_of(drive, out, **arguments):
     return radarsdf.fit_tiles(drive, out, **given)
 
 
-def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
+def test_one_tile_equals_one_fit(drive, tmp_path):
     city = tiles_of(drive, tmp_path / "city", tile_size=512, halo=51.2)
     contents = {tile.tile: city.contents_of(tile.tile) for tile in city.tiles}
-    assert len(contents) == 2  # the drive crosses a border, and each knows what lies within 51 m
+    assert len(contents) == 2  # the drive crosses a border, and each tile has the returns within 51 m
     part = contents[0, 0]
     scale = (city.intensity_scale.low, city.intensity_scale.high)
     known = {
@@ -66,7 +66,7 @@ def test_one_tile_is_the_map_of_one_fit(drive, tmp_path):
     np.testing.assert_array_equal(whole.field.table.leaf_keys(), part.field.table.leaf_keys())
     np.testing.assert_array_equal(whole.evidence.visibility, part.evidence.visibility)
     points = np.concatenate([s.world_points for s in drive])[::50]
-    # Positions are rounded to float32 in another frame, which smoothing carries from corner to corner: 0.24 mm at most.
+    # Positions are rounded to float32 in another frame, and smoothing propagates the error: at most 0.24 mm.
     error_m = np.abs(city.sdf(points) - whole.sdf(points))
     assert np.nanmedian(error_m) < 1e-5
     assert np.nanmax(error_m) < 1e-3
@@ -89,13 +89,13 @@ def test_trained_tiles(drive, tmp_path):
     )  # of different networks after few iterations
 
 
-def test_done_tiles_are_kept_and_others_are_made_with_the_same_bits(drive, folder, tmp_path):
+def test_resuming_keeps_finished_tiles_and_changes_no_bit(drive, folder, tmp_path):
     again = tmp_path / "city"
     shutil.copytree(folder, again)
     plan = Plan.load(again)
     first, second = map_path(again, plan.tiles[0]), map_path(again, plan.tiles[1])
     first.unlink()
-    second.write_bytes(second.read_bytes()[:1000])  # as a full disk would leave it, were it not written whole
+    second.write_bytes(second.read_bytes()[:1000])  # as a full disk would leave it without atomic writes
     others = {tile.name: map_path(again, tile).stat().st_mtime_ns for tile in plan.tiles[2:]}
     city = tiles_of(drive, again)
     assert city.missing == {}
@@ -103,7 +103,7 @@ def test_done_tiles_are_kept_and_others_are_made_with_the_same_bits(drive, folde
     assert_same_bits(maps_of(folder), maps_of(again))
 
 
-def test_a_tile_that_fails_is_named_and_the_others_go_on(drive, tmp_path):
+def test_a_failed_tile_is_named_and_the_others_continue(drive, tmp_path):
     out = tmp_path / "city"
     plan = plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
     bad = plan.tiles[2].name
@@ -117,7 +117,7 @@ def test_a_tile_that_fails_is_named_and_the_others_go_on(drive, tmp_path):
 
 
 class Broken:
-    """An executor whose workers die."""
+    """An executor with workers that die."""
 
     def submit(self, task, *arguments):
         future = Future()
@@ -135,7 +135,7 @@ def test_a_killed_worker_loses_only_its_tile(drive, folder, tmp_path):
     assert_same_bits(maps_of(folder), maps_of(tmp_path / "city"))
 
 
-def test_another_plan_is_refused(drive, folder):
+def test_another_plan_is_rejected(drive, folder):
     with pytest.raises(ValueError, match="another plan: seed differ"):
         tiles_of(drive, folder, config=CONFIG.override(seed=1))
     with pytest.raises(ValueError, match="another plan: tile_size differ"):
@@ -151,19 +151,19 @@ def test_one_process_at_a_time_plans_a_folder(drive, folder, tmp_path):
     out, lock = (
         tmp_path / "city",
         take_lock(folder / "plan.lock", "planned"),
-    )  # of a folder with a plan, it is free
+    )  # a folder with a plan is unlocked
     os.close(lock)
     out.mkdir()
     lock = take_lock(out / "plan.lock", "planned")
     with pytest.raises(BlockingIOError, match=f"city is being planned by process {os.getpid()}"):
         plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG)
     os.close(lock)
-    (out / "tiles" / "0_0").mkdir(parents=True)  # as a process that was killed leaves it
+    (out / "tiles" / "0_0").mkdir(parents=True)  # as after a killed process
     (out / "tiles" / "0_0" / "rays.bin").write_bytes(b"half")
     assert plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG) == Plan.load(folder)
 
 
-def test_scans_may_come_one_after_another(drive, folder, tmp_path):
+def test_scans_may_be_an_iterator(drive, folder, tmp_path):
     city = tiles_of((scan for scan in drive), tmp_path / "city")
     assert city.plan == Plan.load(folder)
 
@@ -185,10 +185,10 @@ def test_a_scan_in_another_city_has_a_tile_of_its_own(drive, folder, tmp_path):
     seen = city.observed(returns)
     assert seen.mean() > 0.5
     step = city.sdf(returns[seen] + [1e-3, 0, 0]) - city.sdf(returns[seen])
-    assert 0.2e-3 < np.median(np.abs(step)) < 5e-3  # a millimetre counts, 20,000 km from the world's origin
+    assert 0.2e-3 < np.median(np.abs(step)) < 5e-3  # a millimetre matters, 20,000 km from the world origin
 
 
-def test_plans_of_nothing(tmp_path, drive):
+def test_impossible_plans_are_rejected(tmp_path, drive):
     with pytest.raises(ValueError, match="there are no scans"):
         tiles_of([], tmp_path / "a")
     (tmp_path / "thesis.tex").touch()
@@ -213,7 +213,7 @@ def test_a_bad_scan_is_named(drive, tmp_path, values, said):
     assert tiles_of(drive, tmp_path / "city").missing == {}  # and the folder can be used again
 
 
-def test_scans_that_cannot_be_used_are_left_out(drive, tmp_path):
+def test_unusable_scans_are_excluded(drive, tmp_path):
     empty = {"points": np.zeros((0, 3)), "intensities": np.zeros(0)}
     nowhere = np.full((4, 4), np.nan)
     scans = changed(changed(drive, 7, T_world_sensor=nowhere), 3, **empty)
@@ -225,7 +225,7 @@ def test_scans_that_cannot_be_used_are_left_out(drive, tmp_path):
         tiles_of(half, tmp_path / "half")
 
 
-def test_the_sensor_is_that_of_evenly_spread_scans(drive, tmp_path, monkeypatch):
+def test_the_sensor_is_estimated_from_evenly_spaced_scans(drive, tmp_path, monkeypatch):
     monkeypatch.setattr("radarsdf.tiles.planning._SENSOR_SCANS", 5)
     plan = plan_tiles(drive, tmp_path / "city", tile_size=TILE_M, halo=6.4, config=CONFIG)
     some = drive.select(np.array([0, 4, 8]))
@@ -233,7 +233,7 @@ def test_the_sensor_is_that_of_evenly_spread_scans(drive, tmp_path, monkeypatch)
     assert plan.sensor == Sensor.of(some.points, some.intensities, noise=plan.sensor.noise, **limits)
 
 
-def test_a_map_of_which_all_tiles_fail_is_an_error(drive, tmp_path):
+def test_a_map_without_a_fitted_tile_is_an_error(drive, tmp_path):
     out = tmp_path / "city"
     names = [tile.name for tile in plan_tiles(drive, out, tile_size=TILE_M, halo=6.4, config=CONFIG).tiles]
     for name in names:
@@ -261,7 +261,7 @@ def test_a_full_disk_is_reported_and_finished_tiles_are_kept(drive, folder, tmp_
     assert_same_bits(maps_of(folder), maps_of(out))
 
 
-def test_chunks_end_between_groups_where_they_are_long_dense_or_far():
+def test_chunks_are_split_between_groups_by_length_density_and_distance():
     def sizes(count, returns=0, step_m=0.0):
         poses = np.tile(np.eye(4), (count, 1, 1))
         poses[:, 1, 3] = step_m * np.arange(count)
@@ -269,7 +269,7 @@ def test_chunks_end_between_groups_where_they_are_long_dense_or_far():
         return [len(chunk) for chunk in _chunks(scans, 3)]
 
     assert sizes(520) == [258, 258, 4]
-    assert sizes(8, returns=100_000) == [6, 2]  # half a million with the fifth
+    assert sizes(8, returns=100_000) == [6, 2]  # the fifth exceeds half a million
     assert sizes(10, step_m=-199.9) == [6, 4]
     assert sizes(10, step_m=-334.0) == [3, 3, 3, 1]
     assert sizes(0) == []
@@ -278,7 +278,7 @@ def test_chunks_end_between_groups_where_they_are_long_dense_or_far():
 GRID = TileGrid(tile_m=12.8, halo_m=6.4, corner_m=-2.0)
 
 
-def test_weights_add_up_to_one_and_ignore_the_outer_half_of_the_halo():
+def test_weights_sum_to_one_and_are_zero_in_the_outer_half_of_the_halo():
     points = np.random.default_rng(0).uniform(0, 12.8, (500, 3))
     weights = np.stack([GRID.weights(tile, points) for tile in neighbours((0, 0))])
     np.testing.assert_allclose(weights.sum(axis=0), 1, atol=1e-12)
@@ -290,7 +290,7 @@ def test_weights_add_up_to_one_and_ignore_the_outer_half_of_the_halo():
 
 
 @pytest.mark.parametrize("straight", [False, True])
-def test_a_ray_goes_to_each_tile_that_it_crosses(straight):
+def test_a_ray_is_assigned_to_each_tile_that_it_crosses(straight):
     rng = np.random.default_rng(2)
     a, b = rng.uniform(-40, 40, (2, 200, 3))
     if straight:
@@ -304,18 +304,18 @@ def test_a_ray_goes_to_each_tile_that_it_crosses(straight):
 
 
 def through(tile, a, b):
-    """Rows of the rays from a to b (N, 3) that go through a tile and its halo."""
+    """Rows of the rays from a to b (N, 3) that cross a tile with its halo."""
     lower = GRID.lower_corner(tile) - GRID.halo_m
     sides = np.stack([lower, lower + GRID.tile_m + 2 * GRID.halo_m])[:, None]
     with np.errstate(
         divide="ignore"
-    ):  # along an axis that a ray keeps its place on, it is there always or never
+    ):  # along an axis with a constant coordinate, a ray is always or never inside
         shares = np.sort((sides - a[:, :2]) / (b - a)[:, :2], axis=0)
     first, last = shares[0].max(axis=1), shares[1].min(axis=1)
     return np.flatnonzero(np.maximum(first, 0) <= np.minimum(last, 1)).tolist()
 
 
-def test_the_cells_are_those_that_the_fit_of_the_tile_has(folder):
+def test_estimated_cells_equal_those_of_the_fitted_tile(folder):
     plan = Plan.load(folder)
     for tile in plan.tiles:
         rays, inside = read_rays(folder, plan, tile)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Folders of tiles that are damaged, or come from elsewhere: what is wrong is named, and nothing else is touched."""
+"""Damaged and malicious folders of tiles: the fault is named, and no other file is changed."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ WILD = [
 
 @pytest.fixture
 def copy(folder, tmp_path):
-    """A folder of tiles that may be spoilt."""
+    """A copy of a folder of tiles, to be damaged."""
     return shutil.copytree(folder, tmp_path / "city")
 
 
@@ -58,13 +58,13 @@ def test_types_of_a_plan_are_checked(copy):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "null", "{}", "[" * 5000, '{"format": 1}', "\xff"])
-def test_a_plan_that_is_none(copy, text):
+def test_an_invalid_plan_is_rejected(copy, text):
     (copy / "plan.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(ValueError, match="is not a whole plan: "):
         Plan.load(copy)
 
 
-def test_a_reason_is_printed_as_letters(copy):
+def test_control_characters_of_a_reason_are_escaped(copy):
     tile = Plan.load(copy).tiles[0]
     map_path(copy, tile).unlink()
     failure_path(copy, tile).write_bytes(b"\x1b[2J\x1b]0;x\x07gone\nnext\xff" + b"x" * 10**6)
@@ -74,7 +74,7 @@ def test_a_reason_is_printed_as_letters(copy):
     assert len(reason) <= 10_000
 
 
-def test_parts_of_a_mesh_that_are_damaged_are_refused(copy):
+def test_damaged_parts_of_a_mesh_are_rejected(copy):
     for part in copy.rglob("mesh-*.npz"):  # of other settings
         part.unlink()
     radarsdf.load(copy).mesh(0.2, progress=False)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The mesh of a map in tiles, against one that is cut from all cells at once."""
+"""The mesh of a map in tiles, against one extracted from all cells at once."""
 
 import json
 
@@ -40,13 +40,13 @@ def in_one_go(city, steps, min_triangles):
 
 
 def triangles(vertices, faces):
-    """The triangles as a set, each with its corners in an order that does not depend on the numbering."""
+    """The set of triangles, with corners in an order independent of the numbering."""
     corners = np.ascontiguousarray(vertices[faces])
     return {tuple(sorted(map(tuple, corner))) for corner in corners.tolist()}
 
 
 @pytest.mark.parametrize(("steps", "min_triangles"), [(1, 30), (1, 1500), (2, 0)])
-def test_the_mesh_is_that_of_all_cells_at_once(city, steps, min_triangles):
+def test_the_mesh_equals_that_of_all_cells_at_once(city, steps, min_triangles):
     mesh = city.mesh(0.2 / steps, min_component_triangles=min_triangles, progress=False)
     found, expected = triangles(mesh.vertices, mesh.faces), triangles(*in_one_go(city, steps, min_triangles))
     assert len(expected) > 5000
@@ -72,7 +72,7 @@ def test_export_writes_the_same_mesh(city, tmp_path):
 
 
 def test_the_threshold_is_that_of_the_whole_map(city):
-    """No tile has one of its own: their sums give it, whatever is kept afterwards."""
+    """Tiles have none of their own: their sums determine it, independent of later limits."""
     for given in (None, 0.3):
         mesh = city.mesh(0.2, min_confidence=given, progress=False)
         threshold = city.threshold(0.2, min_confidence=given, progress=False)
@@ -96,7 +96,7 @@ def test_a_box_and_a_viewpoint(city):
     np.testing.assert_allclose(values, city.intensity(np.array(mesh.vertices), [0, 0, 1]), rtol=1e-5)
 
 
-def test_voxels_that_do_not_divide_cells(city):
+def test_voxels_that_do_not_divide_cells_are_rejected(city):
     for size in (0.3, 0.15, 0.07):
         with pytest.raises(ValueError, match="do not divide leaf cells"):
             city.mesh(size)
@@ -106,18 +106,18 @@ def test_voxels_that_do_not_divide_cells(city):
         city.mesh(0.2, boxes=None)
 
 
-def test_a_mesh_that_memory_cannot_hold(city, tmp_path, monkeypatch):
+def test_a_mesh_beyond_the_memory_is_rejected(city, tmp_path, monkeypatch):
     monkeypatch.setattr("radarsdf.memory.available_bytes", lambda: 10**6)
     with pytest.raises(MemoryError, match="radarsdf tiles mesh"):
         city.mesh(0.2, progress=False)
     assert city.export(tmp_path / "mesh.json", 0.2, progress=False)[1] > 10**6 / 320
 
 
-Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # what a viewer does to glTF: y up becomes z up
+Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # viewers convert glTF from y up to z up
 
 
 def leaves_of(node, transform=None):
-    """Leaves below a node with their transforms; each box must hold those below it."""
+    """Leaves below a node with their transforms; each box must contain its descendants."""
     transform = np.eye(4) if transform is None else transform
     if "transform" in node:
         transform = transform @ np.reshape(node["transform"], (4, 4)).T
@@ -135,7 +135,7 @@ def bounds(node, transform):
     return centre - half, centre + half
 
 
-def test_a_viewer_finds_the_mesh_where_it_is(city, tmp_path):
+def test_a_viewer_loads_the_mesh_at_its_position(city, tmp_path):
     path = tmp_path / "city.json"
     counts = city.export(path, 0.2, min_component_triangles=0, progress=False)
     tileset = json.loads(path.read_bytes())
@@ -163,14 +163,14 @@ def test_a_viewer_finds_the_mesh_where_it_is(city, tmp_path):
     np.testing.assert_allclose(*normals, atol=0.01)  # turned, not mirrored
 
 
-def test_small_components_go_unless_they_reach_a_border(city, tmp_path):
+def test_small_components_are_removed_unless_they_reach_a_border(city, tmp_path):
     whole, most, none = (
         city.export(tmp_path / "city.json", 0.2, min_component_triangles=least, progress=False)[1]
         for least in (0, 40, 10**9)
     )
     mesh = city.mesh(0.2, min_component_triangles=40, progress=False)
     assert 0 < none <= len(mesh.faces) <= most < whole
-    tileset = json.loads((tmp_path / "city.json").read_bytes())  # what is left is all at borders
+    tileset = json.loads((tmp_path / "city.json").read_bytes())  # all remaining ones are at borders
     for leaf, transform in leaves_of(tileset["root"]):
         part = trimesh.load_mesh(tmp_path / leaf["content"]["uri"], process=False)
         world = (part.vertices @ Z_UP.T + transform[:3, 3])[:, :2] - city.plan.grid.corner_m
@@ -179,7 +179,7 @@ def test_small_components_go_unless_they_reach_a_border(city, tmp_path):
             assert away_m[component].min() < 1e-3
 
 
-def test_a_file_in_the_way_is_refused_before_the_work(city, tmp_path):
+def test_an_existing_file_is_rejected_before_the_work(city, tmp_path):
     (tmp_path / "city").write_text("not a folder")
     with pytest.raises(FileExistsError):
         city.export(tmp_path / "city.json", 0.2, progress=False)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""One map that answers from many tiles."""
+"""A map that evaluates many tiles as one."""
 
 import pickle
 import shutil
@@ -26,7 +26,7 @@ def whole(drive):
     return radarsdf.fit(drive, config=CONFIG, progress=False)
 
 
-def test_answers_are_those_of_one_map(city, whole, points):
+def test_queries_equal_those_of_one_map(city, whole, points):
     known = whole.observed(points) & city.observed(points)
     assert known.mean() > 0.95
     points = points[known]
@@ -41,7 +41,7 @@ def test_answers_are_those_of_one_map(city, whole, points):
     assert np.quantile(np.linalg.norm(gradients[0] - gradients[1], axis=1), 0.95) < 0.05
 
 
-def test_what_all_tiles_have_in_common_is_that_of_one_map(folder, city, whole, drive):
+def test_common_properties_equal_those_of_one_map(folder, city, whole, drive):
     plan = city.plan
     rays = [read_rays(folder, plan, tile)[0] for tile in plan.tiles]
     surfels, counts = [SurfaceReturns.of(part, CONFIG, 1).surfels for part in rays], list(map(len, rays))
@@ -69,9 +69,7 @@ def test_what_all_tiles_have_in_common_is_that_of_one_map(folder, city, whole, d
         np.testing.assert_array_equal(upper - lower, [plan.tile_cells] * 2 + [2 * MAX_CELLS_FROM_ORIGIN])
 
 
-def test_beyond_a_tile_that_is_missing_its_neighbours_answer_within_half_a_halo(
-    folder, city, points, tmp_path
-):
+def test_neighbours_cover_half_a_halo_of_a_missing_tile(folder, city, points, tmp_path):
     shutil.copytree(folder, tmp_path / "city")
     gone = max(city.tiles, key=lambda tile: tile.returns)
     (tmp_path / "city" / "tiles" / gone.name / "map.safetensors").unlink()
@@ -88,16 +86,16 @@ def test_beyond_a_tile_that_is_missing_its_neighbours_answer_within_half_a_halo(
 
 
 def near_borders(points, offset_m=0.0):
-    """Points of the surface moved to the borders between tiles along y, which the wall crosses, or beside them."""
+    """Points of the surface moved to or near the borders between tiles along y, which the wall crosses."""
     distance_m = points[:, 1] - np.round(points[:, 1] / TILE_M) * TILE_M
     moved = points[np.abs(distance_m - offset_m) < 0.3].copy()
     moved[:, 1] = np.round(moved[:, 1] / TILE_M) * TILE_M + offset_m
     return moved
 
 
-# The border itself, inside the overlap, and where the weights begin to rise.
+# The border itself, inside the overlap, and where weights start to rise.
 @pytest.mark.parametrize("offset_m", [0.0, 1.7, 3.2, -3.2])
-def test_no_step_between_tiles(city, points, offset_m):
+def test_distances_are_continuous_across_tiles(city, points, offset_m):
     border, step = near_borders(points, offset_m), np.array([0, 1e-5, 0])
     border = border[city.observed(border - step) & city.observed(border + step)]
     assert len(border) > 20
@@ -106,14 +104,14 @@ def test_no_step_between_tiles(city, points, offset_m):
     assert np.median(np.abs(after - before)) < 0.01
 
 
-def test_little_memory_gives_the_same_bits(folder, city, points):
+def test_limited_memory_changes_no_bit(folder, city, points):
     small = TiledMap(folder, memory_bytes=1)
     np.testing.assert_array_equal(small.sdf(points), city.sdf(points))
     assert len(small._held) == 1
     assert len(city._held) == len(city.tiles)
 
 
-def test_views_are_those_of_one_map(city, whole, drive):
+def test_views_equal_those_of_one_map(city, whole, drive):
     one, other = (map_.render(drive.poses[5], whole.sensor) for map_ in (whole, city))
     assert len(other) == pytest.approx(len(one), rel=0.05)
     both = np.isfinite(one.beam_ranges_m) & np.isfinite(other.beam_ranges_m)
@@ -142,13 +140,13 @@ def test_a_copy_is_the_same_map(city, points, tmp_path):
         city.save(tmp_path / "copy")
 
 
-def test_view_statistics_of_tiles_are_those_of_one_map(drive, tmp_path):
-    """Where tiles overlap, a return is in several of them, and counts once."""
+def test_view_statistics_equal_those_of_one_map(drive, tmp_path):
+    """Returns in the overlap of several tiles count once."""
     config = CONFIG.override(returns={"free_space": True})
     radarsdf.fit_tiles(drive, tmp_path / "city", tile_size=TILE_M, halo=6.4, config=config, progress=False)
     found = radarsdf.load(tmp_path / "city").view_statistics()
     expected = radarsdf.fit(drive, config=config, progress=False).view_statistics()
-    # Means near a border may fall on either side of it. Twice as many, if all tiles counted.
+    # Means near a border may be on either side of it. If all tiles counted, there would be twice as many.
     assert abs(found.counts.sum() / expected.counts.sum() - 1) < 0.03
     weights = [view_statistics.counts / view_statistics.counts.sum() for view_statistics in (found, expected)]
     for name in ("intensities", "ranges_m"):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What was not observed has no answer, in every kind of map and for every kind of number."""
+"""Unobserved places are NaN, for every kind of map and quantity."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ CONFIGS = {
     "quick": FitConfig.quick(training=SHORT),
     "octree": FitConfig.paper(training=SHORT, encoding={"kind": "octree"}),
 }
-# In free space before the sensor, below the ground, far away, and no places at all.
+# In free space before the sensor, below the ground, far away, and invalid places.
 NAN, INF = np.nan, np.inf
 NOWHERE = np.array([
     [2.0, 0, 1], [2, 0, -40], [1e7, 0, 0], [0, -1e30, 0], [1e30, 1e30, 1e30], [0, 0, 1e30],
@@ -48,7 +48,7 @@ def answers(any_map, x, sensor=SENSOR, **options):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
-def test_what_was_not_observed_is_not_a_number(any_map, kind, dtype):
+def test_unobserved_places_are_nan(any_map, kind, dtype):
     found = answers(any_map, kind(NOWHERE.astype(dtype)))
     for name, answer in found.items():
         assert isinstance(answer, type(kind(NOWHERE)))
@@ -63,7 +63,7 @@ def test_what_was_not_observed_is_not_a_number(any_map, kind, dtype):
             assert np.isnan(values).all(), name
 
 
-def test_what_was_observed_has_an_answer_and_only_that(any_map, returns):
+def test_exactly_observed_places_have_values(any_map, returns):
     x = (returns[:, None] + np.random.default_rng(0).normal(0, 1.0, (4, 3))).reshape(-1, 3)
     found = answers(any_map, x)
     assert 0.1 < found["observed"].mean() < 0.9
@@ -72,7 +72,7 @@ def test_what_was_observed_has_an_answer_and_only_that(any_map, returns):
         np.testing.assert_array_equal(known, found["observed"])
 
 
-def test_extrapolation_answers_at_all_places_near_tiles(any_map, returns):
+def test_extrapolation_has_values_everywhere_near_tiles(any_map, returns):
     x = np.concatenate([returns, returns + [0.0, 0.0, 30.0]])
     found, known = answers(any_map, x, extrapolate=True), answers(any_map, x)
     for name in ("sdf", "gradient", "intensity"):
@@ -86,7 +86,7 @@ def test_extrapolation_answers_at_all_places_near_tiles(any_map, returns):
 
 @pytest.mark.parametrize("extrapolate", [False, True])
 @pytest.mark.parametrize("wild", [np.nan, np.inf, -np.inf])
-def test_a_sensor_that_is_nowhere_measures_no_intensity(any_map, returns, wild, extrapolate):
+def test_a_nan_sensor_position_has_no_intensity(any_map, returns, wild, extrapolate):
     for axis in range(3):
         sensor = SENSOR.copy()
         sensor[axis] = wild

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A client of the viewer without a browser: it answers, drags the sensor and keeps what it receives."""
+"""A client of the viewer without a browser: it responds, drags the sensor and records messages."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def is_mesh(message: Received) -> bool:
 class PlainClient:
     def __init__(self, host: str, port: int) -> None:
         protocol = Subprotocol(f"viser-v{viser.__version__}")
-        # Whole meshes come in one frame; its answers to pings must not wait for them.
+        # Meshes arrive in one frame; responses to pings must not wait for them.
         self._socket = connect(
             f"ws://{host}:{port}", subprotocols=[protocol], max_size=None, ping_interval=None
         )
@@ -60,7 +60,7 @@ class PlainClient:
         self._news = threading.Condition()
         self._thread = threading.Thread(target=self._receive, daemon=True)
         self._thread.start()
-        self.send(  # which tells the server that a page is there
+        self.send(  # which notifies the server of a page
             "ViewerCameraMessage",
             wxyz=(1.0, 0.0, 0.0, 0.0),
             position=(0.0, 0.0, 0.0),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""A page in a real browser without a screen: drags, clicks, every frame that it draws, what it asks for and complains of."""
+"""A page in a headless browser: drags, clicks, drawn frames, requests and errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def open_page(url: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
 class Page:
     def __init__(self, tab: Any) -> None:
         self.tab = tab
-        tab.set_default_timeout(120_000)  # ms: it draws without a GPU, beside other tests
+        tab.set_default_timeout(120_000)  # ms: it draws without a GPU, next to other tests
         self.requests: list[str] = []
         self.errors: list[str] = []
         tab.on("request", lambda request: self.requests.append(request.url))

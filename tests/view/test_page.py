@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The page in a headless browser: a drag and a click by the mouse, every frame meanwhile, and a narrow screen."""
+"""The page in a headless browser: a drag and a click, all frames meanwhile, and a narrow screen."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_a_drag_and_a_click(sharp_map, scene):
         position = page.text().split("position")[1].split("signed")[0].strip().removesuffix(" m")
         assert np.array(position.split(","), float) == pytest.approx(target, abs=0.5)
 
-        # The sensor is dragged by its arrow along x, and no frame is blank meanwhile.
+        # The sensor is dragged by its arrow along x, without a blank frame.
         start, meshes = np.array(viewer._gizmo.position), viewer._canvas.sent
         arrow = start + [0.6 * viewer._gizmo.scale, 0, 0]
         page.start_recording()
@@ -57,7 +57,7 @@ def test_a_drag_and_a_click(sharp_map, scene):
 
 
 def _of_scale(pixels):
-    """Whether each colour (N, 3) is one of the scale, as it is or as dark as a shade makes it."""
+    """Whether each colour (N, 3) is on the scale, up to shading."""
     scale = intensity_colors(np.linspace(0, 1, 256), 0, 1)[:, :3]
     shades = np.concatenate([shaded(scale, np.full(256, factor)) for factor in np.linspace(0.87, 1, 8)])
     return cKDTree(shades.astype(float)).query(pixels.astype(float))[0] < 6
@@ -73,7 +73,7 @@ def test_a_narrow_screen_shows_the_map_in_the_colours_of_the_scale(sharp_map):
         seen = page.settle()[170:540]  # without the panel, and what the page says of the graphics card
         pixels = seen[seen.min(axis=2) < 200]
         assert len(pixels) > 2_000
-        assert _of_scale(pixels).mean() > 0.9  # edges of triangles are mixed with the white behind them
+        assert _of_scale(pixels).mean() > 0.9  # edges of triangles are blended with the white background
 
         # All of the surface is in the frame, and the controls are folded.
         camera = camera_of(viewer._server)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""What the page shows meanwhile and in the end. viser is not needed: the scene only records its nodes."""
+"""Contents of the page during and after updates. viser is not needed: the scene only records its nodes."""
 
 import contextlib
 import threading
@@ -46,7 +46,7 @@ class Scene:
 
 @pytest.fixture
 def page(sharp_map, monkeypatch):
-    """A scene, its canvas, and what is visible each time that the canvas waits for the page."""
+    """A scene, its canvas, and the visible nodes whenever the canvas waits for the page."""
     scene, waits, shown = Scene(), [], []
     monkeypatch.setattr(module, "wait_until_drawn", lambda *_: waits.append(scene.seen()))
     surface = ShownSurface.of(sharp_map, 0.4, max_vertices=100_000, progress=False)
@@ -58,7 +58,7 @@ def never():
     return False
 
 
-def test_something_is_visible_while_a_mesh_is_on_its_way(page):
+def test_something_is_visible_while_a_mesh_is_transferred(page):
     nodes, canvas, waits, shown = page
     canvas.show_mesh(ALL, never)
     less = replace(ALL, max_uncertainty_m=8.0)
@@ -80,7 +80,7 @@ def test_a_superseded_mesh_does_not_count_as_drawn(page):
     nodes, canvas, _, shown = page
     canvas.show_mesh(ALL, never)
     canvas.show_cloud(MOVING)
-    answers = iter([False, True])  # a new position arrives while the page is waited for
+    answers = iter([False, True])  # a new position arrives while waiting for the page
     canvas.show_mesh(MOVING, lambda: next(answers))
     assert nodes.seen() == ["cloud", "mesh 2"]
     assert shown == [ALL]

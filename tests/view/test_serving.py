@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Where the page is served, and when it has been drawn. viser is not needed."""
+"""Address of the page, and when it has been drawn. viser is not needed."""
 
 import socket
 import sys
@@ -10,7 +10,7 @@ from radarsdf.view import serving
 from radarsdf.view.guarding import refusal
 
 
-def test_a_port_that_is_taken(monkeypatch):
+def test_a_port_in_use_is_rejected(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as listening:
         taken = listening.getsockname()[1]
         monkeypatch.setattr(serving, "_FIRST_PORT", taken)
@@ -39,7 +39,7 @@ def test_the_address_of_the_page(host, name):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others always have a screen")
-def test_a_browser_is_for_a_screen(monkeypatch):
+def test_a_browser_opens_only_with_a_display(monkeypatch):
     for name in ("SSH_CONNECTION", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert not serving.has_display()
@@ -63,7 +63,7 @@ def test_a_browser_is_for_a_screen(monkeypatch):
         ("0.0.0.0", f"{socket.gethostname()}:8080"),
     ],
 )
-def test_its_own_page_is_answered(listening, host):
+def test_requests_of_the_own_page_are_accepted(listening, host):
     assert refusal([host], [], listening) is None
     assert refusal([host], [f"http://{host}"], listening) is None
     assert refusal([host], [f"http://{host}", f"http://{host}"], listening) is not None
@@ -76,7 +76,7 @@ def test_its_own_page_is_answered(listening, host):
     ["evil.example:8080", "localhost.evil.example", "evil.example#localhost", "localhost@evil.example", "", "[", ":80",
      "127.0.0.1.evil.example:8080", "evil.example\tlocalhost"],
 )  # fmt: skip
-def test_another_host_is_refused(listening, host):
+def test_another_host_is_rejected(listening, host):
     assert "Host" in str(refusal([host], [], listening))
     assert "Host" in str(refusal([], [], listening))
 
@@ -86,5 +86,5 @@ def test_another_host_is_refused(listening, host):
     ["http://evil.example", "null", "", "file://", "http://localhost:3000", "http://localhost:8080.evil.example",
      "http://127.0.0.1:8080"],
 )  # fmt: skip
-def test_another_origin_is_refused(origin):
+def test_another_origin_is_rejected(origin):
     assert "Origin" in str(refusal(["localhost:8080"], [origin], "127.0.0.1"))

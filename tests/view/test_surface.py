@@ -26,14 +26,14 @@ def test_a_thinned_mesh_is_the_same_surface_with_the_same_attributes(sharp_map):
     assert set(np.unique(thin.faces)) == set(range(len(thin.vertices)))
     assert (np.sort(thin.faces, axis=1)[:, 1:] != np.sort(thin.faces, axis=1)[:, :-1]).all()
     assert thin.area == pytest.approx(full.area, rel=0.15)
-    # No hole: the surface is nowhere farther than a cube. And it faces the same way.
+    # No hole: the surface is nowhere farther than a cube. And its orientation is the same.
     samples, _ = trimesh.sample.sample_surface(thin, 50_000, seed=0)
     assert cKDTree(samples).query(full.vertices)[0].max() < 2 * spacing_m
     assert (thin.vertex_normals * full.vertex_normals[row]).sum(axis=1).mean() > 0.8
     assert thinned(full, len(full.vertices), 0.1)[0] is full
 
 
-def test_points_that_fill_a_volume_are_thinned_to_those_nearest_to_the_mean_of_their_cube():
+def test_volumetric_points_are_thinned_to_the_nearest_to_each_cube_mean():
     points = np.random.default_rng(0).uniform(-3, 3, (4000, 3)) + [5e5, 0, 0]
     rows, of_point, edge_m = spread_evenly(points, 100, 0.1)  # cubes of a surface would be far too small
     assert 50 < len(rows) <= 100
@@ -61,7 +61,7 @@ def test_a_vertex_without_uncertainty_is_shown_unless_the_uncertainty_is_limited
     assert surface.kept(0.3, 0.0).tolist() == [True, False, True]
 
 
-def test_a_glb_has_the_colors_that_were_given():
+def test_a_glb_has_the_given_colors():
     pytest.importorskip("viser", reason="the extra view is not installed")
     from .client import Glb  # noqa: PLC0415 - which needs it
 
@@ -74,7 +74,7 @@ def test_a_glb_has_the_colors_that_were_given():
     np.testing.assert_allclose(mesh.colors, colors, atol=0.5)
 
 
-def test_all_is_seen_and_the_frame_is_filled():
+def test_the_view_fits_the_whole_surface():
     rng = np.random.default_rng(3)
     points = rng.normal(size=(500, 3)) * [40, 6, 2] + [500, -300, 20]
     for aspect in (0.4, 1.0, 2.4):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""The viewer as its clients see it: what they receive, and whom it refuses."""
+"""The viewer from its clients' side: messages that they receive, and rejected requests."""
 
 import gc
 import re
@@ -54,7 +54,7 @@ def mesh_of(message):
 
 
 def content(message):
-    """The HTML that a message gives to a text of the panel."""
+    """HTML that a message assigns to a text of the panel."""
     return str(message.message.get("updates", {}).get("content", ""))
 
 
@@ -137,7 +137,7 @@ def test_a_scan_is_shown_and_the_sensor_moves_there(client, viewer, scans, sharp
     slide(client, "predicted", value=True)
 
 
-def test_a_click_shows_what_the_map_knows(client, viewer, sharp_map):
+def test_a_click_shows_the_values_of_the_map(client, viewer, sharp_map):
     eye = np.array([3.0, 0.5, 2.0])
     target = np.array([12.0, 1.0, 0.0]) - sharp_map.origin  # on the plane
     before = len(client.received())
@@ -161,7 +161,7 @@ def test_a_click_shows_what_the_map_knows(client, viewer, sharp_map):
     assert not any(map(content, client.received(before)))
 
 
-def test_the_surface_is_coloured_by_what_is_chosen(client, viewer):
+def test_the_surface_is_coloured_by_the_chosen_quantity(client, viewer):
     surface = viewer.surface
     for name, values, limits in (
         ("uncertainty", surface.uncertainty_m, np.percentile(surface.uncertainty_m, [2, 98])),
@@ -180,19 +180,19 @@ def test_the_surface_is_coloured_by_what_is_chosen(client, viewer):
 
 
 def status_of(viewer, *headers):
-    """The HTTP status that a request gets."""
+    """HTTP status of a request."""
     with socket.create_connection((viewer.host, viewer.port), timeout=10) as connection:
         lines = "\r\n".join(["GET / HTTP/1.1", *headers, "Connection: close", "", ""])
         connection.sendall(lines.encode())
         return int(connection.makefile("rb").readline().split()[1])
 
 
-def test_other_pages_are_refused(viewer):
+def test_requests_of_other_pages_are_rejected(viewer):
     host = f"Host: localhost:{viewer.port}"
     assert status_of(viewer, host) == 200
     assert (
         status_of(viewer, f"Host: evil.example:{viewer.port}") == 403
-    )  # whose name resolves to this machine
+    )  # a name that resolves to this machine
     assert status_of(viewer, host, "Origin: http://evil.example") == 403
     upgrade = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
                "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==")  # fmt: skip
@@ -201,13 +201,13 @@ def test_other_pages_are_refused(viewer):
     assert status_of(viewer, f"Host: evil.example:{viewer.port}", *upgrade) == 403
 
 
-def test_a_server_that_cannot_be_guarded_is_not_started(monkeypatch):
-    monkeypatch.setattr("viser.ViserServer", lambda *_, **__: None)  # as if it listened in another way
+def test_an_unguarded_server_is_not_started(monkeypatch):
+    monkeypatch.setattr("viser.ViserServer", lambda *_, **__: None)  # as if it had another listener
     with pytest.raises(RuntimeError, match="cannot be guarded"):
         start_server("127.0.0.1", 0)
 
 
-def test_a_host_that_others_reach_is_warned_of(sharp_map):
+def test_a_publicly_reachable_host_is_a_warning(sharp_map):
     with (
         pytest.warns(RuntimeWarning, match=r"0\.0\.0\.0"),
         Viewer(sharp_map, None, voxel_size=0.4, host="0.0.0.0", port=0, progress=False),
@@ -215,11 +215,11 @@ def test_a_host_that_others_reach_is_warned_of(sharp_map):
         pass
 
 
-def test_connections_that_ended_leave_nothing(viewer):
+def test_closed_connections_are_released(viewer):
     def held():
         return sum(type(thing) is ClientHandle for thing in gc.get_objects())
 
-    gc.disable()  # which would free some by chance
+    gc.disable()  # the collector would free some by chance
     try:
         for _ in range(4):
             with PlainClient(viewer.host, viewer.port) as client:
@@ -241,7 +241,7 @@ def test_a_map_far_away_without_intensities():
         PlainClient(viewer.host, viewer.port) as client,
     ):
         mesh = mesh_of(client.wait_for(is_mesh))
-        assert np.abs(mesh.vertices).max() < 50  # of the local frame, which float32 can hold
+        assert np.abs(mesh.vertices).max() < 50  # of the local frame, representable in float32
         assert not any(message.name in (CLOUD, "/sensor") for message in client.received())
         sensor = scene.poses[:, :3, 3].mean(axis=0) - radar_map.origin + [0, 0, 2]
         viewer._on_click(SimpleNamespace(ray_origin=sensor.tolist(), ray_direction=[8.0, 0.0, -3.0]))

@@ -11,7 +11,7 @@
 #include <radarsdf/surface/marching_cubes.hpp>
 #include <vector>
 
-// Features that are one everywhere are interpolated to the number of groups of corners.
+// Constant features of one are interpolated to the number of corner groups.
 int main() {
   const std::vector<double> points = {0.3, 0.4, 0.5, -1.2, 2.0, 0.1};
   radarsdf::CellSet cells(0.2);
