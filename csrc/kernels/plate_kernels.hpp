@@ -27,18 +27,27 @@ struct PlateSweep {
   float least_m;             ///< distance of a vertex whose side is known
 };
 
-// Places where the distance is known, in cells.
+// At most one place in each of the 2 x 2 x 2 cells of a block, where the distance is known.
+struct PlateLayer {
+  float weights[8];  ///< 0 without a place
+  // Two numbers of 16 bits each: the shares of the cell's upper corners along x and y; that along z and the distance,
+  // of 0 to 2 leaf cells from one behind the plane on.
+  std::uint32_t x_and_y[8], z_and_leaf[8];
+};
+constexpr int kPlateQuanta = 65535;  // of a share
+
+// Blocks of cells with places. Their cells have the places of the blocks of vertices.
 struct PlatePlaces {
-  const std::int32_t* corners;  ///< (cells, 8), vertices
-  const std::int32_t* first;    ///< (cells + 1), place of each cell
-  const float* shares;          ///< (places, 8), of the corners, times the square root of the weight
-  const float* targets_m;       ///< (places), times the square root of the weight
+  const std::int32_t* corners;  ///< (blocks, 8), blocks of vertices; where there is none, the first one
+  const std::int32_t* first;    ///< (blocks + 1), layer of each block
+  const PlateLayer* layers;
+  float leaf_m;
 };
 
 struct PlateKernels {
   void (*sweep)(const PlateSweep& plates, std::int64_t begin, std::int64_t end);  // blocks
   void (*pull)(const PlatePlaces& places, const float* distances_m, float* pulls_m, std::int64_t begin,
-               std::int64_t end);  // cells
+               std::int64_t end);  // blocks of cells
 };
 
 #define RADARSDF_DECLARE_KERNEL(isa) \
