@@ -26,14 +26,18 @@ void grid_distances(const VertexTable& table, const float* distances_m, const st
   if (parts < 1) throw std::invalid_argument("parts must be at least 1");
   parallel_blocks(num_corners, kCorners, num_threads, [&](std::int64_t begin, std::int64_t end) {
     NearbyRows rows(table.leaves());
+    std::int32_t last[3] = {}, cell[3] = {};
+    int part[3] = {};
     for (std::int64_t i = begin; i < end; ++i) {
-      std::int32_t cell[3];
-      int part[3], on_border = 0;  // bit `axis`: the cell before has the corner, too
+      int on_border = 0;  // bit `axis`: the cell before has the corner, too
       bool is_near = true;
       for (int axis = 0; axis < 3; ++axis) {
         const std::int32_t corner = corners[3 * i + axis];
-        cell[axis] = corner / parts - (corner % parts < 0 ? 1 : 0);
-        part[axis] = corner - cell[axis] * parts;
+        if (corner != last[axis]) {  // of sorted corners, one of three differs
+          last[axis] = corner;
+          cell[axis] = corner / parts - (corner % parts < 0 ? 1 : 0);
+          part[axis] = corner - cell[axis] * parts;
+        }
         if (part[axis] == 0) on_border |= 1 << axis;
         is_near = is_near && cell[axis] > -kAxisBias && cell[axis] < kAxisBias;
       }
