@@ -42,11 +42,12 @@ CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
 class SurfaceReturns:
     """The returns that the surface is made of, and what is known of them."""
 
-    rays: Rays  # without ghosts; if a field is trained on them, moved towards the flat surfel of their cell
+    rays: Rays  # without ghosts, moved towards the flat surfel of their cell; all as they were if no field is trained
+    count: int  # how many of them are no ghosts
     surfels: Surfels  # of all returns
     noise: SensorNoise
     means: MeanRays | None  # of the leaf cells, without ghosts, to average. None: a field is trained
-    true: NDArray[np.bool_] | None  # (N,) which of all rays end at no ghost. None: ghosts were not looked for
+    true: NDArray[np.bool_] | None  # (N,) which of all rays end at no ghost. None: all, or nobody asks
 
     @classmethod
     def of(
@@ -63,11 +64,15 @@ class SurfaceReturns:
         means = None if config.train else MeanRays.of_sums(sums, num_threads)
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
-        kept, true = inside, None
+        kept, true, count = inside, None, len(rays) if inside is None else int(np.count_nonzero(inside))
         if config.returns.drop_ghosts:
             of_ghosts = find_ghosts(surfels, rays if means is None else means, noise, num_threads)
-            true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)]
-            kept = true if inside is None else true & inside
+            if config.train or config.returns.free_space or inside is not None:
+                true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)]
+                kept = true if inside is None else true & inside
+                count = int(np.count_nonzero(kept))
+            else:  # averages need no more than the number, which follows from the cells
+                count = int(surfels.counts[~of_ghosts].sum())
             if means is not None:
                 means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
         if means is not None and inside is not None:
@@ -75,7 +80,9 @@ class SurfaceReturns:
             means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
         if config.train and config.returns.onto_planes:
             rays = onto_surfels(surfels, rays, noise, num_threads)
-        return cls(rays if kept is None else rays.select(kept), surfels, noise, means, true)
+        if config.train and kept is not None:
+            rays = rays.select(kept)
+        return cls(rays, count, surfels, noise, means, true)
 
 
 def occupied_cells(

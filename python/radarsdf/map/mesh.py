@@ -85,8 +85,8 @@ class Surface:
         kept = within(limits, min_confidence, self.faces, self.confidence, self.uncertainty_m)
         rows = np.flatnonzero(kept)
         if len(rows):
-            labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
-            kept[rows] = sizes[labels] >= limits.min_component_triangles
+            labels, sizes = mesh_components(self.faces.take(rows, axis=0), len(self.vertices))
+            kept[rows] = (sizes >= limits.min_component_triangles).take(labels)
         return kept
 
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
@@ -100,9 +100,13 @@ class Surface:
         self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
     ) -> trimesh.Trimesh:
         """The faces that are `kept` (F,), in the world."""
-        used, faces = renumbered(len(self.vertices), self.faces[kept])
-        vertices, confidence = self.vertices[used] + origin, self.confidence[used]
-        return described_mesh(vertices, faces, confidence, self.uncertainty_m[used], **metadata)
+        # Row numbers: a mask takes three times as long.
+        used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
+        rows = np.flatnonzero(used)
+        vertices = self.vertices.take(rows, axis=0)
+        vertices += origin
+        columns = (column.take(rows) for column in (self.confidence, self.uncertainty_m))
+        return described_mesh(vertices, faces, *columns, **metadata)
 
 
 def extract_mesh(
@@ -164,7 +168,7 @@ def within(
 def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
     """(F,) which of the faces (F, 3) have three vertices that are `good` (V,)."""
     first, second, third = faces.T
-    found: NDArray[np.bool_] = good[first] & good[second] & good[third]
+    found: NDArray[np.bool_] = good.take(first) & good.take(second) & good.take(third)
     return found
 
 
@@ -173,7 +177,7 @@ def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.
     used = np.zeros(num_vertices, bool)
     used[faces] = True
     renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return used, renumbered[faces]
+    return used, renumbered.take(faces)
 
 
 def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int32]:

@@ -160,7 +160,9 @@ class MeanRays:
         return cls(sums.keys, points, directions, counts, sums.scans, ranges_m)
 
     def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
-        return MeanRays(**{name: column[part] for name, column in vars(self).items()})
+        # `take` with row numbers is faster than a mask.
+        rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
+        return MeanRays(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
         """(C,) uint64, ascending Morton keys of the leaf cells that rays cross within `reach_m` of their returns."""
