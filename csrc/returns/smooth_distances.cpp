@@ -199,25 +199,27 @@ class Plates {
                         std::fill(layers_.begin() + first_[b], layers_.begin() + first_[b + 1], PlateLayer{});
                         for (std::size_t cell = of_blocks[b].first; cell < of_blocks[b].second; ++cell) {
                           PlateLayer* layer = layers_.data() + first_[b];
+                          double lower[3];
+                          for (int axis = 0; axis < 3; ++axis)
+                            lower[axis] = static_cast<std::int32_t>(morton_coordinate(keys[cell], axis)) - kAxisBias;
                           for (std::int32_t k = first_of(cell); k < next[cell]; ++k)
-                            put(planes, used[static_cast<std::size_t>(k)], keys[cell], scale, *layer++);
+                            put(planes, used[static_cast<std::size_t>(k)], lower, scale, keys[cell] & 7, *layer++);
                         }
                         find_corners(of_blocks[b], corners_.data() + 8 * b);
                       }
                     });
   }
 
-  // Place i into the layer, in the cell with this key.
-  void put(const KnownPlanes& planes, std::int32_t i, std::uint64_t key, double scale, PlateLayer& layer) const {
+  // Place i into a lane of the layer. lower: corner of its cell, in cells.
+  void put(const KnownPlanes& planes, std::int32_t i, const double* lower, double scale, std::size_t lane,
+           PlateLayer& layer) const {
     float point[3];
     std::uint32_t upper[3];
     place_of(planes, i, point);
     for (int axis = 0; axis < 3; ++axis) {
-      const double lower = static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias;
-      const double share = std::clamp(point[axis] / table_->leaf_size_m() - lower, 0.0, 1.0);
+      const double share = std::clamp(point[axis] / table_->leaf_size_m() - lower[axis], 0.0, 1.0);
       upper[axis] = static_cast<std::uint32_t>(share * kPlateQuanta + 0.5);
     }
-    const std::size_t lane = key & 7;
     layer.weights[lane] = static_cast<float>(scale * static_cast<double>(planes.information[i / kPlaces]));
     layer.x_and_y[lane] = upper[0] | upper[1] << 16;
     layer.z_and_leaf[lane] = upper[2] | static_cast<std::uint32_t>(i % kPlaces) << 16;
