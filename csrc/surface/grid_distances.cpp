@@ -30,7 +30,7 @@ void grid_distances(const VertexTable& table, const float* distances_m, const st
     std::int32_t last[3] = {}, cell[3] = {};
     int part[3] = {};
     float upper[3] = {};
-    std::uint64_t keys[3] = {};  // bits of each axis
+    std::uint64_t keys[3][2] = {};  // bits of each axis, of the cell and of the one before
     for (std::int64_t i = begin; i < end; ++i) {
       int on_border = 0;  // bit `axis`: the cell before has the corner, too
       bool is_near = true;
@@ -41,17 +41,17 @@ void grid_distances(const VertexTable& table, const float* distances_m, const st
           cell[axis] = corner / parts - (corner % parts < 0 ? 1 : 0);
           part[axis] = corner - cell[axis] * parts;
           upper[axis] = static_cast<float>(part[axis]) / static_cast<float>(parts);
-          keys[axis] = spread_bits(static_cast<std::uint32_t>(cell[axis]) + kAxisBias) << axis;
+          for (std::uint32_t k = 0; k < 2; ++k)
+            keys[axis][k] = spread_bits(static_cast<std::uint32_t>(cell[axis]) + kAxisBias - k) << axis;
         }
         if (part[axis] == 0) on_border |= 1 << axis;
         is_near = is_near && cell[axis] > -kAxisBias && cell[axis] < kAxisBias;
       }
-      std::int32_t row = is_near ? rows.row(keys[0] | keys[1] | keys[2]) : -1;
-      int before = 0;
+      std::int32_t row = -1;
+      int before = -1;
       while (is_near && row < 0 && ++before < 8) {
         if ((before & ~on_border) != 0) continue;
-        const std::int32_t other[3] = {cell[0] - (before & 1), cell[1] - (before >> 1 & 1), cell[2] - (before >> 2)};
-        row = rows.row(lattice_key(other));
+        row = rows.row(keys[0][before & 1] | keys[1][before >> 1 & 1] | keys[2][before >> 2]);
       }
       if (row < 0) {
         found_m[i] = std::numeric_limits<float>::quiet_NaN();

@@ -67,12 +67,10 @@ class SurfaceReturns:
         kept, true, count = inside, None, len(rays) if inside is None else int(np.count_nonzero(inside))
         if config.returns.drop_ghosts:
             of_ghosts = find_ghosts(surfels, rays if means is None else means, noise, num_threads)
-            if config.train or config.returns.free_space or inside is not None:
-                true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)]
-                kept = true if inside is None else true & inside
-                count = int(np.count_nonzero(kept))
-            else:  # averages need no more than the number, which follows from the cells
-                count = int(surfels.counts[~of_ghosts].sum())
+            asked = config.train or config.returns.free_space or inside is not None
+            true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)] if asked else None
+            kept = true if true is None or inside is None else true & inside
+            count = int(surfels.counts[~of_ghosts].sum()) if kept is None else int(np.count_nonzero(kept))
             if means is not None:
                 means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
         if means is not None and inside is not None:
@@ -80,8 +78,7 @@ class SurfaceReturns:
             means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
         if config.train and config.returns.onto_planes:
             rays = onto_surfels(surfels, rays, noise, num_threads)
-        if config.train and kept is not None:
-            rays = rays.select(kept)
+        rays = rays.select(kept) if config.train and kept is not None else rays
         return cls(rays, count, surfels, noise, means, true)
 
 
@@ -127,9 +124,8 @@ def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig)
     """Precision, numbers of scans and of returns of each leaf cell, by its mean ray."""
     # The returns of a cell are at nearly the same range if they are of the same sensor position.
     information = means.counts / noise.variances_m2(means.ranges_m)
-    counts = means.counts.astype(np.float64)
-    found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
-    return found.with_uncertain_poses(means.ranges_m, config)
+    columns = information.astype(np.float32), means.scans, means.counts.astype(np.float64)
+    return ReturnsOfCells(means.keys, *columns).with_uncertain_poses(means.ranges_m, config)
 
 
 @torch.no_grad()
@@ -181,9 +177,8 @@ def average_at_corners(
     Distances depend on what is within `CELLS_SMOOTHED` of the cells of their rays, to the bit.
     """
     normals = np.ascontiguousarray(normals, np.float32)
-    distances_m, sides = table.average_rays(
-        rays.points, rays.directions, normals, rays.counts, config.metres(TRUNCATION_CELLS), num_threads
-    )
+    columns = rays.points, rays.directions, normals, rays.counts
+    distances_m, sides = table.average_rays(*columns, config.metres(TRUNCATION_CELLS), num_threads)
     return table.smoothed(
         distances_m, rays.points, normals, returns.information, sides, _SMOOTHINGS, num_threads
     )
