@@ -102,8 +102,8 @@ class Surface:
         """The faces that are `kept` (F,), in the world."""
         used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
         rows = np.flatnonzero(used)
-        columns = (column.take(rows) for column in (self.confidence, self.uncertainty_m))
-        return described_mesh(self.vertices.take(rows, axis=0) + origin, faces, *columns, **metadata)
+        vertices, confidence = self.vertices.take(rows, axis=0) + origin, self.confidence.take(rows)
+        return described_mesh(vertices, faces, confidence, self.uncertainty_m.take(rows), **metadata)
 
 
 def extract_mesh(
