@@ -98,25 +98,88 @@ void sweep(const PlateSweep& plates, std::int64_t begin, std::int64_t end) {
   }
 }
 
+// The lower and the upper 16 bits of each number.
+inline void unpack(const std::uint32_t* numbers, Floats& lower, Floats& upper) {
+#ifdef RADARSDF_SHUFFLE
+  using Integers = VectorOf<int, kPlateVertices>::Type;
+  using Bits = VectorOf<std::uint32_t, kPlateVertices>::Type;
+  const auto bits = load_vector<Bits>(numbers);
+  lower = __builtin_convertvector((Integers)(bits & 0xffffU), Floats);
+  upper = __builtin_convertvector((Integers)(bits >> 16), Floats);
+#else
+  float lanes[2][kPlateVertices];
+  for (int i = 0; i < kPlateVertices; ++i) {
+    lanes[0][i] = static_cast<float>(numbers[i] & 0xffffU);
+    lanes[1][i] = static_cast<float>(numbers[i] >> 16);
+  }
+  lower = load_vector<Floats>(lanes[0]);
+  upper = load_vector<Floats>(lanes[1]);
+#endif
+}
+
+// Lanes of the first operand where the bit of the lane index is set, else of the second.
+template <int kBit>
+constexpr int set_or_second(int i) {
+  return i + ((i & kBit) != 0 ? 0 : kPlateVertices);
+}
+
+// Values at corner c of the eight cells of a block, from the adjacent blocks, in two shuffles.
+template <int kBit>
+inline void to_corners(Floats* corners) {
+  for (int c = 0; c < kPlateVertices; ++c) {
+    if ((c & kBit) == 0) continue;
+    const Floats ahead = shuffled<set_or_second<kBit>>(corners[c ^ kBit], corners[c]);
+    corners[c] = shuffled<across<kBit>>(ahead, ahead);
+  }
+}
+
+// Adjoint of `to_corners`: accumulates the values at corners in the adjacent blocks.
+template <int kBit>
+inline void from_corners(Floats* corners) {
+  for (int c = 0; c < kPlateVertices; ++c) {
+    if ((c & kBit) == 0) continue;
+    const Floats back = shuffled<across<kBit>>(corners[c], corners[c]), zero = {};
+    corners[c ^ kBit] += shuffled<set_or_second<kBit>>(back, zero);
+    corners[c] = shuffled<set_or_second<kBit>>(zero, back);
+  }
+}
+
 void pull(const PlatePlaces& places, const float* distances_m, float* pulls_m, std::int64_t begin, std::int64_t end) {
-  for (std::int64_t cell = begin; cell < end; ++cell) {
-    const std::int32_t* corners = places.corners + 8 * cell;
-    // Through memory, the vector load would wait for eight stores.
-    const Floats distances = {distances_m[corners[0]], distances_m[corners[1]], distances_m[corners[2]],
-                              distances_m[corners[3]], distances_m[corners[4]], distances_m[corners[5]],
-                              distances_m[corners[6]], distances_m[corners[7]]};
-    Floats pulls = {};
-    for (std::int32_t k = places.first[cell]; k < places.first[cell + 1]; ++k) {
-      const auto shares = load_vector<Floats>(places.shares + 8 * std::int64_t{k});
-      const Floats products = shares * distances;
-      const Floats pairs = products + shuffled<across<4>>(products, products);
-      const Floats fours = pairs + shuffled<across<1>>(pairs, pairs);
-      const float target_m = places.targets_m[k];
-      pulls += (fours + shuffled<across<2>>(fours, fours) - target_m) * shares;  // every lane holds the full sum
+  for (std::int64_t block = begin; block < end; ++block) {
+    const std::int32_t* blocks = places.corners + 8 * block;
+    const Floats one = {1, 1, 1, 1, 1, 1, 1, 1};
+    Floats corners[8], pulls[8] = {};
+    for (int c = 0; c < 8; ++c)
+      corners[c] = load_vector<Floats>(distances_m + kPlateVertices * std::int64_t{blocks[c]});
+    to_corners<1>(corners);
+    to_corners<2>(corners);
+    to_corners<4>(corners);
+    for (std::int32_t k = places.first[block]; k < places.first[block + 1]; ++k) {
+      const PlateLayer& layer = places.layers[k];
+      Floats upper[3], leaves, values[8];
+      unpack(layer.x_and_y, upper[0], upper[1]);
+      unpack(layer.z_and_leaf, upper[2], leaves);
+      for (int axis = 0; axis < 3; ++axis) upper[axis] = (1.0F / kPlateQuanta) * upper[axis];
+      for (int c = 0; c < 8; ++c) values[c] = corners[c];
+      for (int axis = 3; axis-- > 0;)
+        for (int c = 0; c < 1 << axis; ++c) values[c] += upper[axis] * (values[c + (1 << axis)] - values[c]);
+      const auto weights = load_vector<Floats>(layer.weights);
+      values[0] = weights * (values[0] - places.leaf_m * (leaves - one));
+      for (int axis = 0; axis < 3; ++axis) {
+        for (int c = 0; c < 1 << axis; ++c) {
+          values[c + (1 << axis)] = upper[axis] * values[c];
+          values[c] = values[c] - values[c + (1 << axis)];
+        }
+      }
+      for (int c = 0; c < 8; ++c) pulls[c] += values[c];
     }
-    float of_corners[kPlateVertices];
-    store_vector(of_corners, pulls);
-    for (int c = 0; c < kPlateVertices; ++c) pulls_m[corners[c]] += of_corners[c];
+    from_corners<4>(pulls);
+    from_corners<2>(pulls);
+    from_corners<1>(pulls);
+    for (int c = 0; c < 8; ++c) {
+      float* to = pulls_m + kPlateVertices * std::int64_t{blocks[c]};
+      store_vector(to, load_vector<Floats>(to) + pulls[c]);
+    }
   }
 }
 

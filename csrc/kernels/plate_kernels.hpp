@@ -27,18 +27,27 @@ struct PlateSweep {
   float least_m;             ///< minimum distance of a vertex with a known side
 };
 
-// Places with known distances, by cell.
+// Points with known distance, at most one in each of the 2 x 2 x 2 cells of a block.
+struct PlateLayer {
+  float weights[8];  ///< 0 without a point
+  // Two 16-bit fields each: the interpolation weights of the upper corners along x and y; the weight along z and the
+  // distance, 0 to 2 leaf cells from one behind the plane.
+  std::uint32_t x_and_y[8], z_and_leaf[8];
+};
+constexpr int kPlateQuanta = 65535;  // steps of an interpolation weight
+
+// Blocks of cells with points, in the same layout as the blocks of vertices.
 struct PlatePlaces {
-  const std::int32_t* corners;  ///< (cells, 8), vertices
-  const std::int32_t* first;    ///< (cells + 1), first place of each cell
-  const float* shares;          ///< (places, 8), interpolation weights times the square root of the weight
-  const float* targets_m;       ///< (places), distances times the square root of the weight
+  const std::int32_t* corners;  ///< (blocks, 8), blocks of vertices; the first one where missing
+  const std::int32_t* first;    ///< (blocks + 1), first layer of each block
+  const PlateLayer* layers;
+  float leaf_m;
 };
 
 struct PlateKernels {
   void (*sweep)(const PlateSweep& plates, std::int64_t begin, std::int64_t end);  // blocks
   void (*pull)(const PlatePlaces& places, const float* distances_m, float* pulls_m, std::int64_t begin,
-               std::int64_t end);  // cells
+               std::int64_t end);  // blocks of cells
 };
 
 #define RADARSDF_DECLARE_KERNEL(isa) \

@@ -81,28 +81,38 @@ class CellBlocks {
   std::vector<Occupancy> regions_, blocks_;
 };
 
-// Cached look-up of keys that mostly lie in the block, or at least in the region, of the previous one.
+// Cached look-up of keys that mostly lie in recently used blocks, or at least in the previous region. One block is
+// cached for each combination of coordinate parities, so adjacent blocks do not evict each other.
 class NearbyRows {
  public:
   explicit NearbyRows(const CellBlocks& cells) : cells_(&cells) {}
 
   // The row of a key, or -1.
   std::int32_t row(std::uint64_t key) {
-    if (CellBlocks::block_key(key) != block_key_) {
-      block_key_ = CellBlocks::block_key(key);
+    const std::uint64_t block_key = CellBlocks::block_key(key);
+    Found& found = found_[block_key & 7];
+    if (found.key != block_key) {
+      found.key = block_key;
       if (CellBlocks::region_key(key) != region_key_) {
         region_key_ = CellBlocks::region_key(key);
         region_ = cells_->region(region_key_);
       }
-      block_ = region_ != nullptr ? cells_->block(*region_, block_key_) : nullptr;
+      const Occupancy* block = region_ != nullptr ? cells_->block(*region_, block_key) : nullptr;
+      found.block = block != nullptr ? *block : Occupancy{0, 0};
     }
-    return block_ != nullptr ? block_->row(key) : -1;
+    return found.block.row(key);
   }
 
  private:
+  struct Found {
+    std::uint64_t key = kEmptyKey;
+    Occupancy block{0, 0};
+  };
+
   const CellBlocks* cells_;
-  std::uint64_t block_key_ = kEmptyKey, region_key_ = kEmptyKey;
-  const Occupancy *block_ = nullptr, *region_ = nullptr;
+  std::uint64_t region_key_ = kEmptyKey;
+  const Occupancy* region_ = nullptr;
+  Found found_[8];
 };
 
 }  // namespace radarsdf

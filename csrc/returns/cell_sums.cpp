@@ -26,15 +26,16 @@ constexpr int kFewColumns = 4;  // the only criterion, so that results do not de
 constexpr std::int32_t part_coordinate(int part, int axis) { return (part >> axis & 1) | (part >> (axis + 2) & 2); }
 
 // For the 27 blocks of a neighbourhood: masks of the cells that touch the central block. `places`: positions of the
-// cells of the central block in the cube of kWide cells per side, which includes the halo.
+// cells of the central block in the cube of kWide cells per side, which includes the halo; `inside`: in the block.
 struct NextTo {
   std::uint64_t masks[27] = {};
-  std::int32_t places[64] = {};
+  std::int32_t places[64] = {}, inside[64] = {};
 
   constexpr NextTo() {
     for (int part = 0; part < 64; ++part) {
       const std::int32_t at[3] = {part_coordinate(part, 0), part_coordinate(part, 1), part_coordinate(part, 2)};
       places[part] = (kWide * (at[0] + 1) + at[1] + 1) * kWide + at[2] + 1;
+      inside[part] = (kEdge * at[0] + at[1]) * kEdge + at[2];
       for (int n = 0; n < 27; ++n) {
         const int steps[3] = {n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1};
         bool touches = true;
@@ -101,12 +102,17 @@ class SumsOfBlock {
       : values_(values), columns_(columns), weight_(weight), sums_(static_cast<std::size_t>(64 * columns)) {}
 
   void move_to(const BlocksRound& round) {
+    std::int64_t first[kWide * kWide * kWide];  // value of each cell that is there
+    std::int32_t places[kWide * kWide * kWide];
+    int count = 0;
+    round.for_each([&](std::int32_t row, std::int32_t place) {
+      first[count] = columns_ * std::int64_t{row};
+      places[count++] = place;
+    });
+    const auto near = [&](double before, double own, double after) { return weight_ * (before + after) + own; };
     for (int k = 0; k < columns_; ++k) {
       double cube[kWide][kWide][kWide] = {}, along_z[kWide][kWide][kEdge], along_y[kWide][kEdge][kEdge];
-      round.for_each([&](std::int32_t row, std::int32_t place) {
-        (&cube[0][0][0])[place] = values_[columns_ * std::int64_t{row} + k];
-      });
-      const auto near = [&](double before, double own, double after) { return weight_ * (before + after) + own; };
+      for (int i = 0; i < count; ++i) (&cube[0][0][0])[places[i]] = values_[first[i] + k];
       for (int x = 0; x < kWide; ++x) {
         for (int y = 0; y < kWide; ++y)
           for (int z = 0; z < kEdge; ++z) along_z[x][y][z] = near(cube[x][y][z], cube[x][y][z + 1], cube[x][y][z + 2]);
@@ -114,21 +120,23 @@ class SumsOfBlock {
           for (int z = 0; z < kEdge; ++z)
             along_y[x][y][z] = near(along_z[x][y][z], along_z[x][y + 1][z], along_z[x][y + 2][z]);
       }
-      for (int i = 0; i < 64; ++i) {
-        const std::int32_t x = part_coordinate(i, 0), y = part_coordinate(i, 1), z = part_coordinate(i, 2);
-        sums_[static_cast<std::size_t>(columns_ * i + k)] =
-            near(along_y[x][y][z], along_y[x + 1][y][z], along_y[x + 2][y][z]);
-      }
+      double* sum = sums_.data() + 64 * k;
+      for (int x = 0; x < kEdge; ++x)
+        for (int y = 0; y < kEdge; ++y)
+          for (int z = 0; z < kEdge; ++z) *sum++ = near(along_y[x][y][z], along_y[x + 1][y][z], along_y[x + 2][y][z]);
     }
   }
 
-  const double* of(std::uint64_t key) const { return sums_.data() + columns_ * static_cast<std::int64_t>(key & 63); }
+  void copy(std::uint64_t key, double* own) const {
+    const double* sum = sums_.data() + kNextTo.inside[key & 63];
+    for (int k = 0; k < columns_; ++k) own[k] = sum[64 * k];
+  }
 
  private:
   const double* values_;
   int columns_;
   double weight_;
-  std::vector<double> sums_;
+  std::vector<double> sums_;  // (columns, 64), the last coordinate fastest
 };
 
 // Moves the origin of the sums `steps` back: (x + a)(y + b) sums to xy + a y + b x + a b.
@@ -154,7 +162,7 @@ void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std
   parallel_tasks(threads, num_threads, [&](std::int64_t task) {
     for (std::int64_t i = 0; i < returns.count; ++i) {
       const std::int64_t cell = returns.cells[i];
-      if ((cell >> 6) % threads != task) continue;
+      if (threads > 1 && (cell >> 6) % threads != task) continue;  // a division takes as long as the rest of a return
       std::uint64_t terms[kSums];
       sum_terms(returns.points + 3 * i, returns.directions + 3 * i, returns.ranges_m[i], corners + 3 * cell, quanta,
                 terms);
@@ -246,7 +254,7 @@ void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int
         }
       }
       if (of_blocks) {
-        std::copy_n(block.of(keys[i]), columns, own);
+        block.copy(keys[i], own);
         continue;
       }
       std::fill_n(own, columns, 0.0);

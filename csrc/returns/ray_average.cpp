@@ -54,8 +54,7 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   const auto size_m = static_cast<float>(table.leaf_size_m()), limit_m = static_cast<float>(truncation_m),
              quanta = kQuanta / limit_m;  // per metre
 
-  const auto add_ray = [&](std::int64_t i, LargeVector<Sum>& sums) {
-    NearbyRows leaf_rows(table.leaves());
+  const auto add_ray = [&](std::int64_t i, NearbyRows& leaf_rows, LargeVector<Sum>& sums) {
     const float *n = rays.normals + 3 * i, *p = rays.points + 3 * i;
     const auto weight = static_cast<std::uint32_t>(rays.weights[i]);
     float steps_m[8];  // offsets from the first corner of a cell to each corner
@@ -99,7 +98,9 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
   parallel_tasks(num_groups, num_threads, [&](std::int64_t g) {
     LargeVector<Sum>& sums = groups[static_cast<std::size_t>(g)];
     sums.resize(num_rows);
-    for (std::int64_t i = rays.count * g / num_groups; i < rays.count * (g + 1) / num_groups; ++i) add_ray(i, sums);
+    NearbyRows leaf_rows(table.leaves());
+    const std::int64_t end = rays.count * (g + 1) / num_groups;
+    for (std::int64_t i = rays.count * g / num_groups; i < end; ++i) add_ray(i, leaf_rows, sums);
   });
   parallel_blocks(table.num_rows(), 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (auto row = static_cast<std::size_t>(begin); row < static_cast<std::size_t>(end); ++row) {

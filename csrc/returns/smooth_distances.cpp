@@ -23,8 +23,9 @@
 namespace radarsdf {
 namespace {
 
-constexpr std::int64_t kBlocks = 1 << 11, kCells = 1 << 12, kPlacesOfThread = 1 << 13;  // minimum per thread
-constexpr int kPlaces = 3;       // points of a plane with known distance
+constexpr std::int64_t kBlocks = 1 << 11, kCells = 1 << 12, kPlacesOfThread = 1 << 13,
+                       kRegions = 1 << 4;  // minimum per thread
+constexpr int kPlaces = 3;                 // points of a plane with known distance
 constexpr double kBend = 2;      // leaf cells: second difference where the slope of a distance changes from -1 to 1
 constexpr double kClear = 0.25;  // leaf cells: least distance of a vertex with known side
 class Plates {
@@ -47,8 +48,6 @@ class Plates {
       before_m[v] = distances_m[row];
       if (compliance_[v] > 0) side[v] = sides[row];
     });
-    const PlateKernels kernels = RADARSDF_KERNEL(plate_kernels)();
-    const PlatePlaces places{corners_.data(), first_.data(), shares_.data(), targets_m_.data()};
     PlateSweep sweep{};
     sweep.neighbours = neighbours_.data();
     sweep.is_bent = is_bent_.data();
@@ -64,11 +63,9 @@ class Plates {
       if (k > 0) rho = next;
       sweep.before_m = before_m.data();
       sweep.after_m = after_m.data();
-      of_cells([&](std::int64_t begin, std::int64_t end) {
-        kernels.pull(places, before_m.data(), pulls_m.data(), begin, end);
-      });
+      pull(before_m.data(), static_cast<float>(table_->leaf_size_m()), pulls_m.data());
       parallel_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks, num_threads_,
-                      [&](std::int64_t begin, std::int64_t end) { kernels.sweep(sweep, begin, end); });
+                      [&](std::int64_t begin, std::int64_t end) { kernels_.sweep(sweep, begin, end); });
       std::swap(before_m, after_m);
     }
     of_rows([&](std::size_t row, std::size_t v) { distances_m[row] = before_m[v]; });
@@ -171,82 +168,97 @@ class Plates {
     for (const std::int32_t cell : cells)
       if (cell >= 0) ++next[static_cast<std::size_t>(cell)];
     std::int32_t num_places = 0;
-    for (std::size_t cell = 0; cell < keys.size(); ++cell) {
-      if (next[cell] == 0) continue;
-      begin_cell(keys[cell], static_cast<std::int32_t>(cell), num_places);
-      num_places += std::exchange(next[cell], num_places);
-    }
-    first_.push_back(num_places);
+    for (std::int32_t& of_cell : next) num_places += std::exchange(of_cell, num_places);
     UninitialisedVector<std::int32_t> used(static_cast<std::size_t>(num_places));
     for (std::size_t i = 0; i < cells.size(); ++i) {
       if (cells[i] >= 0)
         used[static_cast<std::size_t>(next[static_cast<std::size_t>(cells[i])]++)] = static_cast<std::int32_t>(i);
     }
-    shares_.resize(8 * used.size());
-    targets_m_.resize(used.size());
-    corners_.resize(8 * cells_.size());
+    // The places of a cell end where `next` says by now.
+    const auto first_of = [&](std::size_t cell) { return cell > 0 ? next[cell - 1] : 0; };
+    std::vector<std::pair<std::size_t, std::size_t>> of_blocks;  // cells
+    std::int32_t num_layers = 0;
+    for (std::size_t cell = 0; cell < keys.size();) {
+      const std::size_t first = cell;
+      std::int32_t most = 0;
+      for (; cell < keys.size() && keys[cell] >> 3 == keys[first] >> 3; ++cell)
+        most = std::max(most, next[cell] - first_of(cell));
+      if (most == 0) continue;
+      begin_block(keys[first], static_cast<std::int64_t>(of_blocks.size()));
+      first_.push_back(num_layers);
+      of_blocks.emplace_back(first, cell);
+      num_layers += most;
+    }
+    first_.push_back(num_layers);
+    layers_.resize(static_cast<std::size_t>(num_layers));
+    corners_.resize(8 * of_blocks.size());
     const double scale = kBend * kBend * size_m * size_m / kPlaces;
-    parallel_blocks(static_cast<std::int64_t>(cells_.size()), kCells, num_threads_,
+    parallel_blocks(static_cast<std::int64_t>(of_blocks.size()), kCells / 4, num_threads_,
                     [&](std::int64_t begin, std::int64_t end) {
-                      for (auto cell = static_cast<std::size_t>(begin); cell < static_cast<std::size_t>(end); ++cell) {
-                        const std::uint64_t key = keys[static_cast<std::size_t>(cells_[cell])];
-                        double lower[3];
-                        for (int axis = 0; axis < 3; ++axis)
-                          lower[axis] = static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias;
-                        for (std::int32_t k = first_[cell]; k < first_[cell + 1]; ++k)
-                          share(planes, used[static_cast<std::size_t>(k)], lower, scale, static_cast<std::size_t>(k));
-                        const std::int32_t* rows = table_->cells()[static_cast<std::size_t>(cells_[cell])].rows;
-                        for (std::size_t c = 0; c < 8; ++c)
-                          corners_[8 * cell + c] = vertices_[static_cast<std::size_t>(rows[c])];
+                      for (auto b = static_cast<std::size_t>(begin); b < static_cast<std::size_t>(end); ++b) {
+                        std::fill(layers_.begin() + first_[b], layers_.begin() + first_[b + 1], PlateLayer{});
+                        for (std::size_t cell = of_blocks[b].first; cell < of_blocks[b].second; ++cell) {
+                          PlateLayer* layer = layers_.data() + first_[b];
+                          double lower[3];
+                          for (int axis = 0; axis < 3; ++axis)
+                            lower[axis] = static_cast<std::int32_t>(morton_coordinate(keys[cell], axis)) - kAxisBias;
+                          for (std::int32_t k = first_of(cell); k < next[cell]; ++k)
+                            put(planes, used[static_cast<std::size_t>(k)], lower, scale, keys[cell] & 7, *layer++);
+                        }
+                        find_corners(of_blocks[b], corners_.data() + 8 * b);
                       }
                     });
   }
 
-  // lower: corner of the cell of point i, in cells. k: index of its shares.
-  void share(const KnownPlanes& planes, std::int32_t i, const double* lower, double scale, std::size_t k) {
-    const double size_m = table_->leaf_size_m();
-    const auto root = static_cast<float>(std::sqrt(scale * static_cast<double>(planes.information[i / kPlaces])));
-    float point[3], upper[3];
+  // Stores point i in a lane of the layer. lower: corner of its cell, in cells.
+  void put(const KnownPlanes& planes, std::int32_t i, const double* lower, double scale, std::size_t lane,
+           PlateLayer& layer) const {
+    float point[3];
+    std::uint32_t upper[3];
     place_of(planes, i, point);
-    for (int axis = 0; axis < 3; ++axis)
-      upper[axis] = static_cast<float>(std::clamp(point[axis] / size_m - lower[axis], 0.0, 1.0));
-    for (std::size_t c = 0; c < 8; ++c) {  // bit `axis` of a corner: set if upper
-      float product = root;
-      for (int axis = 0; axis < 3; ++axis) product *= (c >> axis & 1) != 0 ? upper[axis] : 1 - upper[axis];
-      shares_[8 * k + c] = product;
+    for (int axis = 0; axis < 3; ++axis) {
+      const double share = std::clamp(point[axis] / table_->leaf_size_m() - lower[axis], 0.0, 1.0);
+      upper[axis] = static_cast<std::uint32_t>(share * kPlateQuanta + 0.5);
     }
-    targets_m_[k] = root * static_cast<float>((i % kPlaces - 1) * size_m);
+    layer.weights[lane] = static_cast<float>(scale * static_cast<double>(planes.information[i / kPlaces]));
+    layer.x_and_y[lane] = upper[0] | upper[1] << 16;
+    layer.z_and_leaf[lane] = upper[2] | static_cast<std::uint32_t>(i % kPlaces) << 16;
   }
 
-  // Cells are grouped by regions of 16 x 16 x 16. Regions with equal parities of all coordinates share no vertex, so
-  // threads add their pulls in parallel. The order of pulls at a vertex depends neither on the number of threads nor on
-  // the other cells present.
-  void begin_cell(std::uint64_t key, std::int32_t cell, std::int32_t first_place) {
+  // Blocks of vertices that contain the corners of the cells of a block.
+  void find_corners(const std::pair<std::size_t, std::size_t>& cells, std::int32_t* blocks) const {
+    const auto block_of = [&](std::int32_t row) { return vertices_[static_cast<std::size_t>(row)] / kPlateVertices; };
+    std::fill_n(blocks, 8, -1);
+    for (std::size_t cell = cells.first; cell < cells.second; ++cell) {
+      const auto at = static_cast<unsigned>(table_->leaf_keys()[cell] & 7);
+      const std::int32_t* rows = table_->cells()[cell].rows;
+      // Corners beyond the upper faces are in the next blocks.
+      for (unsigned c = 0; c < 8; ++c) blocks[at & c] = block_of(rows[c]);
+    }
+    for (int c = 1; c < 8; ++c)
+      if (blocks[c] < 0) blocks[c] = blocks[0];
+  }
+
+  // Blocks are grouped by regions of 16 x 16 x 16 cells. Regions with equal parities of all coordinates share no
+  // vertex, so threads add their pulls in parallel. The order of pulls at a vertex depends neither on the number of
+  // threads nor on the other cells present.
+  void begin_block(std::uint64_t key, std::int64_t number) {
     const std::uint64_t region = CellBlocks::region_key(key);
-    const auto number = static_cast<std::int64_t>(cells_.size());
     std::vector<Range>& apart = regions_[region & 7];
-    if (cells_.empty() || region != last_region_) apart.emplace_back(number, number);
+    if (number == 0 || region != last_region_) apart.emplace_back(number, number);
     last_region_ = region;
     ++apart.back().second;
-    first_.push_back(first_place);
-    cells_.push_back(cell);
   }
 
-  // Calls body(begin, end) for the cells of each region, in parallel for regions that share no vertex.
-  template <typename Body>
-  void of_cells(const Body& body) const {
-    std::size_t num_regions = 0;
-    for (const std::vector<Range>& apart : regions_) num_regions += apart.size();
-    const auto regions_of_thread =
-        1 + kCells * static_cast<std::int64_t>(num_regions) / static_cast<std::int64_t>(first_.size());
+  // Accumulates the pulls of all points in pulls_m.
+  void pull(const float* distances_m, float leaf_m, float* pulls_m) const {
+    const PlatePlaces places{corners_.data(), first_.data(), layers_.data(), leaf_m};
     for (const std::vector<Range>& apart : regions_) {
-      const auto count = static_cast<std::int64_t>(apart.size());
-      parallel_blocks(count, regions_of_thread, num_threads_, [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t i = begin; i < end; ++i) {
-          const Range& cells = apart[static_cast<std::size_t>(i)];
-          body(cells.first, cells.second);
-        }
-      });
+      parallel_blocks(static_cast<std::int64_t>(apart.size()), kRegions, num_threads_,
+                      [&](std::int64_t begin, std::int64_t end) {
+                        for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i)
+                          kernels_.pull(places, distances_m, pulls_m, apart[i].first, apart[i].second);
+                      });
     }
   }
 
@@ -288,17 +300,9 @@ class Plates {
     }
     compliance_.resize(kPlateVertices * num_blocks_);
     of_blocks([&](std::size_t b) { connect_block(b); });
-    of_cells([&](std::int64_t begin, std::int64_t end) {
-      for (auto cell = static_cast<std::size_t>(begin); cell < static_cast<std::size_t>(end); ++cell) {
-        const std::int32_t* corners = corners_.data() + 8 * cell;
-        for (auto k = static_cast<std::size_t>(first_[cell]); k < static_cast<std::size_t>(first_[cell + 1]); ++k) {
-          const float* shares = shares_.data() + 8 * k;
-          float root = 0;
-          for (int c = 0; c < 8; ++c) root += shares[c];
-          for (int c = 0; c < 8; ++c) compliance_[static_cast<std::size_t>(corners[c])] += root * shares[c];
-        }
-      }
-    });
+    // Of a place that is 0, the products of the shares pull, where all distances are 1.
+    const LargeVector<float> ones(compliance_.size(), 1.0F);
+    pull(ones.data(), 0, compliance_.data());
     of_blocks([&](std::size_t b) {
       float* compliance = compliance_.data() + kPlateVertices * b;
       for (std::size_t i = 0; i < kPlateVertices; ++i) compliance[i] = compliance[i] > 0 ? 1 / compliance[i] : 0;
@@ -360,18 +364,18 @@ class Plates {
 
   const VertexTable* table_;
   int num_threads_;
-  UninitialisedVector<std::int32_t> vertices_;  // position in the blocks of each row
+  PlateKernels kernels_ = RADARSDF_KERNEL(plate_kernels)();
+  UninitialisedVector<std::int32_t> vertices_;  // position of each row in the blocks
   std::size_t num_blocks_ = 0;
   FlatMap numbers_;                // index of the table's blocks by key
   std::vector<Occupancy> blocks_;  // by block of the table
   UninitialisedVector<std::int32_t> neighbours_;
   LargeVector<std::uint8_t> is_bent_;
   UninitialisedVector<float> compliance_;  // stiffness during setup
-  std::vector<std::int32_t> cells_;        // cells with points
-  std::vector<std::int32_t> first_;        // first point of each such cell
+  std::vector<std::int32_t> first_;        // first layer of each block of cells with points
   UninitialisedVector<std::int32_t> corners_;
-  UninitialisedVector<float> shares_, targets_m_;
-  std::array<std::vector<Range>, 8> regions_;  // ranges of cells, by parities of the region's coordinates
+  UninitialisedVector<PlateLayer> layers_;
+  std::array<std::vector<Range>, 8> regions_;  // ranges of these blocks, by parities of the region's coordinates
   std::uint64_t last_region_ = 0;
 };
 

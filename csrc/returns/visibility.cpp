@@ -50,9 +50,13 @@ void check_whole_rays(const float* points, const float* directions, const float*
                       double leaf_size_m) {
   const double limit_m = (kAxisBias - (1 << kMaxLevels)) * leaf_size_m;
   bool inside = true;
-  for (std::int64_t i = 0; i < 3 * count; ++i) {  // NaN fails the comparison too
-    const double sensor_m = points[i] - double{ranges_m[i / 3]} * double{directions[i]};
-    inside = inside && std::abs(double{points[i]}) < limit_m && std::abs(sensor_m) < limit_m && ranges_m[i / 3] >= 0;
+  for (std::int64_t i = 0; i < count; ++i) {  // NaN fails the comparison too
+    const double range_m = ranges_m[i];
+    inside = inside & (range_m >= 0);
+    for (std::int64_t k = 3 * i; k < 3 * i + 3; ++k) {
+      const double sensor_m = points[k] - range_m * double{directions[k]};
+      inside = inside & (std::abs(double{points[k]}) < limit_m) & (std::abs(sensor_m) < limit_m);
+    }
   }
   if (!inside) throw std::invalid_argument("rays must be finite and within a million cells of the origin");
 }

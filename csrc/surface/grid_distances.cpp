@@ -26,23 +26,32 @@ void grid_distances(const VertexTable& table, const float* distances_m, const st
   if (parts < 1) throw std::invalid_argument("parts must be at least 1");
   parallel_blocks(num_corners, kCorners, num_threads, [&](std::int64_t begin, std::int64_t end) {
     NearbyRows rows(table.leaves());
+    // State of the previous corner: sorted corners mostly share coordinates with it.
+    std::int32_t last[3] = {}, cell[3] = {};
+    int part[3] = {};
+    float upper[3] = {};
+    std::uint64_t keys[3][2] = {};  // key bits by axis, of the cell and of the previous one
     for (std::int64_t i = begin; i < end; ++i) {
-      std::int32_t cell[3];
-      int part[3], on_border = 0;  // bit `axis`: the previous cell has the corner, too
+      int on_border = 0;  // bit `axis`: the previous cell has the corner, too
       bool is_near = true;
       for (int axis = 0; axis < 3; ++axis) {
         const std::int32_t corner = corners[3 * i + axis];
-        cell[axis] = corner / parts - (corner % parts < 0 ? 1 : 0);
-        part[axis] = corner - cell[axis] * parts;
+        if (i == begin || corner != last[axis]) {
+          last[axis] = corner;
+          cell[axis] = corner / parts - (corner % parts < 0 ? 1 : 0);
+          part[axis] = corner - cell[axis] * parts;
+          upper[axis] = static_cast<float>(part[axis]) / static_cast<float>(parts);
+          for (std::uint32_t k = 0; k < 2; ++k)
+            keys[axis][k] = spread_bits(static_cast<std::uint32_t>(cell[axis]) + kAxisBias - k) << axis;
+        }
         if (part[axis] == 0) on_border |= 1 << axis;
         is_near = is_near && cell[axis] > -kAxisBias && cell[axis] < kAxisBias;
       }
       std::int32_t row = -1;
-      int before = 0;
-      for (; is_near && row < 0 && before < 8; ++before) {
+      int before = -1;
+      while (is_near && row < 0 && ++before < 8) {
         if ((before & ~on_border) != 0) continue;
-        const std::int32_t other[3] = {cell[0] - (before & 1), cell[1] - (before >> 1 & 1), cell[2] - (before >> 2)};
-        row = rows.row(lattice_key(other));
+        row = rows.row(keys[0][before & 1] | keys[1][before >> 1 & 1] | keys[2][before >> 2]);
       }
       if (row < 0) {
         found_m[i] = std::numeric_limits<float>::quiet_NaN();
@@ -51,8 +60,7 @@ void grid_distances(const VertexTable& table, const float* distances_m, const st
       const std::int32_t* vertices = table.cells()[static_cast<std::size_t>(row)].rows;
       float values[8], share[3];
       for (int c = 0; c < 8; ++c) values[c] = distances_m[vertices[c]];
-      for (int axis = 0; axis < 3; ++axis)
-        share[axis] = ((before - 1) >> axis & 1) != 0 ? 1 : static_cast<float>(part[axis]) / static_cast<float>(parts);
+      for (int axis = 0; axis < 3; ++axis) share[axis] = (before >> axis & 1) != 0 ? 1 : upper[axis];
       for (int axis = 0; axis < 3; ++axis)
         for (int c = 0; c < 4 >> axis; ++c) values[c] = between(values[2 * c], values[2 * c + 1], share[axis]);
       found_m[i] = values[0];

@@ -40,25 +40,23 @@ void sum_up(std::vector<int64_t>& counts) {
   for (size_t i = 1; i < counts.size(); ++i) counts[i] += counts[i - 1];
 }
 
-// Signs of the corners, or 0 (a pattern without triangles) if a value is NaN.
-template <typename T>
-std::uint8_t sign_pattern(const T* values, const int32_t* cell, double level) {
-  unsigned pattern = 0;
-  bool has_nan = false;
+constexpr unsigned is_nan = 1 << 8;
+
+// Signs of the corners, or 0 (a pattern without triangles) if a value is NaN. signs: 0, 1 or is_nan for each value.
+std::uint8_t sign_pattern(const std::uint16_t* signs, const int32_t* cell) {
+  unsigned pattern = 0, any = 0;
   for (int corner = 0; corner < 8; ++corner) {
-    const T value = values[cell[corner]];
-    has_nan |= value != value;
-    pattern |= static_cast<unsigned>(static_cast<double>(value) > level) << corner;
+    const unsigned sign = signs[cell[corner]];
+    any |= sign;
+    pattern |= sign << corner;
   }
-  return has_nan ? std::uint8_t{0} : static_cast<std::uint8_t>(pattern);
+  return (any & is_nan) != 0 ? std::uint8_t{0} : static_cast<std::uint8_t>(pattern);
 }
 
 void check_corner_numbers(const int32_t* cell, int64_t num_corners) {
-  for (int corner = 0; corner < 8; ++corner) {
-    if (cell[corner] < 0 || cell[corner] >= num_corners) {
-      throw std::invalid_argument("a cell refers to a corner that does not exist");
-    }
-  }
+  std::uint32_t highest = 0;  // a negative number is a high one
+  for (int corner = 0; corner < 8; ++corner) highest = std::max(highest, static_cast<std::uint32_t>(cell[corner]));
+  if (int64_t{highest} >= num_corners) throw std::invalid_argument("a cell refers to a corner that does not exist");
 }
 
 void check_corner_positions(const int32_t* corners, const int32_t* cell) {
@@ -97,13 +95,20 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
     return edges[static_cast<size_t>(3 * int64_t{cell[corner]} + axis)];
   };
 
+  const auto signs = large_array<std::uint16_t>(num_corners);
+  for_each_block(num_corners, num_threads, [&](size_t, int64_t begin, int64_t end) {
+    for (int64_t c = begin; c < end; ++c) {
+      const auto value = static_cast<double>(values[c]);
+      signs[static_cast<size_t>(c)] = static_cast<std::uint16_t>(value > level ? 1 : value == value ? 0 : is_nan);
+    }
+  });
   const auto patterns = large_array<std::uint8_t>(num_cells);
   std::vector<int64_t> first_face = block_counts(num_cells);
   for_each_block(num_cells, num_threads, [&](size_t block, int64_t begin, int64_t end) {
     for (int64_t m = begin; m < end; ++m) {
       const int32_t* cell = cells + 8 * m;
       check_corner_numbers(cell, num_corners);
-      const std::uint8_t pattern = patterns[static_cast<size_t>(m)] = sign_pattern(values, cell, level);
+      const std::uint8_t pattern = patterns[static_cast<size_t>(m)] = sign_pattern(signs.get(), cell);
       if (pattern == 0 || pattern == 255) continue;
       check_corner_positions(corners, cell);
       first_face[block + 1] += table[pattern].num_triangles;

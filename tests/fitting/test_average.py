@@ -84,9 +84,11 @@ def test_ghosts_of_a_part_equal_those_of_the_whole():
     scans = radarsdf.simulate.hugin(frames=8, seed=3)
     rays = prepare(scans.points, scans.poses)
     inside = rays.points[:, 0] < np.median(rays.points[:, 0])
-    whole, part = (SurfaceReturns.of(rays, FitConfig.quick(), 1, some).true for some in (None, inside))
-    assert not whole.all()
-    np.testing.assert_array_equal(part, whole)
+    config = FitConfig.quick(returns={"free_space": True})
+    whole, part = (SurfaceReturns.of(rays, config, 1, some) for some in (None, inside))
+    assert not whole.true.all()
+    np.testing.assert_array_equal(part.true, whole.true)
+    assert whole.count == SurfaceReturns.of(rays, FitConfig.quick(), 1).count == whole.true.sum()
 
 
 HALF_M, HEIGHT_M = 3.0, 3.0

@@ -42,11 +42,14 @@ CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
 class SurfaceReturns:
     """Returns from which the surface is fitted, with their surfels and noise."""
 
-    rays: Rays  # without ghosts; for training, moved towards the flat surfel of their cell
+    rays: Rays  # for training, without ghosts and moved towards the flat surfel of their cell; otherwise all
+    count: int  # number of returns that are no ghosts
     surfels: Surfels  # of all returns
     noise: SensorNoise
     means: MeanRays | None  # mean rays of the leaf cells without ghosts, to average. None for training
-    true: NDArray[np.bool_] | None  # (N,) False for ghosts among all rays. None if ghosts are not detected
+    true: (
+        NDArray[np.bool_] | None
+    )  # (N,) False for ghosts among all rays. None if ghosts are not detected, or not needed
 
     @classmethod
     def of(
@@ -63,11 +66,13 @@ class SurfaceReturns:
         means = None if config.train else MeanRays.of_sums(sums, num_threads)
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
-        kept, true = inside, None
+        kept, true, count = inside, None, len(rays) if inside is None else int(np.count_nonzero(inside))
         if config.returns.drop_ghosts:
             of_ghosts = find_ghosts(surfels, rays if means is None else means, noise, num_threads)
-            true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)]
-            kept = true if inside is None else true & inside
+            asked = config.train or config.returns.free_space or inside is not None
+            true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)] if asked else None
+            kept = true if true is None or inside is None else true & inside
+            count = int(surfels.counts[~of_ghosts].sum()) if kept is None else int(np.count_nonzero(kept))
             if means is not None:
                 means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
         if means is not None and inside is not None:
@@ -75,7 +80,8 @@ class SurfaceReturns:
             means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
         if config.train and config.returns.onto_planes:
             rays = onto_surfels(surfels, rays, noise, num_threads)
-        return cls(rays if kept is None else rays.select(kept), surfels, noise, means, true)
+        rays = rays.select(kept) if config.train and kept is not None else rays
+        return cls(rays, count, surfels, noise, means, true)
 
 
 def occupied_cells(
@@ -120,9 +126,8 @@ def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig)
     """Compute information, scans and returns of each leaf cell from its mean ray."""
     # The returns of a cell have nearly the same range if they are seen from the same sensor position.
     information = means.counts / noise.variances_m2(means.ranges_m)
-    counts = means.counts.astype(np.float64)
-    found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
-    return found.with_uncertain_poses(means.ranges_m, config)
+    columns = information.astype(np.float32), means.scans, means.counts.astype(np.float64)
+    return ReturnsOfCells(means.keys, *columns).with_uncertain_poses(means.ranges_m, config)
 
 
 @torch.no_grad()
@@ -174,9 +179,8 @@ def average_at_corners(
     Distances depend only on what is within `CELLS_SMOOTHED` of the cells of their rays, to the last bit.
     """
     normals = np.ascontiguousarray(normals, np.float32)
-    distances_m, sides = table.average_rays(
-        rays.points, rays.directions, normals, rays.counts, config.metres(TRUNCATION_CELLS), num_threads
-    )
+    columns = rays.points, rays.directions, normals, rays.counts
+    distances_m, sides = table.average_rays(*columns, config.metres(TRUNCATION_CELLS), num_threads)
     return table.smoothed(
         distances_m, rays.points, normals, returns.information, sides, _SMOOTHINGS, num_threads
     )

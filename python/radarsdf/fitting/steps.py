@@ -113,7 +113,7 @@ def _fit(
         field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
     lap("occupied_cells_s")
 
-    sizes = {"surface_returns": len(surface.rays), "returns": len(learnt), "vertices": field.table.num_rows}
+    sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
     schedule = Schedule.of(config, with_intensity=with_network, **sizes)
     report = _report(given, learnt, surface, field, schedule, config)
     contents = _contents(given, learnt, surface, leaf_keys, returns, field, report, config, num_threads)
@@ -205,8 +205,8 @@ def _report(
     return {
         "scans": len(given.rays.up_of_scan),
         "returns": given.rays.num_given + given.moving,
-        "returns_used": len(surface.rays),
-        "ghosts": len(learnt) - len(surface.rays),
+        "returns_used": surface.count,
+        "ghosts": len(learnt) - surface.count,
         "moving": given.moving,
         "intensity_outliers": outliers,
         "noise": dataclasses.asdict(surface.noise),

@@ -85,8 +85,8 @@ class Surface:
         kept = within(limits, min_confidence, self.faces, self.confidence, self.uncertainty_m)
         rows = np.flatnonzero(kept)
         if len(rows):
-            labels, sizes = mesh_components(self.faces[rows], len(self.vertices))
-            kept[rows] = sizes[labels] >= limits.min_component_triangles
+            labels, sizes = mesh_components(self.faces.take(rows, axis=0), len(self.vertices))
+            kept[rows] = (sizes >= limits.min_component_triangles).take(labels)
         return kept
 
     def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
@@ -100,9 +100,10 @@ class Surface:
         self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
     ) -> trimesh.Trimesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
-        used, faces = renumbered(len(self.vertices), self.faces[kept])
-        vertices, confidence = self.vertices[used] + origin, self.confidence[used]
-        return described_mesh(vertices, faces, confidence, self.uncertainty_m[used], **metadata)
+        used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
+        rows = np.flatnonzero(used)
+        vertices, confidence = self.vertices.take(rows, axis=0) + origin, self.confidence.take(rows)
+        return described_mesh(vertices, faces, confidence, self.uncertainty_m.take(rows), **metadata)
 
 
 def extract_mesh(
@@ -163,7 +164,7 @@ def within(
 def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
     """Return a mask (F,) of the faces (F, 3) with all vertices in the mask `good` (V,)."""
     first, second, third = faces.T
-    found: NDArray[np.bool_] = good[first] & good[second] & good[third]
+    found: NDArray[np.bool_] = good.take(first) & good.take(second) & good.take(third)
     return found
 
 
@@ -172,7 +173,7 @@ def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.
     used = np.zeros(num_vertices, bool)
     used[faces] = True
     renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return used, renumbered[faces]
+    return used, renumbered.take(faces)
 
 
 def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -239,10 +240,8 @@ def crossed(
 
 def _near_surface(values_m: NDArray[Any], leaf_size_m: float) -> NDArray[np.bool_]:
     """Return a mask (M,) of the leaf cells with corner distances (M, 8) not all clearly on one side."""
-    margin_m, corners = (
-        _CLEARLY * leaf_size_m,
-        np.ascontiguousarray(values_m.T),
-    )  # reductions along rows of eight are slow
+    margin_m = _CLEARLY * leaf_size_m
+    corners = np.ascontiguousarray(values_m.T)  # reductions along rows of eight are slow
     found: NDArray[np.bool_] = (corners.min(axis=0) <= margin_m) & (corners.max(axis=0) >= -margin_m)
     return found
 

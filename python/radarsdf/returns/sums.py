@@ -154,13 +154,13 @@ class MeanRays:
 
     @classmethod
     def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> MeanRays:
-        points, directions, ranges_m, counts = mean_rays(
-            sums.keys, np.ascontiguousarray(sums.sums), sums.leaf_size_m, num_threads
-        )
+        means = mean_rays(sums.keys, np.ascontiguousarray(sums.sums), sums.leaf_size_m, num_threads)
+        points, directions, ranges_m, counts = means
         return cls(sums.keys, points, directions, counts, sums.scans, ranges_m)
 
     def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
-        return MeanRays(**{name: column[part] for name, column in vars(self).items()})
+        rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
+        return MeanRays(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
     def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
         """Return ascending Morton keys (C,) of the leaf cells that rays cross within `reach_m` of their returns."""
