@@ -96,7 +96,7 @@ def skipped_of(config, with_intensity):
     return schedule, dict(found)
 
 
-def test_each_part_that_was_skipped_has_a_time():
+def test_each_part_that_was_skipped_has_a_time_but_what_a_fit_never_runs():
     parts = {
         "default": ["40% of the samples"],
         "quick": ["training of the surface", "free space", "the intensity network"],
@@ -108,4 +108,4 @@ def test_each_part_that_was_skipped_has_a_time():
         assert len(saved_s) == len(expected)
         for words, start in zip(saved_s, expected, strict=True):
             assert words.startswith(start)
-            assert saved_s[words] > 0
+            assert saved_s[words] is None if start == "free space" else saved_s[words] > 0

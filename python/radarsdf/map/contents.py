@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,21 @@ from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatistics
+
+_Part = TypeVar("_Part")
+
+
+class Deferred(Generic[_Part]):
+    """A part that `make` computes when it is first asked for. What `make` refers to stays in memory until then."""
+
+    def __init__(self, make: Callable[[], _Part]) -> None:
+        self._make: Callable[[], _Part] | None = make
+
+    def __call__(self) -> _Part:
+        if (make := self._make) is not None:
+            self._part = make()
+            self._make = None
+        return self._part
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,7 @@ class MapContents(WholeMap):
     evidence: Evidence  # evidence of a surface in each leaf cell
     sensor: Sensor  # the radar, as the scans of the fit show it
     report: dict[str, Any]  # counts, losses, noise of the sensor and seconds of the fit
-    free_space: FreeSpace = dataclasses.field(default_factory=FreeSpace.none)  # free-space crossings, or none
-    # View statistics of intensity, or none.
-    view_statistics: ViewStatistics = dataclasses.field(default_factory=ViewStatistics.none)
+    free_space: Callable[[], FreeSpace] = FreeSpace.none  # free-space crossings, or none
+    view_statistics: Callable[[], ViewStatistics] = (
+        ViewStatistics.none
+    )  # view statistics of intensity, or none
