@@ -123,7 +123,7 @@ def _fit(
     closes = learnt.intensities is not None and config.closes_intensity
     of_intensity = (learnt, surface.surfels) if closes else None
     surface_rays = surface.rays
-    del given, surface, returns, leaf_keys  # most of the memory, of which the training makes use again
+    del given, surface, returns, leaf_keys  # memory that the training can use
     stop: KeyboardInterrupt | Diverged | None = None
     if isinstance(field, NeuralField):
         training = Training(field, surface_rays, learnt, scale, schedule, config, pool)
