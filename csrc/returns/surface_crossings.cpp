@@ -12,12 +12,26 @@
 namespace radarsdf {
 namespace {
 
-constexpr float kSlack = 0.25F;  // cells: planes of neighbours do not meet exactly at their common face
+constexpr float kSlack = 0.25F;                 // cells: planes of neighbours do not exactly meet at their common face
+constexpr double kBlockEdge = 1 << kBlockBits;  // cells
+constexpr int kEmptyCells = 8;                  // consecutive ones, after which a ray steps by blocks again
+
+CellBlocks blocks_of(const std::uint64_t* keys, std::int64_t count) {
+  std::vector<std::uint64_t> blocks;
+  for (std::int64_t i = 0; i < count; ++i) {
+    if (blocks.empty() || blocks.back() != CellBlocks::block_key(keys[i]))
+      blocks.push_back(CellBlocks::block_key(keys[i]));
+  }
+  return {blocks.data(), static_cast<std::int64_t>(blocks.size())};
+}
 
 }  // namespace
 
 SurfelMap::SurfelMap(const std::uint64_t* keys, const Surfel* surfels, std::int64_t count, double cell_size_m)
-    : cell_size_m_(cell_size_m), cells_(keys, count), surfels_(surfels, surfels + count) {
+    : cell_size_m_(cell_size_m),
+      cells_(keys, count),
+      blocks_(blocks_of(keys, count)),
+      surfels_(surfels, surfels + count) {
   if (!(cell_size_m > 0) || !std::isfinite(cell_size_m)) {
     throw std::invalid_argument("cell_size_m must be positive and finite");
   }
@@ -53,7 +67,7 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
 
   constexpr std::int64_t kRays = 1 << 12;  // per task: few, so that a long traversal can be interrupted
   parallel_tasks((count + kRays - 1) / kRays, num_threads, [&](std::int64_t task) {
-    NearbyRows rows(cells_);
+    NearbyRows rows(cells_), blocks(blocks_);
     const std::int64_t end = std::min(count, (task + 1) * kRays);
     for (std::int64_t i = task * kRays; i < end; ++i) {
       crossed[i] = -1;
@@ -61,16 +75,29 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
       bool inside = range_m > 0;
       for (int axis = 0; axis < 3; ++axis) inside = inside && std::abs(points[3 * i + axis]) + range_m < limit_m;
       if (!inside || -range_m > last_m) continue;
+      // Most of the way is empty: only where blocks hold surfels is the ray followed from cell to cell.
       double begin_m = -range_m;
-      for (CellWalk cell(points + 3 * i, directions + 3 * i, -range_m, last_m, cell_size_m_); cell.inside();
-           cell.next()) {
-        const double end_m = cell.leaves_m();
-        const std::int32_t row = rows.row(cell.key());
-        if (row >= 0 && crosses(i, surfels_[static_cast<std::size_t>(row)], begin_m, end_m)) {
-          crossed[i] = row;
-          break;
+      CellWalk block(points + 3 * i, directions + 3 * i, -range_m, last_m, kBlockEdge * cell_size_m_,
+                     kAxisBias >> kBlockBits);
+      while (block.inside() && crossed[i] < 0) {
+        const double leaves_m = block.leaves_m();
+        if (blocks.row(block.key()) >= 0) {
+          int on_end = 0;
+          for (CellWalk cell(points + 3 * i, directions + 3 * i, begin_m, last_m, cell_size_m_); cell.inside();
+               cell.next()) {
+            const double end_m = cell.leaves_m();
+            const std::int32_t row = rows.row(cell.key());
+            on_end = row < 0 ? on_end + 1 : 0;
+            if (on_end > kEmptyCells) break;
+            if (row >= 0 && crosses(i, surfels_[static_cast<std::size_t>(row)], begin_m, end_m)) {
+              crossed[i] = row;
+              break;
+            }
+            begin_m = end_m;
+          }
         }
-        begin_m = end_m;
+        begin_m = std::max(begin_m, leaves_m);
+        while (block.inside() && block.leaves_m() <= begin_m) block.next();
       }
     }
   });

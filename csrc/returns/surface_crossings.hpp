@@ -38,7 +38,7 @@ class SurfelMap {
 
  private:
   double cell_size_m_;
-  CellBlocks cells_;
+  CellBlocks cells_, blocks_;  // and the blocks that hold them
   std::vector<Surfel> surfels_;
 };
 

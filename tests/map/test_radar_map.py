@@ -3,12 +3,14 @@
 """Queries of a map: array types, chunks and threads."""
 
 import threading
+import weakref
 
 import numpy as np
 import pytest
 import radarsdf
 import torch
 from radarsdf.field.neural_field import NeuralField
+from radarsdf.map.contents import Deferred
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 
@@ -151,3 +153,20 @@ def test_repr_has_the_size_of_map_and_file(scene, sharp_map, tmp_path):
     assert 0 < names < 5000  # with checksums of all arrays
     config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     assert repr(radarsdf.fit(scene.points, scene.poses, config=config)).startswith("RadarMap(surface, ")
+
+
+def test_a_deferred_part_is_computed_once_and_then_lets_go_of_its_input():
+    class Rays:
+        computed = 0
+
+        def part(self):
+            Rays.computed += 1
+            return Rays.computed
+
+    rays = Rays()
+    alive, part = weakref.ref(rays), Deferred(rays.part)
+    del rays
+    assert Rays.computed == 0
+    assert alive() is not None
+    assert [part(), part()] == [1, 1]
+    assert alive() is None

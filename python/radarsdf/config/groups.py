@@ -72,9 +72,9 @@ class ReturnsConfig:
     is one (3QFPI: no). Measured: 0.8 to 1.7 points of F-score on simulated scenes, -0.9 to 0.5 on real ones;
     up to 1 % more error of intensities."""
     free_space: bool = True
-    """Whether the map keeps the cells that rays crossed, and mean intensities by place and view, for :func:`radarsdf.grid`
-    and :func:`radarsdf.compare`. It takes about 1 µs of CPU time per return, and 0.3 kB per block of
-    8 × 8 × 8 leaf cells that rays crossed."""
+    """Whether the map provides free-space crossings, and mean intensities by place and view, for :func:`radarsdf.grid` and
+    :func:`radarsdf.compare`. They are computed on first use or on saving, in 1 to 5 µs of CPU time per return; until then
+    the map keeps the rays, 40 bytes each. They take 0.3 kB per block of 8 × 8 × 8 leaf cells that rays crossed."""
 
     def __post_init__(self) -> None:
         if self.max_range_m is not None and self.max_range_m <= self.min_range_m:

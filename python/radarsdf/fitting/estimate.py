@@ -27,7 +27,7 @@ from radarsdf.threads import resolve_num_threads
 
 # Seconds of one thread, measured on the machine named in BENCHMARK.md. The estimates of twenty fits were 0.65 to 1.24
 # times their processor time; reproduce with `python -m bench.estimates durations`.
-_S_PER_RETURN, _S_PER_RETURN_OF_FREE_SPACE, _S_PER_CELL = 1.7e-6, 1e-6, 9.4e-7
+_S_PER_RETURN, _S_PER_CELL = 1.7e-6, 9.4e-7
 _S_PER_ITERATION, _S_PER_MOVED_ROW = 9.3e-4, 7.5e-9
 _S_PER_INPUT, _S_PER_MULTIPLICATION = 2.2e-9, 2.6e-11  # of a network, which all threads share
 
@@ -178,8 +178,8 @@ def seconds_of(
 
 def skipped_parts(
     config: FitConfig, schedule: Schedule, *, returns: int, cells: int, rows: int, with_intensity: bool
-) -> list[tuple[str, float]]:
-    """List the parts of the method that a fit skips, and the seconds that this saves."""
+) -> list[tuple[str, float | None]]:
+    """List the parts of the method that a fit skips, and the seconds saved; None if it takes no time of the fit."""
 
     def seconds(network: bool, **changes: Any) -> float:
         changed = config.override(**changes)
@@ -190,14 +190,13 @@ def skipped_parts(
 
     network = with_intensity and config.trains_intensity
     now_s, surface_s = seconds(network), seconds(False, train=True)
-    skipped = []
+    skipped: list[tuple[str, float | None]] = []
     if not config.train:
         skipped.append(
             ("training of the surface: returns are averaged, and not moved onto planes", surface_s - now_s)
         )
     if not config.returns.free_space:
-        saved_s = _S_PER_RETURN_OF_FREE_SPACE * returns
-        skipped.append(("free space, which grids and comparisons need (returns.free_space)", saved_s))
+        skipped.append(("free space, which grids and comparisons need (returns.free_space)", None))
     if not network:
         why = "intensities are in closed form" if with_intensity else "there are no intensities"
         skipped.append((f"the intensity network: {why}", seconds(True, train=True) - surface_s))

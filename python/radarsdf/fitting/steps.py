@@ -23,7 +23,7 @@ from radarsdf.fitting.checkpoint import Checkpoint
 from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import Diverged, Interrupted, Training
-from radarsdf.map.contents import MapContents
+from radarsdf.map.contents import Deferred, MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
 from radarsdf.returns.free_space import FreeSpace
@@ -162,23 +162,31 @@ def _contents(
     if sensor is None:
         assert given.poses is not None
         sensor = Sensor.of_rays(rays, given.poses, surface.noise)
-    free_space, view_statistics = FreeSpace.none(), ViewStatistics.none()
-    if config.returns.free_space:
-        to_surface = rays if surface.true is None else rays.select(surface.true)
-        free_space = FreeSpace.of(to_surface, surface.noise, leaf_m, given.box_cells, num_threads)
+    noise, true, box_cells = surface.noise, surface.true, given.box_cells
+
+    def free_space() -> FreeSpace:
+        return FreeSpace.of(
+            rays if true is None else rays.select(true), noise, leaf_m, box_cells, num_threads
+        )
+
+    def view_statistics() -> ViewStatistics:
         known = learnt.with_intensity
-        if scale is not None and known.any():
-            chosen = learnt if known.all() else learnt.select(known)
-            assert chosen.intensities is not None
-            view_statistics = ViewStatistics.of(chosen, scale.to_unit(chosen.intensities), leaf_m)
+        if scale is None or not known.any():
+            return ViewStatistics.none()
+        chosen = learnt if known.all() else learnt.select(known)
+        assert chosen.intensities is not None
+        return ViewStatistics.of(chosen, scale.to_unit(chosen.intensities), leaf_m)
+
+    # Only grids, comparisons and files ask for these, which took a third of a fit. The map keeps the rays until then.
+    deferred = config.returns.free_space
     return MapContents(
         field=field,
         origin=rays.origin,
         intensity_scale=scale,
         config=config,
         evidence=Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.visibility),
-        free_space=free_space,
-        view_statistics=view_statistics,
+        free_space=Deferred(free_space) if deferred else FreeSpace.none,
+        view_statistics=Deferred(view_statistics) if deferred else ViewStatistics.none,
         clutter_ratio=surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
         returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
         sensor=sensor,

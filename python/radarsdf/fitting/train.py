@@ -33,7 +33,9 @@ from radarsdf.returns.rays import Rays
 from radarsdf.threads import ThreadPool
 
 _GENERATORS = 2  # number of random generators: for samples, for dropout
-_CHECK_EVERY = 100  # iterations. Checking and copying all parameters in each would take a tenth of the time
+# Minimum iterations between checks and copies of all parameters, and rows of features per further iteration: of millions
+# of rows, a copy every 100 iterations would take a tenth of the training.
+_CHECK_EVERY, _ROWS_PER_ITERATION = 100, 4096
 _MOST_SPANS = 200  # maximum length of the history of a loss: enough for a plot, small in the file of a map
 _KEPT = 0.99  # decay per iteration of the sums that detect divergence: about the last hundred count
 _WORST = {
@@ -65,7 +67,7 @@ class Diverged(FloatingPointError):
     Attributes
     ----------
     radar_map : RadarMap or None
-        The last state that passed the check, at most 100 iterations before.
+        The last state that passed the check, at most 100 iterations before; for maps of millions of rows, a thousand.
     """
 
     radar_map: RadarMap | None = None
@@ -302,6 +304,7 @@ class Training:
         changing = [p for optimiser in stage.optimisers for p in optimiser.parameters]
         if rows is not None:
             changing.append(rows.features)
+        every = max(_CHECK_EVERY, sum(map(len, changing)) // _ROWS_PER_ITERATION)
         good = [p.detach().clone() for p in changing]
 
         def give_up(fault: str) -> NoReturn:
@@ -317,7 +320,7 @@ class Training:
             share = cosine if self._config.training.optimiser == "soap" else 1.0
             stop = interrupted()
             write = checkpoint is not None and (stop or checkpoint.due())
-            judge = i % _CHECK_EVERY == _CHECK_EVERY - 1 or i == iterations - 1
+            judge = i % every == every - 1 or i == iterations - 1
             pause = stop or write or judge
             # Samples are not prefetched before the state is written: it would include their draw.
             batch = ahead or stage.draw()

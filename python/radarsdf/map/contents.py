@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,21 @@ from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatistics
+
+_Part = TypeVar("_Part")
+
+
+class Deferred(Generic[_Part]):
+    """A part computed by `make` on first use. Until then, the references of `make` stay in memory."""
+
+    def __init__(self, make: Callable[[], _Part]) -> None:
+        self._make: Callable[[], _Part] | None = make
+
+    def __call__(self) -> _Part:
+        if (make := self._make) is not None:
+            self._part = make()
+            self._make = None
+        return self._part
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,5 @@ class MapContents(WholeMap):
     evidence: Evidence  # evidence of a surface in each leaf cell
     sensor: Sensor  # the radar, estimated from the scans of the fit
     report: dict[str, Any]  # counts, losses, sensor noise and times of the fit, s
-    free_space: FreeSpace = dataclasses.field(default_factory=FreeSpace.none)  # free-space crossings, or none
-    # View statistics of intensity, possibly empty.
-    view_statistics: ViewStatistics = dataclasses.field(default_factory=ViewStatistics.none)
+    free_space: Callable[[], FreeSpace] = FreeSpace.none  # free-space crossings, or none
+    view_statistics: Callable[[], ViewStatistics] = ViewStatistics.none  # of intensity, or none

@@ -271,7 +271,7 @@ def dense_cells(
     contents: MapContents, lower: NDArray[np.int64], shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
     """Return `passed`, `returns` and `observed` of the leaf cells from `lower` (3,) on, relative to the map's origin."""
-    passed, returns = contents.free_space.dense(lower, shape)
+    passed, returns = contents.free_space().dense(lower, shape)
     cells = lattice_of(contents.field.table.leaf_keys()) - lower
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
     observed = np.zeros(shape, bool)
@@ -291,7 +291,7 @@ def free_space_odds(contents: MapContents) -> NDArray[np.float64]:
     # At grazing incidence the field exceeds the distance, and with noisy returns falls below it; so does its gradient.
     edge = leaf_m * np.linalg.norm(gradient(contents, centres).numpy(), axis=1)
     weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
-    passed = contents.free_space.at(keys)
+    passed = contents.free_space().at(keys)
 
     sides = (distances_m < -edge, distances_m > edge)
     behind, before = (np.bincount(passed[side], weights[side], MOST_SCANS + 1) + 1 for side in sides)

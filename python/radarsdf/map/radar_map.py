@@ -82,7 +82,7 @@ class RadarMap(Map):
     def view_statistics(self) -> ViewStatisticsAt:
         scale = self.intensity_scale
         low, high = (0, 1) if scale is None else (scale.low, scale.high)
-        return self._contents.view_statistics.in_world(self.origin, low, high)
+        return self._contents.view_statistics().in_world(self.origin, low, high)
 
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
         return self._viewed

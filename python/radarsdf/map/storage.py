@@ -129,8 +129,8 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors["leaf_keys"] = torch.from_numpy(field.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
     parts = {
-        "free_space": contents.free_space,
-        "view_statistics": contents.view_statistics,
+        "free_space": contents.free_space(),
+        "view_statistics": contents.view_statistics(),
         "reflectance": reflectance,
     }
     for part, owner in parts.items():
@@ -142,7 +142,7 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
         "config": contents.config.to_dict(),
         "intensity_scale": None if scale is None else [scale.low, scale.high],
         "network_share": None if reflectance is None else reflectance.network_share,
-        "view_sigma": contents.view_statistics.sigma,
+        "view_sigma": contents.view_statistics().sigma,
         "clutter_ratio": contents.clutter_ratio,
         "returns_per_cell": contents.returns_per_cell,
         "sensor": contents.sensor.to_dict(),
@@ -185,8 +185,8 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
         config=config,
         report=checked_report(description["report"]),
         evidence=Evidence(**evidence),
-        free_space=free_space,
-        view_statistics=view_statistics,
+        free_space=lambda: free_space,
+        view_statistics=lambda: view_statistics,
         clutter_ratio=_in_range("clutter_ratio", description["clutter_ratio"], 1),
         returns_per_cell=_in_range("returns_per_cell", description["returns_per_cell"], math.inf),
         sensor=Sensor.from_dict(description["sensor"]),

@@ -124,7 +124,7 @@ class TiledMap(TileBlend):
         found = []
         for planned in self.tiles:
             contents = self.contents_of(planned.tile)
-            view_statistics = contents.view_statistics.in_world(contents.origin, *ends)
+            view_statistics = contents.view_statistics().in_world(contents.origin, *ends)
             cells = np.floor(self.config.lattice.cells(view_statistics.points)[:, :2])
             found.append(view_statistics.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
         return ViewStatisticsAt.together(found)
