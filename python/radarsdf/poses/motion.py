@@ -21,7 +21,7 @@ _SPAN = 4.0  # standard deviations from end to end, that a search covers
 _FEWEST, _MOST = 64, 8192  # poses of a search
 
 _LEAST_SPAN = 0.1  # of a step, in median steps: two scans at the same time may still differ
-_LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # deviations to divide by: no radar resolves less
+_LEAST_M, _LEAST_RAD, _LEAST_S = 1e-5, 1e-6, 1e-6  # deviations to divide by: no radar resolves less
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,23 @@ class MotionPrior:
         share = float(np.exp(-0.5 * elapsed_s * self.change.sum() / self.usual.sum()))
         covariance = share**2 * rate.covariance + (1 - share**2) * np.diag(self.usual)
         return MotionRate(share * rate.mean, covariance)
+
+    def conditional(self, rates: Floats, durations_s: Floats) -> tuple[Floats, Floats]:
+        """(K, 3) mean and variance of the rates (K, 3) of steps that last so long (K,), each given that before and that after it."""
+        elapsed_s = (durations_s[1:] + durations_s[:-1])[:, None] / 2
+        share, variance = np.ones_like(rates[1:]), elapsed_s * self.change
+        if (
+            self.settles
+        ):  # each axis by itself: where a sensor keeps turning in yaw, it may still nod at random
+            share = np.exp(-0.5 * elapsed_s * self.change / self.usual)
+            variance = (1 - share**2) * self.usual
+        information, total = np.zeros((2, *rates.shape))
+        information[0] = 1 / self.usual
+        information[1:] += 1 / variance
+        total[1:] += share * rates[:-1] / variance
+        information[:-1] += share**2 / variance
+        total[:-1] += share * rates[1:] / variance
+        return total / information, 1 / information
 
     def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
         """From the rates of a drive's steps, which lasted so long. None: it was lost there."""
@@ -141,8 +158,6 @@ class Motion:
     spans: Floats  # (F - 1,) duration of each step over the median. Biases grow with it
     # (6,) deviation of the part of the bias that no measurement of this source can find.
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
-    # (2,) lower bounds of `variances` where the covariance is computed.
-    least_variances: Floats = field(default_factory=lambda: np.zeros(2), kw_only=True)
 
     @classmethod
     def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> Motion:
@@ -154,6 +169,10 @@ class Motion:
 
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
         """As measured by a sensor with these poses (F, 4, 4). Most measurements are the same for all."""
+        return self
+
+    def evidence(self) -> Motion:
+        """What it adds to the returns, for a covariance."""
         return self
 
     def errors(self, poses: Floats) -> Floats:
@@ -219,6 +238,55 @@ class Motion:
         sums, counts = squares.sum(axis=0).reshape(2, 3).sum(axis=1), counts.reshape(2, 3).sum(axis=1)
         found = np.maximum(sums / np.maximum(counts, 1), [_LEAST_M**2, _LEAST_RAD**2])
         return dataclasses.replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
+
+
+@dataclass(frozen=True)
+class SteadyMotion(Motion):
+    """What the motion priors expect of each step, given the steps before and after it.
+
+    Where an estimate settles with the conditional expectation of every step, its posterior density is highest. Steps that were
+    tracked by the same returns, as if measured, added their errors to it: heights in a forest were 2 to 7 times as far off.
+    """
+
+    moves: MotionPrior
+    turns: MotionPrior
+    durations_s: Floats  # (F - 1,)
+    usual: Floats  # (2,) variances of a step about which nothing but the usual rates is known, m² and rad²
+
+    @classmethod
+    def by(
+        cls, moves: MotionPrior, turns: MotionPrior, usual: Floats, times_s: Floats, poses: Floats
+    ) -> SteadyMotion:
+        """Of scans with these times (F,) and about these poses (F, 4, 4); `usual` (2,) are mean squares of rates."""
+        spans = spans_of(times_s, len(times_s))
+        duration_s = max(float(np.median(np.diff(times_s))), _LEAST_S)
+        unknown = np.zeros(6), np.ones(2), np.zeros((len(spans), 6)), spans
+        return cls(steps(poses), *unknown, moves, turns, duration_s * spans, duration_s**2 * usual).at(poses)
+
+    def at(self, poses: Floats) -> SteadyMotion:
+        """Of a sensor with these poses."""
+        durations_s = self.durations_s[:, None]
+        rates = step_vectors(poses) / durations_s
+        ways, way_variances = self.moves.conditional(rates[:, :3], self.durations_s)
+        turns, turn_variances = self.turns.conditional(rates[:, 3:], self.durations_s)
+        variances = durations_s**2 * np.concatenate([way_variances, turn_variances], axis=1)
+        shares = np.where(
+            np.isfinite(self.shares),
+            np.maximum(variances, np.repeat([_LEAST_M**2, _LEAST_RAD**2], 3)),
+            np.inf,
+        )
+        return dataclasses.replace(
+            self, steps=transform(durations_s * turns, durations_s * ways), shares=shares
+        )
+
+    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> SteadyMotion:  # noqa: ARG002
+        """As it is: the priors are the drive's."""
+        return self
+
+    def evidence(self) -> Motion:
+        """The usual rates alone: that steps resemble their neighbours is no measurement of each."""
+        shares = np.where(np.isfinite(self.shares), self.spans[:, None], np.inf)
+        return Motion(self.steps, self.bias, self.usual, shares, self.spans, bias_sigma=self.bias_sigma)
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -223,9 +223,7 @@ class PosesEstimate:
             if window == count and cells == 1 and decrement < _SETTLED**2 * steps.size:
                 break
         assert noise is not None
-        # Steps that were tracked by the same returns have the errors of these. As independent measurements, they would
-        # halve the deviations.
-        evidence = [replace(m, variances=np.maximum(m.variances, m.least_variances)) for m in motions]
+        evidence = [motion.evidence() for motion in motions]
         diagonal, below, gradient = _prior(evidence, poses)
         diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]

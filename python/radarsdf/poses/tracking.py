@@ -20,7 +20,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.imu import Gyroscope
-from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep
+from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, SteadyMotion
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.rigid import Floats, increments, moved, rotation, rotation_vector
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -66,7 +66,7 @@ _MOST_SCALE = 2.5
 # Errors of the scale that returns find: 0.01 to 0.04 where they see all of the motion, up to 0.22 in tunnels and yards.
 _SAME_SCALE = 0.25
 _BY_CHANCE = 0.02  # probability that another scale seems to fit better
-_TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # deviations of a tracked step, until the estimate finds them
+_GYROSCOPE_RAD = 0.003  # deviation of a step's rotation by a gyroscope, until the estimate finds it
 
 
 @dataclass
@@ -341,29 +341,27 @@ class Drive:
     def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
         """The measured motions from scan to scan among these."""
         times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
-        # The tracked steps initialise the estimate; it finds how good they are. Other measurements replace them.
-        motion = Motion.of(poses, _TRACKED_M, _TRACKED_RAD, times_s)
-        duration_s = float(np.median(np.diff(times_s)))
-        # They are no evidence in addition to the returns that they were tracked by, but for how this sensor usually moves.
-        least = duration_s**2 * np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
-        turn_sigma_rad_s = np.full(3, self.usual_turn_rad_s)
-        if self.gyroscope is not None:
-            least[1] = 0.0
-            measured = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
-            motion.steps[:, :3, :3] = rotation(np.stack(measured))
-            turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
-        motion = dataclasses.replace(motion, least_variances=least)
-        if self.velocities is None:
-            return [motion]
-        # Tracked translations in addition to Doppler, or in its place, double the errors of positions on simulated drives. What
-        # few returns hardly change of an expected turn is an error that all steps have in common.
-        motion.shares[:, :3] = np.inf
-        common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
         turns = np.stack([found.turn for found in tracked[rows][1:]])
-        return [
-            dataclasses.replace(motion, bias_sigma=common),
-            DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
-        ]
+        duration_s, turn_sigma_rad_s = float(np.median(np.diff(times_s))), np.full(3, self.usual_turn_rad_s)
+        usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
+        motions: list[Motion] = [SteadyMotion.by(self.moves, self.turns, usual, times_s, poses)]
+        steady = motions[0].shares
+        if self.gyroscope is not None:
+            steady[:, 3:] = np.inf
+            turned = Motion.of(poses, 0.0, _GYROSCOPE_RAD, times_s)
+            turned.shares[:, :3] = np.inf
+            turned.steps[:, :3, :3] = rotation(
+                np.stack([self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)])
+            )
+            turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
+            motions.insert(0, turned)
+        if self.velocities is None:
+            return motions
+        # What few returns hardly change of an expected turn is an error that all steps have in common.
+        common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
+        motions[0] = dataclasses.replace(motions[0], bias_sigma=common)
+        steady[:, :3] = np.inf
+        return [*motions, DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns)]
 
 
 def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRate, MotionRate]:
