@@ -16,12 +16,10 @@ from scipy.stats import qmc
 from radarsdf.poses.rigid import Floats, between, rotation, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # steps that the first guess of habits is worth
-
 _SPAN = 4.0  # standard deviations from end to end, that a search covers
 _FEWEST, _MOST = 64, 8192  # poses of a search
-
 _LEAST_SPAN = 0.1  # of a step, in median steps: two scans at the same time may still differ
-_LEAST_M, _LEAST_RAD, _LEAST_S = 1e-5, 1e-6, 1e-6  # deviations to divide by: no radar resolves less
+_LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # deviations to divide by: no radar resolves less
 
 
 @dataclass(frozen=True)
@@ -49,17 +47,17 @@ class MotionPrior:
         """(K, 3) mean and variance of the rates (K, 3) of steps that last so long (K,), each given that before and that after it."""
         elapsed_s = (durations_s[1:] + durations_s[:-1])[:, None] / 2
         share, variance = np.ones_like(rates[1:]), elapsed_s * self.change
-        if (
-            self.settles
-        ):  # each axis by itself: where a sensor keeps turning in yaw, it may still nod at random
+        if self.settles:
+            # Each axis by itself: where a sensor keeps turning in yaw, it may still nod at random.
             share = np.exp(-0.5 * elapsed_s * self.change / self.usual)
             variance = (1 - share**2) * self.usual
-        information, total = np.zeros((2, *rates.shape))
-        information[0] = 1 / self.usual
-        information[1:] += 1 / variance
-        total[1:] += share * rates[:-1] / variance
-        information[:-1] += share**2 / variance
-        total[:-1] += share * rates[1:] / variance
+        before, after = (
+            np.zeros((2, *rates.shape)),
+            np.zeros((2, *rates.shape)),
+        )  # information, and times rates
+        before[0, 0], before[:, 1:] = 1 / self.usual, [1 / variance, share * rates[:-1] / variance]
+        after[:, :-1] = share**2 / variance, share * rates[1:] / variance
+        information, total = before + after
         return total / information, 1 / information
 
     def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
@@ -68,12 +66,11 @@ class MotionPrior:
         if not known:
             return self
         usual = (_PRIOR_STEPS * self.usual + np.square(known).sum(axis=0)) / (_PRIOR_STEPS + len(known))
+        elapsed_s = (durations_s[:-1] + durations_s[1:]) / 2
         changes = [
-            2 * (second.mean - first.mean) ** 2 / (before_s + after_s)
-            for first, second, before_s, after_s in zip(
-                rates, rates[1:], durations_s, durations_s[1:], strict=False
-            )
-            if first is not None and second is not None and before_s + after_s > 0
+            (second.mean - first.mean) ** 2 / after_s
+            for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False)
+            if first is not None and second is not None and after_s > 0
         ]
         change = (_PRIOR_STEPS * self.change + np.sum(changes, axis=0)) / (_PRIOR_STEPS + len(changes))
         return MotionPrior(usual, change, self.settles)
@@ -149,12 +146,9 @@ class Motion:
 
     steps: Floats  # (F - 1, 4, 4)
     bias: Floats  # (6,) of each step: translation, m, rotation vector, rad, in the frame of the sensor
-    variances: (
-        Floats  # (2,) of each component of a step's translation, m², and rotation, rad², where its share is 1
-    )
-    shares: (
-        Floats  # (F - 1, 6) factors of these variances. Infinite: the source does not measure this component
-    )
+    # (2,) of each component of a step's translation, m², and rotation, rad², where its share is 1.
+    variances: Floats
+    shares: Floats  # (F - 1, 6) factors of these variances. Infinite: this component is not measured
     spans: Floats  # (F - 1,) duration of each step over the median. Biases grow with it
     # (6,) deviation of the part of the bias that no measurement of this source can find.
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
@@ -228,10 +222,8 @@ class Motion:
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
         # Where the returns alone leave more than the bias, along a corridor say, it would follow the poses, and these the bias,
         # for ever: a straight corridor was drawn together by 3 cm a step. So the share of the variance that is left shrinks it.
-        variances, left_mean = (
-            np.repeat(self.variances, 3),
-            (weights * left).sum(axis=0) / np.maximum(counts, 1),
-        )
+        variances = np.repeat(self.variances, 3)
+        left_mean = (weights * left).sum(axis=0) / np.maximum(counts, 1)
         gained = bias**2 * np.maximum(variances - left_mean, 0.0)
         bias *= gained / np.maximum(gained + left_mean * variances, 1e-30)
         squares = ((errors - bias * spans) ** 2 + left) * weights
@@ -244,48 +236,41 @@ class Motion:
 class SteadyMotion(Motion):
     """What the motion priors expect of each step, given the steps before and after it.
 
-    Where an estimate settles with the conditional expectation of every step, its posterior density is highest. Steps that were
-    tracked by the same returns, as if measured, added their errors to it: heights in a forest were 2 to 7 times as far off.
+    Where all steps agree with these expectations, the posterior density is highest. When tracked steps counted as measured, the
+    errors that they owe to the same returns stayed: heights in a forest were 2 to 7 times as far off.
     """
 
-    moves: MotionPrior
-    turns: MotionPrior
+    priors: tuple[MotionPrior, MotionPrior]  # of moving and of turning
     durations_s: Floats  # (F - 1,)
     usual: Floats  # (2,) variances of a step about which nothing but the usual rates is known, m² and rad²
 
     @classmethod
     def by(
-        cls, moves: MotionPrior, turns: MotionPrior, usual: Floats, times_s: Floats, poses: Floats
+        cls, priors: tuple[MotionPrior, MotionPrior], usual: Floats, times_s: Floats, poses: Floats
     ) -> SteadyMotion:
-        """Of scans with these times (F,) and about these poses (F, 4, 4); `usual` (2,) are mean squares of rates."""
+        """Of scans with these times (F,), about these poses (F, 4, 4); `usual` (2,) are mean squares of rates."""
         spans = spans_of(times_s, len(times_s))
-        duration_s = max(float(np.median(np.diff(times_s))), _LEAST_S)
+        duration_s = float(np.median(np.diff(times_s)))
         unknown = np.zeros(6), np.ones(2), np.zeros((len(spans), 6)), spans
-        return cls(steps(poses), *unknown, moves, turns, duration_s * spans, duration_s**2 * usual).at(poses)
+        return cls(steps(poses), *unknown, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 
     def at(self, poses: Floats) -> SteadyMotion:
         """Of a sensor with these poses."""
-        durations_s = self.durations_s[:, None]
-        rates = step_vectors(poses) / durations_s
-        ways, way_variances = self.moves.conditional(rates[:, :3], self.durations_s)
-        turns, turn_variances = self.turns.conditional(rates[:, 3:], self.durations_s)
-        variances = durations_s**2 * np.concatenate([way_variances, turn_variances], axis=1)
-        shares = np.where(
-            np.isfinite(self.shares),
-            np.maximum(variances, np.repeat([_LEAST_M**2, _LEAST_RAD**2], 3)),
-            np.inf,
-        )
-        return dataclasses.replace(
-            self, steps=transform(durations_s * turns, durations_s * ways), shares=shares
-        )
+        durations_s = self.durations_s
+        rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)
+        both = [p.conditional(r, durations_s) for p, r in zip(self.priors, rates, strict=True)]
+        ways, turns = (durations_s[:, None] * mean for mean, _ in both)
+        variances = np.concatenate([variance for _, variance in both], axis=1) * durations_s[:, None] ** 2
+        shares = np.where(np.isinf(self.shares), np.inf, variances)
+        return dataclasses.replace(self, steps=transform(turns, ways), shares=shares)
 
-    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> SteadyMotion:  # noqa: ARG002
+    def learnt(self, *_: Floats) -> SteadyMotion:
         """As it is: the priors are the drive's."""
         return self
 
     def evidence(self) -> Motion:
         """The usual rates alone: that steps resemble their neighbours is no measurement of each."""
-        shares = np.where(np.isfinite(self.shares), self.spans[:, None], np.inf)
+        shares = np.where(np.isinf(self.shares), np.inf, self.spans[:, None])
         return Motion(self.steps, self.bias, self.usual, shares, self.spans, bias_sigma=self.bias_sigma)
 
 

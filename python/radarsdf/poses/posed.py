@@ -71,11 +71,6 @@ class PosedScans:
     notes: tuple[str, ...] = ()  # sentences on what was not used
 
     @classmethod
-    def as_given(cls, poses: Floats) -> PosedScans:
-        """Poses (F, 4, 4) that are neither refined nor found."""
-        return cls(poses, slice(0, len(poses)), poses)
-
-    @classmethod
     def refined(cls, refined: RefinedPoses, given: Floats) -> PosedScans:
         """Given poses (F, 4, 4) that were refined. Deviations are known only of poses that were not kept."""
         sigmas = pose_sigmas(refined.covariance) if refined.improved else None

@@ -22,7 +22,7 @@ from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, SteadyMotion
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
-from radarsdf.poses.rigid import Floats, increments, moved, rotation, rotation_vector
+from radarsdf.poses.rigid import Floats, covariance_in, increments, moved, rotation, rotation_vector
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 
@@ -31,16 +31,13 @@ WINDOW = 25
 _CELLS = (4.0, 2.0)  # edges of cells, in those of a map's surfels
 _ITERATIONS, _SETTLED = 8, 0.03  # of Gauss and Newton's method, in each cell size; in standard deviations
 _MOST_RETURNS, _SEARCHED = 2000, 250  # returns of a scan that are registered, and that a search compares
-# Deviation of an expected translation up to which a search may reach the scans before, in median ranges; and up to which a new
-# segment begins where dead reckoning leads.
-_MOST_RADII, _MOST_RECKONED_M = 10.0, 1e4
+_MOST_RADII = 10.0  # median ranges: deviation of an expected translation up to which a search may succeed
+_MOST_RECKONED_M = 1e4  # the same, up to which a new segment begins where dead reckoning leads
 _FOLLOWED = 12  # best poses of a search
 _ELSEWHERE = 500  # poses that show what agrees by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at a pose that is believed
 _NOISE_AT = (1, 4, 16, 64)  # scans, at which the noise of the sensor is estimated anew
-# Of the last scans, that it is estimated from: so many determine a deviation to a percent. With all 25 scans of 2,000 returns, it took
-# three times as long as a scan.
-_NOISE_RETURNS = 10_000
+_NOISE_RETURNS = 10_000  # of the last scans, that it is estimated from: to a percent
 _SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells: further than returns of one thing reach
 _SURE = 0.05  # cells: deviation of an expected translation that needs no returns
 _LEAST_VARIANCE = 1e-12
@@ -74,9 +71,7 @@ class Tracked:
     """One scan, where it was found."""
 
     pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
-    covariance: (
-        Floats  # (6, 6) of the step that led here: translation, m, and rotation vector, rad, in world axes
-    )
+    covariance: Floats  # (6, 6) of the step that led here: translation, m, rotation vector, rad, world axes
     agreeing: float  # share of the returns on planes of the scans before, in [0, 1]. NaN: it begins a segment
     segment: int  # number of the segment of the drive that it is part of
     turn: Floats  # (3,) rotation vector of the step in the frame of the scan before, rad; may exceed half a turn
@@ -157,9 +152,7 @@ class Tracker:
         return self._searched(scan, expected, capture_m, radius_m)
 
     def _in_world(self, covariance: Floats) -> Floats:
-        both = np.kron(np.eye(2), self.last.pose[:3, :3])
-        found: Floats = both @ covariance @ both.T
-        return found
+        return covariance_in(covariance[None], self.last.pose[:3, :3])[0]
 
     def _fitted(
         self, scan: Floats, expected: PredictedStep, turn: Floats, start: Floats | None = None
@@ -170,11 +163,8 @@ class Tracker:
         pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
         covariance = self._without_chance(scan, pose, prior, covariance)
         turned = rotation_vector(self.last.pose[:3, :3].T @ pose[:3, :3], turn)
-        removed = (
-            _removed_share(prior[:3, :3], covariance[:3, :3]),
-            _removed_share(prior[3:, 3:], covariance[3:, 3:]),
-        )
-        return Tracked(pose, covariance, agreeing, self.last.segment, turned, removed)
+        way, turn_share = (_removed_share(prior[k, k], covariance[k, k]) for k in (slice(0, 3), slice(3, 6)))
+        return Tracked(pose, covariance, agreeing, self.last.segment, turned, (way, turn_share))
 
     def _normal_equations(
         self, planes: LocalPlanes, scan: Floats, pose: Floats
@@ -344,15 +334,14 @@ class Drive:
         turns = np.stack([found.turn for found in tracked[rows][1:]])
         duration_s, turn_sigma_rad_s = float(np.median(np.diff(times_s))), np.full(3, self.usual_turn_rad_s)
         usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
-        motions: list[Motion] = [SteadyMotion.by(self.moves, self.turns, usual, times_s, poses)]
+        motions: list[Motion] = [SteadyMotion.by((self.moves, self.turns), usual, times_s, poses)]
         steady = motions[0].shares
         if self.gyroscope is not None:
             steady[:, 3:] = np.inf
             turned = Motion.of(poses, 0.0, _GYROSCOPE_RAD, times_s)
             turned.shares[:, :3] = np.inf
-            turned.steps[:, :3, :3] = rotation(
-                np.stack([self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)])
-            )
+            measured = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
+            turned.steps[:, :3, :3] = rotation(np.stack(measured))
             turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
             motions.insert(0, turned)
         if self.velocities is None:
@@ -408,17 +397,15 @@ def followed(
             # Its returns agree nowhere. The next passes search less far.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turn_prior = MotionPrior(usual, usual, True)
-        drive = dataclasses.replace(
-            drive,
-            turns=turn_prior.learnt([turn for turn, _ in rates], durations_s),
-            moves=drive.moves.learnt([move for _, move in rates], durations_s),
-        )
+        turns = turn_prior.learnt([turn for turn, _ in rates], durations_s)
+        moves = drive.moves.learnt([move for _, move in rates], durations_s)
+        drive = dataclasses.replace(drive, turns=turns, moves=moves)
         if i == 0 and gyroscope is not None:
             # Rotations that were found with its help could not show its bias.
-            vectors, covariance = np.full((len(rates), 3), np.nan), np.tile(np.eye(3), (len(rates), 1, 1))
-            for k, ((turn, _), duration_s) in enumerate(zip(rates, durations_s, strict=True)):
-                if turn is not None:
-                    vectors[k], covariance[k] = turn.mean * duration_s, turn.covariance * duration_s**2
+            lost = MotionRate(np.full(3, np.nan), np.eye(3))
+            known = [turn or lost for turn, _ in rates]
+            vectors = np.stack([turn.mean for turn in known]) * durations_s[:, None]
+            covariance = np.stack([turn.covariance for turn in known]) * durations_s[:, None, None] ** 2
             drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(vectors, covariance))
     return drive, tracked
 
