@@ -320,8 +320,9 @@ def test_motions_of_a_tracked_drive():
     (motion,) = drive.motions(tracked, slice(0, 5))
     rates = step_vectors(poses) / 0.5
     middle, variance = drive.moves.conditional(rates[:, :3], np.full(4, 0.5))
-    assert_allclose(motion.steps[:, :3, 3], 0.5 * middle)
-    assert_allclose(motion.shares[:, :3], 0.25 * variance)
+    off, expected = motion.errors(poses)[:, :3], 0.5 * (rates[:, :3] - middle)
+    assert_allclose(off / motion.shares[:, :3], expected / (0.25 * variance), atol=1e-12)
+    assert_allclose(off, expected / 2, atol=1e-12)
     assert np.isfinite(motion.shares).all()
     assert_allclose(motion.evidence().variances, [(0.5 * 5) ** 2, (0.5 * 0.3) ** 2])
     assert_allclose(motion.evidence().shares, 1)

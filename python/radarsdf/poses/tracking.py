@@ -152,7 +152,8 @@ class Tracker:
         return self._searched(scan, expected, capture_m, radius_m)
 
     def _in_world(self, covariance: Floats) -> Floats:
-        return covariance_in(covariance[None], self.last.pose[:3, :3])[0]
+        found: Floats = covariance_in(covariance[None], self.last.pose[:3, :3])[0]
+        return found
 
     def _fitted(
         self, scan: Floats, expected: PredictedStep, turn: Floats, start: Floats | None = None
