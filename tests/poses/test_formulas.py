@@ -27,6 +27,7 @@ from radarsdf.poses.rigid import (
     rotation,
     rotation_vector,
     skew,
+    step_vectors,
     transform,
     turned_by,
 )
@@ -327,18 +328,23 @@ def test_motions_of_a_tracked_drive():
     ]
     drive = Drive([np.zeros((0, 3))] * 5, 0.5 * np.arange(5.0), None, None)
     (motion,) = drive.motions(tracked, slice(0, 5))
-    assert_allclose(motion.variances, [0.03**2, 0.003**2])
-    assert_allclose(motion.least_variances, [(0.5 * 5) ** 2, (0.5 * 0.3) ** 2])
-    assert_allclose(motion.steps, between(poses[:-1], poses[1:]), atol=1e-12)
+    rates = step_vectors(poses) / 0.5
+    middle, variance = drive.moves.conditional(rates[:, :3], np.full(4, 0.5))
+    off, expected = motion.errors(poses)[:, :3], 0.5 * (rates[:, :3] - middle)
+    assert_allclose(off / motion.shares[:, :3], expected / (0.25 * variance), atol=1e-12)
+    assert_allclose(off, expected / 2, atol=1e-12)
     assert np.isfinite(motion.shares).all()
+    assert_allclose(motion.evidence().variances, [(0.5 * 5) ** 2, (0.5 * 0.3) ** 2])
+    assert_allclose(motion.evidence().shares, 1)
     velocities = velocities_of(np.tile([10.0, 0, 0], (5, 1)), 0.01 * np.eye(3))
     gyroscope = Gyroscope(
         2 * rotation_vectors, np.full(4, 0.5), MotionRate(np.zeros(3), np.diag([1.0, 4, 9]) * 1e-4)
     )
     with_both = dataclasses.replace(drive, velocities=velocities, gyroscope=gyroscope)
-    turning, moving = with_both.motions(tracked, slice(1, 4))
+    turning, steady, moving = with_both.motions(tracked, slice(1, 4))
+    assert np.isinf(steady.shares).all()
+    assert np.isinf(steady.evidence().shares).all()
     assert_allclose(turning.steps[:, :3, :3], rotation(2 * rotation_vectors[1:3]))
-    assert_allclose(turning.least_variances, [(0.5 * 5) ** 2, 0])
     assert_allclose(turning.bias_sigma, [0, 0, 0, 0.005, 0.01, 0.015])
     assert np.isinf(turning.shares[:, :3]).all()
     assert_allclose(turning.shares[:, 3:], 1)

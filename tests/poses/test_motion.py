@@ -52,6 +52,31 @@ def test_standard_deviations_and_bias_are_estimated_from_known_poses():
 
 TURNS = MotionPrior(np.array([0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.15]), True)
 MOVES = MotionPrior(np.array([20.0, 10.0, 5.0]), np.array([2.0, 1.0, 0.5]), False)
+
+
+@pytest.mark.parametrize("habits", [TURNS, MOVES], ids=["turns", "moves"])
+def test_a_rate_between_two_others_has_their_conditional_expectation(habits):
+    durations_s = np.array([0.1, 0.3, 0.2, 0.5])
+    rates = np.random.default_rng(1).normal(size=(4, 3))
+    mean, variance = habits.conditional(rates, durations_s)
+    for axis in range(3):
+        prior = MotionPrior(*(np.full(3, of[axis]) for of in (habits.usual, habits.change)), habits.settles)
+        joint = np.full((1, 1), habits.usual[axis])  # covariance of the rates, step by step
+        for before_s, after_s in itertools.pairwise(durations_s):
+            known, unknown = (
+                prior.after(MotionRate(np.ones(3), c * np.eye(3)), (before_s + after_s) / 2)
+                for c in (0.0, 1.0)
+            )
+            share, added = known.mean[0], known.covariance[0, 0]
+            np.testing.assert_allclose(unknown.covariance[0, 0], share**2 + added)
+            row = share * joint[-1]
+            joint = np.block([[joint, row[:, None]], [row, share**2 * joint[-1, -1] + added]])
+        information = np.linalg.inv(joint)
+        own = np.diag(information)
+        np.testing.assert_allclose(variance[:, axis], 1 / own)
+        np.testing.assert_allclose(mean[:, axis], rates[:, axis] - information @ rates[:, axis] / own)
+
+
 RATE = MotionRate(np.array([0.3, -0.2, 0.1]), np.diag([0.01, 0.02, 0.03]))
 
 

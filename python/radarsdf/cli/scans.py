@@ -102,7 +102,7 @@ def posed_scans(
         add_segments(results, posed)
         return (scans.select(range(len(scans))[posed.rows]) if posed.segments > 1 else scans), posed
     if not refine:
-        return scans, PosedScans.as_given(scans.poses)
+        return scans, PosedScans(scans.poses, slice(0, len(scans.poses)), scans.poses)
     refined = radarsdf.refine_poses(scans, config=config)
     report = refined.report
     results.add(report["verdict"], poses=report, improved=refined.improved)

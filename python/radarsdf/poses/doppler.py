@@ -143,7 +143,7 @@ class DopplerMotion(Motion):
         unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
         return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
-    def learnt(self, poses: Floats, before: Floats, diagonal: Floats, below: Floats) -> DopplerMotion:  # noqa: ARG002
+    def learnt(self, *_: Floats) -> DopplerMotion:
         """Return self: covariances of velocities are known. Learning them made the final error of real drives four times larger."""
         return self
 
@@ -174,9 +174,8 @@ def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
 def doppler_sign(scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats) -> int:
     """Return -1 if neighbouring scans of static returns agree better with all velocities reversed, else 1."""
     moved_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * np.diff(times_s)
-    usable = (
-        velocities.found[1:] & velocities.found[:-1] & (np.diff(times_s) <= 2 * np.median(np.diff(times_s)))
-    )
+    usable = velocities.found[1:] & velocities.found[:-1]
+    usable &= np.diff(times_s) <= 2 * np.median(np.diff(times_s))
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
     pairs = np.flatnonzero(usable)
     pairs = np.sort(pairs[np.argsort(moved_m[pairs])[-_PAIRS:]])  # the longest steps are most informative

@@ -16,10 +16,8 @@ from scipy.stats import qmc
 from radarsdf.poses.rigid import Floats, between, rotation, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # weight of the initial motion prior, steps
-
 _SPAN = 4.0  # width of a search, standard deviations
 _FEWEST, _MOST = 64, 8192  # limits of the number of poses of a search
-
 _LEAST_SPAN = 0.1  # minimum duration of a step, median steps: two scans at the same time may still differ
 _LEAST_M, _LEAST_RAD = 1e-5, 1e-6  # minimum deviations, below the resolution of any radar
 
@@ -45,18 +43,31 @@ class MotionPrior:
         covariance = share**2 * rate.covariance + (1 - share**2) * np.diag(self.usual)
         return MotionRate(share * rate.mean, covariance)
 
+    def conditional(self, rates: Floats, durations_s: Floats) -> tuple[Floats, Floats]:
+        """Mean and variance (K, 3) of the rates (K, 3) of steps with durations (K,), each given its two neighbours."""
+        elapsed_s = (durations_s[1:] + durations_s[:-1])[:, None] / 2
+        share, variance = np.ones_like(rates[1:]), elapsed_s * self.change
+        if self.settles:
+            # By axis: a sensor that keeps turning in yaw may still pitch at random.
+            share = np.exp(-0.5 * elapsed_s * self.change / self.usual)
+            variance = (1 - share**2) * self.usual
+        before, after = np.zeros((2, 2, *rates.shape))  # information, and times rates
+        before[0, 0], before[:, 1:] = 1 / self.usual, [1 / variance, share * rates[:-1] / variance]
+        after[:, :-1] = share**2 / variance, share * rates[1:] / variance
+        information, total = before + after
+        return total / information, 1 / information
+
     def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
         """Update from the rates of a drive's steps and their durations. Rate None: tracking was lost."""
         known = [rate.mean for rate in rates if rate is not None]
         if not known:
             return self
         usual = (_PRIOR_STEPS * self.usual + np.square(known).sum(axis=0)) / (_PRIOR_STEPS + len(known))
+        elapsed_s = (durations_s[:-1] + durations_s[1:]) / 2
         changes = [
-            2 * (second.mean - first.mean) ** 2 / (before_s + after_s)
-            for first, second, before_s, after_s in zip(
-                rates, rates[1:], durations_s, durations_s[1:], strict=False
-            )
-            if first is not None and second is not None and before_s + after_s > 0
+            (second.mean - first.mean) ** 2 / after_s
+            for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False)
+            if first is not None and second is not None and after_s > 0
         ]
         change = (_PRIOR_STEPS * self.change + np.sum(changes, axis=0)) / (_PRIOR_STEPS + len(changes))
         return MotionPrior(usual, change, self.settles)
@@ -132,15 +143,12 @@ class Motion:
 
     steps: Floats  # (F - 1, 4, 4)
     bias: Floats  # (6,) bias of a step: translation, m, rotation vector, rad, in the sensor frame
-    variances: (
-        Floats  # (2,) variances of a component of a step's translation, m², and rotation, rad², at share 1
-    )
+    # (2,) variances of a component of a step's translation, m², and rotation, rad², at share 1.
+    variances: Floats
     shares: Floats  # (F - 1, 6) factors of these variances. Infinite for components that are not measured
     spans: Floats  # (F - 1,) duration of each step relative to the median, to which biases are proportional
     # (6,) standard deviation of the systematic part of the bias, not observable from this source.
     bias_sigma: Floats = field(default_factory=lambda: np.zeros(6), kw_only=True)
-    # (2,) lower bounds of `variances` where the covariance is computed.
-    least_variances: Floats = field(default_factory=lambda: np.zeros(2), kw_only=True)
 
     @classmethod
     def of(cls, poses: Floats, sigma_m: float, sigma_rad: float, times_s: Floats | None = None) -> Motion:
@@ -152,6 +160,10 @@ class Motion:
 
     def at(self, poses: Floats) -> Motion:  # noqa: ARG002 - for motions by Doppler
         """Relinearise at poses (F, 4, 4). Most measurements do not depend on them."""
+        return self
+
+    def evidence(self) -> Motion:
+        """Return the part that is independent of the returns, for covariances."""
         return self
 
     def errors(self, poses: Floats) -> Floats:
@@ -207,16 +219,57 @@ class Motion:
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
         # Where the returns hardly constrain the poses, along a corridor say, bias and poses would drift together without end:
         # a straight corridor shrank by 3 cm a step. So the bias is shrunk by the share of the variance that remains.
-        variances, left_mean = (
-            np.repeat(self.variances, 3),
-            (weights * left).sum(axis=0) / np.maximum(counts, 1),
-        )
+        variances = np.repeat(self.variances, 3)
+        left_mean = (weights * left).sum(axis=0) / np.maximum(counts, 1)
         gained = bias**2 * np.maximum(variances - left_mean, 0.0)
         bias *= gained / np.maximum(gained + left_mean * variances, 1e-30)
         squares = ((errors - bias * spans) ** 2 + left) * weights
         sums, counts = squares.sum(axis=0).reshape(2, 3).sum(axis=1), counts.reshape(2, 3).sum(axis=1)
         found = np.maximum(sums / np.maximum(counts, 1), [_LEAST_M**2, _LEAST_RAD**2])
         return dataclasses.replace(self, bias=bias, variances=np.where(counts > 0, found, self.variances))
+
+
+@dataclass(frozen=True)
+class SteadyMotion(Motion):
+    """Steps predicted by the motion priors, each from its two neighbours.
+
+    The posterior density is highest where all steps agree with these predictions. Tracked steps, taken as measurements, keep the
+    errors that they share with the returns: heights in a forest were wrong by 2 to 7 times as much.
+    """
+
+    priors: tuple[MotionPrior, MotionPrior]  # translation, rotation
+    durations_s: Floats  # (F - 1,)
+    usual: Floats  # (2,) variances of a step given the usual rates only, m² and rad²
+
+    @classmethod
+    def by(
+        cls, priors: tuple[MotionPrior, MotionPrior], usual: Floats, times_s: Floats, poses: Floats
+    ) -> SteadyMotion:
+        """Build from times (F,) and approximate poses (F, 4, 4) of scans. `usual` (2,): mean squares of rates."""
+        spans = spans_of(times_s, len(times_s))
+        duration_s = float(np.median(np.diff(times_s)))
+        unknown = np.zeros(6), np.ones(2), np.zeros((len(spans), 6)), spans
+        return cls(steps(poses), *unknown, priors, duration_s * spans, duration_s**2 * usual).at(poses)
+
+    def at(self, poses: Floats) -> SteadyMotion:
+        """Predict each step of `poses` from its neighbours."""
+        durations_s = self.durations_s
+        rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)
+        both = [p.conditional(r, durations_s) for p, r in zip(self.priors, rates, strict=True)]
+        # Damped by half at twice the information: the same gradient, but steps that move together do not overshoot.
+        ways, turns = (0.5 * durations_s[:, None] * (r + m) for r, (m, _) in zip(rates, both, strict=True))
+        variances = np.concatenate([v for _, v in both], axis=1) * 0.5 * durations_s[:, None] ** 2
+        shares = np.where(np.isinf(self.shares), np.inf, variances)
+        return dataclasses.replace(self, steps=transform(turns, ways), shares=shares)
+
+    def learnt(self, *_: Floats) -> SteadyMotion:
+        """Return self: the priors are those of the drive."""
+        return self
+
+    def evidence(self) -> Motion:
+        """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""
+        shares = np.where(np.isinf(self.shares), np.inf, self.spans[:, None])
+        return Motion(self.steps, self.bias, self.usual, shares, self.spans, bias_sigma=self.bias_sigma)
 
 
 def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:

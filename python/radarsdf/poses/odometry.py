@@ -147,9 +147,8 @@ def odometry(
         drive = Drive(scans, times_s, velocities, None)
         if (factor := doppler_factor(drive, config, pool.num_threads)) != 1:
             velocities = None
-            notes.append(
-                f"{NOT_USED}: the returns show {factor:.1f} times its speeds. Give it in m/s, and times in s."
-            )
+            why = f"the returns show {factor:.1f} times its speeds. Give it in m/s, and times in s"
+            notes.append(f"{NOT_USED}: {why}.")
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
         drive = dataclasses.replace(drive, velocities=velocities, gyroscope=inertial.gyroscope)
         try:
@@ -164,7 +163,8 @@ def odometry(
         poses, covariance = _together(drive, tracked, segments, config, pool.num_threads)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
-    length_m = trajectory_length_m(poses, segments)
+    lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    length_m = float(lengths_m[np.diff(segments) == 0].sum())
     gyroscope = drive.gyroscope
     report = {
         "verdict": _verdict(segments, length_m, velocities is not None, inertial),
@@ -181,12 +181,6 @@ def odometry(
         "seconds": time.perf_counter() - begin,
     }
     return Odometry(poses, covariance, segments, report)
-
-
-def trajectory_length_m(poses: Floats, segments: NDArray[np.int64]) -> float:
-    """Return the length of a trajectory of poses (F, 4, 4) within its segments."""
-    lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    return float(lengths_m[np.diff(segments) == 0].sum())
 
 
 def _together(

@@ -195,11 +195,9 @@ def common_planes(
 
 
 def _planes_of(points: NDArray[np.float32], surfels: Surfels, num_threads: int) -> NDArray[np.int32]:
-    """Return the flat surfel (N,) of each point (N, 3), local, m: that of the cell of its projection onto the surface; -1: none.
-
-    Noise moves returns across surfaces into other cells. By the cells of the returns themselves, it would be truncated at cell
-    borders, differently for near and far returns, and rotate poses.
-    """
+    """Return the flat surfel (N,) of each point (N, 3), local, m: that of the cell of its projection onto the surface; -1: none."""
+    # Noise moves returns across surfaces into other cells. By the cells of the returns themselves, it would be truncated at cell
+    # borders, differently for near and far returns, and rotate poses.
     planes = surfels.flat_planes_at(points, num_threads)
     on = np.flatnonzero(planes >= 0)
     normals = surfels.normals[planes[on]]

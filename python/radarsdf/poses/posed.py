@@ -71,11 +71,6 @@ class PosedScans:
     notes: tuple[str, ...] = ()  # sentences on unused input
 
     @classmethod
-    def as_given(cls, poses: Floats) -> PosedScans:
-        """Build from original poses (F, 4, 4)."""
-        return cls(poses, slice(0, len(poses)), poses)
-
-    @classmethod
     def refined(cls, refined: RefinedPoses, given: Floats) -> PosedScans:
         """Build from refined poses and the original ones (F, 4, 4). `sigmas` are unknown if these were kept."""
         sigmas = pose_sigmas(refined.covariance) if refined.improved else None

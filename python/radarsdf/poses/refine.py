@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -223,9 +223,7 @@ class PosesEstimate:
             if window == count and cells == 1 and decrement < _SETTLED**2 * steps.size:
                 break
         assert noise is not None
-        # Steps tracked from the same returns share their errors. As independent measurements, they would halve the
-        # deviations.
-        evidence = [replace(m, variances=np.maximum(m.variances, m.least_variances)) for m in motions]
+        evidence = [motion.evidence() for motion in motions]
         diagonal, below, gradient = _prior(evidence, poses)
         diagonal[count // 2] += _FIXED * np.eye(6)
         covariance = planes.solve(diagonal, below, gradient, _TOLERANCE, 0, True, num_threads)[1]
@@ -257,10 +255,8 @@ def _prior(motions: Sequence[Motion], poses: Floats) -> tuple[Floats, Floats, Fl
 def _by_biases(
     motions: Sequence[Motion], poses: Floats, solved: Callable[[Floats | float], Floats]
 ) -> Floats:
-    """Return the covariance (F, 6, 6) of the poses due to systematic errors of all steps, given the returns.
-
-    The biases are unknowns, too: the poses are eliminated (Schur complement).
-    """
+    """Return the covariance (F, 6, 6) of the poses due to systematic errors of all steps, given the returns."""
+    # The biases are unknowns, too: the poses are eliminated (Schur complement).
     by, own = (np.concatenate(parts) for parts in zip(*(m.by_bias(poses) for m in motions), strict=True))
     if len(by) == 0:
         return np.zeros((len(poses), 6, 6))

@@ -20,9 +20,9 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.imu import Gyroscope
-from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep
+from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, SteadyMotion
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
-from radarsdf.poses.rigid import Floats, increments, moved, rotation, rotation_vector
+from radarsdf.poses.rigid import Floats, covariance_in, increments, moved, rotation, rotation_vector
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 
@@ -31,16 +31,13 @@ WINDOW = 25
 _CELLS = (4.0, 2.0)  # cell edges, relative to a map's surfels
 _ITERATIONS, _SETTLED = 8, 0.03  # Gauss-Newton at each cell size: maximum, tolerance in deviations
 _MOST_RETURNS, _SEARCHED = 2000, 250  # maximum returns of a scan to register, to score in a search
-# Maximum standard deviation of a predicted translation: for a search, in median ranges; and for a new segment to begin at the
-# dead-reckoned pose.
-_MOST_RADII, _MOST_RECKONED_M = 10.0, 1e4
+_MOST_RADII = 10.0  # maximum standard deviation of a predicted translation for a search, median ranges
+_MOST_RECKONED_M = 1e4  # and for a new segment to begin at the dead-reckoned pose
 _FOLLOWED = 12  # best candidates of a search, refined
 _ELSEWHERE = 500  # unrelated poses, for the agreement by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at an accepted pose
 _NOISE_AT = (1, 4, 16, 64)  # numbers of scans at which the noise of the sensor is re-estimated
-# Returns of the last scans for this estimate: they determine a deviation to a percent. With all 25 scans of 2,000 returns, it took
-# three times as long as a scan.
-_NOISE_RETURNS = 10_000
+_NOISE_RETURNS = 10_000  # of the last scans, for this estimate: they determine a deviation to a percent
 _SHIFTS = (0.0, 1.0, -1.0, 2.0, -2.0)  # cells, beyond the extent of single objects
 _SURE = 0.05  # standard deviation of a predicted translation that needs no returns, cells
 _LEAST_VARIANCE = 1e-12
@@ -66,7 +63,7 @@ _MOST_SCALE = 2.5
 # Errors of the estimated scale: 0.01 to 0.04 where the motion is fully observed, up to 0.22 in tunnels and yards.
 _SAME_SCALE = 0.25
 _BY_CHANCE = 0.02  # significance level of another scale
-_TRACKED_M, _TRACKED_RAD = 0.03, 0.003  # initial deviations of a tracked step
+_GYROSCOPE_RAD = 0.003  # initial deviation of a step's rotation by a gyroscope
 
 
 @dataclass
@@ -74,9 +71,7 @@ class Tracked:
     """Tracked scan."""
 
     pose: Floats  # (4, 4) T_world_sensor, in the frame of its segment
-    covariance: (
-        Floats  # (6, 6) of the step to this scan: translation, m, and rotation vector, rad, in world axes
-    )
+    covariance: Floats  # (6, 6) of the step to this scan: translation, m, rotation vector, rad, world axes
     agreeing: float  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
     segment: int  # number of its segment of the drive
     turn: Floats  # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn
@@ -157,8 +152,7 @@ class Tracker:
         return self._searched(scan, expected, capture_m, radius_m)
 
     def _in_world(self, covariance: Floats) -> Floats:
-        both = np.kron(np.eye(2), self.last.pose[:3, :3])
-        found: Floats = both @ covariance @ both.T
+        found: Floats = covariance_in(covariance[None], self.last.pose[:3, :3])[0]
         return found
 
     def _fitted(
@@ -170,29 +164,22 @@ class Tracker:
         pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
         covariance = self._without_chance(scan, pose, prior, covariance)
         turned = rotation_vector(self.last.pose[:3, :3].T @ pose[:3, :3], turn)
-        removed = (
-            _removed_share(prior[:3, :3], covariance[:3, :3]),
-            _removed_share(prior[3:, 3:], covariance[3:, 3:]),
-        )
-        return Tracked(pose, covariance, agreeing, self.last.segment, turned, removed)
+        way, turn_share = (_removed_share(prior[k, k], covariance[k, k]) for k in (slice(0, 3), slice(3, 6)))
+        return Tracked(pose, covariance, agreeing, self.last.segment, turned, (way, turn_share))
 
     def _normal_equations(
         self, planes: LocalPlanes, scan: Floats, pose: Floats
     ) -> tuple[Floats, Floats, float]:
-        """Return Hessian and gradient of an increment of `pose`, and the weight of the inliers.
-
-        The contribution of errors of the normals is removed: along a wall, slightly tilted normals would seem to observe the
-        position along it.
-        """
+        """Return Hessian and gradient of an increment of `pose`, and the weight of the inliers."""
+        # The contribution of errors of the normals is removed: along a wall, slightly tilted normals would seem to observe the
+        # position along it.
         hessian, gradient, doubt, weight = planes.agreement(scan, np.ascontiguousarray(pose), self._variances)
         M = reduction(hessian, doubt)
         return M @ hessian @ M.T, M @ (M @ gradient), weight
 
     def _without_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
-        """Remove the spurious information along the least certain axis that returns have for any shift of the scan.
-
-        In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance.
-        """
+        """Remove the spurious information along the least certain axis that returns have for any shift of the scan."""
+        # In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance.
         cell_m = _CELLS[-1] * self.cell_size_m
         axis = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
         before, left = axis @ prior[:3, :3] @ axis, axis @ covariance[:3, :3] @ axis
@@ -341,29 +328,26 @@ class Drive:
     def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
         """Return the measured motions between the scans of `rows`."""
         times_s, poses = self.times_s[rows], np.stack([found.pose for found in tracked[rows]])
-        # Tracked steps initialise the estimate, which finds their errors. Other measurements replace them.
-        motion = Motion.of(poses, _TRACKED_M, _TRACKED_RAD, times_s)
-        duration_s = float(np.median(np.diff(times_s)))
-        # They are no evidence beyond the returns from which they were tracked, except for the motion prior.
-        least = duration_s**2 * np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
-        turn_sigma_rad_s = np.full(3, self.usual_turn_rad_s)
-        if self.gyroscope is not None:
-            least[1] = 0.0
-            measured = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
-            motion.steps[:, :3, :3] = rotation(np.stack(measured))
-            turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
-        motion = dataclasses.replace(motion, least_variances=least)
-        if self.velocities is None:
-            return [motion]
-        # Tracked translations in addition to Doppler, or instead of it, double the position errors on simulated drives. The
-        # error of predicted turns that few returns hardly correct is common to all steps.
-        motion.shares[:, :3] = np.inf
-        common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
         turns = np.stack([found.turn for found in tracked[rows][1:]])
-        return [
-            dataclasses.replace(motion, bias_sigma=common),
-            DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns),
-        ]
+        duration_s, turn_sigma_rad_s = float(np.median(np.diff(times_s))), np.full(3, self.usual_turn_rad_s)
+        usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
+        motions: list[Motion] = [SteadyMotion.by((self.moves, self.turns), usual, times_s, poses)]
+        steady = motions[0].shares
+        if self.gyroscope is not None:
+            steady[:, 3:] = np.inf
+            turned = Motion.of(poses, 0.0, _GYROSCOPE_RAD, times_s)
+            turned.shares[:, :3] = np.inf
+            measured = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
+            turned.steps[:, :3, :3] = rotation(np.stack(measured))
+            turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
+            motions.insert(0, turned)
+        if self.velocities is None:
+            return motions
+        # The error of predicted turns that few returns hardly correct is common to all steps.
+        common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
+        motions[0] = dataclasses.replace(motions[0], bias_sigma=common)
+        steady[:, :3] = np.inf
+        return [*motions, DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns)]
 
 
 def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRate, MotionRate]:
@@ -410,17 +394,15 @@ def followed(
             # Tracking was lost. Narrow the search of the next passes.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turn_prior = MotionPrior(usual, usual, True)
-        drive = dataclasses.replace(
-            drive,
-            turns=turn_prior.learnt([turn for turn, _ in rates], durations_s),
-            moves=drive.moves.learnt([move for _, move in rates], durations_s),
-        )
+        turns = turn_prior.learnt([turn for turn, _ in rates], durations_s)
+        moves = drive.moves.learnt([move for _, move in rates], durations_s)
+        drive = dataclasses.replace(drive, turns=turns, moves=moves)
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.
-            vectors, covariance = np.full((len(rates), 3), np.nan), np.tile(np.eye(3), (len(rates), 1, 1))
-            for k, ((turn, _), duration_s) in enumerate(zip(rates, durations_s, strict=True)):
-                if turn is not None:
-                    vectors[k], covariance[k] = turn.mean * duration_s, turn.covariance * duration_s**2
+            lost = MotionRate(np.full(3, np.nan), np.eye(3))
+            known = [turn or lost for turn, _ in rates]
+            vectors = np.stack([turn.mean for turn in known]) * durations_s[:, None]
+            covariance = np.stack([turn.covariance for turn in known]) * durations_s[:, None, None] ** 2
             drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(vectors, covariance))
     return drive, tracked
 

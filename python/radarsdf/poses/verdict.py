@@ -109,12 +109,10 @@ class Verdict:
 def _gains(
     held: SensorReturns, used: SensorReturns, before: Floats, after: Floats, noise: SensorNoise
 ) -> Floats:
-    """Return the increase (N,) of the log density at the held-out returns.
-
-    A nearest neighbour alone mostly reflects the sampling. The density is a sum over several, with a kernel as wide as the noise
-    of both returns and the spacing of returns. An isolated return is clutter or a new object: the median density is added to
-    each, so that such returns count little.
-    """
+    """Return the increase (N,) of the log density at the held-out returns."""
+    # A nearest neighbour alone mostly reflects the sampling. The density is a sum over several, with a kernel as wide as the noise
+    # of both returns and the spacing of returns. An isolated return is clutter or a new object: the median density is added to
+    # each, so that such returns count little.
     variances = noise.mean_variances_m2(held.ranges_m), noise.mean_variances_m2(used.ranges_m)
     densities, apart_m2 = [], 0.0
     for poses in (before, after):
