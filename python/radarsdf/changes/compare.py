@@ -208,11 +208,9 @@ def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
 def _check_common(
     sides: Sequence[Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, alignment: Alignment
 ) -> None:
-    """Raise a ValueError if the maps do not fit together.
-
-    Maps in wrong frames still agree about the ground and level floors, so level and steep surfaces are tested separately;
-    and on both sides, since a place may have been cleared.
-    """
+    """Raise a ValueError if the maps do not fit together."""
+    # Maps in wrong frames still agree about the ground and level floors, so level and steep surfaces are tested separately;
+    # and on both sides, since a place may have been cleared.
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)
     if seen == 0:
         msg = f"the maps have no surface in common: they are of other places, or in other frames. {alignment.words}"

@@ -217,11 +217,9 @@ class Errors:
 
 
 def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
-    """(N,) log likelihood ratio of the other map's rays: surface gone against unchanged.
-
-    Of all scans whose rays reach a place, some have returns there, and others pass behind it. If nothing changed, the share
-    of hits is that of the own map, which is small for a thin fence. If it is gone, any share is possible (beta-binomial).
-    """
+    """(N,) log likelihood ratio of the other map's rays: surface gone against unchanged."""
+    # Of all scans whose rays reach a place, some have returns there, and others pass behind it. If nothing changed, the share
+    # of hits is that of the own map, which is small for a thin fence. If it is gone, any share is possible (beta-binomial).
     hits, passes = other.hits / _CELLS_PER_SCAN, other.passes / _CELLS_PER_SCAN
     hit, missed = own.hits / _CELLS_PER_SCAN + 0.5, own.passes / _CELLS_PER_SCAN + 0.5
     same = betaln(hit + hits, missed + passes) - betaln(hit, missed)

@@ -162,10 +162,8 @@ def _best(
     scores: FloatArray,
     in_world: bool,
 ) -> tuple[Hypothesis, float, float] | None:
-    """Return the hypothesis that is clearly better than the data as they are, its gain and its significance.
-
-    `in_world`: whether the points may be in the world frame.
-    """
+    """Return the hypothesis that is clearly better than the data as they are, its gain and its significance."""
+    # `in_world`: whether the points may be in the world frame.
     lags = pairs[:, 1] - pairs[:, 0]
     possible = np.ones(len(guesses), bool)
     possible[STILL] = in_world
@@ -219,11 +217,9 @@ def _best_of(
 
 
 def _looks_out_of_its_frame(recording: Scans, pairs: NDArray[np.int64]) -> bool:
-    """Whether the returns stay in one place of their own frame, but not of the sensor frame according to the poses.
-
-    If the sensor moves far between scans, they agree best as if it stood still, when its field of view is the same. But in
-    the world frame, the centroid of the returns and their mean direction move.
-    """
+    """Whether the returns stay in one place of their own frame, but not of the sensor frame according to the poses."""
+    # If the sensor moves far between scans, they agree best as if it stood still, when its field of view is the same. But in
+    # the world frame, the centroid of the returns and their mean direction move.
     rows = np.unique(pairs)
     given = [np.asarray(recording.points[i], np.float64) for i in rows.tolist()]
     afar = [np.linalg.norm(np.median(scan, axis=0)) / max(scan.std(axis=0).max(), 1e-9) for scan in given]

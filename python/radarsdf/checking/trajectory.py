@@ -162,11 +162,9 @@ def _agree_without(
     motions: FloatArray,
     durations: FloatArray,
 ) -> bool:
-    """Whether the scans near a step agree clearly better if it is replaced by the motion of the neighbouring steps.
-
-    If that repairs the poses, the scans then agree about as well as those next to the step. Without this condition,
-    scans that observe different things would agree better wherever the replaced motion makes their fields of view overlap.
-    """
+    """Whether the scans near a step agree clearly better if it is replaced by the motion of the neighbouring steps."""
+    # If that repairs the poses, the scans then agree about as well as those next to the step. Without this condition,
+    # scans that observe different things would agree better wherever the replaced motion makes their fields of view overlap.
     poses = recording.poses
     near = [k for k in range(jump - _NEAR, jump + 1 + _NEAR) if 0 <= k < len(motions) and k not in suspects]
     if not near:

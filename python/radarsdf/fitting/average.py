@@ -47,7 +47,9 @@ class SurfaceReturns:
     surfels: Surfels  # of all returns
     noise: SensorNoise
     means: MeanRays | None  # mean rays of the leaf cells without ghosts, to average. None for training
-    true: NDArray[np.bool_] | None  # (N,) False for ghosts. None if ghosts are not detected, or nothing needs it
+    true: (
+        NDArray[np.bool_] | None
+    )  # (N,) False for ghosts. None if ghosts are not detected, or nothing needs it
 
     @classmethod
     def of(

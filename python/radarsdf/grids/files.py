@@ -65,10 +65,8 @@ def write_octomap(path: Path, state: NDArray[np.int8], origin: NDArray[np.float6
 
 
 def _octree(keys: NDArray[np.int64], codes: NDArray[np.int64]) -> tuple[int, bytes]:
-    """Encode voxels (N, 3) with codes (N,): number of nodes, and two bytes for each inner node in depth-first order.
-
-    The two bytes are the codes of its eight children, x varying fastest; 0: unknown.
-    """
+    """Encode voxels (N, 3) with codes (N,): number of nodes, and two bytes for each inner node in depth-first order."""
+    # The two bytes are the codes of its eight children, x varying fastest; 0: unknown.
     numbers = np.zeros(len(keys), np.int64)  # Morton codes
     for bit in range(_LEVELS):
         for axis in range(3):

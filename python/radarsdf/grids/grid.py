@@ -302,11 +302,9 @@ class Grid:
         return np.asarray(self.origin[2] + (np.arange(self.shape[2]) + 0.5) * self.voxel_size)
 
     def _ground(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the heights (X, Y) of the ground, world, m, and the clearance above it, m. NaN in columns without ground.
-
-        The ground of a column is the lowest surface on which the signed distance increases upwards. Its height is the zero
-        crossing of the distance, interpolated between the voxels above and below.
-        """
+        """Return the heights (X, Y) of the ground, world, m, and the clearance above it, m. NaN in columns without ground."""
+        # The ground of a column is the lowest surface on which the signed distance increases upwards. Its height is the zero
+        # crossing of the distance, interpolated between the voxels above and below.
         z = self._z()
         # Nothing is known above the top voxels.
         lower, occupied = self.distance_m, np.pad(self.occupied, ((0, 0), (0, 0), (0, 1)))

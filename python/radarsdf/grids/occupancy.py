@@ -143,10 +143,8 @@ def _touched(
     size: float,
     step: int,
 ) -> NDArray[np.float32]:
-    """Return the largest probability, by voxel, that the surface of one of the `voxels` (N, 3), `step` away, extends into it.
-
-    `planes`: distances (N,), normals (N, 3), standard errors (N,) and probabilities of a surface (N,).
-    """
+    """Return the largest probability, by voxel, that the surface of one of the `voxels` (N, 3), `step` away, extends into it."""
+    # `planes`: distances (N,), normals (N, 3), standard errors (N,) and probabilities of a surface (N,).
     found = np.zeros(shape, np.float32)
     rows = np.flatnonzero(planes[3] > 0)
     for offset in np.ndindex(3, 3, 3):
@@ -163,10 +161,8 @@ def _touched(
 
 
 def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool_]:
-    """Return a mask of voxels next to a sign change of the distance, if the surface is in reach or nearer than to the neighbour.
-
-    A distance near zero without a sign change may be the end of the observed field.
-    """
+    """Return a mask of voxels next to a sign change of the distance, if the surface is in reach or nearer than to the neighbour."""
+    # A distance near zero without a sign change may be the end of the observed field.
     padded = np.pad(distance_m, 1, constant_values=np.nan)
     found = np.zeros(distance_m.shape, bool)
     for axis in range(3):

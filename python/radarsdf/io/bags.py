@@ -161,11 +161,9 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
 def _read_imu(
     paths: list[Path], topic: str | None, sensor_frame: str, recorded: bool, request: Request
 ) -> Imu | None:
-    """Read the inertial measurements of a topic; None if it has no gyroscope.
-
-    If scans are stamped with record times (`recorded`), each measurement is shifted by the median delay from stamp to
-    record, because IMU messages are recorded in batches.
-    """
+    """Read the inertial measurements of a topic; None if it has no gyroscope."""
+    # If scans are stamped with record times (`recorded`), each measurement is shifted by the median delay from stamp to
+    # record, because IMU messages are recorded in batches.
     if topic is None:
         return None
     numbers, frame = array("d"), ""

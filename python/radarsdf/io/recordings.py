@@ -246,11 +246,9 @@ def lidar_map(folder: Path) -> NDArray[np.float64] | None:
 def _in_order_of_time(
     files: list[Path], poses: Poses, notes: Notes
 ) -> tuple[list[Path], Sequence[float] | None, Poses]:
-    """Sort scans by time; return files, times, s, or None if there are none, and poses.
-
-    Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
-    file of times.
-    """
+    """Sort scans by time; return files, times, s, or None if there are none, and poses."""
+    # Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
+    # file of times.
     times = [time for path in files if (time := _time_in(path.stem)) is not None]
     listed = None
     if len(set(times)) < len(files):

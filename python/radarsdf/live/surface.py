@@ -197,11 +197,9 @@ class GrowingSurface:
         return found
 
     def _derive_distances(self, changed: Keys, noise: SensorNoise, num_threads: int) -> Keys:
-        """Recompute distances and evidence that depend on changed leaf cells. Return their regions, ascending.
-
-        A ray contributes to the cells of its band, and via shared corners to the neighbours of the last one. Added or removed
-        cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
-        """
+        """Recompute distances and evidence that depend on changed leaf cells. Return their regions, ascending."""
+        # A ray contributes to the cells of its band, and via shared corners to the neighbours of the last one. Added or removed
+        # cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
         config = self._config
         reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(max(TRUNCATION_CELLS, BAND_CELLS)) + 1)
         centre = regions_of(reached)

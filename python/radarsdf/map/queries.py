@@ -245,11 +245,9 @@ def terms(contents: WholeMap, evidence: EvidenceAt) -> Tensor:
 
 
 def _smoothed(error_cells: Tensor) -> Tensor:
-    """Return standard errors (N,) of a smooth surface, leaf cells, from `error_cells` of the returns near each place alone.
-
-    For a thin plate with second differences of standard deviation b cells, and returns of information density ρ per cell, the
-    variance is 1 / (8 √(ρ / b²)). Where the returns alone are more precise, the neighbourhood adds nothing.
-    """
+    """Return standard errors (N,) of a smooth surface, leaf cells, from `error_cells` of the returns near each place alone."""
+    # For a thin plate with second differences of standard deviation b cells, and returns of information density ρ per cell, the
+    # variance is 1 / (8 √(ρ / b²)). Where the returns alone are more precise, the neighbourhood adds nothing.
     density = 1 / (CELLS_OF_SURFACE * error_cells.square())
     return error_cells.minimum((_BEND_CELLS / (8 * density.sqrt())).sqrt())
 

@@ -215,10 +215,8 @@ def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tu
 
 
 def _zoom(seen: _Floats, rows: int, columns: int) -> tuple[_Floats, float] | None:
-    """Middle (2,) of the picture, and pixels per unit, both at depth 1, for points (N, 3) along the axes of the eye.
-
-    None if all of them are more than 56° off its axis. The zoom ignores such points.
-    """
+    """Middle (2,) of the picture, and pixels per unit, both at depth 1, for points (N, 3) along the axes of the eye."""
+    # None if all of them are more than 56° off its axis. The zoom ignores such points.
     screen = np.stack([seen[:, 0], -seen[:, 1]]) / seen[:, 2]
     screen = screen[:, np.hypot(*screen) <= 1.5]
     if screen.shape[1] == 0:

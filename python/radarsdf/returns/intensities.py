@@ -94,11 +94,9 @@ def _farthest(distances: NDArray[Any], count: int) -> float:
 
 
 def _reach(distances: NDArray[Any], share: float) -> float:
-    """Extrapolate the distance from the median beyond which a `share` of returns lies, from distances (M,), ascending.
-
-    Each quartering of the share extends an exponential tail by the same length, and a heavy tail by growing lengths. A tail
-    lighter than exponential is treated as exponential, because returns are of several kinds.
-    """
+    """Extrapolate the distance from the median beyond which a `share` of returns lies, from distances (M,), ascending."""
+    # Each quartering of the share extends an exponential tail by the same length, and a heavy tail by growing lengths. A tail
+    # lighter than exponential is treated as exponential, because returns are of several kinds.
     quarter, second, third = (float(distances[len(distances) * (4**k - 1) // 4**k]) for k in (1, 2, 3))
     step, before = third - second, second - quarter
     growth = max(step / before, 1.0) if before > 0 else 1.0

@@ -250,10 +250,8 @@ class RadarSensor:
         return _Echoes(distance[rows], angles[beam[rows]], power[rows])
 
     def _phantoms(self, rays: _Rays, R: FloatArray, seed: int, rng: np.random.Generator) -> _Echoes:
-        """Weak false returns behind surfaces, more behind far ones, whose beams are wider.
-
-        Lasting ones have the same places in all scans of a seed: at most one per cell of space.
-        """
+        """Weak false returns behind surfaces, more behind far ones, whose beams are wider."""
+        # Lasting ones have the same places in all scans of a seed: at most one per cell of space.
         lasting = self.phantom_lasting_share
         expected = self.phantoms_per_scan * np.array([1 - lasting, lasting])
         passing, tries = rng.poisson(expected / [1, _PHANTOM_SHARE])
@@ -313,10 +311,8 @@ def _hash(cells: NDArray[np.int64], key: int) -> FloatArray:
 
 
 def _speckle_db(looks: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Fading (N,), dB, for numbers of scatterers (N,).
-
-    Its median is 0, so a fit with the L1 loss, which estimates medians, finds the noiseless intensity.
-    """
+    """Fading (N,), dB, for numbers of scatterers (N,)."""
+    # Its median is 0, so a fit with the L1 loss, which estimates medians, finds the noiseless intensity.
     power = rng.standard_gamma(looks)
     values, index = np.unique(looks, return_inverse=True)
     fading: FloatArray = 10 * np.log10(np.maximum(power, 1e-12) / gammaincinv(values, 0.5)[index])

@@ -106,10 +106,8 @@ class TileBlend(Map):
         return cells[inside]
 
     def _shares(self, world: _Floats) -> Iterator[Share]:
-        """Yield the shares of tiles at positions (N, 3), world, m, in ascending order, which fixes the bits of sums.
-
-        Weights depend only on the borders between tiles, not on what a tile observed.
-        """
+        """Yield the shares of tiles at positions (N, 3), world, m, in ascending order, which fixes the bits of sums."""
+        # Weights depend only on the borders between tiles, not on what a tile observed.
         grid = self.plan.grid
         places = world[np.isfinite(world).all(axis=1), :2]
         if len(places) == 0:
@@ -126,11 +124,9 @@ class TileBlend(Map):
                 yield Share(planned.tile, contents, rows, grid.weights(planned.tile, world[rows]), local)
 
     def _seen(self, world: _Floats) -> NDArray[np.bool_]:
-        """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border.
-
-        Tiles disagree, because ghosts depend on surfaces in front of them. The tile that contains a position decides; for
-        an unfinished one, its neighbours do.
-        """
+        """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border."""
+        # Tiles disagree, because ghosts depend on surfaces in front of them. The tile that contains a position decides; for
+        # an unfinished one, its neighbours do.
         found = np.zeros(len(world), bool)
         for share in self._shares(world):
             _, inside = queries.into_cells(share.contents, share.local)
