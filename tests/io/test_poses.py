@@ -65,11 +65,11 @@ def test_tum(tmp_path, separator):
     [
         ("", "not a table of poses"),
         ("1 2 3\n4 5 6\n", "has 3 columns: poses have 8"),
-        ("1 2 3 4 5 6 7 8\n1 2 3\n", "not unit quaternions.*pose 0"),
+        ("1 2 3 4 5 6 7 8\n1 2 3\n", "no unit quaternion.*pose 0"),
         ("1 0 0 0 0 0 0 nan\n", "finite"),
         ("1 0 0 0 0 0 0 one\n", "finite"),
         ("1 0 0 0 0 0 0 1\n", "at least two"),
-        ("1 0 0 0 0 0 0 2\n2 0 0 0 0 0 0 1\n", "unit quaternions"),
+        ("1 0 0 0 0 0 0 2\n2 0 0 0 0 0 0 1\n", "unit quaternion"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "holds 1 poses at different times"),
         (" ".join(["1"] * 12), "rigid"),
         (" ".join(["1"] * 16), "rigid"),
@@ -165,26 +165,26 @@ def test_most_rows_of_a_table_must_be_poses():
         trajectory_of(rows, "x")
 
 
-POSES, TIMES = trajectory(7), np.arange(7) * 0.25 + 1.6e9
+WRITTEN, TIMES = trajectory(7), np.arange(7) * 0.25 + 1.6e9
 
 
 @pytest.mark.parametrize("name", ["a.tum", "a.kitti", "a.npy"])
 def test_poses_come_back(tmp_path, name):
-    write_poses(tmp_path / name, POSES, TIMES)
+    write_poses(tmp_path / name, WRITTEN, TIMES)
     found = read_poses(tmp_path / name, Notes())
     if not isinstance(found, np.ndarray):
         np.testing.assert_allclose(found.times_s, TIMES)
         found = found.poses(TIMES)
-    np.testing.assert_allclose(found, POSES, atol=1e-8)
+    np.testing.assert_allclose(found, WRITTEN, atol=1e-8)
 
 
 def test_wrong_arguments_are_refused_and_nothing_is_written(tmp_path):
     with pytest.raises(ValueError, match=r"\.tum, \.kitti, \.npy"):
-        write_poses(tmp_path / "a.txt", POSES, TIMES)
+        write_poses(tmp_path / "a.txt", WRITTEN, TIMES)
     with pytest.raises(ValueError, match="needs times"):
-        write_poses(tmp_path / "a.tum", POSES)
+        write_poses(tmp_path / "a.tum", WRITTEN)
     with pytest.raises(ValueError, match="times_s must be"):
-        write_poses(tmp_path / "a.tum", POSES, TIMES[:3])
+        write_poses(tmp_path / "a.tum", WRITTEN, TIMES[:3])
     with pytest.raises(ValueError, match="rigid"):
-        write_poses(tmp_path / "a.kitti", 2 * POSES)
+        write_poses(tmp_path / "a.kitti", 2 * WRITTEN)
     assert list(tmp_path.iterdir()) == []

@@ -150,7 +150,7 @@ def test_a_given_sensor_decides(sharp_map):
 
 def test_missing_memory_is_reported_before_the_work(sharp_map, monkeypatch):
     monkeypatch.setattr("radarsdf.memory.available_bytes", lambda: 100_000)
-    with pytest.raises(MemoryError, match=r"would take about .* GB, of 0.00: ask for fewer"):
+    with pytest.raises(MemoryError, match=r"would take about .* GB, of 0.00: use fewer"):
         sharp_map.render(POSE)
     unseen = pickle.loads(pickle.dumps(sharp_map))  # without a cached surface for rays
     with pytest.raises(MemoryError, match="would take about"):

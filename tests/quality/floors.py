@@ -34,7 +34,7 @@ KINDS = ("default", "quick")
 SCENE_SEED = 7  # the figures of BENCHMARK.md, by which the defaults were chosen, are of seed 0
 # With 20 frames of the wall, one quick fit in six has large errors at the held-out first frame.
 FRAMES = {"hugin": 20, "oculii": 20, "wall": 40}
-MESH_SAMPLES = 100_000
+MESH_SAMPLES = 300_000
 
 
 @dataclass(frozen=True)

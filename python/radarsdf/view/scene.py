@@ -191,7 +191,7 @@ class Canvas:
         self.faces = rows[faces].astype(np.int32)
         wait_until_drawn(self._server, superseded)
         if superseded():
-            self._meshes = old + self._meshes
+            self._meshes, self._drawn = old + self._meshes, None
             return
         with self._server.atomic():
             for mesh in old:
