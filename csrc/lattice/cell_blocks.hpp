@@ -88,25 +88,28 @@ class NearbyRows {
   explicit NearbyRows(const CellBlocks& cells) : cells_(&cells) {}
 
   // The row of a key, or -1.
-  std::int32_t row(std::uint64_t key) {
-    const std::uint64_t block_key = CellBlocks::block_key(key);
+  std::int32_t row(std::uint64_t key) { return block(CellBlocks::block_key(key)).row(key); }
+
+  // The cells of a block.
+  const Occupancy& block(std::uint64_t block_key) {
     Found& found = found_[block_key & 7];
     if (found.key != block_key) {
       found.key = block_key;
-      if (CellBlocks::region_key(key) != region_key_) {
-        region_key_ = CellBlocks::region_key(key);
+      const std::uint64_t region_key = CellBlocks::block_key(block_key);  // a region is a block of blocks
+      if (region_key != region_key_) {
+        region_key_ = region_key;
         region_ = cells_->region(region_key_);
       }
-      const Occupancy* block = region_ != nullptr ? cells_->block(*region_, block_key) : nullptr;
-      found.block = block != nullptr ? *block : Occupancy{0, 0};
+      const Occupancy* cells = region_ != nullptr ? cells_->block(*region_, block_key) : nullptr;
+      found.cells = cells != nullptr ? *cells : Occupancy{0, 0};
     }
-    return found.block.row(key);
+    return found.cells;
   }
 
  private:
   struct Found {
     std::uint64_t key = kEmptyKey;
-    Occupancy block{0, 0};
+    Occupancy cells{0, 0};
   };
 
   const CellBlocks* cells_;

@@ -14,24 +14,13 @@ namespace {
 
 constexpr float kSlack = 0.25F;                 // cells: planes of neighbours do not exactly meet at their common face
 constexpr double kBlockEdge = 1 << kBlockBits;  // cells
-constexpr int kEmptyCells = 8;                  // consecutive ones, after which a ray steps by blocks again
-
-CellBlocks blocks_of(const std::uint64_t* keys, std::int64_t count) {
-  std::vector<std::uint64_t> blocks;
-  for (std::int64_t i = 0; i < count; ++i) {
-    if (blocks.empty() || blocks.back() != CellBlocks::block_key(keys[i]))
-      blocks.push_back(CellBlocks::block_key(keys[i]));
-  }
-  return {blocks.data(), static_cast<std::int64_t>(blocks.size())};
-}
+// Consecutive ones, after which a ray steps by blocks again: no fewer than the cells of a block that a line crosses.
+constexpr int kEmptyCells = 3 * (1 << kBlockBits) - 2;
 
 }  // namespace
 
 SurfelMap::SurfelMap(const std::uint64_t* keys, const Surfel* surfels, std::int64_t count, double cell_size_m)
-    : cell_size_m_(cell_size_m),
-      cells_(keys, count),
-      blocks_(blocks_of(keys, count)),
-      surfels_(surfels, surfels + count) {
+    : cell_size_m_(cell_size_m), cells_(keys, count), surfels_(surfels, surfels + count) {
   if (!(cell_size_m > 0) || !std::isfinite(cell_size_m)) {
     throw std::invalid_argument("cell_size_m must be positive and finite");
   }
@@ -67,7 +56,7 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
 
   constexpr std::int64_t kRays = 1 << 12;  // per task: few, so that a long traversal can be interrupted
   parallel_tasks((count + kRays - 1) / kRays, num_threads, [&](std::int64_t task) {
-    NearbyRows rows(cells_), blocks(blocks_);
+    NearbyRows rows(cells_);
     const std::int64_t end = std::min(count, (task + 1) * kRays);
     for (std::int64_t i = task * kRays; i < end; ++i) {
       crossed[i] = -1;
@@ -81,7 +70,7 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
                      kAxisBias >> kBlockBits);
       while (block.inside() && crossed[i] < 0) {
         const double leaves_m = block.leaves_m();
-        if (blocks.row(block.key()) >= 0) {
+        if (rows.block(block.key()).mask != 0) {
           int on_end = 0;
           for (CellWalk cell(points + 3 * i, directions + 3 * i, begin_m, last_m, cell_size_m_); cell.inside();
                cell.next()) {

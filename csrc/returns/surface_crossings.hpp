@@ -38,7 +38,7 @@ class SurfelMap {
 
  private:
   double cell_size_m_;
-  CellBlocks cells_, blocks_;  // and the blocks that hold them
+  CellBlocks cells_;
   std::vector<Surfel> surfels_;
 };
 

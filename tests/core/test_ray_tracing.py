@@ -325,6 +325,20 @@ def test_skipping_empty_space_equals_a_plain_traversal(kind):
         np.testing.assert_array_equal(found, expected)
 
 
+def test_the_last_of_ten_cells_of_a_block_is_searched():
+    """A line crosses up to ten cells of a block; here only the last one holds a surfel."""
+    direction = np.full(3, 3**-0.5)
+    crossing = (
+        np.array([3.6, 3.5, 3.4]) * CELL_M
+    )  # in the cell (3, 3, 3), behind nine empty ones of its block
+    surfels = np.concatenate([crossing, -direction, [0, np.inf]])[None].astype(np.float32)
+    keys = cell_keys(crossing[None], CELL_M)
+    points = (crossing + 5 * CELL_M * direction)[None].astype(np.float32)
+    ranges_m = np.array([40 * CELL_M], np.float32)
+    ray = points, direction[None].astype(np.float32), ranges_m
+    assert SurfelMap(keys, surfels, CELL_M).first_crossings(*ray, 0.0, 0.0, MARGIN_M, 0.0).tolist() == [0]
+
+
 def test_rays_from_far_away_and_past_everything():
     keys, surfels = a_scene(seed=0)
     surfel_map = SurfelMap(keys, surfels, CELL_M)
