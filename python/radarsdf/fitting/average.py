@@ -126,8 +126,9 @@ def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig)
     """Compute information, scans and returns of each leaf cell from its mean ray."""
     # The returns of a cell have nearly the same range if they are seen from the same sensor position.
     information = means.counts / noise.variances_m2(means.ranges_m)
-    columns = information.astype(np.float32), means.scans, means.counts.astype(np.float64)
-    return ReturnsOfCells(means.keys, *columns).with_uncertain_poses(means.ranges_m, config)
+    counts = means.counts.astype(np.float64)
+    found = ReturnsOfCells(means.keys, information.astype(np.float32), means.scans, counts)
+    return found.with_uncertain_poses(means.ranges_m, config)
 
 
 @torch.no_grad()
@@ -179,8 +180,9 @@ def average_at_corners(
     Distances depend only on what is within `CELLS_SMOOTHED` of the cells of their rays, to the last bit.
     """
     normals = np.ascontiguousarray(normals, np.float32)
-    columns = rays.points, rays.directions, normals, rays.counts
-    distances_m, sides = table.average_rays(*columns, config.metres(TRUNCATION_CELLS), num_threads)
+    distances_m, sides = table.average_rays(
+        rays.points, rays.directions, normals, rays.counts, config.metres(TRUNCATION_CELLS), num_threads
+    )
     return table.smoothed(
         distances_m, rays.points, normals, returns.information, sides, _SMOOTHINGS, num_threads
     )

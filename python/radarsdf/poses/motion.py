@@ -243,12 +243,21 @@ class SteadyMotion(Motion):
 
     @classmethod
     def by(
-        cls, priors: tuple[MotionPrior, MotionPrior], usual: Floats, times_s: Floats, poses: Floats
+        cls,
+        priors: tuple[MotionPrior, MotionPrior],
+        usual: Floats,
+        times_s: Floats,
+        poses: Floats,
+        measured: NDArray[np.bool_],
     ) -> SteadyMotion:
-        """Build from times (F,) and approximate poses (F, 4, 4) of scans. `usual` (2,): mean squares of rates."""
+        """Build from times (F,) and approximate poses (F, 4, 4) of scans.
+
+        `usual` (2,): mean squares of rates. `measured` (6,): components of steps that other sources measure.
+        """
         spans = spans_of(times_s, len(times_s))
         duration_s = float(np.median(np.diff(times_s)))
-        unknown = np.zeros(6), np.ones(2), np.zeros((len(spans), 6)), spans
+        shares = np.tile(np.where(measured, np.inf, 1.0), (len(spans), 1))
+        unknown = np.zeros(6), np.ones(2), shares, spans
         return cls(steps(poses), *unknown, priors, duration_s * spans, duration_s**2 * usual).at(poses)
 
     def at(self, poses: Floats) -> SteadyMotion:
@@ -257,10 +266,10 @@ class SteadyMotion(Motion):
         rates = np.split(step_vectors(poses) / durations_s[:, None], 2, axis=1)
         both = [p.conditional(r, durations_s) for p, r in zip(self.priors, rates, strict=True)]
         # Damped by half at twice the information: the same gradient, but steps that move together do not overshoot.
-        ways, turns = (0.5 * durations_s[:, None] * (r + m) for r, (m, _) in zip(rates, both, strict=True))
+        moves, turns = (0.5 * durations_s[:, None] * (r + m) for r, (m, _) in zip(rates, both, strict=True))
         variances = np.concatenate([v for _, v in both], axis=1) * 0.5 * durations_s[:, None] ** 2
         shares = np.where(np.isinf(self.shares), np.inf, variances)
-        return dataclasses.replace(self, steps=transform(turns, ways), shares=shares)
+        return dataclasses.replace(self, steps=transform(turns, moves), shares=shares)
 
     def learnt(self, *_: Floats) -> SteadyMotion:
         """Return self: the priors are those of the drive."""

@@ -164,8 +164,9 @@ class Tracker:
         pose, covariance, agreeing = self._settled(scan, middle if start is None else start, middle, prior)
         covariance = self._without_chance(scan, pose, prior, covariance)
         turned = rotation_vector(self.last.pose[:3, :3].T @ pose[:3, :3], turn)
-        way, turn_share = (_removed_share(prior[k, k], covariance[k, k]) for k in (slice(0, 3), slice(3, 6)))
-        return Tracked(pose, covariance, agreeing, self.last.segment, turned, (way, turn_share))
+        move_share = _removed_share(prior[:3, :3], covariance[:3, :3])
+        turn_share = _removed_share(prior[3:, 3:], covariance[3:, 3:])
+        return Tracked(pose, covariance, agreeing, self.last.segment, turned, (move_share, turn_share))
 
     def _normal_equations(
         self, planes: LocalPlanes, scan: Floats, pose: Floats
@@ -331,14 +332,13 @@ class Drive:
         turns = np.stack([found.turn for found in tracked[rows][1:]])
         duration_s, turn_sigma_rad_s = float(np.median(np.diff(times_s))), np.full(3, self.usual_turn_rad_s)
         usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
-        motions: list[Motion] = [SteadyMotion.by((self.moves, self.turns), usual, times_s, poses)]
-        steady = motions[0].shares
+        measured = np.repeat([self.velocities is not None, self.gyroscope is not None], 3)
+        motions: list[Motion] = [SteadyMotion.by((self.moves, self.turns), usual, times_s, poses, measured)]
         if self.gyroscope is not None:
-            steady[:, 3:] = np.inf
             turned = Motion.of(poses, 0.0, _GYROSCOPE_RAD, times_s)
             turned.shares[:, :3] = np.inf
-            measured = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
-            turned.steps[:, :3, :3] = rotation(np.stack(measured))
+            vectors = [self.gyroscope.step(i).mean for i in range(rows.start, rows.stop - 1)]
+            turned.steps[:, :3, :3] = rotation(np.stack(vectors))
             turn_sigma_rad_s = np.sqrt(self.gyroscope.bias.covariance.diagonal())
             motions.insert(0, turned)
         if self.velocities is None:
@@ -346,7 +346,6 @@ class Drive:
         # The error of predicted turns that few returns hardly correct is common to all steps.
         common = np.concatenate([np.zeros(3), turn_sigma_rad_s * duration_s])
         motions[0] = dataclasses.replace(motions[0], bias_sigma=common)
-        steady[:, :3] = np.inf
         return [*motions, DopplerMotion.by(self.velocities.select(rows), times_s, poses, turns)]
 
 
