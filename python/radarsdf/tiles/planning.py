@@ -210,7 +210,7 @@ class _Planner:
     def _completed(self, plan: Plan) -> Plan:
         """Complete the plan with the noise and clutter ratio of the largest tiles, and the cost of each."""
         noises: list[SensorNoise] = []
-        tiles, clutter, returns, cells = [], 0.0, 0, 0
+        tiles, clutter, returns, cells, in_cells = [], 0.0, 0, 0, 0.0
         for tile in sorted(plan.tiles, key=lambda planned: -planned.returns):
             rays, inside = read_rays(self._folder, plan, tile)
             cost = estimate_rays(rays, plan.config, inside)
@@ -221,15 +221,20 @@ class _Planner:
             with ThreadPool(plan.config.num_threads) as workers:
                 surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
             noises.append(surface.noise)
-            clutter += surface.surfels.clutter_ratio() * len(rays)
+            surfels = surface.surfels
+            clutter += surfels.clutter_ratio() * len(rays)
             returns += len(rays)
-            cells += len(surface.surfels.keys)
+            # Of the cells beyond, the tile has only the returns whose rays cross it.
+            held = np.unique(surfels.cells_at(rays.points[inside]))
+            held = held[held >= 0]
+            in_cells += float(surfels.counts[held].sum())
+            cells += len(held)
         noise = SensorNoise.median(noises)
         return dataclasses.replace(
             plan,
             config=plan.config.override(returns=noise.settings),
             clutter_ratio=clutter / returns,
-            returns_per_cell=returns / max(cells, 1),
+            returns_per_cell=in_cells / max(cells, 1),
             sensor=self._sensor(noise),
             tiles=tuple(sorted(tiles, key=lambda tile: tile.tile)),
         )
