@@ -182,7 +182,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
 
         - the name of a simulated scene in `radarsdf.simulate.SCENES` or `bench.kinds.KINDS`;
         - an ``.npz`` file for :func:`radarsdf.io.npz.read_scans`. Only lidar points within 1 m of a return that is
-          2.5 to 60 m from its sensor are ground truth;
+          2.5 to 60 m from its sensor are ground truth, unless an array ``box`` (2, 3) says where it is complete;
         - a folder of scans with poses for :func:`radarsdf.io.read`, such as a recording of Viking Hill. All its lidar
           points are ground truth; `box` selects a region.
     frames : int, optional
@@ -228,6 +228,9 @@ def _simulated(simulation: Simulation) -> Scene:
 def _file(path: Path, frames: int | None) -> Scene:
     scans = read_scans(path)
     scene = _recorded(path.stem, scans, frames)
+    with np.load(path) as arrays:
+        if "box" in arrays:
+            return dataclasses.replace(scene, box=check_box(arrays["box"]))
     scene = dataclasses.replace(
         scene,
         holdout_every=_HOLDOUT_EVERY_SHORT if len(scans.points) < _SHORT_FRAMES else _HOLDOUT_EVERY,

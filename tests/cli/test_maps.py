@@ -173,13 +173,14 @@ def test_points_of_several_formats(mesh_file, tmp_path, capsys):
     np.savetxt(tmp_path / "lidar.xyz", np.column_stack([points, points]))
     np.savetxt(tmp_path / "lidar.csv", points, delimiter=",")
     np.savez(tmp_path / "lidar.npz", lidar_points=points)
+    np.savez(tmp_path / "truth.npz", ground_truth=points, points=np.zeros((9, 3)))
     cloud = Scans([points], np.eye(4)[None])
     names = ["lidar.pcd", "lidar.las", "lidar.laz"] if find_spec("laspy") else ["lidar.pcd"]
     for name in names:
         write_cloud(tmp_path / name, cloud)
     trimesh.PointCloud(points).export(tmp_path / "lidar.ply")
     rows = set()
-    for name in ("lidar.npy", "lidar.xyz", "lidar.csv", "lidar.ply", "lidar.npz", *names):
+    for name in ("lidar.npy", "lidar.xyz", "lidar.csv", "lidar.ply", "lidar.npz", "truth.npz", *names):
         assert call("eval", mesh_file, tmp_path / name, *SAMPLES) == 0
         rows.add(row(capsys.readouterr().out, "completion"))
     assert len(rows) == 1

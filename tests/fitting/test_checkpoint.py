@@ -210,7 +210,7 @@ class TestOtherFiles:
             assert name == "something" or name in file.keys()  # noqa: SIM118
             value = torch.full_like(file.get_tensor(name), float("inf")) if value is None else value
         self.rewrite(path, {name: value})
-        self.refused(scene, path, "is not a whole checkpoint of this fit")
+        self.refused(scene, path, "is not a complete checkpoint of this fit")
 
 
 def test_a_full_disk_is_a_warning_and_the_fit_continues(scene, tmp_path, monkeypatch):

@@ -243,12 +243,12 @@ def test_damaged_bags(tmp_path, kind):
     for size in (0, 10, len(whole) // 3):
         file.write_bytes(whole[:size])
         for target in {path, file}:
-            with pytest.raises(ValueError, match="is not a whole bag") as error:
+            with pytest.raises(ValueError, match="is not a complete bag") as error:
                 list(read(target))
             assert str(tmp_path) in str(error.value)
     if kind != "ros1":
         file.unlink()
         text = "rosbag2_bagfile_information: !!python/object/apply:os.getcwd []\n"
         (path / "metadata.yaml").write_text(text)
-        with pytest.raises(ValueError, match="is not a whole bag"):
+        with pytest.raises(ValueError, match="is not a complete bag"):
             read(path)

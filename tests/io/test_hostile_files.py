@@ -100,7 +100,7 @@ def test_shapes_that_no_file_holds(tmp_path, shape):
     path = tmp_path / "scans.npz"
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("points.npy", samples._claim(shape))
-    with pytest.raises(ValueError, match=r"scans\.npz is not a whole"):
+    with pytest.raises(ValueError, match=r"scans\.npz is not a complete"):
         read_scans(path)
 
 
@@ -132,7 +132,7 @@ def with_config(group, **changes):
 def test_a_map_that_describes_more_than_it_holds(tmp_path, group, name, value):
     path = tmp_path / "map.safetensors"
     path.write_bytes(with_config(group, **{name: value}))
-    with pytest.raises(ValueError, match=r"map\.safetensors is not a whole"):
+    with pytest.raises(ValueError, match=r"map\.safetensors is not a complete"):
         radarsdf.load(path)
 
 
@@ -140,7 +140,7 @@ def test_a_map_that_describes_more_than_it_holds(tmp_path, group, name, value):
 def test_what_is_no_file(tmp_path, read):
     path = tmp_path / "map.npz"
     path.write_bytes(b"")
-    with pytest.raises(ValueError, match=r"map\.npz is not a whole"):
+    with pytest.raises(ValueError, match=r"map\.npz is not a complete"):
         read(path)
     path.unlink()
     path.mkdir()  # a map may be a folder

@@ -57,7 +57,7 @@ def test_reading_is_lazy_and_damaged_scans_are_left_out(tmp_path):
     assert_array_equal(scans.poses, POSES[[0, 1, 2, 3, 4, 6, 9, 10]])
     (note,) = scans.notes
     assert note.startswith("3 scans left out")
-    assert "scan_5.pcd is not a whole .pcd file" in note
+    assert "scan_5.pcd is not a complete .pcd file" in note
 
 
 def test_scans_of_bad_poses_are_left_out(tmp_path):

@@ -104,7 +104,7 @@ def test_truncated_files(saved, tmp_path, keep):
     data = saved[1].read_bytes()
     path = tmp_path / "cut.safetensors"
     path.write_bytes(data[: int(len(data) * keep) if isinstance(keep, float) else keep])
-    with pytest.raises(ValueError, match=r"cut\.safetensors is not a whole radarsdf map"):
+    with pytest.raises(ValueError, match=r"cut\.safetensors is not a complete radarsdf map"):
         radarsdf.load(path)
 
 
@@ -121,7 +121,7 @@ def test_files_of_other_programs_and_versions(saved, tmp_path):
             radarsdf.load(path)
     for content in (b"\xff" * 64, b"ply\nformat ascii 1.0\n"):
         path.write_bytes(content)
-        with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        with pytest.raises(ValueError, match="is not a complete radarsdf map"):
             radarsdf.load(path)
     with pytest.raises(FileNotFoundError, match="nothing"):
         radarsdf.load(tmp_path / "nothing.safetensors")
@@ -170,7 +170,7 @@ TENSORS = [
 def test_inconsistent_tensors_are_rejected(saved, tmp_path, name, change):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "bad.safetensors", tensors | {name: change(tensors[name])}, metadata)
-    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+    with pytest.raises(ValueError, match="is not a complete radarsdf map"):
         radarsdf.load(path)
 
 
@@ -186,7 +186,7 @@ def test_keys_that_are_read_alone_are_checked(saved, tmp_path):
         torch.cat([-torch.ones_like(keys[:1]), keys]),
     ):
         damaged = write(tmp_path / "bad.safetensors", {"leaf_keys": wrong}, metadata)
-        with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        with pytest.raises(ValueError, match="is not a complete radarsdf map"):
             load_leaf_keys(damaged)
 
 
@@ -196,7 +196,7 @@ def test_keys_that_are_read_alone_are_checked(saved, tmp_path):
 def test_missing_and_unknown_tensors_are_rejected(saved, tmp_path, name):
     _, _, tensors, metadata = saved
     for changed in ({n: t for n, t in tensors.items() if n != name}, tensors | {"field.x": torch.zeros(2)}):
-        with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+        with pytest.raises(ValueError, match="is not a complete radarsdf map"):
             radarsdf.load(write(tmp_path / "bad.safetensors", changed, metadata))
 
 
@@ -222,7 +222,7 @@ DAMAGE = {
 def test_inconsistent_metadata_are_rejected(saved, tmp_path, damage):
     _, _, tensors, metadata = saved
     path = write(tmp_path / "bad.safetensors", tensors, with_description(metadata, DAMAGE[damage]))
-    with pytest.raises(ValueError, match="is not a whole radarsdf map"):
+    with pytest.raises(ValueError, match="is not a complete radarsdf map"):
         radarsdf.load(path)
 
 

@@ -33,7 +33,7 @@ def test_a_tile_cannot_be_named_by_a_path(copy, tmp_path, capsys):
     (copy / "plan.json").write_text(json.dumps(plan))
     for words in (["status"], ["fit"], ["mesh"]):
         said = refusal(capsys, copy, "tiles", *words, copy)
-        assert "plan.json is not a whole plan" in said
+        assert "plan.json is not a complete plan" in said
         assert "secret" not in said
     assert [(path.name, path.read_text()) for path in victim.iterdir()] == [("failed.txt", "secret")]
 
@@ -50,7 +50,7 @@ def test_types_of_a_plan_are_checked(copy):
             try:
                 loaded = Plan.load(copy)
             except ValueError as error:
-                assert str(error).startswith(f"{path} is not a whole plan: ")  # noqa: PT017
+                assert str(error).startswith(f"{path} is not a complete plan: ")  # noqa: PT017
                 refused += 1
             else:
                 assert all(map_path(copy, tile).parent.parent == copy / "tiles" for tile in loaded.tiles)
@@ -60,7 +60,7 @@ def test_types_of_a_plan_are_checked(copy):
 @pytest.mark.parametrize("text", ["", "[]", "null", "{}", "[" * 5000, '{"format": 1}', "\xff"])
 def test_an_invalid_plan_is_rejected(copy, text):
     (copy / "plan.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(ValueError, match="is not a whole plan: "):
+    with pytest.raises(ValueError, match="is not a complete plan: "):
         Plan.load(copy)
 
 
@@ -83,5 +83,5 @@ def test_damaged_parts_of_a_mesh_are_rejected(copy):
         arrays = dict(file)
     for damaged in (arrays | {"faces": np.zeros((2, 2))}, {"vertices": arrays["vertices"]}):
         np.savez(path, **damaged)
-        with pytest.raises(ValueError, match=f"{path.name} is not a whole"):
+        with pytest.raises(ValueError, match=f"{path.name} is not a complete"):
             radarsdf.load(copy).mesh(0.2, progress=False)

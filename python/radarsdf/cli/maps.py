@@ -73,7 +73,7 @@ def evaluate(given: Namespace, results: Results) -> None:
     ground_truth = scans.ground_truth if scans is not None else read_ground_truth(truth)
     if ground_truth is None and holdout is None:
         msg = (
-            f"{truth} has no lidar points: lidar_points in an .npz file, lidar.pcd or lidar.ply in a folder; "
+            f"{truth} has no lidar points: lidar_points or ground_truth in an .npz file, lidar.pcd or lidar.ply in a folder; "
             "--holdout N evaluates intensities"
         )
         raise ValueError(msg)

@@ -88,7 +88,7 @@ class Checkpoint:
         except OSError:
             raise
         except Exception as error:  # damaged files raise exceptions of many kinds
-            msg = f"{self._path} is not a whole checkpoint of this fit: {error}"
+            msg = f"{self._path} is not a complete checkpoint of this fit: {error}"
             raise ValueError(msg) from error
 
     def _check_identity(self) -> None:

@@ -264,7 +264,7 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
             for connection in reader.connections:
                 name = connection.topic
                 named = isinstance(name, str) and isinstance(connection.msgtype, str)
-                check(named, f"{path} is not a whole bag: a topic has no name or no type")
+                check(named, f"{path} is not a complete bag: a topic has no name or no type")
                 count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
                 topics[name] = Topic(name, connection.msgtype, count)
     return topics
@@ -291,7 +291,7 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
                 content = _READERS[message_type](message)
             except Exception as error:  # noqa: BLE001 - damaged messages raise exceptions of many kinds
                 at = f"message {number} of {topic}, at {recorded_s:.3f} s"
-                damaged.setdefault(topic, []).append(f"{path}: {at}, is not a whole {message_type}: {error}")
+                damaged.setdefault(topic, []).append(f"{path}: {at}, no complete {message_type}: {error}")
                 continue
             yield Message(path, topic, message_type, recorded_s, number, *_stamp(message), content)
     for topic, texts in damaged.items():
@@ -350,5 +350,5 @@ def _opened(path: Path) -> Iterator[Any]:
 def _damaged(path: Path, error: Exception) -> ValueError:
     remedy = "if its recording was cut off, mcap recover or rosbag reindex may repair it"
     return ValueError(
-        f"{path} is not a whole bag: {(str(error) or type(error).__name__).rstrip('.')}; {remedy}"
+        f"{path} is not a complete bag: {(str(error) or type(error).__name__).rstrip('.')}; {remedy}"
     )

@@ -54,7 +54,7 @@ def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
             raise
         if not isinstance(error, Exception) and type(error).__name__ != _PANIC:
             raise
-        msg = f"{path} is not a whole {suffix} file of points: {error}"
+        msg = f"{path} is not a complete {suffix} file of points: {error}"
         raise ValueError(msg) from error
 
 

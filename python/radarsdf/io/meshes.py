@@ -15,7 +15,7 @@ from radarsdf.checks import check, path_of, positions
 from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.clouds import has_faces, ply_bytes, read_points
 from radarsdf.io.files import check_fits_float32, check_regular_file, write_whole
-from radarsdf.io.npz import arrays_of
+from radarsdf.io.npz import TRUTH_ARRAYS, arrays_of
 from radarsdf.scans import Columns
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
-_TRUTH_ARRAYS = ("lidar_points", "points")  # the first of these that a file has is used
 _SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 
@@ -139,8 +138,9 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
         samples: Any = mesh.sample(_SAMPLES, return_index=True, seed=0)
         return np.asarray(samples[0], np.float64)
     if suffix == ".npz":
-        arrays = arrays_of(file, _TRUTH_ARRAYS)
-        check(arrays, f"{path} has no ground truth: it lacks an array {' or '.join(_TRUTH_ARRAYS)}")
+        names = (*TRUTH_ARRAYS, "points")
+        arrays = arrays_of(file, names)
+        check(arrays, f"{path} has no ground truth: it lacks an array {' or '.join(names)}")
         name, points = next(iter(arrays.items()))
         return positions(points, f"{path}: {name}")
     return read_points(file)

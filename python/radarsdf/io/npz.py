@@ -25,8 +25,9 @@ _ALWAYS_UNPACKED = 1 << 28  # bytes; smaller files are accepted at any compressi
 _IMU = ("imu_times", "angular_velocity", "specific_force", "R_sensor_imu")  # in the order of Imu's fields
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "points": ("N", 3), "frame": ("N",), "poses": ("F", 4, 4), "intensity": ("N",), "static": ("N",), "doppler": ("N",),
-    "times": ("F",), "sigma": ("N", 3), "lidar_points": ("M", 3),
+    "times": ("F",), "sigma": ("N", 3), "lidar_points": ("M", 3), "ground_truth": ("M", 3),
 }  # fmt: skip
+TRUTH_ARRAYS = ("lidar_points", "ground_truth")  # the first of these that a file has is used
 
 
 def read_scans(path: str | PathLike[str]) -> Scans:
@@ -42,7 +43,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         - ``frame`` (N,): row of ``poses`` for each return;
         - ``intensity`` (N,), optional: sensor units;
         - ``static`` (N,) bool, optional: only returns with True are used;
-        - ``lidar_points`` (M, 3), optional: ground truth, world frame, m;
+        - ``lidar_points`` or ``ground_truth`` (M, 3), optional: ground truth, world frame, m;
         - ``doppler`` (N,), optional: m/s;
         - ``times`` (F,), optional: time of each scan, s;
         - ``sigma`` (N, 3), optional: the sensor's own standard deviations of range, azimuth and elevation, m, rad, rad;
@@ -82,7 +83,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
         points=by_scan("points") or [],
         poses=arrays["poses"][frames].astype(np.float64),
         intensities=by_scan("intensity"),
-        ground_truth=arrays.get("lidar_points"),
+        ground_truth=next((arrays[name] for name in TRUTH_ARRAYS if name in arrays), None),
         doppler_mps=by_scan("doppler"),
         times_s=arrays["times"][frames].astype(np.float64) if "times" in arrays else None,
         sigmas=by_scan("sigma"),
@@ -144,7 +145,7 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
 def array_in(path: Path) -> NDArray[Any]:
     """Map the array of an ``.npy`` file into memory; a header that claims more than the file holds is refused."""
     check_regular_file(path)
-    with reading(path, "a whole .npy file", EOFError):
+    with reading(path, "a complete .npy file", EOFError):
         array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
         return array
 
@@ -154,7 +155,7 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
     check_regular_file(path)
     arrays = {}
     # Damaged files raise exceptions of many kinds, including OSError.
-    with reading(path, "a whole .npz file", Exception), zipfile.ZipFile(path) as file:
+    with reading(path, "a complete .npz file", Exception), zipfile.ZipFile(path) as file:
         held = set(file.namelist())
         members = {name: file.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in held}
         unpacked = sum(member.file_size for member in members.values())

@@ -97,7 +97,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
     except SafetensorError as error:
         raise _damaged(path) from error
     except Exception as error:  # damaged files raise exceptions of many kinds
-        msg = f"{path} is not a whole radarsdf map: {error}"
+        msg = f"{path} is not a complete radarsdf map: {error}"
         raise ValueError(msg) from error
     raise ValueError(foreign)
 
@@ -243,7 +243,7 @@ def _check(fits: Any, text: str) -> None:
 
 
 def _damaged(path: str | PathLike[str]) -> ValueError:
-    return ValueError(f"{path} is not a whole radarsdf map: it is cut off, damaged, or of another kind")
+    return ValueError(f"{path} is not a complete radarsdf map: truncated, damaged, or of another format")
 
 
 class _Report(TypedDict, total=False):

@@ -77,7 +77,7 @@ def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
     try:
         check_arrays(arrays, wanted)
     except ValueError as error:
-        msg = f"{path} is not a whole part of a mesh: {error}"
+        msg = f"{path} is not a complete part of a mesh: {error}"
         raise ValueError(msg) from error
     return arrays
 

@@ -216,7 +216,7 @@ class Plan:
                 **described,
             )
         except Exception as error:  # damaged files raise exceptions of many kinds
-            msg = f"{path} is not a whole plan: {error}"
+            msg = f"{path} is not a complete plan: {error}"
             raise ValueError(msg) from error
 
 
@@ -259,5 +259,5 @@ def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
         with open_tensors(path, "np") as file:
             return checked_report(json.loads(file.metadata["description"])["report"])
     except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        msg = f"{path} is not a whole radarsdf map: {error}"
+        msg = f"{path} is not a complete radarsdf map: {error}"
         raise ValueError(msg) from error
