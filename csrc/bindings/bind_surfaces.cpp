@@ -1,7 +1,5 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
-#include <pybind11/numpy.h>
-#include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 #include <pybind11/typing.h>
 
@@ -11,19 +9,15 @@
 #include <utility>
 #include <vector>
 
+#include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
-#include "surface/grid_distances.hpp"
+#include "surface/grid_surface.hpp"
 #include "surface/marching_cubes.hpp"
 #include "surface/mesh_components.hpp"
 #include "surface/sparse_lattice.hpp"
 
-namespace py = pybind11;
-
 namespace radarsdf {
 namespace {
-
-template <typename T>
-using Array = py::array_t<T, py::array::c_style>;
 
 // NumPy array that takes ownership of the memory.
 template <typename T>
@@ -168,20 +162,38 @@ py::array_t<double> areas_of_vertices(const Array<double>& vertices, const Array
   return areas;
 }
 
-Array<float> distances_at_corners(const VertexTable& table, const Array<float>& distances_m,
-                                  const Array<std::int32_t>& corners, int parts, int num_threads) {
-  check_columns(corners, 3, "corners must have shape (K, 3)");
+// Validated distances at the rows of the table.
+const float* stored_distances(const VertexTable& table, const Array<float>& distances_m) {
   if (distances_m.ndim() != 1 || distances_m.shape(0) != table.num_rows()) {
     throw std::invalid_argument("distances_m must have shape (num_rows,)");
   }
-  Array<float> found(corners.shape(0));
-  float* result = found.mutable_data();
-  const float* distances = distances_m.data();
-  const std::int32_t* positions = corners.data();
-  const std::int64_t num_corners = corners.shape(0);
-  const py::gil_scoped_release nogil;
-  grid_distances(table, distances, positions, num_corners, parts, result, num_threads);
-  return found;
+  return distances_m.data();
+}
+
+Array<std::int32_t> near_surface(const VertexTable& table, const Array<float>& distances_m, float margin_m,
+                                 int num_threads) {
+  const float* distances = stored_distances(table, distances_m);
+  std::vector<std::int32_t> rows;
+  {
+    const py::gil_scoped_release nogil;
+    rows = cells_near_surface(table, distances, margin_m, num_threads);
+  }
+  return to_array(std::move(rows));
+}
+
+Arrays<double, std::int32_t> surface_of_grid(const VertexTable& table, const Array<float>& distances_m,
+                                             const Array<std::int32_t>& cells, int parts, double voxel_size,
+                                             const std::array<std::int32_t, 3>& lowest,
+                                             const std::array<std::int32_t, 3>& highest, int num_threads) {
+  const float* distances = stored_distances(table, distances_m);
+  const std::int64_t num_cells = check_column(cells, "cells");
+  const std::int32_t* rows = cells.data();
+  Mesh mesh;
+  {
+    const py::gil_scoped_release nogil;
+    mesh = grid_surface(table, distances, rows, num_cells, {parts, voxel_size, lowest, highest}, num_threads);
+  }
+  return adopt_mesh(std::move(mesh));
 }
 
 template <typename T>
@@ -203,10 +215,16 @@ void bind_for_type(py::module_& m) {
 }  // namespace
 
 void bind_surfaces(py::module_& m, VertexTableClass& table) {
-  table.def("distances_at", &distances_at_corners, py::arg("distances_m").noconvert(), py::arg("corners").noconvert(),
-            py::arg("parts"), py::arg("num_threads") = 0,
-            "For an octree, trilinear interpolation of `distances_m` (num_rows,) float32 at `corners` (K, 3) int32 of "
-            "voxels, with `parts` voxels per edge of a leaf cell: (K,) float32. NaN outside all cells.");
+  using py::arg;
+  table.def(
+      "cells_near_surface", &near_surface, arg("distances_m").noconvert(), arg("margin_m"), arg("num_threads") = 0,
+      "For an octree with `distances_m` (num_rows,) float32 at its corners, the rows (S,) int32 of the leaf cells "
+      "with corners not all farther than `margin_m` from the surface, on the same side.");
+  table.def("surface", &surface_of_grid, arg("distances_m").noconvert(), arg("cells").noconvert(), arg("parts"),
+            arg("voxel_size"), arg("lowest"), arg("highest"), arg("num_threads") = 0,
+            "Vertices (V, 3) float64, m, and faces (F, 3) int32 of the surface in the leaf cells with these rows (S,) "
+            "int32, by trilinear interpolation at the corners of voxels: `parts` per edge of a leaf cell, with lattice "
+            "coordinates from `lowest` to `highest`.");
   bind_for_type<float>(m);
   bind_for_type<double>(m);
   m.def("sparse_lattice", &lattice, py::arg("cells").noconvert(), py::arg("num_threads") = 0);

@@ -3,6 +3,7 @@
 #include "surface/mesh_components.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <numeric>
 #include <stdexcept>
@@ -59,6 +60,28 @@ MeshComponents mesh_components(const int32_t* faces, int64_t num_faces, int64_t 
     ++components.sizes[static_cast<std::size_t>(label)];
   }
   return components;
+}
+
+void vertex_areas(const double* vertices, int64_t num_vertices, const int32_t* faces, int64_t num_faces,
+                  double* areas) {
+  for (int64_t v = 0; v < num_vertices; ++v) areas[v] = 0;
+  for (int64_t f = 0; f < num_faces; ++f) {
+    if (f % (1 << 18) == 0) check_interrupt();
+    const double* corners[3];
+    for (int c = 0; c < 3; ++c) {
+      const int32_t v = faces[3 * f + c];
+      if (v < 0 || v >= num_vertices) throw std::invalid_argument("a face refers to a vertex that does not exist");
+      corners[c] = vertices + 3 * int64_t{v};
+    }
+    double a[3], b[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      a[axis] = corners[1][axis] - corners[0][axis];
+      b[axis] = corners[2][axis] - corners[0][axis];
+    }
+    const double x = a[1] * b[2] - a[2] * b[1], y = a[2] * b[0] - a[0] * b[2], z = a[0] * b[1] - a[1] * b[0];
+    const double sixth = std::sqrt(x * x + y * y + z * z) / 6;
+    for (int c = 0; c < 3; ++c) areas[faces[3 * f + c]] += sixth;
+  }
 }
 
 }  // namespace radarsdf

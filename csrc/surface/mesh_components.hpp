@@ -17,4 +17,9 @@ struct MeshComponents {
 // nearly linear time.
 MeshComponents mesh_components(const std::int32_t* faces, std::int64_t num_faces, std::int64_t num_vertices);
 
+// areas: (num_vertices), a third of the area of the incident triangles (num_faces, 3) of each vertex (num_vertices, 3).
+// Throws std::invalid_argument for a face with a vertex out of range.
+void vertex_areas(const double* vertices, std::int64_t num_vertices, const std::int32_t* faces, std::int64_t num_faces,
+                  double* areas);
+
 }  // namespace radarsdf

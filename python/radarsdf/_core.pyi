@@ -248,6 +248,15 @@ class VertexTable:
         """
         Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed like `scatter`, on the other threads of `pool`; its `finish` waits for it. The state is `moments` (num_rows, 16) and `marks` (num_rows, 2) int32: the last step that updated a row, and a zero. `decays` (more than step, 2) are the powers of both betas.
         """
+    def cells_near_surface(
+        self,
+        distances_m: numpy.typing.NDArray[numpy.float32],
+        margin_m: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.int32]:
+        """
+        For an octree with `distances_m` (num_rows,) float32 at its corners, the rows (S,) int32 of the leaf cells with corners not all farther than `margin_m` from the surface, on the same side.
+        """
     @typing.overload
     def coordinate_gradient(
         self,
@@ -275,16 +284,6 @@ class VertexTable:
     ) -> None:
         """
         Writes the gradient of (interpolate . out_grad) by the points to `points_grad` (N, 3), 1/m.
-        """
-    def distances_at(
-        self,
-        distances_m: numpy.typing.NDArray[numpy.float32],
-        corners: numpy.typing.NDArray[numpy.int32],
-        parts: typing.SupportsInt | typing.SupportsIndex,
-        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
-    ) -> numpy.typing.NDArray[numpy.float32]:
-        """
-        For an octree, trilinear interpolation of `distances_m` (num_rows,) float32 at `corners` (K, 3) int32 of voxels, with `parts` voxels per edge of a leaf cell: (K,) float32. NaN outside all cells.
         """
     @typing.overload
     def encode(
@@ -432,6 +431,23 @@ class VertexTable:
     ) -> numpy.typing.NDArray[numpy.float32]:
         """
         For an octree, smooths `distances_m` (num_rows,) float32 by `iterations` steps towards the minimum of squared residuals from planes through `points` (N, 3) with `normals` (N, 3) and `information` (N,), m^-2, all float32, local frame, plus bending energy. Vertices stay on the `sides` (num_rows,) int8 of `average_rays`. An iteration propagates information by SMOOTHING_REACH vertices.
+        """
+    def surface(
+        self,
+        distances_m: numpy.typing.NDArray[numpy.float32],
+        cells: numpy.typing.NDArray[numpy.int32],
+        parts: typing.SupportsInt | typing.SupportsIndex,
+        voxel_size: typing.SupportsFloat | typing.SupportsIndex,
+        lowest: typing.Annotated[
+            collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], "FixedSize(3)"
+        ],
+        highest: typing.Annotated[
+            collections.abc.Sequence[typing.SupportsInt | typing.SupportsIndex], "FixedSize(3)"
+        ],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32]]:
+        """
+        Vertices (V, 3) float64, m, and faces (F, 3) int32 of the surface in the leaf cells with these rows (S,) int32, by trilinear interpolation at the corners of voxels: `parts` per edge of a leaf cell, with lattice coordinates from `lowest` to `highest`.
         """
     @property
     def encoding(self) -> Encoding: ...

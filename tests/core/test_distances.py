@@ -10,7 +10,9 @@ import torch
 import trimesh
 from radarsdf._core import CellBlocks, CellSet, Encoding, VertexTable, cell_keys, vertex_areas
 from radarsdf.field.grid_field import GridField
+from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from scipy.linalg import lstsq
+from scipy.spatial import cKDTree
 
 LEAF_M = 0.2
 
@@ -326,47 +328,73 @@ def grid_field(cells, seed=0):
     return field
 
 
-def distances_at(field, corners, parts, num_threads=1):
-    return field.table.distances_at(field.leaf_corners().distances_m, corners, parts, num_threads)
+def surface(field, parts, lowest=(-99,) * 3, highest=(99,) * 3, num_threads=1):
+    distances_m = field.corner_distances_m()
+    rows = field.table.cells_near_surface(distances_m, 0.0, num_threads)
+    return field.table.surface(distances_m, rows, parts, EDGE_M / parts, lowest, highest, num_threads)
 
 
-@pytest.mark.parametrize("parts", [1, 2, 3])
-def test_corners_inside_a_cell_equal_the_field(parts):
-    rng = np.random.default_rng(1)
-    cells = rng.integers(-6, 6, (200, 3))
-    field = grid_field(cells)
-    corners = (
-        (cells[:, None] * parts + np.indices((parts + 1,) * 3).reshape(3, -1).T)
-        .reshape(-1, 3)
-        .astype(np.int32)
-    )
-    found = distances_at(field, corners, parts)
-    # Moved into the cell by a millionth: there may be no cell outside.
-    centres = np.repeat((cells + 0.5) * EDGE_M, (parts + 1) ** 3, axis=0)
-    inside = corners * (EDGE_M / parts) + 1e-6 * (centres - corners * (EDGE_M / parts))
-    expected = field.sdf(torch.from_numpy(inside.astype(np.float32))).detach().numpy()
-    np.testing.assert_allclose(found, expected, atol=3e-5)
+def expected_surface(field, parts, lowest, highest):
+    """The surface from interpolation at the corners of all voxels."""
+    inside = np.indices((parts,) * 3).reshape(3, -1).T
+    voxels = (field.table.leaf_cells()[:, None] * parts + inside).reshape(-1, 3)
+    voxels = voxels[((voxels >= lowest) & (voxels <= highest)).all(axis=1)]
+    voxels, corners, voxel_corners = sparse_lattice(voxels)
+    centres, at = np.zeros((2, len(corners), 3))
+    at[voxel_corners] = corners[voxel_corners]
+    centres[voxel_corners] = voxels[:, None] + 0.5
+    inside = (at + 1e-5 * (centres - at)) * (EDGE_M / parts)  # beyond a face, there may be no cell
+    values = field.sdf(torch.from_numpy(inside.astype(np.float32))).detach().numpy()
+    return extract_cells(corners, values, voxel_corners, spacing=[EDGE_M / parts] * 3)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 4])
+@pytest.mark.parametrize(("lowest", "highest"), [((-99,) * 3, (99,) * 3), ((-3, -2, -9), (5, 7, 4))])
+def test_the_surface_between_corners_is_that_of_all_voxels(parts, lowest, highest):
+    field = grid_field(np.random.default_rng(1).integers(-3, 3, (120, 3)))
+    vertices, faces = surface(field, parts, lowest, highest)
+    expected_vertices, expected_faces = expected_surface(field, parts, lowest, highest)
+    assert len(vertices) == len(expected_vertices)
+    assert len(faces) == len(expected_faces) > 30
+    off_m, rows = cKDTree(expected_vertices).query(vertices)
+    assert off_m.max() < 1e-4
+    assert len(np.unique(rows)) == len(rows)
+    turned = [np.roll(face, -np.argmin(face)).tolist() for face in rows[faces]]
+    assert sorted(turned) == sorted(np.roll(face, -np.argmin(face)).tolist() for face in expected_faces)
     for threads in (2, 3):
-        assert distances_at(field, corners, parts, threads).tobytes() == found.tobytes()
+        again = surface(field, parts, lowest, highest, threads)
+        assert [array.tobytes() for array in again] == [vertices.tobytes(), faces.tobytes()]
 
 
-def test_corners_of_cells_have_the_stored_distances():
-    field = grid_field(np.indices((3, 3, 3)).reshape(3, -1).T - 1)
-    stored = field.leaf_corners()
-    np.testing.assert_array_equal(distances_at(field, 3 * stored.corners, 3), stored.distances_m)
+def test_cells_near_the_surface_have_corners_near_it_or_on_both_sides():
+    field = grid_field(np.indices((5, 5, 5)).reshape(3, -1).T - 2)
+    distances_m = field.corner_distances_m()
+    of_cells = distances_m[field.table.leaf_vertices()[1]]
+    for margin_m in (0.0, 0.5):
+        expected = (of_cells.min(axis=1) <= margin_m) & (of_cells.max(axis=1) >= -margin_m)
+        found = field.table.cells_near_surface(distances_m, margin_m, 2)
+        np.testing.assert_array_equal(found, np.flatnonzero(expected))
+    distances_m[of_cells.argmax() // 8] = np.nan
+    unknown = np.isnan(distances_m[field.table.leaf_vertices()[1]]).any(axis=1)
+    assert unknown.any()
+    assert not unknown[field.table.cells_near_surface(distances_m, 0.0)].any()
 
 
-def test_a_corner_outside_all_cells_is_nan():
+def test_a_surface_needs_corners_in_space_and_cells_that_exist():
     field = grid_field([[0, 0, 0]])
-    corners = np.array([[0, 0, 0], [2, 2, 2], [3, 0, 0], [-1, 0, 0], [2**30, 0, 0]], np.int32)
-    assert np.isnan(distances_at(field, corners, 2)).tolist() == [False, False, True, True, True]
     flat = VertexTable(field.table.leaf_keys(), EDGE_M, 1, Encoding.TRI_QUADTREE)
+    none, limits = np.zeros(0, np.int32), ([0] * 3, [1] * 3)
     with pytest.raises(ValueError, match="octree"):
-        flat.distances_at(np.zeros(flat.num_rows, np.float32), corners, 2)
+        flat.surface(np.zeros(flat.num_rows, np.float32), none, 2, 0.1, *limits)
+    with pytest.raises(ValueError, match="octree"):
+        flat.cells_near_surface(np.zeros(flat.num_rows, np.float32), 0.0)
     with pytest.raises(ValueError, match="distances_m"):
-        field.table.distances_at(np.zeros(3, np.float32), corners, 2)
+        field.table.surface(np.zeros(3, np.float32), none, 2, 0.1, *limits)
     with pytest.raises(ValueError, match="parts"):
-        distances_at(field, corners, 0)
+        field.table.surface(field.corner_distances_m(), none, 0, 0.1, *limits)
+    for wrong in (-1, 1):
+        with pytest.raises(ValueError, match="cell"):
+            field.table.surface(field.corner_distances_m(), np.array([wrong], np.int32), 2, 0.1, *limits)
 
 
 def test_areas_at_vertices_are_thirds_of_the_triangles():

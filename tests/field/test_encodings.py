@@ -108,7 +108,8 @@ def test_the_gradient_is_the_derivative(field):
 
 
 def test_corners_equal_the_stored_values(field):
-    corners, of_cells, distances_m = field.leaf_corners()
+    corners, of_cells = field.table.leaf_vertices()
+    distances_m = field.corner_distances_m()
     x = torch.from_numpy(((field.table.leaf_cells() + 0.5) * LEAF_M).astype(np.float32))
     np.testing.assert_allclose(field.sdf(x).detach(), distances_m[of_cells].mean(axis=1), atol=1e-6)
     np.testing.assert_allclose(distances_m, corners @ SLOPE * LEAF_M + 0.1, atol=1e-6)

@@ -65,11 +65,13 @@ def test_intensities_have_a_closed_form():
     assert np.median(error) < 2.0  # of about 20 dB from near to far
 
 
-def test_the_mesh_of_stored_corners_equals_that_of_the_field():
+@pytest.mark.parametrize("voxel_size", [0.1, 0.2])
+def test_the_mesh_of_stored_corners_equals_that_of_the_field(monkeypatch, voxel_size):
     scene = ground_and_wall()
     radar_map = radarsdf.fit(scene.points, scene.poses, config=FitConfig.quick(), progress=False)
-    everywhere = [[-100.0] * 3, [100.0] * 3]  # a box: corners are looked up one by one
-    one, other = radar_map.mesh(0.2), radar_map.mesh(0.2, box=everywhere)
+    one = radar_map.mesh(voxel_size)
+    monkeypatch.setattr(GridField, "corner_distances_m", lambda _: None)
+    other = radar_map.mesh(voxel_size)
     # Distances near zero may change sign: a triangle more or less.
     assert len(one.faces) == pytest.approx(len(other.faces), rel=1e-3)
     assert len(one.faces) > 1000
@@ -77,7 +79,7 @@ def test_the_mesh_of_stored_corners_equals_that_of_the_field():
         off_m = cKDTree(a.vertices).query(b.vertices)[0]
         assert np.median(off_m) < 1e-4
         assert np.quantile(off_m, 0.99) < 0.005  # on the border, where the other is evaluated slightly inside
-    assert one.metadata["leaf_cells"] == one.metadata["leaf_cells_searched"]
+    assert one.metadata["leaf_cells"] > one.metadata["leaf_cells_searched"] > 0
 
 
 def test_ghosts_of_a_part_equal_those_of_the_whole():

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,14 +14,6 @@ from torch import Tensor, nn
 from radarsdf._core import VertexTable
 from radarsdf.field import kernels
 from radarsdf.returns.reflectance import Reflectance
-
-
-class LeafCorners(NamedTuple):
-    """Signed distances at the corners of all leaf cells."""
-
-    corners: NDArray[np.int32]  # (V, 3) lattice coordinates, leaf cells from the origin
-    of_cells: NDArray[np.int32]  # (C, 8) rows of `corners` for each leaf cell, in C order
-    distances_m: NDArray[np.float32]  # (V,)
 
 
 class Field(nn.Module, ABC):
@@ -63,8 +54,8 @@ class Field(nn.Module, ABC):
         """Return a mask (N,) of the points (N, 3), local frame, m, in occupied leaf cells."""
         return kernels.locate(points, self.table)[:, 0] >= 0
 
-    def leaf_corners(self) -> LeafCorners | None:
-        """Return the distances stored at the corners of leaf cells. None if they must be evaluated by :meth:`sdf`."""
+    def corner_distances_m(self) -> NDArray[np.float32] | None:
+        """Return the distances of which :meth:`sdf` is the trilinear interpolation, by row of the table; None if it is not."""
         return None
 
     @property

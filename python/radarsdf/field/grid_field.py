@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from radarsdf._core import Encoding, VertexTable
 from radarsdf.field import kernels
-from radarsdf.field.field import Field, LeafCorners
+from radarsdf.field.field import Field
 
 
 class GridField(Field):
@@ -44,9 +44,9 @@ class GridField(Field):
         # The closed form is unbounded; intensities beyond the range of the returns were never measured.
         return self._closed_form(points, directions, ranges_m).clamp(0, 1)
 
-    def leaf_corners(self) -> LeafCorners:
-        corners, of_cells = self.table.leaf_vertices()
-        return LeafCorners(corners, of_cells, self.distances_m.detach().numpy())
+    def corner_distances_m(self) -> NDArray[np.float32]:
+        found: NDArray[np.float32] = self.distances_m.detach().numpy()
+        return found
 
     @cached_property
     def _corners_of_cells(self) -> Tensor:

@@ -55,9 +55,7 @@ class Surface:
         progress: bool | None = False,
     ) -> Surface:
         """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
-        corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
-        options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": torch.get_num_threads()}
-        vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
+        vertices, faces, searched = extract_triangles(contents, voxel_size, box, progress)
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
         evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
         return cls.from_triangles(contents, vertices, faces, evidence, searched)
@@ -187,6 +185,39 @@ def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDA
 # Voxels
 
 
+def extract_triangles(
+    contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
+) -> tuple[NDArray[np.float64], NDArray[np.int32], int]:
+    """Triangulate the surface in voxels. `box` (2, 3), local frame, m, limits their centres.
+
+    Returns vertices (V, 3), local frame, m, faces (F, 3), and the number of leaf cells searched.
+    """
+    stored_m = contents.field.corner_distances_m()
+    if stored_m is not None and per_cell(voxel_size, contents.config.leaf_size_m)[1]:
+        return _between_corners(contents, stored_m, voxel_size, box)
+    corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
+    options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": torch.get_num_threads()}
+    return *extract_cells(corners, distances_m, voxel_corners, **options), searched
+
+
+def _between_corners(
+    contents: MapContents, stored_m: NDArray[np.float32], voxel_size: float, box: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.int32], int]:
+    """Triangulate distances stored at the corners of leaf cells, in voxels that divide these evenly."""
+    table, num_threads = contents.field.table, torch.get_num_threads()
+    rows = table.cells_near_surface(stored_m, 0.0, num_threads)
+    limits = np.array([[-np.inf] * 3, [np.inf] * 3])
+    if box is not None:
+        rows = rows[_overlap(table.leaf_cells()[rows], contents.config.leaf_size_m, box)]
+        limits = box / voxel_size - 0.5
+    parts, _ = per_cell(voxel_size, contents.config.leaf_size_m)
+    _check_voxels(len(rows), voxel_size, parts, True, contents.config)
+    lowest, highest = np.clip([np.ceil(limits[0]), np.floor(limits[1])], -_MAX_VOXELS, _MAX_VOXELS).astype(
+        int
+    )
+    return *table.surface(stored_m, rows, parts, voxel_size, lowest, highest, num_threads), len(rows)
+
+
 def sample_lattice(
     contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], int]:
@@ -198,31 +229,33 @@ def sample_lattice(
     config, num_threads = contents.config, torch.get_num_threads()
     leaf_size_m = config.leaf_size_m
     parts, even = per_cell(voxel_size, leaf_size_m)
-    stored = contents.field.leaf_corners() if box is None else None
-    if stored is not None and even and parts == 1:
-        return *stored, len(stored.of_cells)
     cells = contents.field.table.leaf_cells()
+    stored_m = contents.field.corner_distances_m()
+    if stored_m is not None and voxel_size < leaf_size_m:
+        cells = cells[contents.field.table.cells_near_surface(stored_m, _CLEARLY * leaf_size_m, num_threads)]
     if box is not None:
-        lower, upper = box
-        cells = cells[(((cells + 1) * leaf_size_m >= lower) & (cells * leaf_size_m <= upper)).all(axis=1)]
-    if stored is not None and voxel_size < leaf_size_m:
-        cells = cells[_near_surface(stored.distances_m[stored.of_cells], leaf_size_m)]
-    elif voxel_size < leaf_size_m and contents.field.smooth_in_cells:
+        cells = cells[_overlap(cells, leaf_size_m, box)]
+    if stored_m is None and voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
     voxels = _voxels_of(cells, voxel_size, parts, even, config)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
-        voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
+        voxels = voxels[((centres >= box[0]) & (centres <= box[1])).all(axis=1)]
     if voxel_size < leaf_size_m and not even:
         # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
         centre = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
         voxels = voxels[_occupied(contents, centre)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
-    if stored is not None and even:
-        distances_m = contents.field.table.distances_at(stored.distances_m, corners, parts, num_threads)
-    else:
-        distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
+    distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return corners, voxel_corners, distances_m, len(cells)
+
+
+def _overlap(cells: NDArray[np.int32], leaf_size_m: float, box: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return a mask (M,) of the leaf cells (M, 3) that overlap a box (2, 3), m."""
+    found: NDArray[np.bool_] = (((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])).all(
+        axis=1
+    )
+    return found
 
 
 def crossed(
@@ -264,21 +297,26 @@ def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.
     return inside
 
 
+def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config: FitConfig) -> None:
+    if (
+        max(cells, 1) * (parts + 1) ** 3 > _MAX_VOXELS
+    ):  # with the number of a cell, so that coordinates are int32, too
+        msg = f"voxels of {voxel_size} m are too many for {cells} cells of {config.leaf_size_m} m: use larger ones"
+        raise ValueError(msg)
+    check_mesh(cells * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
+
+
 def _voxels_of(
     cells: NDArray[np.int32], voxel_size: float, parts: int, even: bool, config: FitConfig
 ) -> NDArray[np.int32]:
     """Return the voxels (M, 3) that overlap leaf cells, with duplicates. `parts`, `even`: see :func:`per_cell`."""
-    leaf_size_m = config.leaf_size_m
-    if max(len(cells) * (parts + 1) ** 3, int(np.abs(cells).max(initial=0)) * parts) > _MAX_VOXELS:
-        msg = f"voxels of {voxel_size} m are too many for {len(cells)} cells of {leaf_size_m} m: use larger ones"
-        raise ValueError(msg)
-    check_mesh(len(cells) * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
+    _check_voxels(len(cells), voxel_size, parts, even, config)
     if even:
         return subdivided(cells, parts)
     # Points across a cell, at most a voxel apart, hit every voxel that overlaps it.
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
     inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    voxels = np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32)
+    voxels = np.floor((cells[:, None] + inside) * (config.leaf_size_m / voxel_size)).astype(np.int32)
     return voxels.reshape(-1, 3)
 
 
