@@ -12,6 +12,7 @@
 #include "lattice/cell.hpp"
 #include "lattice/morton.hpp"
 #include "util/bits.hpp"
+#include "util/large_array.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
@@ -276,39 +277,51 @@ void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int
 void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, int columns,
                        const float* points, std::int64_t count, float* interpolated, int num_threads) {
   const auto size_m = static_cast<float>(cell_size_m);
+  // Rows of whole vectors, and one of zeros for empty cells.
+  constexpr int kLanes = 4;
+  const std::int64_t width = (columns + kLanes - 1) / kLanes * kLanes;
+  LargeVector<float> padded(static_cast<std::size_t>(width * (cells.size() + 1)));
+  for (std::int64_t row = 0; row < cells.size(); ++row)
+    std::copy_n(values + columns * row, columns, padded.data() + width * row);
   std::atomic<bool> inside{true};
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
     NearbyRows rows(cells);
+    // Of the previous point: vertices of a mesh mostly lie between the same cells.
+    std::int32_t last[3] = {-1, -1, -1};
+    std::int64_t near[8];
     for (std::int64_t i = begin; i < end; ++i) {
       float share[3];
       std::int32_t lower[3];
-      std::uint64_t parts[3][2];  // key bits of the lower and the upper cell along each axis
       for (int axis = 0; axis < 3; ++axis) {
         const float u = points[3 * i + axis] / size_m - 0.5F;
         if (!(std::abs(u) < static_cast<float>(kAxisBias - (1 << kMaxLevels)))) {
           inside = false;
           return;
         }
-        const float whole = std::floor(u);
-        share[axis] = u - whole;
-        lower[axis] = static_cast<std::int32_t>(whole) + kAxisBias;
-        for (std::uint32_t step = 0; step < 2; ++step) {
-          parts[axis][step] = spread_bits(static_cast<std::uint32_t>(lower[axis]) + step) << axis;
+        const std::int32_t whole = floor_to_int(u);
+        share[axis] = u - static_cast<float>(whole);
+        lower[axis] = whole + kAxisBias;
+      }
+      if (!std::equal(lower, lower + 3, last)) {
+        std::copy_n(lower, 3, last);
+        std::uint64_t parts[3][2];  // key bits of the lower and the upper cell along each axis
+        for (int axis = 0; axis < 3; ++axis)
+          for (std::uint32_t step = 0; step < 2; ++step)
+            parts[axis][step] = spread_bits(static_cast<std::uint32_t>(lower[axis]) + step) << axis;
+        for (int corner = 0; corner < 8; ++corner) {
+          const std::int32_t row = rows.row(parts[0][corner >> 2] | parts[1][corner >> 1 & 1] | parts[2][corner & 1]);
+          near[corner] = row >= 0 ? row : cells.size();
         }
       }
-      float* sums = interpolated + columns * i;
-      std::fill(sums, sums + columns, 0.0F);
-      for (int corner = 0; corner < 8; ++corner) {
-        float weight = 1;
-        std::uint64_t key = 0;
-        for (int axis = 0; axis < 3; ++axis) {
-          const int step = corner >> (2 - axis) & 1;
-          weight *= step != 0 ? share[axis] : 1 - share[axis];
-          key |= parts[axis][step];
+      const float x[2] = {1 - share[0], share[0]}, y[2] = {1 - share[1], share[1]}, z[2] = {1 - share[2], share[2]};
+      for (int first = 0; first < columns; first += kLanes) {
+        float sums[kLanes] = {};
+        for (int corner = 0; corner < 8; ++corner) {
+          const float weight = x[corner >> 2] * y[corner >> 1 & 1] * z[corner & 1];
+          const float* own = padded.data() + width * near[corner] + first;
+          for (int k = 0; k < kLanes; ++k) sums[k] += weight * own[k];
         }
-        const std::int32_t row = rows.row(key);
-        if (row < 0) continue;
-        for (int k = 0; k < columns; ++k) sums[k] += weight * values[columns * std::int64_t{row} + k];
+        std::copy_n(sums, std::min(kLanes, columns - first), interpolated + columns * i + first);
       }
     }
   });
