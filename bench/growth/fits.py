@@ -167,7 +167,8 @@ def surfel_row(returns: int, threads: int) -> Row:
     with measured() as of_ghosts:
         surfels = Surfels.of(rays, config.leaf_size_m, threads)
         noise = sensor_noise(surfels, rays, config.returns)
-        is_ghost = find_ghosts(surfels, rays, noise, threads)[surfels.cells_at(rays.points, threads)]
+        cells = surfels.cells_at(rays.points, threads)
+        is_ghost = find_ghosts(surfels, rays, cells, noise, threads)[cells]
     leaf_keys = near_leaf_keys(rays.select(~is_ghost), config, threads)
     columns = rays.points, rays.directions, rays.ranges_m, rays.scans
     with measured() as of_visibility:

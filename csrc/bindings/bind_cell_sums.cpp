@@ -100,30 +100,29 @@ void bind_cell_sums(py::module_& m) {
   m.def(
       "sum_returns",
       [](const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m,
-         const Array<std::int32_t>& cells, const Array<std::int64_t>& corners, double quantum_m, int num_threads) {
-        const std::int64_t num_cells = corners.ndim() == 2 ? corners.shape(0) : 0;
-        check_shape(corners, num_cells, 3, "corners");
+         const Array<std::int32_t>& cells, const Array<std::uint64_t>& keys, double leaf_size_m, int num_threads) {
+        const std::int64_t num_cells = check_column(keys, "keys");
         const std::int64_t count = check_cells_of_returns(cells, num_cells);
         check_shape(points, count, 3, "points");
         check_shape(directions, count, 3, "directions");
         if (check_column(ranges_m, "ranges_m") != count) throw std::invalid_argument("ranges_m must be one a return");
-        if (!(quantum_m > 0)) throw std::invalid_argument("quantum_m must be positive");
+        if (!(leaf_size_m > 0)) throw std::invalid_argument("leaf_size_m must be positive");
         const ReturnsInCells returns{points.data(), directions.data(), ranges_m.data(), cells.data(), count};
-        const std::int64_t* c = corners.data();
+        const std::uint64_t* k = keys.data();
         py::array_t<std::int64_t> sums({static_cast<py::ssize_t>(num_cells), py::ssize_t{kSums}});
         std::int64_t* result = sums.mutable_data();
         {
           const py::gil_scoped_release release;
-          sum_returns(returns, c, num_cells, quantum_m, result, num_threads);
+          sum_returns(returns, k, num_cells, leaf_size_m, result, num_threads);
         }
         return sums;
       },
       "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "cells"_a.noconvert(),
-      "corners"_a.noconvert(), "quantum_m"_a, "num_threads"_a = 0,
+      "keys"_a.noconvert(), "leaf_size_m"_a, "num_threads"_a = 0,
       "Sums over the returns of each cell, (C, 14) int64: 1, x, y, z, xx, xy, xz, yy, yz, zz, direction, range. "
-      "Lengths are in quanta, positions relative to the corners (C, 3) int64 of the cells, in quanta; directions are "
-      "multiplied by DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` (N,) float32; `cells` (N,) int32, "
-      "the row of each return's cell.");
+      "Lengths are in quanta, QUANTA per leaf cell, positions relative to the corners of the leaf cells with Morton "
+      "`keys` (C,) uint64; directions are multiplied by DIRECTION_QUANTA. `points`, `directions` (N, 3) and `ranges_m` "
+      "(N,) float32; `cells` (N,) int32, the row of each return's cell.");
   m.attr("QUANTA") = kQuanta;
   const auto check_sums = [](const Array<std::uint64_t>& keys, const Array<std::int64_t>& sums) {
     const std::int64_t count = check_column(keys, "keys");

@@ -40,14 +40,8 @@ class LatticeOf {
     if (!inside) throw std::invalid_argument(kOutside);
   }
 
-  std::uint64_t key(const T* point) const {  // requires holds(point)
-    std::int32_t cell[3];
-    for (int axis = 0; axis < 3; ++axis) {  // std::floor is a function call in the baseline
-      const T u = point[axis] * inverse_;
-      cell[axis] = static_cast<std::int32_t>(u);
-      cell[axis] -= u < static_cast<T>(cell[axis]) ? 1 : 0;
-    }
-    return lattice_key(cell);
+  void cell(const T* point, std::int32_t* cell) const {  // requires holds(point)
+    for (int axis = 0; axis < 3; ++axis) cell[axis] = floor_to_int(point[axis] * inverse_);
   }
 
  private:
@@ -68,7 +62,11 @@ void cell_keys(const T* points, std::int64_t count, double leaf_size_m, std::uin
   const LatticeOf<T> lattice(leaf_size_m);
   lattice.check(points, count, num_threads);
   parallel_blocks(count, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) keys[i] = lattice.key(points + 3 * i);
+    for (std::int64_t i = begin; i < end; ++i) {
+      std::int32_t cell[3];
+      lattice.cell(points + 3 * i, cell);
+      keys[i] = lattice_key(cell);
+    }
   });
 }
 
@@ -80,23 +78,30 @@ std::size_t CellSet::partition_of(std::uint64_t block) {
 
 class CellSet::Marks {
  public:
-  void add(std::uint64_t key) {
-    const std::uint64_t block = CellBlocks::block_key(key);
-    if (block != block_) {  // consecutive points along a ray often share a block
-      finish();
-      block_ = block;
+  void add(const std::int32_t* cell) {
+    constexpr std::uint64_t kSpread[1 << kBlockBits] = {0, 1, 8, 9};
+    std::uint64_t part = 0;
+    bool moved = false;
+    for (int axis = 0; axis < 3; ++axis) {
+      part |= kSpread[cell[axis] & ((1 << kBlockBits) - 1)] << axis;
+      moved = moved || cell[axis] >> kBlockBits != block_[axis];
     }
-    mask_ |= std::uint64_t{1} << (key & 63);
+    if (moved) {  // consecutive cells along a ray often share a block
+      finish();
+      for (int axis = 0; axis < 3; ++axis) block_[axis] = cell[axis] >> kBlockBits;
+    }
+    mask_ |= std::uint64_t{1} << part;
   }
 
   void finish() {
-    if (mask_ != 0) of_partitions_[partition_of(block_)].push_back({block_, mask_});
+    if (mask_ == 0) return;
+    const std::uint64_t key = lattice_key(block_, kAxisBias >> kBlockBits);
+    of_partitions_[partition_of(key)].push_back({key, mask_});
     mask_ = 0;
   }
 
   void clear() {
     for (auto& entries : of_partitions_) entries.clear();
-    block_ = kEmptyKey;
   }
 
   struct Entry {
@@ -106,12 +111,13 @@ class CellSet::Marks {
 
  private:
   std::array<std::vector<Entry>, kPartitions> of_partitions_;
-  std::uint64_t block_ = kEmptyKey, mask_ = 0;
+  std::int32_t block_[3] = {};
+  std::uint64_t mask_ = 0;
 };
 
 template <typename Mark>
 void CellSet::insert_marks(std::int64_t count, int num_threads, const Mark& mark) {
-  constexpr std::int64_t kAtOnce = 1 << 16;  // bounds the memory for marks
+  constexpr std::int64_t kAtOnce = 1 << 18;  // bounds the memory for marks
   const std::int64_t num_parts = std::min<std::int64_t>(resolve_num_threads(num_threads), kPartitions);
   std::vector<Marks> parts(static_cast<std::size_t>(num_parts));
   for (std::int64_t first = 0; first < count; first += kAtOnce) {
@@ -147,7 +153,11 @@ void CellSet::insert(const T* points, std::int64_t count, int num_threads) {
   const LatticeOf<T> lattice(leaf_size_m_);
   lattice.check(points, count, num_threads);
   insert_marks(count, num_threads, [&](std::int64_t begin, std::int64_t end, Marks& marks) {
-    for (std::int64_t i = begin; i < end; ++i) marks.add(lattice.key(points + 3 * i));
+    for (std::int64_t i = begin; i < end; ++i) {
+      std::int32_t cell[3];
+      lattice.cell(points + 3 * i, cell);
+      marks.add(cell);
+    }
   });
 }
 
@@ -164,7 +174,9 @@ void CellSet::insert_along(const float* points, const float* directions, std::in
           inside = false;
           return;
         }
-        marks.add(lattice.key(at));
+        std::int32_t cell[3];
+        lattice.cell(at, cell);
+        marks.add(cell);
       }
     }
   });
@@ -177,7 +189,10 @@ void CellSet::insert_rays(const float* points, const float* directions, std::int
   insert_marks(count, num_threads, [&](std::int64_t begin, std::int64_t end, Marks& marks) {
     for (std::int64_t i = begin; i < end; ++i) {
       CellWalk cell(points + 3 * i, directions + 3 * i, -reach_m, reach_m, leaf_size_m_);
-      for (; cell.inside(); cell.next()) marks.add(cell.key());
+      for (; cell.inside(); cell.next()) {
+        const std::int32_t at[3] = {cell.coordinate(0), cell.coordinate(1), cell.coordinate(2)};
+        marks.add(at);
+      }
     }
   });
 }

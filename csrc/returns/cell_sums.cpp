@@ -14,6 +14,7 @@
 #include "util/bits.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
+#include "util/prefetch.hpp"
 
 namespace radarsdf {
 namespace {
@@ -153,20 +154,26 @@ void move_moments(const T* steps, T* sums) {
 
 }  // namespace
 
-void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std::int64_t num_cells, double quantum_m,
+void sum_returns(const ReturnsInCells& returns, const std::uint64_t* keys, std::int64_t num_cells, double leaf_size_m,
                  std::int64_t* sums, int num_threads) {
+  constexpr std::int64_t kAhead = 16;  // returns: the cells of consecutive ones are rarely in the cache
   std::fill(sums, sums + kSums * num_cells, std::int64_t{0});
-  const double quanta = 1 / quantum_m;  // per metre
+  const double quanta = 1 / (leaf_size_m / static_cast<double>(kQuanta));  // per metre
   // Every thread reads all returns and adds those of its own cells. Groups of cells are interleaved among threads to
   // balance the uneven density of returns.
   const std::int64_t threads = returns.count > (1 << 14) ? resolve_num_threads(num_threads) : 1;
   parallel_tasks(threads, num_threads, [&](std::int64_t task) {
     for (std::int64_t i = 0; i < returns.count; ++i) {
-      const std::int64_t cell = returns.cells[i];
+      const std::int64_t cell = returns.cells[i], ahead = returns.cells[std::min(i + kAhead, returns.count - 1)];
+      prefetch(keys + ahead);
+      prefetch(sums + kSums * ahead);
+      prefetch(sums + kSums * ahead + kSums - 1);
       if (threads > 1 && (cell >> 6) % threads != task) continue;  // a division takes as long as the rest of a return
+      std::int64_t corner[3];
+      for (int axis = 0; axis < 3; ++axis)
+        corner[axis] = (std::int64_t{morton_coordinate(keys[cell], axis)} - kAxisBias) * kQuanta;
       std::uint64_t terms[kSums];
-      sum_terms(returns.points + 3 * i, returns.directions + 3 * i, returns.ranges_m[i], corners + 3 * cell, quanta,
-                terms);
+      sum_terms(returns.points + 3 * i, returns.directions + 3 * i, returns.ranges_m[i], corner, quanta, terms);
       std::int64_t* own = sums + kSums * cell;
       for (int k = 0; k < kSums; ++k) own[k] = static_cast<std::int64_t>(static_cast<std::uint64_t>(own[k]) + terms[k]);
     }

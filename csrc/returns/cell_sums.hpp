@@ -46,10 +46,10 @@ struct ReturnsInCells {
   std::int64_t count;
 };
 
-// sums: (num_cells, kSums), integer sums over the returns of each cell, independent of their order and exactly
-// reversible. Lengths are in quanta, relative to the corners (num_cells, 3) of the cells; directions in 1 /
-// kDirectionQuanta. Sums wrap around: those of products are invalid if a corner is far away.
-void sum_returns(const ReturnsInCells& returns, const std::int64_t* corners, std::int64_t num_cells, double quantum_m,
+// sums: (num_cells, kSums), integer sums over the returns of each cell with Morton keys (num_cells), independent of
+// their order and exactly reversible. Lengths are in quanta, relative to the corners of the cells; directions in 1 /
+// kDirectionQuanta. Sums wrap around: those of products are invalid for a return far from its cell.
+void sum_returns(const ReturnsInCells& returns, const std::uint64_t* keys, std::int64_t num_cells, double leaf_size_m,
                  std::int64_t* sums, int num_threads);
 
 // Merges sums of leaf cells with ascending keys, in quanta, to those of the cells twice as large: ascending keys, and

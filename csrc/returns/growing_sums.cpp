@@ -3,10 +3,13 @@
 #include "returns/growing_sums.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <stdexcept>
 
+#include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
+#include "lattice/morton.hpp"
 #include "util/bits.hpp"
 
 namespace radarsdf {
@@ -47,7 +50,7 @@ void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
   cell_keys(rays.points, rays.count, leaf_size_m_, keys.data(), 1);
   const double quanta = 1 / quantum_m_, quanta_of_cell = std::round(leaf_size_m_ / quantum_m_);
   const std::int64_t scan = ++collected_;
-  FlatMap passed;
+  ReachedCubes reached;
   for (std::int64_t i = 0; i < rays.count; ++i) {
     const float *point = rays.points + 3 * i, *direction = rays.directions + 3 * i;
     const std::uint64_t key = keys[static_cast<std::size_t>(i)];
@@ -69,12 +72,16 @@ void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
       cell.last = scan;
       cell.scans += sign;
     }
-    visit_visible_cubes(point, direction, rays.ranges_m[i], leaf_size_m_, passed, [&](std::uint64_t cube) {
+    reached.trace(point, direction, rays.ranges_m[i], leaf_size_m_);
+  }
+  reached.for_each_block([&](std::uint64_t block_key, std::uint64_t mask) {
+    for (; mask != 0; mask &= mask - 1) {
+      const std::uint64_t cube = block_key << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(mask));
       const auto number = static_cast<std::int32_t>(visibility_.size());
       if (number_of_cube_.insert(cube, number)) visibility_.push_back({cube, 0});
       visibility_[static_cast<std::size_t>(number_of_cube_.find(cube))].visibility += sign;
-    });
-  }
+    }
+  });
 }
 
 std::vector<std::uint64_t> SumsChange::block_keys() const {

@@ -6,54 +6,80 @@
 #include <cmath>
 #include <vector>
 
+#include "util/large_array.hpp"
 #include "util/parallel.hpp"
+#include "util/prefetch.hpp"
 
 namespace radarsdf {
 namespace {
 
 constexpr double kMinRangeM = 1e-6;  // lower bound of a divisor
+constexpr std::int64_t kAhead = 16;  // returns: the planes of consecutive ones are rarely in the cache
+
+// All that a return needs, in one cache line.
+struct alignas(64) Plane {
+  double centre[3], normal[3];
+  double roughness_m2;  // at first the sum of the noise variances of its returns
+  std::int32_t count;
+};
 
 }  // namespace
 
 void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnVariances& noise, const MovedRays& moved,
                       int num_threads) {
+  LargeVector<Plane> own(static_cast<std::size_t>(planes.count));
+  for (std::size_t p = 0; p < own.size(); ++p) {
+    std::copy_n(planes.centres + 3 * p, 3, own[p].centre);
+    std::copy_n(planes.normals + 3 * p, 3, own[p].normal);
+  }
   // Variance of a return's position along the plane's normal.
-  const auto variance_m2 = [&](std::int64_t i, const double* normal) {
-    return variance_along(normal, rays.directions + 3 * i, rays.ranges_m[i],
+  const auto variance_m2 = [&](std::int64_t i, const Plane& plane) {
+    return variance_along(plane.normal, rays.directions + 3 * i, rays.ranges_m[i],
                           rays.up_of_scan + 3 * std::int64_t{rays.scans[i]}, noise);
+  };
+  const auto plane_of = [&](std::int64_t i) {
+    prefetch(own.data() + std::max(rays.planes[std::min(i + kAhead, rays.count - 1)], 0));
+    return rays.planes[i] < 0 ? nullptr : own.data() + rays.planes[i];
   };
 
   // Every thread reads all returns in order and adds those of its own planes.
-  std::vector<double> roughness_m2(static_cast<std::size_t>(planes.count));
-  std::vector<std::int32_t> counts(static_cast<std::size_t>(planes.count));
   const std::int64_t threads = rays.count > (1 << 14) ? resolve_num_threads(num_threads) : 1;
   parallel_tasks(threads, num_threads, [&](std::int64_t task) {
     for (std::int64_t i = 0; i < rays.count; ++i) {
-      const std::int32_t plane = rays.planes[i];
-      if (plane < 0 || (plane >> 6) % threads != task) continue;
-      roughness_m2[static_cast<std::size_t>(plane)] += variance_m2(i, planes.normals + 3 * std::int64_t{plane});
-      ++counts[static_cast<std::size_t>(plane)];
+      Plane* plane = plane_of(i);
+      if (plane == nullptr || (threads > 1 && (rays.planes[i] >> 6) % threads != task)) continue;
+      plane->roughness_m2 += variance_m2(i, *plane);
+      ++plane->count;
     }
   });
-  for (std::size_t p = 0; p < roughness_m2.size(); ++p) {
-    roughness_m2[p] = std::max(planes.variances_m2[p] - roughness_m2[p] / std::max(counts[p], 1), 0.0);
-  }
+  for (std::size_t p = 0; p < own.size(); ++p)
+    own[p].roughness_m2 = std::max(planes.variances_m2[p] - own[p].roughness_m2 / std::max(own[p].count, 1), 0.0);
 
-  parallel_blocks(rays.count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
+  constexpr std::int64_t kRays = 1 << 14;  // per task
+  std::vector<std::int64_t> firsts(static_cast<std::size_t>((rays.count + kRays - 1) / kRays));
+  std::int64_t total = 0;
+  for (std::size_t task = 0; task < firsts.size(); ++task) {
+    const std::int64_t begin = static_cast<std::int64_t>(task) * kRays, end = std::min(rays.count, begin + kRays);
+    firsts[task] = total;
+    total += rays.kept == nullptr ? end - begin : std::count(rays.kept + begin, rays.kept + end, true);
+  }
+  parallel_tasks(static_cast<std::int64_t>(firsts.size()), num_threads, [&](std::int64_t task) {
+    std::int64_t to = firsts[static_cast<std::size_t>(task)];
+    for (std::int64_t i = task * kRays; i < std::min(rays.count, (task + 1) * kRays); ++i) {
+      const Plane* plane = plane_of(i);
+      if (rays.kept != nullptr && !rays.kept[i]) continue;
       const float *p = rays.points + 3 * i, *d = rays.directions + 3 * i;
-      float *point = moved.points + 3 * i, *direction = moved.directions + 3 * i;
-      const std::int32_t plane = rays.planes[i];
-      if (plane < 0) {
+      float *point = moved.points + 3 * to, *direction = moved.directions + 3 * to, *moved_m = moved.ranges_m + to;
+      ++to;
+      if (plane == nullptr) {
         std::copy(p, p + 3, point);
         std::copy(d, d + 3, direction);
-        moved.ranges_m[i] = rays.ranges_m[i];
+        *moved_m = rays.ranges_m[i];
         continue;
       }
-      const double *normal = planes.normals + 3 * std::int64_t{plane},
-                   *centre = planes.centres + 3 * std::int64_t{plane};
-      const double variance = variance_m2(i, normal), off[3] = {p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]};
-      const double step_m = dot3(off, normal) * (variance / (variance + roughness_m2[static_cast<std::size_t>(plane)]));
+      const double *normal = plane->normal, *centre = plane->centre;
+      const double variance = variance_m2(i, *plane), off[3] = {p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]};
+      const double step_m = dot3(off, normal) * (variance / (variance + plane->roughness_m2));
       double ray[3];
       for (int axis = 0; axis < 3; ++axis) {
         point[axis] = static_cast<float>(p[axis] - step_m * normal[axis]);
@@ -61,7 +87,7 @@ void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnV
       }
       const double range_m = std::max(std::sqrt(dot3(ray, ray)), kMinRangeM);
       for (int axis = 0; axis < 3; ++axis) direction[axis] = static_cast<float>(ray[axis] / range_m);
-      moved.ranges_m[i] = static_cast<float>(range_m);
+      *moved_m = static_cast<float>(range_m);
     }
   });
 }

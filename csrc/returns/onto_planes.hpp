@@ -17,6 +17,7 @@ struct NoisyRays {
   const float* ranges_m;       ///< (count)
   const std::int32_t* scans;   ///< (count)
   const std::int32_t* planes;  ///< (count), the plane of each return; -1: none, not moved
+  const bool* kept;            ///< (count), rays to write; nullptr: all
   std::int64_t count;
   const double* up_of_scan;  ///< (scans, 3), the z axis of the sensor
 };
@@ -28,13 +29,14 @@ struct Planes {
   std::int64_t count;
 };
 
+// The kept rays, in their order.
 struct MovedRays {
   float *points, *directions, *ranges_m;
 };
 
 // A return keeps the share tau^2 / (tau^2 + sigma^2) of its distance from its plane: sigma^2 is the variance of its
-// noise across the plane, tau^2 that of the plane's returns minus the mean of their sigma^2. Independent of the number
-// of threads.
+// noise across the plane, tau^2 that of all returns of the plane minus the mean of their sigma^2. Independent of the
+// number of threads.
 void move_onto_planes(const NoisyRays& rays, const Planes& planes, const ReturnVariances& noise, const MovedRays& moved,
                       int num_threads);
 

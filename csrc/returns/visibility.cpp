@@ -10,6 +10,8 @@
 #include <vector>
 
 #include "lattice/cell_blocks.hpp"
+#include "lattice/cell_walk.hpp"
+#include "util/bits.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
@@ -46,6 +48,26 @@ void check_scans(const std::int32_t* scans, std::int64_t count) {
 
 }  // namespace
 
+ReachedCubes::Block& ReachedCubes::block_at(std::uint64_t key) {
+  const std::int32_t found = numbers_.find(key);
+  if (found >= 0) return blocks_[static_cast<std::size_t>(found)];
+  numbers_.insert(key, static_cast<std::int32_t>(blocks_.size()));
+  blocks_.push_back({key, 0});
+  return blocks_.back();
+}
+
+void ReachedCubes::trace(const float* point, const float* direction, double range_m, double leaf_size_m) {
+  const float backwards[3] = {-direction[0], -direction[1], -direction[2]};
+  CellWalk cube(point, backwards, 0, range_m, (1 << kVisibilityLevels) * leaf_size_m, kAxisBias >> kVisibilityLevels);
+  Block* block = nullptr;
+  for (int in_a_row = 0; cube.inside() && in_a_row < kPassedCubes; cube.next()) {
+    const std::uint64_t key = cube.key(), bit = std::uint64_t{1} << (key & 63);
+    if (block == nullptr || block->key != CellBlocks::block_key(key)) block = &block_at(CellBlocks::block_key(key));
+    in_a_row = (block->mask & bit) != 0 ? in_a_row + 1 : 0;
+    block->mask |= bit;
+  }
+}
+
 void check_whole_rays(const float* points, const float* directions, const float* ranges_m, std::int64_t count,
                       double leaf_size_m) {
   const double limit_m = (kAxisBias - (1 << kMaxLevels)) * leaf_size_m;
@@ -73,15 +95,19 @@ void count_visibility(const std::uint64_t* leaf_keys, std::int64_t num_leaves, d
   const CellBlocks cubes(keys.data(), static_cast<std::int64_t>(keys.size()));
   check_whole_rays(points, directions, ranges_m, count, leaf_size_m);
   const auto of_rays = [&](std::int64_t begin, std::int64_t end, std::vector<std::uint32_t>& counts) {
-    NearbyRows rows(cubes);
-    FlatMap passed;  // cubes crossed by rays of the current scan
+    ReachedCubes reached;  // by rays of the current scan
     for (std::int64_t i = begin; i < end; ++i) {
       if (i % (1 << 12) == 0) check_interrupt();
-      if (i > begin && scans[i] != scans[i - 1]) passed.clear();
-      visit_visible_cubes(points + 3 * i, directions + 3 * i, ranges_m[i], leaf_size_m, passed, [&](std::uint64_t key) {
-        const std::int32_t row = rows.row(key);
-        if (row >= 0) ++counts[static_cast<std::size_t>(row)];
+      reached.trace(points + 3 * i, directions + 3 * i, ranges_m[i], leaf_size_m);
+      if (i + 1 < end && scans[i + 1] == scans[i]) continue;
+      reached.for_each_block([&](std::uint64_t block_key, std::uint64_t mask) {
+        const Occupancy* region = cubes.region(CellBlocks::block_key(block_key));  // a region is a block of blocks
+        const Occupancy* block = region != nullptr ? cubes.block(*region, block_key) : nullptr;
+        if (block == nullptr) return;
+        for (mask &= block->mask; mask != 0; mask &= mask - 1)
+          ++counts[static_cast<std::size_t>(block->row(static_cast<std::uint64_t>(lowest_bit(mask))))];
       });
+      reached.clear();
     }
   };
   const auto counts = count_by_scans(scans, count, cubes.size(), num_threads, of_rays);

@@ -5,8 +5,8 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
-#include "lattice/cell_walk.hpp"
 #include "lattice/flat_map.hpp"
 
 namespace radarsdf {
@@ -19,21 +19,34 @@ constexpr int kVisibilityLevels = 3;
 // passed this many cubes in a row. On `hugin` this finds 99.0 % of the counts in half the time; 3 cubes find 98.1 %.
 constexpr int kPassedCubes = 4;
 
-// Calls visit(key) for each cube that a ray of a scan reaches first. passed: cubes reached so far.
-template <typename Visit>
-void visit_visible_cubes(const float* point, const float* direction, double range_m, double leaf_size_m,
-                         FlatMap& passed, const Visit& visit) {
-  const float backwards[3] = {-direction[0], -direction[1], -direction[2]};
-  CellWalk cube(point, backwards, 0, range_m, (1 << kVisibilityLevels) * leaf_size_m, kAxisBias >> kVisibilityLevels);
-  for (int on_end = 0; cube.inside() && on_end < kPassedCubes; cube.next()) {
-    if (!passed.insert(cube.key(), 0)) {
-      ++on_end;
-      continue;
-    }
-    on_end = 0;
-    visit(cube.key());
+// Cubes that the rays of one scan reach, as bit masks of blocks of 4 x 4 x 4 cubes: consecutive cubes of a ray share a
+// look-up, and the table stays in the cache.
+class ReachedCubes {
+ public:
+  // Traces a ray from its return, until earlier rays have passed kPassedCubes cubes in a row.
+  void trace(const float* point, const float* direction, double range_m, double leaf_size_m);
+
+  // Calls visit(block_key, mask) for each block with reached cubes.
+  template <typename Visit>
+  void for_each_block(const Visit& visit) const {
+    for (const Block& block : blocks_) visit(block.key, block.mask);
   }
-}
+
+  void clear() {
+    numbers_.clear();
+    blocks_.clear();
+  }
+
+ private:
+  struct Block {
+    std::uint64_t key, mask;
+  };
+
+  Block& block_at(std::uint64_t key);
+
+  FlatMap numbers_;  // indices of blocks by key
+  std::vector<Block> blocks_;
+};
 
 // Throws std::invalid_argument unless all rays, from their sensors, lie within a million leaf cells of the origin.
 void check_whole_rays(const float* points, const float* directions, const float* ranges_m, std::int64_t count,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from radarsdf._core import (
     DIRECTION_QUANTA,
+    QUANTA,
     CellBlocks,
     CellMeans,
     CellSet,
@@ -63,12 +64,15 @@ def test_neighbour_sums_equal_a_plain_loop(weight, columns):
 
 def test_sums_over_the_returns_of_a_cell():
     rng = np.random.default_rng(0)
-    count, num_cells, quantum_m = 50_000, 300, 1e-4  # enough for several threads
+    count, num_cells, leaf_m = 50_000, 300, 0.2  # enough for several threads
+    quantum_m = leaf_m / QUANTA
     points, directions = (rng.normal(size=(count, 3)).astype(np.float32) for _ in range(2))
     ranges_m = rng.uniform(1, 100, count).astype(np.float32)
     cells = rng.integers(0, num_cells - 1, count).astype(np.int32)  # the last stays empty
-    corners = rng.integers(-5000, 5000, (num_cells, 3))
-    x, y, z = (np.rint(points.astype(np.float64) / quantum_m).astype(np.int64) - corners[cells]).T
+    lattice = rng.integers(-20, 20, (num_cells, 3))
+    x, y, z = (
+        np.rint(points.astype(np.float64) / quantum_m).astype(np.int64) - QUANTA * lattice[cells]
+    ).T
     along = np.rint(directions * DIRECTION_QUANTA).astype(np.int64).T
     ranges = np.rint(ranges_m.astype(np.float64) / quantum_m).astype(np.int64)
     ones = np.ones(count, np.int64)
@@ -76,7 +80,7 @@ def test_sums_over_the_returns_of_a_cell():
     for k, column in enumerate([ones, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, *along, ranges]):
         np.add.at(expected[:, k], cells, column)
     for num_threads in (0, 1, 3):
-        sums = sum_returns(points, directions, ranges_m, cells, corners, quantum_m, num_threads)
+        sums = sum_returns(points, directions, ranges_m, cells, keys_of(lattice), leaf_m, num_threads)
         np.testing.assert_array_equal(sums, expected)
 
 

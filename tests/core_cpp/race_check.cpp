@@ -178,10 +178,9 @@ void sums_and_rays(int threads, Results& results) {
   blocks.rows(keys.data(), kPoints, rows.data(), threads);
   results.add(rows.data(), kPoints);
   const std::vector<float> ranges(kPoints, 6.0F);
-  const std::vector<std::int64_t> corners(static_cast<std::size_t>(3 * num_cells));
   std::vector<std::int64_t> sums(static_cast<std::size_t>(radarsdf::kSums * num_cells));
-  radarsdf::sum_returns({points.data(), directions.data(), ranges.data(), rows.data(), kPoints}, corners.data(),
-                        num_cells, 1e-4, sums.data(), threads);
+  radarsdf::sum_returns({points.data(), directions.data(), ranges.data(), rows.data(), kPoints}, sorted.data(),
+                        num_cells, 0.4, sums.data(), threads);
   const std::vector<double> values(sums.begin(), sums.end());
   std::vector<double> round(values.size());
   radarsdf::neighbour_sums(blocks, sorted.data(), num_cells, values.data(), radarsdf::kSums, 0.5, round.data(),
@@ -192,8 +191,12 @@ void sums_and_rays(int threads, Results& results) {
   std::vector<radarsdf::Surfel> surfels;
   for (std::int64_t cell = 0; cell < num_cells; ++cell) {
     const double* m = values.data() + radarsdf::kSums * cell;
-    const auto mean = [&](int k) { return static_cast<float>(1e-4 * m[k] / m[0]); };
-    surfels.push_back({{mean(1), mean(2), mean(3)}, {0, 0, 1}, 0.05F, 0.3F});
+    const std::uint64_t key = sorted[static_cast<std::size_t>(cell)];
+    const auto mean = [&](int axis) {
+      const double in_cell = m[1 + axis] / (m[0] * static_cast<double>(radarsdf::kQuanta));
+      return static_cast<float>(0.4 * (radarsdf::morton_coordinate(key, axis) + in_cell - radarsdf::kAxisBias));
+    };
+    surfels.push_back({{mean(0), mean(1), mean(2)}, {0, 0, 1}, 0.05F, 0.3F});
   }
   const radarsdf::SurfelMap map(sorted.data(), surfels.data(), num_cells, 0.4);
   std::vector<std::int32_t> crossed(kPoints);

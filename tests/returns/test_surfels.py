@@ -23,7 +23,8 @@ NOISE = SensorNoise(0.05, 0.01, 0.01)
 
 def ghosts_of(rays, surfels, noise=NOISE, num_threads=0):
     """(N,) bool of the returns."""
-    return find_ghosts(surfels, rays, noise, num_threads)[surfels.cells_at(rays.points)]
+    cells = surfels.cells_at(rays.points)
+    return find_ghosts(surfels, rays, cells, noise, num_threads)[cells]
 
 
 def test_ghosts_are_found_and_the_surface_is_kept():
@@ -133,7 +134,15 @@ def test_the_shift_is_the_best_linear_estimate():
         normal = surfels.normals[plane[i]]
         off_m = (expected[i] - surfels.centres[plane[i]]) @ normal
         expected[i] -= off_m * variance / (variance + rough) * normal
-    np.testing.assert_allclose(onto_surfels(surfels, rays, noise).points, expected, atol=2e-6)
+    cells = surfels.cells_at(rays.points)
+    moved = onto_surfels(surfels, rays, cells, noise)
+    np.testing.assert_allclose(moved.points, expected, atol=2e-6)
+    # Rays that are left out count for the scatter of their plane.
+    kept = np.random.default_rng(0).random(len(rays)) < 0.5
+    for threads in (1, 3):
+        chosen = onto_surfels(surfels, rays, cells, noise, kept, threads)
+        for name in ("points", "directions", "ranges_m", "scans"):
+            np.testing.assert_array_equal(getattr(chosen, name), getattr(moved, name)[kept])
 
 
 def test_a_rough_surface_keeps_its_shape():
@@ -143,8 +152,9 @@ def test_a_rough_surface_keeps_its_shape():
     depth_m = 0.1 * np.sin(2 * np.pi * y / 0.5)
     rays = prepare([np.column_stack([10 + depth_m + rng.normal(0, 0.01, len(y)), y, z])], np.eye(4)[None])
     surfels = Surfels.of(rays, LEAF_M)
+    cells = surfels.cells_at(rays.points)
     kept = {
-        sigma_m: np.std(onto_surfels(surfels, rays, SensorNoise(sigma_m, 1e-4, 1e-4)).points[:, 0])
+        sigma_m: np.std(onto_surfels(surfels, rays, cells, SensorNoise(sigma_m, 1e-4, 1e-4)).points[:, 0])
         / np.std(rays.points[:, 0])
         for sigma_m in (0.01, 0.1)
     }

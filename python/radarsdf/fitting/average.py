@@ -61,26 +61,42 @@ class SurfaceReturns:
         sums: ScanSums | None = None,
     ) -> SurfaceReturns:
         """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`: of the rays, if known."""
-        sums = ScanSums.of(rays, config.leaf_size_m, num_threads) if sums is None else sums
+        cells = None
+        if sums is None:
+            cells = ReturnCells.of(rays, config.leaf_size_m, num_threads)
+            sums = ScanSums.of_cells(rays, cells, config.leaf_size_m, num_threads)
         surfels = Surfels.of_sums(sums, num_threads)
         means = None if config.train else MeanRays.of_sums(sums, num_threads)
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
+        drop, asked = config.returns.drop_ghosts, config.train or config.returns.free_space or inside is not None
+        cell_of_ray = None  # row of surfels
+        if config.train or (drop and asked):
+            if cells is None:
+                cell_of_ray = surfels.cells_at(rays.points, num_threads)
+            else:
+                cell_of_ray = surfels.cells_of_leaves(cells.keys, num_threads)[cells.cell_of_ray]
+        del cells
         kept, true, count = inside, None, len(rays) if inside is None else int(np.count_nonzero(inside))
-        if config.returns.drop_ghosts:
-            of_ghosts = find_ghosts(surfels, rays if means is None else means, noise, num_threads)
-            asked = config.train or config.returns.free_space or inside is not None
-            true = ~of_ghosts[surfels.cells_at(rays.points, num_threads)] if asked else None
+        if drop:
+            if means is None:
+                assert cell_of_ray is not None
+                of_ghosts = find_ghosts(surfels, rays, cell_of_ray, noise, num_threads)
+            else:
+                cell_of_mean = surfels.cells_of_leaves(means.keys, num_threads)
+                of_ghosts = find_ghosts(surfels, means, cell_of_mean, noise, num_threads)
+                means = means.select(~of_ghosts[cell_of_mean])
+            true = None if cell_of_ray is None else ~of_ghosts[cell_of_ray]
             kept = true if true is None or inside is None else true & inside
             count = int(surfels.counts[~of_ghosts].sum()) if kept is None else int(np.count_nonzero(kept))
-            if means is not None:
-                means = means.select(~of_ghosts[surfels.cells_of_leaves(means.keys, num_threads)])
         if means is not None and inside is not None:
             leaf_cells = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
             means = means.select(leaf_cells.blocks.rows(means.keys, num_threads) >= 0)
         if config.train and config.returns.onto_planes:
-            rays = onto_surfels(surfels, rays, noise, num_threads)
-        rays = rays.select(kept) if config.train and kept is not None else rays
+            assert cell_of_ray is not None
+            rays = onto_surfels(surfels, rays, cell_of_ray, noise, kept, num_threads)
+        elif config.train and kept is not None:
+            rays = rays.select(kept)
         return cls(rays, count, surfels, noise, means, true)
 
 

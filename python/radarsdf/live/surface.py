@@ -179,7 +179,8 @@ class GrowingSurface:
     def _find_ghosts(self, noise: SensorNoise, num_threads: int) -> Keys:
         """Detect ghosts again. Return the keys of the leaf cells that became ghosts or ceased to be."""
         leaves = self._leaves.gather()
-        found = find_ghosts(self._surfels, _means_of(leaves), noise, num_threads)
+        cells = self._surfels.cells_of_leaves(leaves["keys"], num_threads)
+        found = find_ghosts(self._surfels, _means_of(leaves), cells, noise, num_threads)
         before, self._ghosts = self._ghosts, self._surfels.keys[found]
         differs: Keys = leaves["keys"][
             np.isin(merged_keys(leaves["keys"]), np.setxor1d(before, self._ghosts))

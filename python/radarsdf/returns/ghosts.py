@@ -33,13 +33,17 @@ _MIN_SHARE = 0.5
 
 
 def find_ghosts(
-    surfels: Surfels, rays: Rays | MeanRays, noise: SensorNoise, num_threads: int = 0
+    surfels: Surfels,
+    rays: Rays | MeanRays,
+    cell_of_ray: NDArray[np.int32],
+    noise: SensorNoise,
+    num_threads: int = 0,
 ) -> NDArray[np.bool_]:
-    """Return a mask (C,) of the cells of `surfels` that hold ghosts. `rays`: all, or the fewer mean rays of leaf cells."""
-    if isinstance(rays, MeanRays):
-        cell_of_ray, weights = surfels.cells_of_leaves(rays.keys, num_threads), rays.counts
-    else:
-        cell_of_ray, weights = surfels.cells_at(rays.points, num_threads), None
+    """Return a mask (C,) of the cells of `surfels` that hold ghosts.
+
+    `rays`: all, or the fewer mean rays of leaf cells; `cell_of_ray` (N,): the cell in which each ends.
+    """
+    weights = rays.counts if isinstance(rays, MeanRays) else None
 
     def count(rows: NDArray[np.int32], of: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
         counted = np.bincount(rows[of], None if weights is None else weights[of], size)

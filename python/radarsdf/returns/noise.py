@@ -143,8 +143,17 @@ def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
     return np.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
 
 
-def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: int = 0) -> Rays:
-    """Move each return towards the surfel of its cell, if that is flat.
+def onto_surfels(
+    surfels: Surfels,
+    rays: Rays,
+    cells: NDArray[np.int32],
+    noise: SensorNoise,
+    kept: NDArray[np.bool_] | None = None,
+    num_threads: int = 0,
+) -> Rays:
+    """Move each return towards the surfel of its cell, in row `cells` (N,) of `surfels`, if that is flat.
+
+    `kept`: mask (N,) of the rays to return; None: all. The scatter below is that of all returns.
 
     A plane through dozens of returns has much less noise than one return. But a surface is not a plane: scatter
     of the returns beyond their noise is the shape of the surface. So a return keeps the share τ² / (τ² + σ²) of
@@ -156,11 +165,16 @@ def onto_surfels(surfels: Surfels, rays: Rays, noise: SensorNoise, num_threads: 
         *rays.in_c_order(),
         np.ascontiguousarray(rays.scans),
         rays.up_of_scan,
-        surfels.flat_planes_at(rays.points, num_threads),
+        surfels.flat_planes_of(cells),
         surfels.centres,
         surfels.normals,
         np.ascontiguousarray(surfels.variances[:, 0]),
         noise.variances,
+        kept,
         num_threads,
     )
-    return dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)
+    moved = dataclasses.replace(rays, points=points, directions=directions, ranges_m=ranges_m)
+    if kept is None:
+        return moved
+    intensities = None if rays.intensities is None else rays.intensities[kept]
+    return dataclasses.replace(moved, intensities=intensities, scans=rays.scans[kept])

@@ -83,13 +83,14 @@ class Surfels:
 
     def flat_planes_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
         """Return the row (N,) of the flat surfel in the cell of each of the `points` (N, 3), local, m; -1 without one."""
-        return self._flat_planes(self.cells_at(points, num_threads))
+        return self.flat_planes_of(self.cells_at(points, num_threads))
 
     def flat_planes_of_leaves(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.int32]:
         """Return the row (M,) of the flat surfel in the cell that contains each leaf cell with Morton keys (M,); -1 without one."""
-        return self._flat_planes(self.cells_of_leaves(leaf_keys, num_threads))
+        return self.flat_planes_of(self.cells_of_leaves(leaf_keys, num_threads))
 
-    def _flat_planes(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    def flat_planes_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the row (N,) of the flat surfel of each of the `cells` (N,), -1 for none; -1 without one."""
         flat = np.flatnonzero(self.is_flat())
         planes = np.full(len(self.keys) + 1, -1, np.int32)  # the last entry serves row -1, no cell
         planes[self.cell_of_plane[flat]] = flat

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import (
-    QUANTA,
     CellBlocks,
     CellSet,
     cell_keys,
@@ -103,9 +102,11 @@ class ScanSums:
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
-        cells = ReturnCells.of(rays, leaf_size_m, num_threads)
-        corners, quantum_m = lattice_of(cells.keys) * QUANTA, leaf_size_m / QUANTA
-        sums = sum_returns(*rays.in_c_order(), cells.cell_of_ray, corners, quantum_m, num_threads)
+        return cls.of_cells(rays, ReturnCells.of(rays, leaf_size_m, num_threads), leaf_size_m, num_threads)
+
+    @classmethod
+    def of_cells(cls, rays: Rays, cells: ReturnCells, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
+        sums = sum_returns(*rays.in_c_order(), cells.cell_of_ray, cells.keys, leaf_size_m, num_threads)
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         return cls(leaf_size_m, cells.keys, sums, scans)
 
