@@ -5,6 +5,7 @@
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "lattice/cell_blocks.hpp"
+#include "lattice/morton.hpp"
 #include "returns/bridges.hpp"
 #include "returns/cell_sums.hpp"
 #include "returns/principal_axes.hpp"
@@ -96,6 +97,25 @@ void bind_cell_sums(py::module_& m) {
       "Keys of `leaf_keys` (C,) and of the cells, at most `max_cells`, between pairs of `ends` (E,) along one of 13 "
       "directions, if the sum of the `support` (E,) float64 of both ends is below `least_dense`. All keys are uint64, "
       "ascending and unique.");
+  m.def(
+      "block_medians",
+      [](const Array<std::uint64_t>& keys, const Array<double>& values, int levels, int num_threads) {
+        const std::int64_t count = check_column(keys, "keys");
+        if (check_column(values, "values") != count) throw std::invalid_argument("values must be one for each key");
+        if (levels < 0 || levels > kAxisBits) throw std::invalid_argument("levels must be 0 to 21");
+        py::array_t<double> medians(static_cast<py::ssize_t>(count));
+        const std::uint64_t* k = keys.data();
+        const double* v = values.data();
+        double* result = medians.mutable_data();
+        {
+          const py::gil_scoped_release release;
+          block_medians(k, v, count, levels, result, num_threads);
+        }
+        return medians;
+      },
+      "keys"_a.noconvert(), "values"_a.noconvert(), "levels"_a, "num_threads"_a = 0,
+      "Medians (C,) of the positive `values` (C,) float64 in the block, of 2^`levels` cells per edge, that contains each "
+      "cell with ascending Morton `keys` (C,) uint64; 0 without one.");
   m.attr("DIRECTION_QUANTA") = kDirectionQuanta;
   m.def(
       "sum_returns",

@@ -3,54 +3,98 @@
 #include "returns/bridges.hpp"
 
 #include <algorithm>
-#include <iterator>
+#include <array>
+#include <cstddef>
 #include <stdexcept>
 
 #include "lattice/cell_blocks.hpp"
 #include "lattice/morton.hpp"
+#include "util/bits.hpp"
 #include "util/parallel.hpp"
-#include "util/parallel_sort.hpp"
 
 namespace radarsdf {
 namespace {
 
-constexpr std::int32_t kEdge = 1 << kRegionBits;
+constexpr std::int32_t kEdge = 1 << kRegionBits, kBlockEdge = 1 << kBlockBits;
 static_assert(kMostBridgeCells + 1 < kEdge, "the other end lies in a region next to that of the first");
 
-// A region and its 26 neighbours, last coordinate fastest: look-ups of their cells need no hash.
-class RegionsRound {
+// Cells of a block, as a bit mask.
+struct Marks {
+  std::uint64_t block, mask;
+};
+
+// The ends in a region and around it, by block, and the marked cells between them. Coordinates are relative to the first
+// cell of the surrounding blocks.
+class Neighbourhood {
  public:
-  explicit RegionsRound(const CellBlocks& cells) : cells_(&cells) {}
+  Neighbourhood(const CellBlocks& ends, std::int32_t reach_cells)
+      : ends_(&ends),
+        halo_((reach_cells + kBlockEdge - 1) / kBlockEdge),
+        edge_(kBlockEdge + 2 * halo_),
+        there_(static_cast<std::size_t>(edge_ * edge_ * edge_)),
+        marked_(there_.size()) {}
 
   void move_to(std::uint64_t region_key) {
-    if (region_key == region_key_) return;
-    region_key_ = region_key;
+    std::fill(there_.begin(), there_.end(), Occupancy{0, 0});
+    for (int axis = 0; axis < 3; ++axis)
+      first_[axis] = static_cast<std::int32_t>(morton_coordinate(region_key, axis)) * kBlockEdge - halo_;
     for (int i = 0; i < 27; ++i) {
-      regions_[i] =
-          cells_->region(morton_key(morton_coordinate(region_key, 0) + static_cast<std::uint32_t>(i / 9) - 1,
-                                    morton_coordinate(region_key, 1) + static_cast<std::uint32_t>(i / 3 % 3) - 1,
-                                    morton_coordinate(region_key, 2) + static_cast<std::uint32_t>(i % 3) - 1));
+      const std::int32_t steps[3] = {i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1};
+      std::uint32_t at[3];
+      for (int axis = 0; axis < 3; ++axis)
+        at[axis] = morton_coordinate(region_key, axis) + static_cast<std::uint32_t>(steps[axis]);
+      const Occupancy* region = ends_->region(morton_key(at[0], at[1], at[2]));
+      if (region == nullptr) continue;
+      for (std::uint64_t bits = region->mask; bits != 0; bits &= bits - 1) {
+        const auto part = static_cast<std::uint64_t>(lowest_bit(bits));
+        std::int32_t index = 0;
+        bool inside = true;
+        for (int axis = 0; axis < 3; ++axis) {
+          const std::int32_t block =
+              steps[axis] * kBlockEdge + static_cast<std::int32_t>(morton_coordinate(part, axis)) + halo_;
+          inside = inside && block >= 0 && block < edge_;
+          index = index * edge_ + block;
+        }
+        if (inside) there_[static_cast<std::size_t>(index)] = *ends_->block(*region, part);
+      }
     }
   }
 
-  // Row of the cell at these coordinates relative to the first cell of the central region, or -1.
-  std::int32_t row(const std::int32_t* at) const {
-    const auto region = [](std::int32_t v) { return (v + kEdge) >> kRegionBits; };
-    const Occupancy* found = regions_[9 * region(at[0]) + 3 * region(at[1]) + region(at[2])];
-    if (found == nullptr) return -1;
-    const auto part = [&](int axis) { return spread_[at[axis] & (kEdge - 1)] << axis; };
-    const std::uint64_t inside = part(0) | part(1) | part(2);
-    const Occupancy* block = cells_->block(*found, CellBlocks::block_key(inside));
-    return block != nullptr ? block->row(inside) : -1;
+  std::int32_t first_cell() const { return halo_ * kBlockEdge; }  // of the central region, along each axis
+
+  // Row of the end at these coordinates, or -1.
+  std::int32_t row(const std::int32_t* at) const { return there_[block_of(at)].row(part_of(at)); }
+
+  void mark(const std::int32_t* at) { marked_[block_of(at)] |= std::uint64_t{1} << part_of(at); }
+
+  // Appends the marked cells, and forgets them.
+  void take(std::vector<Marks>& marks) {
+    for (std::size_t i = 0; i < marked_.size(); ++i) {
+      if (marked_[i] == 0) continue;
+      const auto place = static_cast<std::int32_t>(i);
+      const std::int32_t block[3] = {first_[0] + place / (edge_ * edge_), first_[1] + place / edge_ % edge_,
+                                     first_[2] + place % edge_};
+      marks.push_back({lattice_key(block, 0), marked_[i]});
+      marked_[i] = 0;
+    }
   }
 
  private:
-  static constexpr std::uint64_t spread_[kEdge] = {0,   1,   8,   9,   64,  65,  72,  73,
-                                                   512, 513, 520, 521, 576, 577, 584, 585};  // spread_bits of 0 to 15
+  std::size_t block_of(const std::int32_t* at) const {
+    const auto block = [&](int axis) { return at[axis] >> kBlockBits; };
+    return static_cast<std::size_t>((block(0) * edge_ + block(1)) * edge_ + block(2));
+  }
+  static std::uint64_t part_of(const std::int32_t* at) {
+    constexpr std::uint64_t kSpread[kBlockEdge] = {0, 1, 8, 9};
+    const auto part = [&](int axis) { return kSpread[at[axis] & (kBlockEdge - 1)] << axis; };
+    return part(0) | part(1) | part(2);
+  }
 
-  const CellBlocks* cells_;
-  std::uint64_t region_key_ = kEmptyKey;
-  const Occupancy* regions_[27] = {};
+  const CellBlocks* ends_;
+  std::int32_t halo_, edge_;  // blocks
+  std::int32_t first_[3] = {};
+  std::vector<Occupancy> there_;
+  std::vector<std::uint64_t> marked_;
 };
 
 struct Direction {
@@ -72,46 +116,88 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
   if (max_cells > kMostBridgeCells) throw std::invalid_argument("bridges are too long");
   const CellBlocks cells(ends, num_ends);
   const std::vector<Direction> ways = directions();
-  constexpr std::int64_t kEnds = 1 << 13;  // per task
-  std::vector<std::vector<std::uint64_t>> parts(static_cast<std::size_t>((num_ends + kEnds - 1) / kEnds));
+  constexpr std::int64_t kEnds = 1 << 13;  // per task, which processes the regions that begin there
+  std::vector<std::vector<Marks>> parts(static_cast<std::size_t>((num_ends + kEnds - 1) / kEnds));
   parallel_tasks(static_cast<std::int64_t>(parts.size()), num_threads, [&](std::int64_t task) {
-    std::vector<std::uint64_t>& found = parts[static_cast<std::size_t>(task)];
-    RegionsRound round(cells);
-    for (std::int64_t i = task * kEnds; i < std::min(num_ends, (task + 1) * kEnds); ++i) {
-      round.move_to(CellBlocks::region_key(ends[i]));
-      std::int32_t cell[3], own[3];  // absolute, and relative to the region's first cell
-      for (int axis = 0; axis < 3; ++axis) {
-        cell[axis] = static_cast<std::int32_t>(morton_coordinate(ends[i], axis));
-        own[axis] = cell[axis] & (kEdge - 1);
-      }
-      for (const Direction& way : ways) {
-        for (std::int32_t distance = 2; distance <= max_cells + 1; ++distance) {
-          const std::int32_t at[3] = {own[0] + distance * way.step[0], own[1] + distance * way.step[1],
-                                      own[2] + distance * way.step[2]};
-          const std::int32_t other = round.row(at);
-          if (other < 0 || !(support[i] + support[other] < least_dense)) continue;
-          for (std::int32_t k = 1; k < distance; ++k) {
-            const std::int32_t between[3] = {cell[0] + k * way.step[0], cell[1] + k * way.step[1],
-                                             cell[2] + k * way.step[2]};
-            found.push_back(lattice_key(between, 0));
+    Neighbourhood near(cells, max_cells + 1);
+    const auto region_of = [&](std::int64_t i) { return CellBlocks::region_key(ends[i]); };
+    std::int64_t i = task * kEnds;
+    while (i > 0 && i < num_ends && region_of(i) == region_of(i - 1)) ++i;
+    while (i < std::min(num_ends, (task + 1) * kEnds)) {
+      const std::uint64_t region = region_of(i);
+      near.move_to(region);
+      for (; i < num_ends && region_of(i) == region; ++i) {
+        std::int32_t own[3];
+        for (int axis = 0; axis < 3; ++axis) {
+          const auto cell = static_cast<std::int32_t>(morton_coordinate(ends[i], axis));
+          own[axis] = near.first_cell() + (cell & (kEdge - 1));
+        }
+        for (const Direction& way : ways) {
+          const auto at = [&](std::int32_t distance) {
+            return std::array<std::int32_t, 3>{own[0] + distance * way.step[0], own[1] + distance * way.step[1],
+                                               own[2] + distance * way.step[2]};
+          };
+          for (std::int32_t distance = 2; distance <= max_cells + 1; ++distance) {
+            const std::int32_t other = near.row(at(distance).data());
+            if (other < 0 || !(support[i] + support[other] < least_dense)) continue;
+            for (std::int32_t k = 1; k < distance; ++k) near.mark(at(k).data());
           }
         }
       }
+      near.take(parts[static_cast<std::size_t>(task)]);
     }
-    std::sort(found.begin(), found.end());
-    found.erase(std::unique(found.begin(), found.end()), found.end());
   });
-  std::vector<std::uint64_t> between;
-  for (std::vector<std::uint64_t>& part : parts) {
+  std::vector<Marks> between;
+  for (std::vector<Marks>& part : parts) {
     between.insert(between.end(), part.begin(), part.end());
     part = {};
   }
-  parallel_sort(between, num_threads);
-  between.erase(std::unique(between.begin(), between.end()), between.end());
+  std::sort(between.begin(), between.end(), [](const Marks& a, const Marks& b) { return a.block < b.block; });
+
   std::vector<std::uint64_t> all;
-  all.reserve(static_cast<std::size_t>(num_leaves) + between.size());
-  std::set_union(leaf_keys, leaf_keys + num_leaves, between.begin(), between.end(), std::back_inserter(all));
+  all.reserve(static_cast<std::size_t>(num_leaves));
+  std::int64_t leaf = 0;
+  for (std::size_t i = 0; i < between.size();) {
+    const std::uint64_t block = between[i].block;
+    std::uint64_t mask = 0;
+    for (; i < between.size() && between[i].block == block; ++i) mask |= between[i].mask;
+    for (; leaf < num_leaves && CellBlocks::block_key(leaf_keys[leaf]) <= block; ++leaf) {
+      if (CellBlocks::block_key(leaf_keys[leaf]) < block) {
+        all.push_back(leaf_keys[leaf]);
+      } else {
+        mask |= std::uint64_t{1} << (leaf_keys[leaf] & 63);
+      }
+    }
+    for (; mask != 0; mask &= mask - 1)
+      all.push_back(block << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(mask)));
+  }
+  all.insert(all.end(), leaf_keys + leaf, leaf_keys + num_leaves);
   return all;
+}
+
+void block_medians(const std::uint64_t* keys, const double* values, std::int64_t count, int levels, double* medians,
+                   int num_threads) {
+  const auto block_of = [&](std::int64_t i) { return keys[i] >> (3 * levels); };
+  constexpr std::int64_t kCells = 1 << 14;  // per task, which processes the blocks that begin there
+  parallel_tasks((count + kCells - 1) / kCells, num_threads, [&](std::int64_t task) {
+    std::vector<double> positive;
+    std::int64_t i = task * kCells;
+    while (i > 0 && i < count && block_of(i) == block_of(i - 1)) ++i;
+    while (i < std::min(count, (task + 1) * kCells)) {
+      const std::int64_t begin = i;
+      positive.clear();
+      for (; i < count && block_of(i) == block_of(begin); ++i) {
+        if (values[i] > 0) positive.push_back(values[i]);
+      }
+      double median = 0;
+      if (!positive.empty()) {
+        const auto upper = positive.begin() + static_cast<std::ptrdiff_t>(positive.size() / 2);
+        std::nth_element(positive.begin(), upper, positive.end());
+        median = positive.size() % 2 == 1 ? *upper : (*std::max_element(positive.begin(), upper) + *upper) / 2;
+      }
+      std::fill(medians + begin, medians + i, median);
+    }
+  });
 }
 
 }  // namespace radarsdf

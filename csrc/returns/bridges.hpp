@@ -19,4 +19,9 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
                                         const std::uint64_t* ends, const double* support, std::int64_t num_ends,
                                         int max_cells, double least_dense, int num_threads);
 
+// medians: (count), for each cell the median of the positive values (count) in its block of 2^levels cells per edge, 0
+// without one. keys: ascending Morton keys of the cells.
+void block_medians(const std::uint64_t* keys, const double* values, std::int64_t count, int levels, double* medians,
+                   int num_threads);
+
 }  // namespace radarsdf

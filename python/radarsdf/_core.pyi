@@ -35,6 +35,7 @@ __all__: list[str] = [
     "ThreadPool",
     "VertexTable",
     "available_instruction_sets",
+    "block_medians",
     "bridge_cells",
     "cell_keys",
     "cell_rows",
@@ -938,6 +939,16 @@ class SurfaceTracer:
 def available_instruction_sets() -> list[str]:
     """
     Compiled instruction sets that this processor supports, slowest first.
+    """
+
+def block_medians(
+    keys: numpy.typing.NDArray[numpy.uint64],
+    values: numpy.typing.NDArray[numpy.float64],
+    levels: typing.SupportsInt | typing.SupportsIndex,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.float64]:
+    """
+    Medians (C,) of the positive `values` (C,) float64 in the block, of 2^`levels` cells per edge, that contains each cell with ascending Morton `keys` (C,) uint64; 0 without one.
     """
 
 def bridge_cells(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, bridge_cells, count_visibility
+from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_visibility
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
@@ -139,24 +139,11 @@ def bridged(
     near = rows >= 0
     keys, counts, rows = keys[near], counts[near], rows[near]
     of_leaves = support_at(leaf_keys, keys, counts, num_threads)
-    least = np.maximum(1.0, _MIN_SUPPORT * _medians(leaf_keys, of_leaves)[rows])
+    # Per block, not over the map: the cells added must not depend on the number of returns elsewhere.
+    levels = LATTICE_BLOCK_CELLS.bit_length() - 1
+    medians = block_medians(leaf_keys, of_leaves, levels, num_threads)[rows]
+    least = np.maximum(1.0, _MIN_SUPPORT * medians)
     support = of_leaves[rows]
     # An end with more support than this exceeds the limit with any other end.
     used = (support >= least) & (support + least < 2 * _MAX_SUPPORT)
     return bridge_cells(leaf_keys, keys[used], support[used], max_cells, 2 * _MAX_SUPPORT, num_threads)
-
-
-def _medians(leaf_keys: NDArray[np.uint64], support: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the median (C,) of the nonzero `support` (C,) in the block of each cell."""
-    # Per block, not over the map: the cells added must not depend on the number of returns elsewhere.
-    block = leaf_keys >> np.uint64(3 * (LATTICE_BLOCK_CELLS.bit_length() - 1))
-    starts = np.flatnonzero(np.diff(block, prepend=~block[:1]))  # the cells of a block are contiguous
-    # Sort within blocks: the block number forms the high bits, the support the low ones.
-    number = np.repeat(np.arange(len(starts), dtype=np.uint64), np.diff(starts, append=len(block)))
-    ordered = np.sort(number << np.uint64(16) | support.astype(np.uint64)) & np.uint64(0xFFFF)
-    ends = np.append(starts[1:], len(block))
-    zeros = np.add.reduceat(ordered == 0, starts)
-    first = starts + zeros  # first nonzero support; if there is none, the median is not used
-    last = np.maximum(ends - 1, first)
-    middle = np.minimum([(first + last) // 2, (first + last + 1) // 2], len(block) - 1)
-    return ordered[middle].mean(axis=0)[number.astype(np.int64)]  # type: ignore[no-any-return]
