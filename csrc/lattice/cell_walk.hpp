@@ -35,7 +35,7 @@ class CellWalk {
       // Rounding may start one cell too early.
       while ((cell + ahead - position) * m_per_cell < from_m) cell += step;
       Axis& way = axes_[axis];
-      way = {position, m_per_cell, static_cast<double>(cell + ahead), static_cast<double>(step), 0, cell, step, 0, 0};
+      way = {position, m_per_cell, 0, cell + ahead, step, ahead, 0, 0};
       way.next_m = (way.face - position) * m_per_cell;
       way.key = spread_bits(static_cast<std::uint32_t>(cell + bias)) << axis;
       // A carry propagates through set bits of the other axes, a borrow through cleared ones.
@@ -45,13 +45,14 @@ class CellWalk {
   }
 
   bool inside() const { return inside_; }
-  std::int32_t coordinate(int axis) const { return axes_[axis].cell; }
+  std::int32_t coordinate(int axis) const { return axes_[axis].face - axes_[axis].ahead; }
   std::uint64_t key() const { return axes_[0].key | axes_[1].key | axes_[2].key; }
 
   // Distance at which the line leaves the cell.
   double leaves_m() const {
-    const double xy_m = std::min(axes_[0].next_m, axes_[1].next_m);
-    return std::min(xy_m, axes_[2].next_m);
+    // Of values, not std::min of references, which GCC compiles to branches.
+    const double x_m = axes_[0].next_m, y_m = axes_[1].next_m, z_m = axes_[2].next_m, xy_m = y_m < x_m ? y_m : x_m;
+    return z_m < xy_m ? z_m : xy_m;
   }
 
   void next() {
@@ -67,9 +68,9 @@ class CellWalk {
  private:
   struct Axis {
     double position, m_per_cell;  // of the point, cells; negative for descending coordinates
-    double face, face_step;       // next face, cells
-    double next_m;                // its distance along the line
-    std::int32_t cell, cell_step;
+    double next_m;                // distance of the next face along the line
+    std::int32_t face, step;      // cells
+    std::int32_t ahead;           // 1 if coordinates ascend
     std::uint64_t key, key_step;  // bits of this axis; increment, with carry propagation
   };
 
@@ -77,9 +78,8 @@ class CellWalk {
 
   void advance(int axis, bool moves) {
     Axis& way = axes_[axis];
-    way.face += moves ? way.face_step : 0.0;
+    way.face += moves ? way.step : 0;
     way.next_m = (way.face - way.position) * way.m_per_cell;
-    way.cell += moves ? way.cell_step : 0;
     way.key = (way.key + (moves ? way.key_step : 0)) & key_bits(axis);
   }
 

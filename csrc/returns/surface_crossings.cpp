@@ -3,6 +3,7 @@
 #include "returns/surface_crossings.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <stdexcept>
 
@@ -16,6 +17,45 @@ constexpr float kSlack = 0.25F;                 // cells: planes of neighbours d
 constexpr double kBlockEdge = 1 << kBlockBits;  // cells
 // Consecutive ones, after which a ray steps by blocks again: no fewer than the cells of a block that a line crosses.
 constexpr int kEmptyCells = 3 * (1 << kBlockBits) - 2;
+
+// Cells of a block, by axis, with coordinates from the first to the second index on.
+using Slabs = std::array<std::array<std::array<std::uint64_t, 4>, 4>, 3>;
+constexpr Slabs slabs_of_block() {
+  Slabs slabs{};
+  for (std::size_t axis = 0; axis < 3; ++axis) {
+    for (std::size_t first = 0; first < 4; ++first) {
+      for (std::size_t last = first; last < 4; ++last) {
+        for (std::size_t k = first; k <= last; ++k)
+          slabs[axis][first][last] |= parts_where(static_cast<int>(axis), (k & 1) != 0, false, k > 1);
+      }
+    }
+  }
+  return slabs;
+}
+constexpr Slabs kSlabs = slabs_of_block();
+
+// A ray in cells.
+struct Line {
+  double position[3], cells_per_m[3];  // of its end
+
+  // Cells of a block that may hold parts of the ray from begin_m to end_m, and others.
+  std::uint64_t cells_near(const CellWalk& block, double begin_m, double end_m) const {
+    constexpr double kRounding = 1e-6;
+    constexpr int kLast = (1 << kBlockBits) - 1;
+    std::uint64_t cells = ~std::uint64_t{0};
+    for (int axis = 0; axis < 3; ++axis) {
+      const double lower = position[axis] - kBlockEdge * block.coordinate(axis), slope = cells_per_m[axis];
+      const double begin = lower + begin_m * slope, end = lower + end_m * slope;
+      const auto cell = [](double place) {
+        const int k = static_cast<int>(place);  // 0 from -1 on
+        return static_cast<std::size_t>(k > kLast ? kLast : k < 0 ? 0 : k);
+      };
+      cells &= kSlabs[static_cast<std::size_t>(axis)][cell((begin < end ? begin : end) - kRounding)]
+                     [cell((begin < end ? end : begin) + kRounding)];
+    }
+    return cells;
+  }
+};
 
 }  // namespace
 
@@ -64,13 +104,19 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
       bool inside = range_m > 0;
       for (int axis = 0; axis < 3; ++axis) inside = inside && std::abs(points[3 * i + axis]) + range_m < limit_m;
       if (!inside || -range_m > last_m) continue;
-      // Most of the way is empty: only where blocks hold surfels is the ray followed from cell to cell.
+      // Most of the way is empty: only where blocks hold surfels nearby is the ray followed from cell to cell.
+      Line line;
+      for (int axis = 0; axis < 3; ++axis) {
+        line.position[axis] = points[3 * i + axis] / cell_size_m_;
+        line.cells_per_m[axis] = directions[3 * i + axis] / cell_size_m_;
+      }
       double begin_m = -range_m;
       CellWalk block(points + 3 * i, directions + 3 * i, -range_m, last_m, kBlockEdge * cell_size_m_,
                      kAxisBias >> kBlockBits);
       while (block.inside() && crossed[i] < 0) {
         const double leaves_m = block.leaves_m();
-        if (rows.block(block.key()).mask != 0) {
+        const std::uint64_t cells = rows.block(block.key()).mask;
+        if (cells != 0 && (cells & line.cells_near(block, begin_m, std::min(leaves_m, last_m))) != 0) {
           int on_end = 0;
           for (CellWalk cell(points + 3 * i, directions + 3 * i, begin_m, last_m, cell_size_m_); cell.inside();
                cell.next()) {
