@@ -21,14 +21,16 @@ namespace {
 
 constexpr std::int32_t kEdge = 1 << kBlockBits;
 
-constexpr std::int32_t kWide = kEdge + 2;
+// A block and its halo of one cell: a cube of kWide cells per edge. Rows along x are padded, so that loops over them
+// are vectorised.
+constexpr std::int32_t kWide = kEdge + 2, kRow = 8, kSlice = kWide * kRow, kCube = kWide * kSlice;
 
 constexpr int kFewColumns = 4;  // the only criterion, so that results do not depend on the set of requested keys
 
 constexpr std::int32_t part_coordinate(int part, int axis) { return (part >> axis & 1) | (part >> (axis + 2) & 2); }
 
 // For the 27 blocks of a neighbourhood: masks of the cells that touch the central block. `places`: positions of the
-// cells of the central block in the cube of kWide cells per side, which includes the halo; `inside`: in the block.
+// cells of the central block in the cube; `inside`: in the block.
 struct NextTo {
   std::uint64_t masks[27] = {};
   std::int32_t places[64] = {}, inside[64] = {};
@@ -36,8 +38,8 @@ struct NextTo {
   constexpr NextTo() {
     for (int part = 0; part < 64; ++part) {
       const std::int32_t at[3] = {part_coordinate(part, 0), part_coordinate(part, 1), part_coordinate(part, 2)};
-      places[part] = (kWide * (at[0] + 1) + at[1] + 1) * kWide + at[2] + 1;
-      inside[part] = (kEdge * at[0] + at[1]) * kEdge + at[2];
+      places[part] = kSlice * (at[2] + 1) + kRow * (at[1] + 1) + at[0] + 1;
+      inside[part] = (kEdge * at[2] + at[1]) * kEdge + at[0];
       for (int n = 0; n < 27; ++n) {
         const int steps[3] = {n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1};
         bool touches = true;
@@ -57,43 +59,63 @@ class BlocksRound {
   explicit BlocksRound(const CellBlocks& cells) : cells_(&cells) {}
 
   void move_to(std::uint64_t block_key) {
-    if (block_key == block_key_) return;
-    block_key_ = block_key;
+    constexpr std::uint64_t kSpread[kEdge] = {0, 1, 8, 9};
+    const std::uint64_t region_key = CellBlocks::block_key(block_key);  // a region is a block of blocks
+    if (region_key != region_key_) find_regions(region_key);
+    int regions[3][3];  // of the 27, along each axis
     std::uint64_t parts[3][3];
     for (int axis = 0; axis < 3; ++axis) {
-      const std::uint32_t coordinate = morton_coordinate(block_key, axis);
-      for (std::uint32_t i = 0; i < 3; ++i) parts[axis][i] = spread_bits(coordinate + i - 1) << axis;
-    }
-    for (int i = 0; i < 27; ++i) {
-      const std::uint64_t key = parts[0][i / 9] | parts[1][i / 3 % 3] | parts[2][i % 3];
-      const std::uint64_t region_key = key >> (3 * (kRegionBits - kBlockBits));
-      if (region_key != region_key_) {  // often unchanged
-        region_key_ = region_key;
-        region_ = cells_->region(region_key);
+      for (int i = 0; i < 3; ++i) {
+        const int at = part_coordinate(static_cast<int>(block_key & 63), axis) + i - 1;
+        regions[axis][i] = (at + kEdge) / kEdge;
+        parts[axis][i] = kSpread[at & (kEdge - 1)] << axis;
       }
-      blocks_[i] = region_ != nullptr ? cells_->block(*region_, key) : nullptr;
+    }
+    count_ = 0;
+    for (int x = 0, n = 0; x < 3; ++x) {
+      for (int y = 0; y < 3; ++y) {
+        const int row = 9 * regions[0][x] + 3 * regions[1][y];
+        const std::uint64_t part = parts[0][x] | parts[1][y];
+        for (int z = 0; z < 3; ++z, ++n) {
+          const Occupancy* region = regions_[row + regions[2][z]];
+          const Occupancy* block = region != nullptr ? cells_->block(*region, part | parts[2][z]) : nullptr;
+          const std::uint64_t mask = block != nullptr ? block->mask & kNextTo.masks[n] : 0;
+          if (mask != 0) near_[count_++] = {block, mask, kEdge * (x - 1 + kRow * (y - 1) + kSlice * (z - 1))};
+        }
+      }
     }
   }
 
-  // Calls visit(row, place) for the cells of the central block and its halo; place is the position in a cube of
-  // 6 x 6 x 6 cells, last coordinate fastest.
+  // Calls visit(row, place) for the cells of the central block and its halo; place is the position in the cube.
   template <typename Visit>
   void for_each(const Visit& visit) const {
-    for (int n = 0; n < 27; ++n) {
-      if (blocks_[n] == nullptr) continue;
-      const int offset = kEdge * (kWide * kWide * (n / 9 - 1) + kWide * (n / 3 % 3 - 1) + n % 3 - 1);
-      for (std::uint64_t bits = blocks_[n]->mask & kNextTo.masks[n]; bits != 0; bits &= bits - 1) {
+    for (int i = 0; i < count_; ++i) {
+      for (std::uint64_t bits = near_[i].mask; bits != 0; bits &= bits - 1) {
         const int part = lowest_bit(bits);
-        visit(blocks_[n]->row(static_cast<std::uint64_t>(part)), kNextTo.places[part] + offset);
+        visit(near_[i].block->row(static_cast<std::uint64_t>(part)), kNextTo.places[part] + near_[i].offset);
       }
     }
   }
 
  private:
+  void find_regions(std::uint64_t region_key) {
+    region_key_ = region_key;
+    std::uint32_t at[3];
+    for (int axis = 0; axis < 3; ++axis) at[axis] = morton_coordinate(region_key, axis) - 1;
+    for (std::uint32_t i = 0; i < 27; ++i)
+      regions_[i] = cells_->region(morton_key(at[0] + i / 9, at[1] + i / 3 % 3, at[2] + i % 3));
+  }
+
   const CellBlocks* cells_;
-  std::uint64_t block_key_ = kEmptyKey, region_key_ = kEmptyKey;
-  const Occupancy* region_ = nullptr;
-  const Occupancy* blocks_[27] = {};
+  std::uint64_t region_key_ = kEmptyKey;
+  const Occupancy* regions_[27] = {};  // around the region of the central block
+  struct Near {
+    const Occupancy* block;
+    std::uint64_t mask;   // cells in the cube
+    std::int32_t offset;  // of their places
+  };
+  Near near_[27] = {};  // blocks with such cells
+  int count_ = 0;
 };
 
 // Separable neighbourhood sums for all cells of a block, axis by axis: (64, columns) in Morton order. With few columns
@@ -111,21 +133,18 @@ class SumsOfBlock {
       first[count] = columns_ * std::int64_t{row};
       places[count++] = place;
     });
-    const auto near = [&](double before, double own, double after) { return weight_ * (before + after) + own; };
+    const auto add = [&](const double* from, int step, int size, double* to) {
+      for (int i = 0; i < size; ++i) to[i] = weight_ * (from[i] + from[i + 2 * step]) + from[i + step];
+    };
     for (int k = 0; k < columns_; ++k) {
-      double cube[kWide][kWide][kWide] = {}, along_z[kWide][kWide][kEdge], along_y[kWide][kEdge][kEdge];
-      for (int i = 0; i < count; ++i) (&cube[0][0][0])[places[i]] = values_[first[i] + k];
-      for (int x = 0; x < kWide; ++x) {
-        for (int y = 0; y < kWide; ++y)
-          for (int z = 0; z < kEdge; ++z) along_z[x][y][z] = near(cube[x][y][z], cube[x][y][z + 1], cube[x][y][z + 2]);
-        for (int y = 0; y < kEdge; ++y)
-          for (int z = 0; z < kEdge; ++z)
-            along_y[x][y][z] = near(along_z[x][y][z], along_z[x][y + 1][z], along_z[x][y + 2][z]);
+      double cube[kCube] = {}, along_z[kEdge * kSlice], along_y[kEdge * kEdge * kRow];
+      for (int i = 0; i < count; ++i) cube[places[i]] = values_[first[i] + k];
+      for (int z = 0; z < kEdge; ++z) {
+        add(cube + kSlice * z, kSlice, kSlice, along_z + kSlice * z);
+        add(along_z + kSlice * z, kRow, kEdge * kRow, along_y + kEdge * kRow * z);
       }
-      double* sum = sums_.data() + 64 * k;
-      for (int x = 0; x < kEdge; ++x)
-        for (int y = 0; y < kEdge; ++y)
-          for (int z = 0; z < kEdge; ++z) *sum++ = near(along_y[x][y][z], along_y[x + 1][y][z], along_y[x + 2][y][z]);
+      for (int row = 0; row < kEdge * kEdge; ++row)
+        add(along_y + kRow * row, 1, kEdge, sums_.data() + 64 * k + kEdge * row);
     }
   }
 
@@ -138,7 +157,7 @@ class SumsOfBlock {
   const double* values_;
   int columns_;
   double weight_;
-  std::vector<double> sums_;  // (columns, 64), the last coordinate fastest
+  std::vector<double> sums_;  // (columns, 64), the first coordinate fastest
 };
 
 // Moves the origin of the sums `steps` back: (x + a)(y + b) sums to xy + a y + b x + a b.
@@ -248,7 +267,7 @@ void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int
     BlocksRound round(cells);
     SumsOfBlock block(values, of_blocks ? columns : 0, weight);
     std::uint64_t block_key = kEmptyKey;
-    std::int32_t rows[kWide * kWide * kWide];
+    std::int32_t rows[kCube];
     for (std::int64_t i = begin; i < end; ++i) {
       double* own = sums + columns * i;
       if (CellBlocks::block_key(keys[i]) != block_key) {
@@ -270,7 +289,7 @@ void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int
       for (int x = -1; x <= 1; ++x) {
         for (int y = -1; y <= 1; ++y) {
           for (int z = -1; z <= 1; ++z) {
-            const std::int32_t row = near[(kWide * x + y) * kWide + z];
+            const std::int32_t row = near[x + kRow * y + kSlice * z];
             if (row < 0) continue;
             const double w = weights[x * x + y * y + z * z];
             for (int k = 0; k < columns; ++k) own[k] += w * values[columns * std::int64_t{row} + k];

@@ -119,7 +119,7 @@ def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | Non
     points = rays.points if inside is None else rays.points[inside]
     occupied = CellSet(config.leaf_size_m)
     occupied.insert(np.ascontiguousarray(points), threads)
-    return _estimate(rays, config, len(points), len(occupied.sorted_keys(threads)))
+    return _estimate(rays, config, len(points), len(occupied))
 
 
 def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) -> Estimate:

@@ -98,11 +98,16 @@ def evidence_sums(
     returns: ReturnsOfCells, leaf_keys: NDArray[np.uint64], num_threads: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Compute `information` and `hits` of :class:`Evidence`, (C,) each, for leaf cells with ascending keys (C,)."""
+    blocks = CellBlocks(returns.keys)
     columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)
-    sums = CellBlocks(returns.keys).neighbour_sums(leaf_keys, columns, 1.0, num_threads)
-    return sums[:, 0].astype(np.float32), sums[:, 1].astype(np.uint32)
+    information, hits = np.empty(len(leaf_keys), np.float32), np.empty(len(leaf_keys), np.uint32)
+    for first in range(0, len(leaf_keys), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        information[part], hits[part] = blocks.neighbour_sums(leaf_keys[part], columns, 1.0, num_threads).T
+    return information, hits
 
 
+_AT_ONCE = 1 << 20  # leaf cells: float64 sums of all would be the peak of a large fit's memory
 _MOST = float(np.iinfo(np.uint16).max)
 
 
