@@ -9,33 +9,25 @@
 
 namespace radarsdf {
 
-template <typename T>
-void adam_task(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, LevelTask task) {
-  const InterpolationKernels<T>& kernels = RADARSDF_KERNEL(interpolation_kernels<T>)(table.encoding());
-  const AdamKernel<T> adam_kernel = RADARSDF_KERNEL(adam_kernel<T>)();
+void adam_task(const VertexTable& table, const std::vector<PointBatch<float>>& batches,
+               const std::vector<const float*>& grads, const std::vector<std::int64_t>& strides, const AdamStep& adam,
+               LevelTask task) {
+  const InterpolationKernels<float>& kernels = RADARSDF_KERNEL(interpolation_kernels<float>)(table.encoding());
   const std::int64_t corners = corners_per_group(table.encoding());
   std::int64_t points = 0;
-  for (const PointBatch<T>& batch : batches) points += batch.count;
+  for (const PointBatch<float>& batch : batches) points += batch.count;
   // Reused between calls: page faults of a new allocation would cost as much as the sums.
   thread_local std::vector<std::int32_t> rows;
-  thread_local std::vector<T> sums;  // zero between calls
+  thread_local std::vector<float> sums;  // zero between calls
   const auto most = static_cast<std::size_t>(std::min(points * corners, table.num_rows())) + 1;
   if (rows.size() < most) rows.resize(most);
   if (sums.size() < most * kFeatureDim) sums.resize(most * kFeatureDim);
-  RowSums<T> touched{adam.marks, rows.data(), sums.data(), 0};
+  RowSums<float> touched{adam.states, rows.data(), sums.data(), 0};
   for (std::size_t b = 0; b < batches.size(); ++b) {
     kernels.scatter_rows(interpolation(table, batches[b]), grads[b], strides[b], touched, task.level, task.group, 0,
                          batches[b].count);
   }
-  adam_kernel.move(adam, touched.rows, touched.sums, touched.count);
+  RADARSDF_KERNEL(adam_kernel)().move(adam, touched.rows, touched.sums, touched.count);
 }
-
-#define RADARSDF_INSTANTIATE(T)                                                                                \
-  template void adam_task(const VertexTable&, const std::vector<PointBatch<T>>&, const std::vector<const T*>&, \
-                          const std::vector<std::int64_t>&, const AdamStep<T>&, LevelTask);
-RADARSDF_INSTANTIATE(float)
-RADARSDF_INSTANTIATE(double)
-#undef RADARSDF_INSTANTIATE
 
 }  // namespace radarsdf

@@ -16,8 +16,8 @@ namespace radarsdf {
 
 // One task (see level_tasks.hpp) of a step of Adam on the rows that batches touch, with the gradients that `scatter`
 // would sum over the batches.
-template <typename T>
-void adam_task(const VertexTable& table, const std::vector<PointBatch<T>>& batches, const std::vector<const T*>& grads,
-               const std::vector<std::int64_t>& strides, const AdamStep<T>& adam, LevelTask task);
+void adam_task(const VertexTable& table, const std::vector<PointBatch<float>>& batches,
+               const std::vector<const float*>& grads, const std::vector<std::int64_t>& strides, const AdamStep& adam,
+               LevelTask task);
 
 }  // namespace radarsdf

@@ -10,62 +10,48 @@
 namespace radarsdf::RADARSDF_ISA {
 namespace {
 
-inline float root(float v) { return sqrtf(v); }
-inline double root(double v) { return sqrt(v); }
+constexpr std::int64_t kBlock = 16;  // rows per block, whose roots are computed in one vector loop
 
-constexpr std::int64_t kBlock = 16;  // rows per block, processed as one long vector loop
+inline float mean_square(const float* gradient) {
+  float sums[4];
+  for (int d = 0; d < 4; ++d) sums[d] = gradient[d] * gradient[d] + gradient[d + 4] * gradient[d + 4];
+  return ((sums[0] + sums[1]) + (sums[2] + sums[3])) / kFeatureDim;
+}
 
-template <typename T>
-void move(const AdamStep<T>& adam, const std::int32_t* rows, T* gradients, std::int64_t count) {
-  constexpr int kNumbers = kBlock * kFeatureDim;
-  const T mean_share = 1 - adam.decays[2], square_share = 1 - adam.decays[3];
-  const T rate = adam.rate, square_scale = adam.square_scale, epsilon = adam.epsilon;
-  T mean[kNumbers] = {}, square[kNumbers] = {}, gradient[kNumbers] = {}, way[kNumbers];
+void move(const AdamStep& adam, const std::int32_t* rows, float* gradients, std::int64_t count) {
+  const float mean_share = 1 - adam.decays[2], square_share = 1 - adam.decays[3];
+  float square[kBlock] = {}, rate[kBlock];
   for (std::int64_t first = 0; first < count; first += kBlock) {
     const std::int64_t size = count - first < kBlock ? count - first : kBlock;
     for (std::int64_t i = first + 2 * kBlock; i < first + 3 * kBlock && i < count; ++i) {
-      prefetch(adam.marks + rows[i]);
-      prefetch(adam.moments + rows[i] * std::int64_t{2 * kFeatureDim});
+      prefetch(adam.states + rows[i]);
       prefetch(adam.features + rows[i] * std::int64_t{kFeatureDim});
     }
     for (std::int64_t i = 0; i < size; ++i) {
-      const std::int32_t row = rows[first + i];
-      const std::int32_t steps = adam.step - adam.marks[row].last_step;
-      adam.marks[row] = {adam.step, 0};
-      const Features<T> moments[2] = {
-          adam.decays[2 * steps] * load(adam.moments + row * std::int64_t{2 * kFeatureDim}),
-          adam.decays[2 * steps + 1] * load(adam.moments + row * std::int64_t{2 * kFeatureDim} + kFeatureDim)};
-      store(mean + i * kFeatureDim, moments[0]);
-      store(square + i * kFeatureDim, moments[1]);
-      T* sum = gradients + (first + i) * kFeatureDim;
-      store(gradient + i * kFeatureDim, load(sum));
-      store(sum, Features<T>{});
+      const RowState& state = adam.states[rows[first + i]];
+      const float decay = adam.decays[2 * std::int64_t{adam.step - state.last_step} + 1];
+      square[i] = decay * state.square + square_share * mean_square(gradients + (first + i) * kFeatureDim);
     }
-    for (int d = 0; d < kNumbers; ++d) {
-      const T g = gradient[d];
-      mean[d] += mean_share * g;
-      square[d] += square_share * g * g;
-      way[d] = rate * mean[d] / (root(square_scale * square[d]) + epsilon);
-    }
+    for (int i = 0; i < kBlock; ++i) rate[i] = adam.rate / (sqrtf(adam.square_scale * square[i]) + adam.epsilon);
     for (std::int64_t i = 0; i < size; ++i) {
       const std::int32_t row = rows[first + i];
-      T* moments = adam.moments + row * std::int64_t{2 * kFeatureDim};
-      store(moments, load(mean + i * kFeatureDim));
-      store(moments + kFeatureDim, load(square + i * kFeatureDim));
-      T* feature = adam.features + row * std::int64_t{kFeatureDim};
-      store(feature, load(feature) - load(way + i * kFeatureDim));
+      RowState& state = adam.states[row];
+      float *gradient = gradients + (first + i) * kFeatureDim,
+            *feature = adam.features + row * std::int64_t{kFeatureDim};
+      const float decay = adam.decays[2 * std::int64_t{adam.step - state.last_step}];
+      const Features<float> mean = decay * load_rounded(state.mean) + mean_share * load(gradient);
+      store(feature, load(feature) - rate[i] * mean);
+      store(gradient, Features<float>{});
+      store_rounded(state.mean, mean);
+      state.square = square[i];
+      state.last_step = adam.step;
+      state.place = 0;
     }
   }
 }
 
 }  // namespace
 
-template <typename T>
-AdamKernel<T> adam_kernel() {
-  return {move<T>};
-}
-
-template AdamKernel<float> adam_kernel();
-template AdamKernel<double> adam_kernel();
+AdamKernel adam_kernel() { return {move}; }
 
 }  // namespace radarsdf::RADARSDF_ISA

@@ -129,11 +129,11 @@ struct TouchedRows {
   RowSums<T> touched;
   void add(std::int32_t row, Features<T> gradient) {
     // Branch-free: whether a row is new is unpredictable, and a misprediction costs more than the sum.
-    const std::int32_t known = touched.marks[row].place;
+    const std::int32_t known = touched.states[row].place;
     touched.rows[touched.count] = row;
     touched.count += known == 0;
     const std::int32_t place = known == 0 ? static_cast<std::int32_t>(touched.count) : known;
-    touched.marks[row].place = place;
+    touched.states[row].place = place;
     T* sum = touched.sums + static_cast<std::int64_t>(place - 1) * kFeatureDim;
     store(sum, load(sum) + gradient);
   }

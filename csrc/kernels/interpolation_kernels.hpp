@@ -29,7 +29,7 @@ struct Interpolation {
 // sums indexed by row would be scattered over the memory of a large map.
 template <typename T>
 struct RowSums {
-  RowMark* marks;      // marks of all rows
+  RowState* states;    // of all rows
   std::int32_t* rows;  // touched rows; capacity for one more
   T* sums;             // (count, 8), zero beyond
   std::int64_t count;

@@ -205,7 +205,6 @@ class VertexTable:
         """
         For an octree, mean signed distance of each vertex, (num_rows,) float32, m, to planes through `points` (N, 3) with `normals` (N, 3). The mean is over rays along `directions` (N, 3) that cross leaf cells of the vertex within `truncation_m` of their points, one term per cell; all float32, local frame. Also the sides of the vertices, (num_rows,) int8: 1 if many rays passed it, -1 if it lies in unobserved space behind many returns, else 0.
         """
-    @typing.overload
     def begin_adam_step(
         self,
         batches: collections.abc.Sequence[
@@ -216,8 +215,7 @@ class VertexTable:
             ]
         ],
         features: numpy.typing.NDArray[numpy.float32],
-        moments: numpy.typing.NDArray[numpy.float32],
-        marks: numpy.typing.NDArray[numpy.int32],
+        states: numpy.typing.NDArray[numpy.int32],
         decays: numpy.typing.NDArray[numpy.float32],
         step: typing.SupportsInt | typing.SupportsIndex,
         learning_rate: typing.SupportsFloat | typing.SupportsIndex,
@@ -225,29 +223,7 @@ class VertexTable:
         pool: ThreadPool,
     ) -> None:
         """
-        Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed like `scatter`, on the other threads of `pool`; its `finish` waits for it. The state is `moments` (num_rows, 16) and `marks` (num_rows, 2) int32: the last step that updated a row, and a zero. `decays` (more than step, 2) are the powers of both betas.
-        """
-    @typing.overload
-    def begin_adam_step(
-        self,
-        batches: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
-                typing.Annotated[numpy.typing.ArrayLike, numpy.int32],
-                typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
-            ]
-        ],
-        features: numpy.typing.NDArray[numpy.float64],
-        moments: numpy.typing.NDArray[numpy.float64],
-        marks: numpy.typing.NDArray[numpy.int32],
-        decays: numpy.typing.NDArray[numpy.float64],
-        step: typing.SupportsInt | typing.SupportsIndex,
-        learning_rate: typing.SupportsFloat | typing.SupportsIndex,
-        epsilon: typing.SupportsFloat | typing.SupportsIndex,
-        pool: ThreadPool,
-    ) -> None:
-        """
-        Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed like `scatter`, on the other threads of `pool`; its `finish` waits for it. The state is `moments` (num_rows, 16) and `marks` (num_rows, 2) int32: the last step that updated a row, and a zero. `decays` (more than step, 2) are the powers of both betas.
+        Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed like `scatter`, on the other threads of `pool`; its `finish` waits for it. `states` (num_rows, 8) int32 are mean gradients in bfloat16 (4 numbers), their mean square as float32, the last step that updated the row, and zeros. `decays` (more than step, 2) are the powers of both betas.
         """
     def cells_near_surface(
         self,

@@ -102,23 +102,20 @@ void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
 }
 
 // Two steps of Adam, as in a fit.
-template <typename T>
 void adam(radarsdf::Encoding encoding, int threads, Results& results) {
-  const auto points = test::normal_numbers<T>(3 * kPoints, 4.0, 1);
+  const auto points = test::normal_numbers<float>(3 * kPoints, 4.0, 1);
   const radarsdf::VertexTable table = table_of(points, encoding, threads);
-  auto features = test::normal_numbers<T>(8 * table.num_rows(), 1.0, 2);
-  const auto grad = test::normal_numbers<T>(8 * kLevels * kPoints, 1.0, 3);
+  auto features = test::normal_numbers<float>(8 * table.num_rows(), 1.0, 2);
+  const auto grad = test::normal_numbers<float>(8 * kLevels * kPoints, 1.0, 3);
   std::vector<std::int32_t> located(kLevels * kPoints);
-  std::vector<radarsdf::RowMark> marks(features.size() / 8);
+  std::vector<radarsdf::RowState> states(features.size() / 8);
   radarsdf::locate(table, points.data(), kPoints, located.data(), threads);
-  std::vector<T> moments(2 * features.size());
-  const std::vector<T> decays{1, 1, T(0.9), T(0.99), T(0.81), T(0.98)};
+  const std::vector<float> decays{1, 1, 0.9F, 0.99F, 0.81F, 0.98F};
   const std::int64_t half = kPoints / 2, stride = 8 * kLevels;
-  const radarsdf::PointBatch<T> whole{points.data(), nullptr, located.data(), half};
-  const radarsdf::PointBatch<T> rest{points.data() + 3 * half, nullptr, located.data() + kLevels * half, half};
+  const radarsdf::PointBatch<float> whole{points.data(), nullptr, located.data(), half};
+  const radarsdf::PointBatch<float> rest{points.data() + 3 * half, nullptr, located.data() + kLevels * half, half};
   for (std::int32_t step = 1; step <= 2; ++step) {
-    const radarsdf::AdamStep<T> adam{features.data(), moments.data(), marks.data(), decays.data(), step,
-                                     T(0.01),         T(1),           T(1e-8)};
+    const radarsdf::AdamStep adam{features.data(), states.data(), decays.data(), step, 0.01F, 1.0F, 1e-8F};
     radarsdf::ThreadPool pool(threads);
     pool.run(radarsdf::num_level_tasks(table), [&](std::int64_t task) {
       radarsdf::adam_task(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
@@ -126,7 +123,7 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
     });
   }
   results.add(features.data(), 8 * table.num_rows());
-  results.add(moments.data(), 16 * table.num_rows());
+  results.add(states.data(), table.num_rows());
 }
 
 // Forward and backward pass of a network with two layers and two blocks of inputs.
@@ -339,8 +336,8 @@ Results all(int threads) {
   Results results;
   encodings<T>(radarsdf::Encoding::kTriQuadtree, threads, results);
   encodings<T>(radarsdf::Encoding::kOctree, threads, results);
-  adam<T>(radarsdf::Encoding::kTriQuadtree, threads, results);
-  adam<T>(radarsdf::Encoding::kOctree, threads, results);
+  adam(radarsdf::Encoding::kTriQuadtree, threads, results);
+  adam(radarsdf::Encoding::kOctree, threads, results);
   networks<T>(threads, results);
   before_the_training(threads, results);
   sums_and_rays(threads, results);

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the radarsdf authors
 # SPDX-License-Identifier: MIT
-"""Adam equals PyTorch's, without its imports; sparse Adam equals Adam if all rows are touched; SOAP."""
+"""Adam equals PyTorch's, without its imports; sparse Adam equals a dense one if all rows are touched; SOAP."""
 
 import subprocess
 import sys
@@ -95,21 +95,27 @@ def steps(cells, batches, threads, learning_rate=1e-2):
 
 
 @pytest.mark.parametrize("encoding", [Encoding.TRI_QUADTREE, Encoding.OCTREE])
-def test_sparse_adam_equals_adam_if_all_rows_are_touched(encoding):
+def test_sparse_adam_equals_dense_adam_if_all_rows_are_touched(encoding):
     cells, points, generator = cells_and_points(encoding)
     weights = torch.randn(10, len(points), cells.table.num_levels * 8, generator=generator)
     dense = cells.features.detach().clone().requires_grad_()
-    reference = torch.optim.Adam([dense], lr=1e-2, eps=1e-15)
-    for w in weights:
-        reference.zero_grad()
-        (kernels.interpolate(dense, points, cells.table) * w).sum().backward()
-        assert dense.grad.any(dim=1).all()
-        reference.step()
+    mean, square = torch.zeros_like(dense), torch.zeros(len(dense), 1)
+    for i, w in enumerate(weights, 1):
+        loss = (kernels.interpolate(dense, points, cells.table) * w).sum()
+        (gradient,) = torch.autograd.grad(loss, [dense])
+        assert gradient.any(dim=1).all()
+        mean = 0.9 * mean.bfloat16().float() + 0.1 * gradient
+        square = 0.999 * square + 0.001 * (gradient**2).mean(1, keepdim=True)
+        with torch.no_grad():
+            dense -= 1e-2 / (1 - 0.9**i) * mean / (square / (1 - 0.999**i)).sqrt()
     before = cells.features.detach().clone()
     half = len(points) // 2  # as two threads' shares
     batches = [((points[:half], w[:half]), (points[half:], w[half:])) for w in weights]
     after = steps(cells, batches, threads=2)
-    np.testing.assert_allclose(after, dense.detach(), atol=2e-5)
+    # Sums that differ in their last bit may round a mean to another bfloat16.
+    difference = (after - dense.detach()).abs()
+    assert (difference < 2e-5).float().mean() > 0.999
+    assert difference.max() < 0.01 * 2**-6
     assert (after - before).abs().max() > 0.05
 
 
