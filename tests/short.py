@@ -28,11 +28,8 @@ def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
 
     def short(*given, **named):
         found = usual(*given, **named)
-        return dataclasses.replace(
-            found,
-            sdf_iterations=min(found.sdf_iterations, 30),
-            intensity_iterations=min(found.intensity_iterations, 30),
-        )
+        names = ("sdf_iterations", "joint_iterations", "intensity_iterations")
+        return dataclasses.replace(found, **{name: min(getattr(found, name), 30) for name in names})
 
     set_attribute(Schedule, "of", short)
     usual_picture = picture.save_picture

@@ -9,8 +9,9 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
+from radarsdf.fitting import schedule as fitting_schedule
 from radarsdf.fitting import train
-from radarsdf.fitting.gradients import AutogradGradients, sdf_loss
+from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, sdf_loss
 from radarsdf.fitting.sampling import RaySampler
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import LossHistory
@@ -126,6 +127,25 @@ def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
         assert one == pytest.approx(found[0], rel=1e-5)
 
 
+def test_joint_iterations_are_spread_over_the_sdf_stage(scene, monkeypatch):
+    kinds, usual = [], CoreGradients.of
+    monkeypatch.setattr(
+        CoreGradients, "of", lambda self, kind, *of: kinds.append(kind) or usual(self, kind, *of)
+    )
+    monkeypatch.setattr(fitting_schedule, "_MOST_JOINT_ITERATIONS", 50)
+    config = FitConfig(effort=0.2, training={"batch_size": 64, "intensity_batch_size": 64})
+    radar_map = radarsdf.fit(scene.points, scene.poses, scene.intensities, config=config, progress=False)
+    done = radar_map.report["iterations_done"]
+    assert (
+        done
+        == radar_map.report["iterations"]
+        == {"sdf": kinds.index("intensity"), "intensity": len(kinds) - kinds.count("sdf")}
+    )
+    joint = [-1, *(i for i, kind in enumerate(kinds) if kind == "joint")]
+    assert (len(joint) - 1, joint[-1] + 1) == (10, done["sdf"])
+    assert np.ptp(np.diff(joint)) <= 1
+
+
 @pytest.mark.parametrize("batch_size", [1, 5, 101])
 @pytest.mark.parametrize("parts", [1, 3, 16])
 def test_parts_are_weighted_by_their_samples(scene, batch_size, parts):
@@ -199,6 +219,14 @@ def test_batches_grow_to_limit_iterations():
     assert many.neighbours == many.batch_size // FitConfig().training.batch_size > 1
     assert schedule(10**6).batch_size == FitConfig().training.batch_size
     assert schedule(10**6).neighbours == 1
+
+
+def test_joint_iterations_are_limited_and_spread_over_the_sdf_stage():
+    assert schedule(10**5).joint_iterations == schedule(10**5).sdf_iterations == 180
+    large = schedule(2 * 10**6)
+    assert (large.sdf_iterations, large.joint_iterations, large.intensity_iterations) == (3516, 1450, 1750)
+    explicit = schedule(2 * 10**6, intensity_iterations=9)
+    assert explicit.joint_iterations == explicit.sdf_iterations
 
 
 def test_a_small_scene_trains_its_intensities_for_long_and_with_more_dropout():

@@ -31,18 +31,21 @@ _LEAST_INTENSITY_ITERATIONS = 500  # with fewer, it has not converged on a small
 _MOST_INTENSITY_ITERATIONS = 1750
 # Minimum after the joint iterations, during which the field still changes.
 _LEAST_INTENSITY_STAGE = 300
+# Beyond this, iterations of the sdf stage that train the surface alone are interspersed.
+_MOST_JOINT_ITERATIONS = _MOST_INTENSITY_ITERATIONS - _LEAST_INTENSITY_STAGE
 
 _HALF_DROPOUT_PASSES = 2.5  # uses of each sample at which dropout has half of the configured rate
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Batch sizes and iterations of the sdf stage and the intensity stage. Joint iterations count for both."""
+    """Batch sizes and iterations of the sdf stage and the intensity stage. Joint iterations, of the first, count for both."""
 
     batch_size: int = 0  # samples in an iteration of the sdf stage
     neighbours: int = 1  # length of the runs of neighbouring rays in a batch
     sdf_iterations: int = 0
     passes: float = 0.0  # passes of the sdf stage over the samples
+    joint_iterations: int = 0
     intensity_iterations: int = 0  # iterations that train the intensity network
     intensity_batch_size: int = 0
     dropout_scale: float = 0.0  # factor on the dropout
@@ -66,17 +69,18 @@ class Schedule:
             return cls(*surface)
         samples = returns * NEAR_SAMPLES
         intensity_batch_size = training.intensity_batch_size
-        intensity_iterations = training.intensity_iterations
+        joint_iterations, intensity_iterations = iterations, training.intensity_iterations
         if intensity_iterations is None:
+            joint_iterations = min(iterations, max(1, round(config.effort * _MOST_JOINT_ITERATIONS)))
             intensity_batch_size = min(intensity_batch_size, samples)
-            intensity_iterations = _intensity_iterations(config, samples, iterations)
+            intensity_iterations = _intensity_iterations(config, samples, joint_iterations)
         if training.intensity_in_free_space:  # the samples are those of the sdf stage
             intensity_batch_size = batch_size
         # A frequently used sample is easily memorised. Measured: constant dropout for all scenes (0.7 and 0.2)
         # is as good on sparse ones, but costs 2 % on a dense one, which uses its samples twice.
         times_used = intensity_iterations * intensity_batch_size / samples
         dropout_scale = times_used / (times_used + _HALF_DROPOUT_PASSES)
-        return cls(*surface, intensity_iterations, intensity_batch_size, dropout_scale)
+        return cls(*surface, joint_iterations, intensity_iterations, intensity_batch_size, dropout_scale)
 
     @property
     def iterations(self) -> dict[str, int]:

@@ -139,16 +139,28 @@ class _Stage:
     name: str
     losses: Losses
     iterations: int
-    done_before: int  # iterations of the sdf stage that count for this stage too
+    joint: int  # iterations of the sdf stage that train the intensity network, too, evenly spread
     optimisers: list[Optimiser]  # optimisers of the trained parameters, in the order of their gradients
     rows: RowAdam | None  # optimiser of the features if only touched rows move
     draw: Callable[[], Batch]
+
+    def done(self, count: int) -> dict[str, int]:
+        """Return how often each loss was trained after `count` iterations of this stage."""
+        if self.name == "sdf":
+            return {"sdf": count, "intensity": count * self.joint // self.iterations}
+        return {"intensity": self.joint + count}
+
+    def trained_by(self, i: int) -> tuple[Losses, list[Optimiser]]:
+        """Return the losses of an iteration, and the optimisers of what they train."""
+        if self.losses == "joint" and self.done(i)["intensity"] == self.done(i + 1)["intensity"]:
+            return "sdf", self.optimisers[:-1]
+        return self.losses, self.optimisers
 
 
 class Training:
     """Train `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
 
-    In the sdf stage the intensity network, if any, trains too: these are joint iterations. Ghosts are not part of the surface,
+    In joint iterations of the sdf stage the intensity network, if any, trains too. Ghosts are not part of the surface,
     but the sensor will see them again, so their intensities are learnt. `scale` is None without intensities.
     """
 
@@ -272,13 +284,13 @@ class Training:
     def _stages(self) -> list[_Stage]:
         """Return the sdf stage, and the intensity stage if it has iterations."""
         joint = "intensity" in self._optimisers
-        iterations, optimisers = self.iterations["sdf"], list(self._optimisers.values())
+        optimisers, shared = list(self._optimisers.values()), self._schedule.joint_iterations
         losses: Losses = "joint" if joint else "sdf"
-        stages = [_Stage("sdf", losses, iterations, 0, optimisers, self._rows, self._batch)]
-        left = self.iterations["intensity"] - iterations
+        stages = [_Stage("sdf", losses, self.iterations["sdf"], shared, optimisers, self._rows, self._batch)]
+        left = self.iterations["intensity"] - shared
         if joint and left > 0:
             draw = self._labelled_batch
-            stages.append(_Stage("intensity", "intensity", left, iterations, optimisers[-1:], None, draw))
+            stages.append(_Stage("intensity", "intensity", left, shared, optimisers[-1:], None, draw))
         return stages
 
     def _batch(self) -> Batch:
@@ -294,13 +306,13 @@ class Training:
         return self._sampler.spread(count, self._backend.num_parts(count))
 
     def _done(self, stage: _Stage) -> int:
-        return max(0, self.iterations_done[stage.name] - stage.done_before)
+        before = stage.joint if stage.name == "intensity" else 0
+        return max(0, self.iterations_done[stage.name] - before)
 
     def _run_stage(
         self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
     ) -> None:
         rows, iterations = stage.rows, stage.iterations
-        counts = ("sdf", "intensity") if stage.losses == "joint" else (stage.name,)
         changing = [p for optimiser in stage.optimisers for p in optimiser.parameters]
         if rows is not None:
             changing.append(rows.features)
@@ -324,12 +336,13 @@ class Training:
             pause = stop or write or judge
             # Samples are not prefetched before the state is written: it would include their draw.
             batch = ahead or stage.draw()
-            found, ahead = self._backend.of(stage.losses, batch, _nothing if pause else stage.draw)
+            losses, optimisers = stage.trained_by(i)
+            found, ahead = self._backend.of(losses, batch, _nothing if pause else stage.draw)
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
-            move_networks = functools.partial(_move_networks, found, stage.optimisers, share)
+            move_networks = functools.partial(_move_networks, found, optimisers, share)
             if rows is None:
                 move_networks(self._pool)
             else:
@@ -337,8 +350,8 @@ class Training:
                 rows.learning_rate = share * rows.full_rate
                 rows.step([found.touched], self._pool, meanwhile=move_networks)
             self.losses[stage.name] = loss
-            for name in counts:
-                self.iterations_done[name] = min(stage.done_before + i + 1, self.iterations[name])
+            for name, count in stage.done(i + 1).items():
+                self.iterations_done[name] = min(count, self.iterations[name])
             self.history.add(found.losses, self.iterations_done, batch.sdf_m)
             # Gradients of all features are as large as the features: free them before the next ones.
             del batch, found, move_networks
