@@ -216,9 +216,13 @@ def test_batches_grow_to_limit_iterations():
     many = schedule(10**7)
     assert many.sdf_iterations == 5000
     assert many.sdf_iterations * many.batch_size == pytest.approx(0.6 * 12e7, rel=1e-3)
-    assert many.neighbours == many.batch_size // FitConfig().training.batch_size > 1
+    assert many.batch_size > 3 * FitConfig().training.batch_size
     assert schedule(10**6).batch_size == FitConfig().training.batch_size
-    assert schedule(10**6).neighbours == 1
+
+
+def test_batches_of_maps_beyond_the_caches_are_runs_of_neighbours():
+    sizes = ((10**6, 500_000), (10**6, 500_001), (500_000, 10**6))
+    assert [schedule(returns, vertices).neighbours for returns, vertices in sizes] == [1, 8, 1]
 
 
 def test_joint_iterations_are_limited_and_spread_over_the_sdf_stage():

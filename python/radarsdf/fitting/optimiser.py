@@ -151,10 +151,6 @@ class RowAdam:
         self._arrays = view(cells.features), self._states.numpy()
         self._decays = torch.zeros(0, 2, dtype=torch.float32, device="cpu")
 
-    @property
-    def features(self) -> Tensor:
-        return self._cells.features
-
     def state(self) -> dict[str, Tensor]:
         count = torch.tensor(self.step_count, dtype=torch.int64, device="cpu")
         return {"states": self._states, "step_count": count}

@@ -23,6 +23,10 @@ _MOST_SAMPLES_PER_VERTEX = 20.0
 _MANY_SDF_ITERATIONS = 300
 # Beyond this, batches grow: one of the usual size covers little of so large a map.
 _MOST_SDF_ITERATIONS = 5000
+# Rows of features beyond which they and the state of their optimiser, 64 bytes, exceed the caches. Batches then consist of
+# runs of neighbouring rays, which share rows. Measured: iterations at two million returns take 0.8 of the time. On `hugin`,
+# where it gains nothing, F-scores fall by 0.04 points and intensities are 0.4 % worse.
+_ROWS_IN_CACHES, _NEIGHBOURS = 500_000, 8
 
 # Passes of the intensity network's training over the samples near the surface, joint iterations included, within the
 # limits below. Measured with SOAP: 0.4 of Adam's iterations have the same error to 0.4 %.
@@ -62,8 +66,7 @@ class Schedule:
         batch_size, iterations = training.batch_size, training.sdf_iterations
         if iterations is None:
             batch_size, iterations = _sdf_schedule(config, samples, vertices)
-        # A larger batch draws longer runs of rays at as many places: neighbouring rays share cache lines.
-        neighbours = max(1, batch_size // training.batch_size)
+        neighbours = _NEIGHBOURS if min(vertices, surface_returns) > _ROWS_IN_CACHES else 1
         surface = (batch_size, neighbours, iterations, iterations * batch_size / samples)
         if not with_intensity:
             return cls(*surface)

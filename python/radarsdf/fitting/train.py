@@ -150,12 +150,6 @@ class _Stage:
             return {"sdf": count, "intensity": count * self.joint // self.iterations}
         return {"intensity": self.joint + count}
 
-    def trained_by(self, i: int) -> tuple[Losses, list[Optimiser]]:
-        """Return the losses of an iteration, and the optimisers of what they train."""
-        if self.losses == "joint" and self.done(i)["intensity"] == self.done(i + 1)["intensity"]:
-            return "sdf", self.optimisers[:-1]
-        return self.losses, self.optimisers
-
 
 class Training:
     """Train `field` in place: the sdf stage on `surface`, then the intensity stage on all `returns`.
@@ -306,8 +300,7 @@ class Training:
         return self._sampler.spread(count, self._backend.num_parts(count))
 
     def _done(self, stage: _Stage) -> int:
-        before = stage.joint if stage.name == "intensity" else 0
-        return max(0, self.iterations_done[stage.name] - before)
+        return max(0, self.iterations_done[stage.name] - stage.done(0)[stage.name])
 
     def _run_stage(
         self, stage: _Stage, bar: Any, interrupted: Callable[[], bool], checkpoint: Checkpoint | None
@@ -315,7 +308,7 @@ class Training:
         rows, iterations = stage.rows, stage.iterations
         changing = [p for optimiser in stage.optimisers for p in optimiser.parameters]
         if rows is not None:
-            changing.append(rows.features)
+            changing.append(self._field.cells.features)
         every = max(_CHECK_EVERY, sum(map(len, changing)) // _ROWS_PER_ITERATION)
         good = [p.detach().clone() for p in changing]
 
@@ -336,13 +329,16 @@ class Training:
             pause = stop or write or judge
             # Samples are not prefetched before the state is written: it would include their draw.
             batch = ahead or stage.draw()
-            losses, optimisers = stage.trained_by(i)
-            found, ahead = self._backend.of(losses, batch, _nothing if pause else stage.draw)
+            done = stage.done(i + 1)
+            trains_all = stage.losses != "joint" or done["intensity"] > stage.done(i)["intensity"]
+            losses = stage.losses if trains_all else "sdf"
+            found, ahead = self._backend.of(losses, batch, (lambda: None) if pause else stage.draw)
             loss = sum(found.losses.values())
             if not math.isfinite(loss):
                 bad = sorted(name for name, value in found.losses.items() if not math.isfinite(value))
                 give_up(f"the {' and '.join(bad)} loss is {loss}")
-            move_networks = functools.partial(_move_networks, found, optimisers, share)
+            moved = stage.optimisers if trains_all else stage.optimisers[:-1]
+            move_networks = functools.partial(_move_networks, found, moved, share)
             if rows is None:
                 move_networks(self._pool)
             else:
@@ -350,7 +346,7 @@ class Training:
                 rows.learning_rate = share * rows.full_rate
                 rows.step([found.touched], self._pool, meanwhile=move_networks)
             self.losses[stage.name] = loss
-            for name, count in stage.done(i + 1).items():
+            for name, count in done.items():
                 self.iterations_done[name] = min(count, self.iterations[name])
             self.history.add(found.losses, self.iterations_done, batch.sdf_m)
             # Gradients of all features are as large as the features: free them before the next ones.
@@ -379,7 +375,3 @@ def _move_networks(
     for optimiser in optimisers:
         optimiser.learning_rate = share * optimiser.full_rate
         optimiser.step(list(itertools.islice(total, len(optimiser.parameters))), pool)
-
-
-def _nothing() -> None:
-    """Stand in for the prefetch of a batch."""
