@@ -58,18 +58,29 @@ class MotionPrior:
         return total / information, 1 / information
 
     def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
-        """Update from the rates of a drive's steps and their durations. Rate None: tracking was lost."""
-        known = [rate.mean for rate in rates if rate is not None]
+        """Update from the rates of a drive's steps, estimated with this prior, and their durations. Rate None: tracking was lost.
+
+        Estimates are shrunk towards the prior. So their squares are divided by the share of the variance that the measurements
+        removed, not by the number of steps (evidence approximation, MacKay 1992).
+        """
+        known = [rate for rate in rates if rate is not None]
         if not known:
             return self
-        usual = (_PRIOR_STEPS * self.usual + np.square(known).sum(axis=0)) / (_PRIOR_STEPS + len(known))
+        of_usual = [(rate.mean**2, np.maximum(1 - rate.variance / self.usual, 0.0)) for rate in known]
+        of_change = []
         elapsed_s = (durations_s[:-1] + durations_s[1:]) / 2
-        changes = [
-            (second.mean - first.mean) ** 2 / after_s
-            for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False)
-            if first is not None and second is not None and after_s > 0
-        ]
-        change = (_PRIOR_STEPS * self.change + np.sum(changes, axis=0)) / (_PRIOR_STEPS + len(changes))
+        for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False):
+            if first is not None and second is not None and after_s > 0:
+                own = self.change * after_s
+                predicted = first.variance + own
+                share = own / predicted
+                removed = share * np.maximum(1 - second.variance / predicted, 0.0)
+                of_change.append(((share * (second.mean - first.mean)) ** 2 / after_s, removed))
+        usual, change = (
+            (_PRIOR_STEPS * before + np.sum([square for square, _ in each], axis=0))
+            / (_PRIOR_STEPS + np.sum([removed for _, removed in each], axis=0))
+            for before, each in ((self.usual, of_usual), (self.change, of_change))
+        )
         return MotionPrior(usual, change, self.settles)
 
 
@@ -79,6 +90,11 @@ class MotionRate:
 
     mean: Floats  # (3,)
     covariance: Floats  # (3, 3)
+
+    @property
+    def variance(self) -> Floats:
+        """Variances (3,) of the components."""
+        return self.covariance.diagonal()
 
 
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
@@ -137,6 +153,25 @@ class PredictedStep:
         return drawn, poses
 
 
+def _jacobians(poses: Floats) -> tuple[Floats, Floats]:
+    """Return Jacobians (F - 1, 6, 6) of the residuals by increments of the first and the second pose of a step."""
+    first, second = np.zeros((2, len(poses) - 1, 6, 6))
+    back = poses[:-1, :3, :3].transpose(0, 2, 1)
+    first[:, :3, :3], second[:, :3, :3] = -back, back
+    first[:, :3, 3:] = np.einsum("fij,fjk->fik", back, skew(poses[1:, :3, 3] - poses[:-1, :3, 3]))
+    turned_back = poses[1:, :3, :3].transpose(0, 2, 1)
+    first[:, 3:, 3:], second[:, 3:, 3:] = -turned_back, turned_back
+    return first, second
+
+
+def step_variances(poses: Floats, diagonal: Floats, below: Floats) -> Floats:
+    """Return variances (F - 1, 6) of the steps of `poses`, whose covariance has blocks (F, 6, 6) and (F - 1, 6, 6)."""
+    first, second = _jacobians(poses)
+    blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
+    found: Floats = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
+    return found
+
+
 @dataclass(frozen=True)
 class Motion:
     """Motions between neighbouring scans measured by one source: given poses, Doppler, or a gyroscope."""
@@ -173,21 +208,10 @@ class Motion:
         off_m = found[:, :3, 3] - self.steps[:, :3, 3]
         return np.concatenate([off_m, Rotation.from_matrix(turns).as_rotvec()], 1)
 
-    @staticmethod
-    def _jacobians(poses: Floats) -> tuple[Floats, Floats]:
-        """Return Jacobians (F - 1, 6, 6) of the residuals by increments of the first and the second pose of a step."""
-        first, second = np.zeros((2, len(poses) - 1, 6, 6))
-        back = poses[:-1, :3, :3].transpose(0, 2, 1)
-        first[:, :3, :3], second[:, :3, :3] = -back, back
-        first[:, :3, 3:] = np.einsum("fij,fjk->fik", back, skew(poses[1:, :3, 3] - poses[:-1, :3, 3]))
-        turned_back = poses[1:, :3, :3].transpose(0, 2, 1)
-        first[:, 3:, 3:], second[:, 3:, 3:] = -turned_back, turned_back
-        return first, second
-
     def prior(self, poses: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the normal equations of increments of `poses`: diagonal blocks (F, 6, 6), sub-diagonal ones, gradient (F, 6)."""
         information = 1 / (np.repeat(self.variances, 3) * self.shares)
-        first, second = self._jacobians(poses)
+        first, second = _jacobians(poses)
         errors = (self.errors(poses) - self.bias * self.spans[:, None]) * information
         diagonal, gradient = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6))
         for rows, jacobian in ((slice(None, -1), first), (slice(1, None), second)):
@@ -200,7 +224,7 @@ class Motion:
         rows = np.flatnonzero(self.bias_sigma)
         weights = self.spans[:, None] / (np.repeat(self.variances, 3) * self.shares) * self.bias_sigma
         found = np.zeros((len(rows), len(poses), 6))
-        for scans, jacobian in zip((slice(None, -1), slice(1, None)), self._jacobians(poses), strict=True):
+        for scans, jacobian in zip((slice(None, -1), slice(1, None)), _jacobians(poses), strict=True):
             found[:, scans] -= np.einsum("fki,fk->kfi", jacobian[:, rows], weights[:, rows])
         return found, (weights * self.spans[:, None] * self.bias_sigma).sum(axis=0)[rows]
 
@@ -211,9 +235,7 @@ class Motion:
         poses, the gauge freedom would count as step errors. One step of expectation maximisation (Dempster et al. 1977): the
         expected square of an error is the square of its estimate plus its variance.
         """
-        first, second = self._jacobians(before)
-        blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
-        left = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
+        left = step_variances(before, diagonal, below)
         errors, spans, weights = self.errors(poses), self.spans[:, None], 1 / self.shares
         counts = np.isfinite(self.shares).sum(axis=0)
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)

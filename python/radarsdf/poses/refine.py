@@ -18,7 +18,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
-from radarsdf.poses.motion import Motion, unsteadiness
+from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, increments, moved, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
@@ -37,6 +37,9 @@ _FIRST_WINDOW = 8
 _OF_WINDOWS = (4, 2)  # cell edges for windows, relative to a map's surfels
 _OF_ALL = (4, 4, 2, 2)  # cell edges for all scans
 _MOST_ROUNDS = 12  # maximum number of rounds with the cells of a map's surfels
+# Log ratio of the variances of steps with fine cells to those with coarse ones from which on coarse ones are kept: few returns
+# constrain the steps less in fine cells, but surfaces are less flat in coarse ones, which no variance includes.
+_COARSER = np.log(2)
 # Convergence threshold on the step, standard deviations. Planes change in each round, so that 0.1 is often never reached;
 # 0.3 results in the same errors in half the time.
 _SETTLED = 0.3
@@ -207,9 +210,10 @@ class PosesEstimate:
     ) -> PosesEstimate:
         """Estimate from `given` (F, 4, 4) and measured motions by the Gauss-Newton method, with new planes in each round."""
         poses, count, noise, motions = given, len(given), None, list(motions)
-        plan = _plan(count, first_window)
+        plan, finest, spread = _plan(count, first_window), 1, np.inf
         rounds = 0
-        for window, cells in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
+        for window, planned in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
+            cells = max(planned, finest)
             grid = PlaneGrid(window, rounds % 2 == 1, cells * cell_m)
             # The noise is estimated every other round: it changes slowly.
             known = None if rounds % 2 == 0 else noise
@@ -217,10 +221,14 @@ class PosesEstimate:
             steps, inverse, inverse_below, decrement = planes.solve(
                 *_prior(motions, poses), _TOLERANCE, _MOST_ITERATIONS, True, num_threads
             )
+            rounds += 1
+            coarser, spread = spread, float(np.log(step_variances(poses, inverse, inverse_below)).mean())
+            if rounds == len(plan) - _MOST_ROUNDS + 1 and spread > coarser + _COARSER:
+                finest = _OF_ALL[-1]
+                continue
             before, poses = poses, aligned(moved(poses, steps), given)
             motions = [motion.at(poses).learnt(poses, before, inverse, inverse_below) for motion in motions]
-            rounds += 1
-            if window == count and cells == 1 and decrement < _SETTLED**2 * steps.size:
+            if window == count and cells == finest and decrement < _SETTLED**2 * steps.size:
                 break
         assert noise is not None
         evidence = [motion.evidence() for motion in motions]
