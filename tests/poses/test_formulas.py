@@ -10,7 +10,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.poses.checked_scans import median_range_m
-from radarsdf.poses.doppler import NoVelocityError, SensorVelocities, doppler_sign, upright
+from radarsdf.poses.doppler import (
+    CLEAR,
+    ERRORS,
+    NoVelocityError,
+    SensorVelocities,
+    motion_significance,
+    scale_gains,
+    sign_significance,
+    upright,
+)
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
@@ -182,7 +191,9 @@ def test_missing_velocities_are_interpolated():
     assert_allclose(
         found.step_covariance(3, 2.0), found.covariance[3:5].sum(axis=0) + np.diag(found.change) * 8 / 12
     )
-    assert doppler_sign(scans[:2], found.select(slice(0, 2)), times_s[:2]) == 1  # one pair is not enough
+    assert (
+        abs(sign_significance(scans[:2], found.select(slice(0, 2)), times_s[:2])) < CLEAR
+    )  # unrelated scans
     assert found.usual_mps == pytest.approx(np.sqrt([50, 65]).mean(), abs=1e-2)
     noise = [rng.uniform(-50, 50, 60) for _ in scans]
     assert SensorVelocities.of(scans, speeds[:3] + noise[:2] + speeds[5:], times_s).found.sum() == 3
@@ -404,3 +415,43 @@ def test_gains_equal_a_brute_force_search():
     expected = np.log((counts[1] + floor) / (counts[0] + floor))
     assert_allclose(_crowding(held, used, before, trajectory(4)), expected, atol=1e-9)
     assert np.ptp(expected) > 0.5
+
+
+def test_the_displacement_between_scans_is_found_and_common_patterns_cancel():
+    rng = np.random.default_rng(3)
+    world, wall = (
+        rng.uniform(-20, 20, (300, 3)),
+        np.column_stack([rng.uniform(-20, 20, (2, 400)).T, np.zeros(400)]),
+    )
+    moved_m = np.array([1.0, 0.5, 0.2])
+    scales = np.array([0.5, 0.8, 1.0, 1.25])
+    gains = scale_gains(world, world - moved_m, moved_m, scales)
+    assert gains.argmax() == 2
+    assert_allclose(scale_gains(world, world - moved_m, -moved_m, scales), -gains, atol=1e-12)
+    # Two views of a wall along the motion agree equally for either direction.
+    assert (
+        np.abs(scale_gains(wall[::2], wall[1::2], np.array([1.0, 0, 0]), scales)).max() < 0.05 * gains.max()
+    )
+
+
+def test_one_pair_of_scans_of_a_turning_sensor_shows_the_sign_of_the_doppler():
+    rng = np.random.default_rng(4)
+    world, times_s = rng.uniform(-20, 20, (300, 3)), np.array([0.0, 0.1])
+    velocity = np.array([[20.0, 1.0, 0.0]] * 2)
+    velocities = SensorVelocities(velocity, np.tile(np.eye(3), (2, 1, 1)), np.ones(3), [], np.ones(2, bool))
+    turn = rotation(np.array([0.0, 0.0, 0.2]))
+    scans = [world, (world - 0.1 * velocity[0]) @ turn]
+    assert sign_significance(scans, velocities, times_s) > CLEAR
+    assert sign_significance(scans, velocities.scaled(-1.0), times_s) < -CLEAR
+
+
+def test_scans_of_walls_along_the_motion_agree_best_without_it():
+    rng = np.random.default_rng(5)
+    motion = np.eye(4)
+    motion[0, 3] = 1.0
+    walls = [np.column_stack([rng.uniform(-10, 10, 300), np.repeat([-2.0, 2.0], 150), np.zeros(300)])] * 12
+    assert motion_significance(walls, [motion] * 11) < -ERRORS  # the same clutter in each scan
+    world = rng.uniform(-20, 20, (500, 3))
+    scans = [world - i * motion[:3, 3] for i in range(12)]
+    assert motion_significance(scans, [motion] * 11) > ERRORS
+    assert motion_significance(scans, [None] * 11) == 0

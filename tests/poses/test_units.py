@@ -12,7 +12,7 @@ from radarsdf.io import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.rigid import aligned
-from radarsdf.poses.tracking import Drive, doppler_factor
+from radarsdf.poses.tracking import Drive, doppler_scale
 from radarsdf.simulate import measured_motion
 
 from bench.kinds import KINDS
@@ -63,15 +63,27 @@ def test_speeds_contradicting_returns_are_excluded(drive, motion):
     assert position_error_m(aligned(found.poses, drive.poses), drive.poses) < 0.1
 
 
-def test_speeds_that_returns_cannot_contradict_are_kept():
-    """Scans contracted by a fifth agree equally well."""
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25, 2.0])
+def test_the_scale_of_the_doppler_is_estimated(factor):
+    """Regression: 0.8 or 1.25 times the speed counted as right, with poses up to 100 standard deviations off."""
     yard = KINDS["yard"](seed=2, frames=24)
     motion = measured_motion(yard, seed=2)
-    checked = CheckedScans.of(yard.points, motion.doppler_mps, motion.times_s)
+    speeds = [factor * speeds for speeds in motion.doppler_mps]
+    checked = CheckedScans.of(yard.points, speeds, motion.times_s)
     drive = Drive(checked.scans, checked.times_s, checked.velocities, None)
-    assert doppler_factor(drive, FitConfig(num_threads=1), 1) == 1
-    doubled = dataclasses.replace(drive, velocities=checked.velocities.scaled(2.0))
-    assert doppler_factor(doubled, FitConfig(num_threads=1), 1) == pytest.approx(0.5, rel=0.1)
+    scale, least, most = doppler_scale(drive, FitConfig(num_threads=1), 1)
+    assert scale * factor == pytest.approx(1, abs=0.08)
+    assert least <= 1.01 / factor <= 1.02 * most
+    assert (least < 1.1 and most > 1 / 1.1) == (factor == 1)
+
+
+def test_too_few_scans_do_not_measure_the_scale_of_the_doppler(drive, motion):
+    """Regression: it counted as confirmed."""
+    found = radarsdf.odometry(
+        drive.points[:5], doppler_mps=motion.doppler_mps[:5], times_s=motion.times_s[:5]
+    )
+    assert found.report["doppler"]
+    assert any("the Doppler is in m/s" in note for note in found.report["notes"])
 
 
 @pytest.mark.parametrize(

@@ -67,8 +67,8 @@ def fit(given: Namespace, results: Results) -> None:
             stop.radar_map.save(out)
             stop.args = (f"{stop}; the map so far is in {out}",)
         raise
-    if posed.way is not None:
-        radar_map.report["poses"] = posed.way
+    if posed.trajectory is not None:
+        radar_map.report["poses"] = posed.trajectory
     radar_map.save(out)
     if given.checkpoint is not None:
         given.checkpoint.unlink(missing_ok=True)

@@ -16,7 +16,15 @@ import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog
-from radarsdf.poses.doppler import LEAST_MPS, NOT_USED, NoVelocityError, SensorVelocities, upright
+from radarsdf.poses.doppler import (
+    CLEAR,
+    LEAST_MPS,
+    NOT_USED,
+    NoVelocityError,
+    SensorVelocities,
+    sign_significance,
+    upright,
+)
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import Floats, rotation_vector
 from radarsdf.poses.tracking import LEAST_OBSERVED, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
@@ -26,8 +34,6 @@ from radarsdf.returns.planes import LEAVES_PER_SURFEL
 _STEPS = 100  # steps from which the motion prior is learnt
 _START = 8  # scans of the initialisation, re-estimated jointly after 2, 4 and 8 scans
 _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
-_CLEAR = 5.0  # standard errors by which more returns agree with one sign of the Doppler
-_CHANCE = 0.25  # approximate share of a sparse radar's returns that agree at a wrong pose: 0.13 to 0.27
 _MOVES = 5.0  # standard deviations of a significant velocity
 _OBSERVED_STEPS = 10  # steps over which returns alone must observe the motion of the sensor
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # approximate covariance of a step between given poses
@@ -204,7 +210,7 @@ class Follower:
         first = max([first, len(steps) - _START, *(i - 1 for i in moving[:1])])
         count, sign_open = len(moving), sign == 0 and new.velocity is not None
         due = count & (count - 1) == 0 and (sign_open or (first < _KNOWN_STEPS and count <= _START))
-        due = due or (sign_open and count <= _START / 2)
+        due = due or (sign_open and count <= _START)
         if not new.moves or not due:
             return None
         sign, tracked = self._followed(steps[first:], sign)
@@ -231,27 +237,12 @@ class Follower:
             with contextlib.suppress(NoVelocityError):
                 velocities = SensorVelocities.of(points, speeds, drive.times_s)
 
-        def by(sign: int) -> list[Tracked]:
-            signed = None if velocities is None else _signed(velocities, sign)
-            return followed(
-                dataclasses.replace(drive, velocities=signed), self.config, self.config.num_threads
-            )[1]
-
-        if sign or velocities is None:
-            return sign, by(sign)
-        counts = np.array([len(scan) for scan in drive.scans[1:]])
-        returns = max(int(counts.sum()), 1)
-
-        def share(tracked: list[Tracked], lost: float = 0.0) -> float:
-            agreeing = np.nan_to_num([found.agreeing for found in tracked[1:]], nan=lost)
-            return float(np.dot(agreeing, counts) / returns)
-
-        ahead, back = by(1), by(-1)
-        a, b = share(ahead, _CHANCE), share(back, _CHANCE)
-        clear = abs(a - b) > _CLEAR * np.sqrt((a * (1 - a) + b * (1 - b)) / returns)
-        if clear and max(a, b) > _CHANCE:
-            return (1, ahead) if a > b else (-1, back)
-        return 0, max(ahead, back, by(0), key=share)
+        if velocities is not None:
+            evidence = CLEAR * sign or sign_significance(drive.scans, velocities, drive.times_s)
+            sign = int(np.sign(evidence)) if abs(evidence) >= CLEAR else 0
+            # Until the sign is clear, the scans are placed by the likelier one, and re-estimated.
+            drive = dataclasses.replace(drive, velocities=_signed(velocities, int(np.sign(evidence))))
+        return sign, followed(drive, self.config, self.config.num_threads)[1]
 
 
 def _covariance(velocity: SensorVelocity) -> Floats:

@@ -14,12 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.poses.motion import Motion, spans_of, way
-from radarsdf.poses.rigid import Floats, rotation_vector, step_vectors, steps
+from radarsdf.poses.motion import KnownMotion, spans_of, way
+from radarsdf.poses.rigid import Floats, rotation, rotation_vector, step_vectors, steps
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
-_SAMPLED, _PAIRS = 400, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
-_ERRORS = 3.0  # standard errors of a significant difference
+_SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
+_FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
+_TURNS_RAD = np.linspace(-0.4, 0.4, 13)  # possible yaws between neighbouring scans
+CLEAR = 4.0
+"""Standard errors by which scans must agree better with one sign of the Doppler."""
+_LEAST_M = 0.05  # minimum distance between returns that counts, below the noise of any radar
+ERRORS = 3.0
+"""Standard errors of a significant difference."""
 # Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
 # elevations with a common error.
 LEAST_MPS = 0.02
@@ -119,7 +125,7 @@ def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
 
 
 @dataclass(frozen=True)
-class DopplerMotion(Motion):
+class DopplerMotion(KnownMotion):
     """Translations between scans from velocities. They depend on the rotation of the sensor in between."""
 
     velocities: SensorVelocities
@@ -143,10 +149,6 @@ class DopplerMotion(Motion):
         unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
         return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 
-    def learnt(self, *_: Floats) -> DopplerMotion:
-        """Return self: covariances of velocities are known. Learning them made the final error of real drives four times larger."""
-        return self
-
     def at(self, poses: Floats) -> DopplerMotion:
         """Update the translations for the rotations of `poses`."""
         between, means = steps(poses), self.velocities.mean_mps
@@ -166,27 +168,77 @@ def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
     )
     given = np.diff(poses[::count, :3, 3], axis=0)
     squares = float(((measured - given) ** 2).sum())
-    if squares <= _ERRORS**2 * float(variance.sum()):
+    if squares <= ERRORS**2 * float(variance.sum()):
         return 0.0
     return squares / max(float((given**2).sum()), float((measured**2).sum()))
 
 
-def doppler_sign(scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats) -> int:
-    """Return -1 if neighbouring scans of static returns agree better with all velocities reversed, else 1."""
-    moved_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * np.diff(times_s)
-    usable = velocities.found[1:] & velocities.found[:-1]
-    usable &= np.diff(times_s) <= 2 * np.median(np.diff(times_s))
+def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
+    """Return log distances (K, M) from returns of two scans to the nearest one of the other, if `second` is shifted by (K, 3)."""
+    trees = cKDTree(first), cKDTree(second)
+    some = [scan[:: max(1, len(scan) // _SAMPLED)] for scan in (second, first)]
+    distances = [
+        tree.query(points + towards * shifts_m[:, None])[0]
+        for tree, points, towards in zip(trees, some, (1, -1), strict=True)
+    ]
+    found: Floats = np.log(np.maximum(np.concatenate(distances, axis=1), _LEAST_M))
+    return found
+
+
+def scale_gains(first: Floats, second: Floats, moved_m: Floats, scales: Floats) -> Floats:
+    """Return how much nearer returns of two scans are after a motion of `scales` (K,) times `moved_m` (3,) than after its reverse.
+
+    The scans have common axes. What they have in common wherever they were taken, such as their density, clutter, or walls along the
+    motion, does not contribute.
+    """
+    shifts_m = np.multiply.outer(np.concatenate([scales, -scales]), moved_m)
+    ahead, back = np.split(log_distances(first, second, shifts_m).mean(axis=1), 2)
+    found: Floats = back - ahead
+    return found
+
+
+def sign_significance(scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats) -> float:
+    """Return by how many standard errors neighbouring scans agree better with all velocities than with these reversed."""
+    durations_s = np.diff(times_s)
+    moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
+    usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
-    pairs = np.flatnonzero(usable)
-    pairs = np.sort(pairs[np.argsort(moved_m[pairs])[-_PAIRS:]])  # the longest steps are most informative
+    # The longest steps are most informative.
+    pairs = sorted(np.flatnonzero(usable).tolist(), key=lambda i: -float(moved_m[i] @ moved_m[i]))[:_PAIRS]
+    if not pairs:
+        return 0.0
+    gains = [_reversal_gains(scans[i], scans[i + 1], moved_m[i]) for i in pairs]
+    means = np.array([gain.mean() for gain in gains])
+    if len(gains) < _FEW_PAIRS:
+        # Returns of both scans count, mostly on the same objects: half of them are independent.
+        variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
+    else:
+        variance = means.var(ddof=1) / len(gains)
+    return float(means.mean() / np.sqrt(max(variance, 1e-12)))
+
+
+def motion_significance(scans: Sequence[Floats], motions: Sequence[Floats | None]) -> float:
+    """Return by how many standard errors neighbouring scans agree better after `motions` (4, 4) than after their rotations alone.
+
+    Negative where a pattern that moves with the sensor, such as that of a straight wall, explains the returns better. 0 if unknown.
+    """
     gains = []
-    for i in pairs.tolist():
-        first, second = scans[i : i + 2]
-        sampled = second[:: max(1, len(second) // _SAMPLED)]
-        moved = 0.5 * (velocities.mean_mps[i] + velocities.mean_mps[i + 1]) * (times_s[i + 1] - times_s[i])
-        tree = cKDTree(first)
-        ahead, back = (np.log(np.maximum(tree.query(sampled + s * moved)[0], 1e-3)).mean() for s in (1, -1))
-        gains.append(ahead - back)
-    if len(gains) < 2:
-        return 1
-    return -1 if np.mean(gains) > _ERRORS * np.std(gains, ddof=1) / np.sqrt(len(gains)) else 1
+    for first, second, motion in zip(scans, scans[1:], motions, strict=False):
+        if motion is not None and min(len(first), len(second)) > 0:
+            turned = second @ motion[:3, :3].T
+            logs = log_distances(first, turned, np.outer([0.0, 1.0], motion[:3, 3])).mean(axis=1)
+            gains.append(logs[0] - logs[1])
+    if len(gains) < _FEW_PAIRS:
+        return 0.0
+    return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(len(gains)), 1e-6))
+
+
+def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> Floats:
+    """Return how much nearer each return (M,) is after this motion than after its reverse, each with the turn that suits it best."""
+    both = []
+    for turn in _TURNS_RAD:
+        whole, half = rotation(np.multiply.outer([turn, 0.5 * turn], [0.0, 0.0, 1.0]))
+        both.append(log_distances(first, second @ whole.T, np.multiply.outer([1.0, -1.0], half @ moved_m)))
+    ahead, back = np.swapaxes(both, 0, 1)
+    found: Floats = back[back.mean(axis=1).argmin()] - ahead[ahead.mean(axis=1).argmin()]
+    return found

@@ -58,29 +58,18 @@ class MotionPrior:
         return total / information, 1 / information
 
     def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
-        """Update from the rates of a drive's steps, estimated with this prior, and their durations. Rate None: tracking was lost.
-
-        Estimates are shrunk towards the prior. So their squares are divided by the share of the variance that the measurements
-        removed, not by the number of steps (evidence approximation, MacKay 1992).
-        """
-        known = [rate for rate in rates if rate is not None]
+        """Update from the rates of a drive's steps and their durations. Rate None: tracking was lost."""
+        known = [rate.mean for rate in rates if rate is not None]
         if not known:
             return self
-        of_usual = [(rate.mean**2, np.maximum(1 - rate.variance / self.usual, 0.0)) for rate in known]
-        of_change = []
+        usual = (_PRIOR_STEPS * self.usual + np.square(known).sum(axis=0)) / (_PRIOR_STEPS + len(known))
         elapsed_s = (durations_s[:-1] + durations_s[1:]) / 2
-        for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False):
-            if first is not None and second is not None and after_s > 0:
-                own = self.change * after_s
-                predicted = first.variance + own
-                share = own / predicted
-                removed = share * np.maximum(1 - second.variance / predicted, 0.0)
-                of_change.append(((share * (second.mean - first.mean)) ** 2 / after_s, removed))
-        usual, change = (
-            (_PRIOR_STEPS * before + np.sum([square for square, _ in each], axis=0))
-            / (_PRIOR_STEPS + np.sum([removed for _, removed in each], axis=0))
-            for before, each in ((self.usual, of_usual), (self.change, of_change))
-        )
+        changes = [
+            (second.mean - first.mean) ** 2 / after_s
+            for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False)
+            if first is not None and second is not None and after_s > 0
+        ]
+        change = (_PRIOR_STEPS * self.change + np.sum(changes, axis=0)) / (_PRIOR_STEPS + len(changes))
         return MotionPrior(usual, change, self.settles)
 
 
@@ -90,11 +79,6 @@ class MotionRate:
 
     mean: Floats  # (3,)
     covariance: Floats  # (3, 3)
-
-    @property
-    def variance(self) -> Floats:
-        """Variances (3,) of the components."""
-        return self.covariance.diagonal()
 
 
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
@@ -252,7 +236,16 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class SteadyMotion(Motion):
+class KnownMotion(Motion):
+    """Motions with known variances. Those of velocities are: learning them made errors of real drives four times larger."""
+
+    def learnt(self, *_: Floats) -> Motion:
+        """Return self."""
+        return self
+
+
+@dataclass(frozen=True)
+class SteadyMotion(KnownMotion):
     """Steps predicted by the motion priors, each from its two neighbours.
 
     The posterior density is highest where all steps agree with these predictions. Tracked steps, taken as measurements, keep the
@@ -292,10 +285,6 @@ class SteadyMotion(Motion):
         variances = np.concatenate([v for _, v in both], axis=1) * 0.5 * durations_s[:, None] ** 2
         shares = np.where(np.isinf(self.shares), np.inf, variances)
         return dataclasses.replace(self, steps=transform(turns, moves), shares=shares)
-
-    def learnt(self, *_: Floats) -> SteadyMotion:
-        """Return self: the priors are those of the drive."""
-        return self
 
     def evidence(self) -> Motion:
         """Return the usual rates alone: similarity to neighbouring steps is no independent measurement."""

@@ -8,6 +8,7 @@ import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,18 +18,18 @@ from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.doppler import NOT_USED, doppler_sign
+from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
-from radarsdf.poses.rigid import Floats
+from radarsdf.poses.rigid import Floats, between
 from radarsdf.poses.tracking import (
     LATERAL_MPS2,
     LEAST_OBSERVED,
     WINDOW,
     Drive,
     Tracked,
-    doppler_factor,
+    doppler_scale,
     followed,
 )
 from radarsdf.returns.rays import within_ranges
@@ -38,6 +39,9 @@ from radarsdf.threads import ThreadPool
 # Minimum share of the prior variance of a step's rotation that the returns must remove: over the window of scans, it adds up to
 # all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_OBSERVED_TURN = 1 / WINDOW
+# Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
+_SAME_SCALE = 1.1
+_SCALE_MEASURED = 1.2  # beyond which confidence limits of that ratio leave the scale of the Doppler open
 
 
 class UnobservedMotionError(ValueError):
@@ -137,7 +141,7 @@ def odometry(
     checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
     if velocities is not None:
-        sign = doppler_sign(checked.scans, velocities, times_s)
+        sign = -1 if sign_significance(checked.scans, velocities, times_s) < -CLEAR else 1
         velocities = velocities.scaled(-1.0) if sign < 0 else velocities
     if imu is None and isinstance(points, Scans):
         imu = points.imu
@@ -145,10 +149,15 @@ def odometry(
     with ThreadPool(config.num_threads) as pool:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, None)
-        if (factor := doppler_factor(drive, config, pool.num_threads)) != 1:
-            velocities = None
-            why = f"the returns show {factor:.1f} times its speeds. Give it in m/s, and times in s"
-            notes.append(f"{NOT_USED}: {why}.")
+        if velocities is not None:
+            scale, least, most = doppler_scale(drive, config, pool.num_threads)
+            if least > _SAME_SCALE or most < 1 / _SAME_SCALE:
+                velocities = None
+                why = f"the returns show {scale:.1f} times its speeds. Give it in m/s, and times in s"
+                notes.append(f"{NOT_USED}: {why}.")
+            elif most > _SCALE_MEASURED or least < 1 / _SCALE_MEASURED:
+                shown = f"{least:.1f} to {most:.1f} times its speeds"
+                notes.append(f"Assumed: the Doppler is in m/s; the returns agree with {shown}.")
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
         drive = dataclasses.replace(drive, velocities=velocities, gyroscope=inertial.gyroscope)
         try:
@@ -219,6 +228,17 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
             msg = (
                 f"the returns alone do not observe how the sensor {moved}: of a step's variance, they remove {observed:.1%}, and "
                 f"{least:.0%} is needed. Give {missing}, or poses"
+            )
+            raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
+    if drive.velocities is None:
+        steps = [
+            between(a.pose[None], b.pose[None])[0] if a.segment == b.segment else None
+            for a, b in pairwise(tracked)
+        ]
+        if motion_significance(drive.scans, steps) < -ERRORS:
+            msg = (
+                "the returns alone do not observe how the sensor moved: neighbouring scans agree better without any motion. "
+                f"Give {doppler}, or poses"
             )
             raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
     if drive.gyroscope is None and turn < _LEAST_OBSERVED_TURN:

@@ -66,7 +66,7 @@ class PosedScans:
     rows: slice  # the K scans among those of the drive: all, or the longest segment of odometry
     given: Floats | None = None  # (K, 4, 4) original poses, if any
     segments: int = 1
-    way: dict[str, Any] | None = None  # trajectory for the report of a map. None for original poses
+    trajectory: dict[str, Any] | None = None  # for the report of a map. None for original poses
     sigmas: tuple[float, float] | None = None  # standard deviations of a pose, m and rad, if known
     notes: tuple[str, ...] = ()  # sentences on unused input
 
@@ -81,8 +81,10 @@ class PosedScans:
     def found(cls, found: Odometry) -> PosedScans:
         """Build from the longest segment of odometry."""
         rows, report = found.longest_segment(), found.report
-        sigmas, way = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
-        return cls(found.poses[rows], rows, None, report["segments"], way, sigmas, tuple(report["notes"]))
+        sigmas, trajectory = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
+        return cls(
+            found.poses[rows], rows, None, report["segments"], trajectory, sigmas, tuple(report["notes"])
+        )
 
     def config(self, config: FitConfig) -> FitConfig:
         """Return `config` with the errors of the poses, unless it specifies its own."""

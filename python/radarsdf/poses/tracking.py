@@ -18,7 +18,7 @@ from radarsdf._core import LocalPlanes
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
+from radarsdf.poses.doppler import DopplerMotion, SensorVelocities, scale_gains
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, SteadyMotion
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
@@ -54,15 +54,11 @@ LATERAL_MPS2 = 2.0
 # Maximum standard deviation of a turn rate that may remain unobserved between scans, that of a sensor faster than 20 m/s: the joint
 # estimate and the covariance are valid for small rotations.
 _SLOW_TURN_RAD_S = 0.1
-# Steps to estimate the scale of Doppler, their minimum, and the first scan with enough previous ones to compare.
-_COMPARED, _FEW_COMPARED, _FIRST_COMPARED = 12, 6, 4
-# Prior deviation of that scale: from half or twice the true one, the returns of most scenes converge to it.
-_FREE_SCALE = 0.15
-# Beyond this ratio, returns yield spurious scales: 0.18 in a hall, where contracted scans agree.
-_MOST_SCALE = 2.5
-# Errors of the estimated scale: 0.01 to 0.04 where the motion is fully observed, up to 0.22 in tunnels and yards.
-_SAME_SCALE = 0.25
-_BY_CHANCE = 0.02  # significance level of another scale
+_COMPARED, _FEW_COMPARED = 24, 6  # pairs of scans to estimate the scale of Doppler, and their minimum
+_COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
+_FREE_SCALE = 0.15  # prior deviation of that scale: from half or twice the true one, returns of most scenes converge to it
+_SCALES = np.geomspace(0.4, 2.5, 33)
+_BY_CHANCE = 0.01  # significance level of another scale than 1
 _GYROSCOPE_RAD = 0.003  # initial deviation of a step's rotation by a gyroscope
 
 
@@ -406,47 +402,37 @@ def followed(
     return drive, tracked
 
 
-def doppler_factor(drive: Drive, config: FitConfig, num_threads: int) -> float:
-    """Estimate the ratio of the speed from returns to that from Doppler, if it differs significantly from 1, else 1.
+def doppler_scale(drive: Drive, config: FitConfig, num_threads: int) -> tuple[float, float, float]:
+    """Estimate the ratio of the speed from returns to that from Doppler, with its lower and upper confidence limit.
 
-    The fastest scans are tracked with a free scale of the Doppler. The estimated scale, when fixed, must also yield more inliers
-    than that of the Doppler: returns alone favour contraction.
+    The fastest scans are tracked with a free scale. The limits are those of the scales at which pairs of scans agree not
+    significantly worse than at the best one.
     """
+    unknown = 1.0, float(_SCALES[0]), float(_SCALES[-1])
     durations_s = np.diff(drive.times_s)
-    count = min(_COMPARED, len(durations_s))
-    if drive.velocities is None or count < _FEW_COMPARED:
-        return 1.0
+    if drive.velocities is None or len(durations_s) < _FEW_COMPARED:
+        return unknown
     lengths_m = np.linalg.norm(drive.velocities.mean_mps[:-1], axis=1) * durations_s
     lengths_m[durations_s > 2 * np.median(durations_s)] = 0.0
+    every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, len(lengths_m) // _FEW_COMPARED))
+    count = min(_COMPARED, len(lengths_m) // every) * every
     begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
-    rows = slice(begin, begin + count + 1)
+    rows = slice(begin, begin + count + 1, every)
     velocities, scans, times_s = drive.velocities.select(rows), drive.scans[rows], drive.times_s[rows]
-    cell_m = plane_cell_m(drive.scans, config.leaf_size_m)
-
-    def tracked(factor: float, sigma: float) -> list[Tracked]:
-        scaled = Drive(scans, times_s, velocities.scaled(factor, sigma), None)
-        return _tracked(scaled, Tracker(cell_m, config.returns, num_threads))[0]
-
-    free, information, off = tracked(1.0, _FREE_SCALE), 0.0, 0.0
-    motion = DopplerMotion.by(velocities, times_s, np.stack([found.pose for found in free]))
-    for step, before, now in zip(motion.steps, free, free[1:], strict=False):
-        moved_m = before.pose[:3, :3] @ step[:3, 3]
-        squared_m2 = float(moved_m @ moved_m)
-        if now.segment == before.segment and squared_m2 > 0:
-            variance = float(moved_m @ now.covariance[:3, :3] @ moved_m) / squared_m2**2
-            # Subtract the prior, that of the mean of two velocities.
-            information += max(1 / variance - 2 / _FREE_SCALE**2, 0.0)
-            off += (float(moved_m @ (now.pose[:3, 3] - before.pose[:3, 3])) / squared_m2 - 1) / variance
-    factor = 1 + off / max(information, 1.0)
-    if (
-        abs(factor - 1) < _SAME_SCALE + _ERRORS / np.sqrt(max(information, 1.0))
-        or not 1 / _MOST_SCALE < factor < _MOST_SCALE
-    ):
-        return 1.0
-    rescaled, measured = (
-        np.nan_to_num([found.agreeing for found in tracked(by, 0.0)[_FIRST_COMPARED:]])
-        for by in (factor, 1.0)
-    )
-    gains = rescaled - measured
-    needed = float(student.ppf(1 - _BY_CHANCE, len(gains) - 1)) * gains.std(ddof=1) / np.sqrt(len(gains))
-    return factor if gains.mean() > needed else 1.0
+    free = Drive(scans, times_s, velocities.scaled(1.0, _FREE_SCALE), None)
+    tracked, _ = _tracked(free, Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads))
+    motion = DopplerMotion.by(velocities, times_s, np.stack([found.pose for found in tracked]))
+    gains = []
+    for i, step in enumerate(motion.steps):
+        if tracked[i].segment == tracked[i + 1].segment and min(len(scans[i]), len(scans[i + 1])) > 0:
+            turned = scans[i + 1] @ step[:3, :3].T
+            gains.append(scale_gains(scans[i], turned, step[:3, 3], _SCALES))
+    if len(gains) < _FEW_COMPARED:
+        return unknown
+    best = int(np.argmax(np.mean(gains, axis=0)))
+    losses = np.array(gains)[:, best, None] - gains
+    errors = losses.std(axis=0, ddof=1) / np.sqrt(len(gains))
+    # The best of many scales is compared with each.
+    needed = float(student.ppf(1 - _BY_CHANCE / len(_SCALES), len(gains) - 1))
+    possible = _SCALES[losses.mean(axis=0) <= needed * errors]
+    return float(_SCALES[best]), float(possible[0]), float(possible[-1])
