@@ -192,7 +192,7 @@ def test_missing_velocities_are_interpolated():
         found.step_covariance(3, 2.0), found.covariance[3:5].sum(axis=0) + np.diag(found.change) * 8 / 12
     )
     assert (
-        abs(sign_significance(scans[:2], found.select(slice(0, 2)), times_s[:2])) < CLEAR
+        abs(sign_significance(scans[:2], found.select(slice(0, 2)), times_s[:2])[0]) < CLEAR
     )  # unrelated scans
     assert found.usual_mps == pytest.approx(np.sqrt([50, 65]).mean(), abs=1e-2)
     noise = [rng.uniform(-50, 50, 60) for _ in scans]
@@ -441,8 +441,10 @@ def test_one_pair_of_scans_of_a_turning_sensor_shows_the_sign_of_the_doppler():
     velocities = SensorVelocities(velocity, np.tile(np.eye(3), (2, 1, 1)), np.ones(3), [], np.ones(2, bool))
     turn = rotation(np.array([0.0, 0.0, 0.2]))
     scans = [world, (world - 0.1 * velocity[0]) @ turn]
-    assert sign_significance(scans, velocities, times_s) > CLEAR
-    assert sign_significance(scans, velocities.scaled(-1.0), times_s) < -CLEAR
+    for sign in (1, -1):
+        significance, yaws = sign_significance(scans, velocities.scaled(sign), times_s)
+        assert sign * significance > CLEAR
+        assert_allclose(yaws, 0.2, atol=0.04)
 
 
 def test_scans_of_walls_along_the_motion_agree_best_without_it():

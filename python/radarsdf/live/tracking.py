@@ -238,10 +238,18 @@ class Follower:
                 velocities = SensorVelocities.of(points, speeds, drive.times_s)
 
         if velocities is not None:
-            evidence = CLEAR * sign or sign_significance(drive.scans, velocities, drive.times_s)
-            sign = int(np.sign(evidence)) if abs(evidence) >= CLEAR else 0
+            evidence, yaws = sign_significance(drive.scans, velocities.scaled(sign or 1.0), drive.times_s)
             # Until the sign is clear, the scans are placed by the likelier one, and re-estimated.
-            drive = dataclasses.replace(drive, velocities=_signed(velocities, int(np.sign(evidence))))
+            likelier = sign or int(np.sign(evidence))
+            sign = sign or (likelier if abs(evidence) > CLEAR else 0)
+            # By the prior alone, a vehicle that turns by 13 degrees between the first scans would be lost.
+            durations_s = np.diff(drive.times_s)
+            rates = [
+                MotionRate(np.array([0.0, 0.0, yaw]), np.zeros((3, 3))) if np.isfinite(yaw) else None
+                for yaw in yaws / durations_s
+            ]
+            turns = drive.turns.learnt(rates, durations_s)
+            drive = dataclasses.replace(drive, velocities=_signed(velocities, likelier), turns=turns)
         return sign, followed(drive, self.config, self.config.num_threads)[1]
 
 

@@ -197,24 +197,31 @@ def scale_gains(first: Floats, second: Floats, moved_m: Floats, scales: Floats) 
     return found
 
 
-def sign_significance(scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats) -> float:
-    """Return by how many standard errors neighbouring scans agree better with all velocities than with these reversed."""
+def sign_significance(
+    scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats
+) -> tuple[float, Floats]:
+    """Return by how many standard errors neighbouring scans agree better with all velocities than with these reversed.
+
+    Also return the yaws (F - 1,) between scans in the likelier direction, rad; NaN: unknown.
+    """
     durations_s = np.diff(times_s)
     moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
     usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
     # The longest steps are most informative.
     pairs = sorted(np.flatnonzero(usable).tolist(), key=lambda i: -float(moved_m[i] @ moved_m[i]))[:_PAIRS]
+    yaws = np.full(len(durations_s), np.nan)
     if not pairs:
-        return 0.0
-    gains = [_reversal_gains(scans[i], scans[i + 1], moved_m[i]) for i in pairs]
+        return 0.0, yaws
+    gains, turns = zip(*(_reversal_gains(scans[i], scans[i + 1], moved_m[i]) for i in pairs), strict=True)
     means = np.array([gain.mean() for gain in gains])
     if len(gains) < _FEW_PAIRS:
         # Returns of both scans count, mostly on the same objects: half of them are independent.
         variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
     else:
         variance = means.var(ddof=1) / len(gains)
-    return float(means.mean() / np.sqrt(max(variance, 1e-12)))
+    yaws[pairs] = np.array(turns)[:, 0 if means.mean() >= 0 else 1]
+    return float(means.mean() / np.sqrt(max(variance, 1e-12))), yaws
 
 
 def motion_significance(scans: Sequence[Floats], motions: Sequence[Floats | None]) -> float:
@@ -233,12 +240,12 @@ def motion_significance(scans: Sequence[Floats], motions: Sequence[Floats | None
     return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(len(gains)), 1e-6))
 
 
-def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> Floats:
-    """Return how much nearer each return (M,) is after this motion than after its reverse, each with the turn that suits it best."""
+def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> tuple[Floats, tuple[float, float]]:
+    """Return how much nearer each return (M,) is after this motion than after its reverse, each with its best yaw, and these."""
     both = []
     for turn in _TURNS_RAD:
         whole, half = rotation(np.multiply.outer([turn, 0.5 * turn], [0.0, 0.0, 1.0]))
         both.append(log_distances(first, second @ whole.T, np.multiply.outer([1.0, -1.0], half @ moved_m)))
     ahead, back = np.swapaxes(both, 0, 1)
-    found: Floats = back[back.mean(axis=1).argmin()] - ahead[ahead.mean(axis=1).argmin()]
-    return found
+    i, j = int(ahead.mean(axis=1).argmin()), int(back.mean(axis=1).argmin())
+    return back[j] - ahead[i], (float(_TURNS_RAD[i]), float(_TURNS_RAD[j]))

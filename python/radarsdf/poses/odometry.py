@@ -141,7 +141,7 @@ def odometry(
     checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
     if velocities is not None:
-        sign = -1 if sign_significance(checked.scans, velocities, times_s) < -CLEAR else 1
+        sign = -1 if sign_significance(checked.scans, velocities, times_s)[0] < -CLEAR else 1
         velocities = velocities.scaled(-1.0) if sign < 0 else velocities
     if imu is None and isinstance(points, Scans):
         imu = points.imu
