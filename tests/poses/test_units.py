@@ -63,7 +63,7 @@ def test_speeds_contradicting_returns_are_excluded(drive, motion):
     assert position_error_m(aligned(found.poses, drive.poses), drive.poses) < 0.1
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25, 2.0])
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
 def test_the_scale_of_the_doppler_is_estimated(factor):
     """Regression: 0.8 or 1.25 times the speed counted as right, with poses up to 100 standard deviations off."""
     yard = KINDS["yard"](seed=2, frames=24)
