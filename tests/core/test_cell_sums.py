@@ -70,9 +70,7 @@ def test_sums_over_the_returns_of_a_cell():
     ranges_m = rng.uniform(1, 100, count).astype(np.float32)
     cells = rng.integers(0, num_cells - 1, count).astype(np.int32)  # the last stays empty
     lattice = rng.integers(-20, 20, (num_cells, 3))
-    x, y, z = (
-        np.rint(points.astype(np.float64) / quantum_m).astype(np.int64) - QUANTA * lattice[cells]
-    ).T
+    x, y, z = (np.rint(points.astype(np.float64) / quantum_m).astype(np.int64) - QUANTA * lattice[cells]).T
     along = np.rint(directions * DIRECTION_QUANTA).astype(np.int64).T
     ranges = np.rint(ranges_m.astype(np.float64) / quantum_m).astype(np.int64)
     ones = np.ones(count, np.int64)

@@ -69,7 +69,10 @@ class SurfaceReturns:
         means = None if config.train else MeanRays.of_sums(sums, num_threads)
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
-        drop, asked = config.returns.drop_ghosts, config.train or config.returns.free_space or inside is not None
+        drop, asked = (
+            config.returns.drop_ghosts,
+            config.train or config.returns.free_space or inside is not None,
+        )
         cell_of_ray = None  # row of surfels
         if config.train or (drop and asked):
             if cells is None:
