@@ -114,7 +114,8 @@ void bind_cell_sums(py::module_& m) {
         return medians;
       },
       "keys"_a.noconvert(), "values"_a.noconvert(), "levels"_a, "num_threads"_a = 0,
-      "Medians (C,) of the positive `values` (C,) float64 in the block, of 2^`levels` cells per edge, that contains each "
+      "Medians (C,) of the positive `values` (C,) float64 in the block, of 2^`levels` cells per edge, that contains "
+      "each "
       "cell with ascending Morton `keys` (C,) uint64; 0 without one.");
   m.attr("DIRECTION_QUANTA") = kDirectionQuanta;
   m.def(

@@ -79,8 +79,7 @@ void bind_surface_crossings(py::module_& m) {
         const bool* k = kept ? kept->data() : nullptr;
         const py::ssize_t rows = static_cast<py::ssize_t>(k == nullptr ? count : std::count(k, k + count, true));
         py::array_t<float> new_points({rows, py::ssize_t{3}}), new_directions({rows, py::ssize_t{3}}), new_ranges(rows);
-        const NoisyRays rays{points.data(), directions.data(), ranges_m.data(),   s, o, k,
-                             count,         up_of_scan.data()};
+        const NoisyRays rays{points.data(), directions.data(), ranges_m.data(), s, o, k, count, up_of_scan.data()};
         const Planes all{centres.data(), normals.data(), variances_m2.data(), num_planes};
         const MovedRays moved{new_points.mutable_data(), new_directions.mutable_data(), new_ranges.mutable_data()};
         {
@@ -92,7 +91,8 @@ void bind_surface_crossings(py::module_& m) {
       "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "scans"_a.noconvert(),
       "up_of_scan"_a.noconvert(), "planes"_a.noconvert(), "centres"_a.noconvert(), "normals"_a.noconvert(),
       "variances_m2"_a.noconvert(), "noise"_a, "kept"_a.noconvert() = py::none(), "num_threads"_a = 0,
-      "Points, directions and ranges of the `kept` rays, (N,) bool or None for all, with returns shrunk towards their `planes` (N,) int32, -1 for none, by "
+      "Points, directions and ranges of the `kept` rays, (N,) bool or None for all, with returns shrunk towards their "
+      "`planes` (N,) int32, -1 for none, by "
       "the share of their noise. Rays: `points`, `directions` (N, 3), `ranges_m` (N,) float32, `scans` (N,) int32; "
       "`up_of_scan` (F, 3) float64. Planes: `centres`, `normals` (P, 3), `variances_m2` (P,) of their returns, "
       "float64. `noise`: variances along the beam, m^2, in azimuth and elevation, rad^2. Local frame, m.");

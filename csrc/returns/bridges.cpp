@@ -23,8 +23,8 @@ struct Marks {
   std::uint64_t block, mask;
 };
 
-// The ends in a region and around it, by block, and the marked cells between them. Coordinates are relative to the first
-// cell of the surrounding blocks.
+// The ends in a region and around it, by block, and the marked cells between them. Coordinates are relative to the
+// first cell of the surrounding blocks.
 class Neighbourhood {
  public:
   Neighbourhood(const CellBlocks& ends, std::int32_t reach_cells)

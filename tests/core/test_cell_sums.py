@@ -12,6 +12,7 @@ from radarsdf._core import (
     CellBlocks,
     CellMeans,
     CellSet,
+    block_medians,
     cell_keys,
     cell_rows,
     fit_cell_means,
@@ -80,6 +81,21 @@ def test_sums_over_the_returns_of_a_cell():
     for num_threads in (0, 1, 3):
         sums = sum_returns(points, directions, ranges_m, cells, keys_of(lattice), leaf_m, num_threads)
         np.testing.assert_array_equal(sums, expected)
+
+
+def test_medians_of_blocks():
+    rng = np.random.default_rng(0)
+    keys = np.unique(
+        keys_of(rng.integers(-40, 40, (60_000, 3)))
+    )  # several tasks, and blocks across their ends
+    values, block = rng.integers(0, 9, len(keys)).astype(float), keys >> np.uint64(9)
+    values[block == block[100]] = 0
+    medians = block_medians(keys, values, 3, 1)
+    np.testing.assert_array_equal(medians, block_medians(keys, values, 3, 3))
+    for own in np.unique(block):
+        positive = values[(block == own) & (values > 0)]
+        expected = np.median(positive) if len(positive) else 0
+        assert (medians[block == own] == expected).all()
 
 
 def test_values_are_interpolated_between_the_centres_of_cells():

@@ -20,6 +20,7 @@
 #include "helpers.hpp"
 #include "lattice/cell_blocks.hpp"
 #include "lattice/cell_set.hpp"
+#include "lattice/morton.hpp"
 #include "lattice/vertex_table.hpp"
 #include "returns/bridges.hpp"
 #include "returns/cell_means.hpp"
@@ -287,7 +288,7 @@ void before_the_training(int threads, Results& results) {
   }
   std::vector<float> moved(7 * kPoints);
   radarsdf::move_onto_planes(
-      {points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), kPoints, up.data()},
+      {points.data(), directions.data(), ranges.data(), scans.data(), of_return.data(), nullptr, kPoints, up.data()},
       {planes.data(), planes.data() + 3 * kPlanes, planes.data() + 6 * kPlanes, kPlanes}, {0.01, 1e-4, 1e-4},
       {moved.data(), moved.data() + 3 * kPoints, moved.data() + 6 * kPoints}, threads);
   results.add(moved.data(), 7 * kPoints);

@@ -219,7 +219,7 @@ def test_badly_supported_and_dense_ends_are_not_bridged():
         assert len(added(rays_to([(0, 0, 0), (2, 0, 0)], count), 1)) == bridges
 
 
-@pytest.mark.parametrize("max_cells", [1, 2, 4])
+@pytest.mark.parametrize("max_cells", [1, 2, 4, 9])
 def test_bridges_equal_a_search_of_all_pairs(max_cells):
     rng = np.random.default_rng(max_cells)
     rays = rays_to(rng.integers(-6, 6, (150, 3)))
