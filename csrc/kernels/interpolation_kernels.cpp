@@ -118,6 +118,7 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
 template <typename T>
 struct AllRows {
   T* gradients;
+  void prefetch_row(std::int32_t) const {}
   void add(std::int32_t row, Features<T> gradient) {
     T* sum = gradients + static_cast<std::int64_t>(row) * kFeatureDim;
     store(sum, load(sum) + gradient);
@@ -127,6 +128,7 @@ struct AllRows {
 template <typename T>
 struct TouchedRows {
   RowSums<T> touched;
+  void prefetch_row(std::int32_t row) const { prefetch(touched.states + row); }
   void add(std::int32_t row, Features<T> gradient) {
     // Branch-free: whether a row is new is unpredictable, and a misprediction costs more than the sum.
     const std::int32_t known = touched.states[row].place;
@@ -149,6 +151,10 @@ Sums scatter(Interpolation<T> in, const T* __restrict out_grad, std::int64_t str
     if (n + kAhead < end) {
       const std::int32_t later = in.located[(n + kAhead) * in.num_levels + level];
       if (later >= 0) prefetch(&in.cells[later]);
+      const std::int32_t soon = in.located[(n + kAhead / 2) * in.num_levels + level];
+      if (soon >= 0) {
+        for (int c = 0; c < C::kPerGroup; ++c) sums.prefetch_row(in.cells[soon].rows[kGroup * C::kPerGroup + c]);
+      }
     }
     const std::int32_t cell = in.located[n * in.num_levels + level];
     if (cell < 0) continue;
