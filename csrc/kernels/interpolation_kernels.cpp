@@ -94,7 +94,15 @@ inline const T* direction_of(const Interpolation<T>& in, std::int64_t n) {
 template <typename C, bool kDirectional, typename T>
 void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __restrict out, std::int64_t stride,
                  std::int64_t begin, std::int64_t end) {
+  constexpr std::int64_t kAhead = 3;  // points
   for (std::int64_t n = begin; n < end; ++n) {
+    for (int level = 0; level < in.num_levels && n + kAhead < end; ++level) {
+      const std::int32_t later = in.located[(n + kAhead) * in.num_levels + level];
+      if (later < 0) continue;
+      for (int k = 0; k < C::kGroups * C::kPerGroup; ++k) {
+        prefetch(features + static_cast<std::int64_t>(in.cells[later].rows[k]) * kFeatureDim);
+      }
+    }
     for (int level = 0; level < in.num_levels; ++level) {
       Features<T> sum = {};
       const std::int32_t cell = in.located[n * in.num_levels + level];
