@@ -34,6 +34,8 @@ from radarsdf.returns.planes import LEAVES_PER_SURFEL
 _STEPS = 100  # steps from which the motion prior is learnt
 _START = 8  # scans of the initialisation, re-estimated jointly after 2, 4 and 8 scans
 _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
+# Least share of the returns that agree while the sign of the Doppler is open: a wrong one places scans metres off.
+_LEAST_AGREEING = 0.1
 _MOVES = 5.0  # standard deviations of a significant velocity
 _OBSERVED_STEPS = 10  # steps over which returns alone must observe the motion of the sensor
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # approximate covariance of a step between given poses
@@ -103,7 +105,10 @@ class Follower:
         by_doppler = new.velocity is not None and (found[-1].sign != 0 or not new.moves)
         observed = [step.found.observed[0] for step in self._steps if not step.given][-_OBSERVED_STEPS:]
         why = ""
-        if any(step.found.segment for step in found):
+        sign_open = found[-1].sign == 0 and new.velocity is not None and new.moves
+        if any(step.found.segment for step in found) or (
+            sign_open and found[-1].found.agreeing < _LEAST_AGREEING
+        ):
             why = f"the scan at {new.time_s:.6f} s agrees with the last ones nowhere near its predicted pose, or in several places"
         elif not by_doppler and len(observed) == _OBSERVED_STEPS and np.median(observed) < LEAST_OBSERVED:
             why = "the returns alone do not observe the motion of the sensor"

@@ -52,6 +52,8 @@ class SensorVelocities:
     change: Floats  # (3,) spectral density of the acceleration by component (random walk), m²/s³
     static: list[NDArray[np.bool_]]  # F masks (N_i,) of the returns that agree with the velocity
     found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Else it is interpolated
+    # Standard deviation of the systematic error of all velocities in any direction, share of the speed.
+    common_sigma: float = _IN_COMMON
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
 
     @classmethod
@@ -84,12 +86,13 @@ class SensorVelocities:
             mean[i] = [np.interp(times_s[i], at, mean[found, axis]) for axis in range(3)]
             away_s = np.abs(at - times_s[i]).min()
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
-        return cls(mean, covariance, change, static, found, weak)
+        return cls(mean, covariance, change, static, found, climb_assumed=weak)
 
     def select(self, rows: slice) -> SensorVelocities:
         """Select scans."""
-        return SensorVelocities(
-            self.mean_mps[rows], self.covariance[rows], self.change, self.static[rows], self.found[rows]
+        mean_mps, covariance, static = self.mean_mps[rows], self.covariance[rows], self.static[rows]
+        return dataclasses.replace(
+            self, mean_mps=mean_mps, covariance=covariance, static=static, found=self.found[rows]
         )
 
     @property
@@ -145,7 +148,7 @@ class DopplerMotion(KnownMotion):
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
         spans = spans_of(times_s, len(times_s))
         speed_mps = np.sqrt((velocities.mean_mps**2).sum(axis=1).mean())
-        common = np.repeat([_IN_COMMON * speed_mps * np.median(durations_s), 0.0], 3)
+        common = np.repeat([velocities.common_sigma * speed_mps * np.median(durations_s), 0.0], 3)
         unknown = np.zeros(6), np.ones(2), shares, spans, velocities, durations_s, turns
         return cls(steps(poses), *unknown, bias_sigma=common).at(poses)
 

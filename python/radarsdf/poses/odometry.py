@@ -158,6 +158,8 @@ def odometry(
             elif most > _SCALE_MEASURED or least < 1 / _SCALE_MEASURED:
                 shown = f"{least:.1f} to {most:.1f} times its speeds"
                 notes.append(f"Assumed: the Doppler is in m/s; the returns agree with {shown}.")
+                off = max(most - 1, 1 - least) / ERRORS
+                velocities = dataclasses.replace(velocities, common_sigma=off)
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
         drive = dataclasses.replace(drive, velocities=velocities, gyroscope=inertial.gyroscope)
         try:

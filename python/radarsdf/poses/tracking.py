@@ -54,7 +54,8 @@ LATERAL_MPS2 = 2.0
 # Maximum standard deviation of a turn rate that may remain unobserved between scans, that of a sensor faster than 20 m/s: the joint
 # estimate and the covariance are valid for small rotations.
 _SLOW_TURN_RAD_S = 0.1
-_COMPARED, _FEW_COMPARED = 24, 6  # pairs of scans to estimate the scale of Doppler, and their minimum
+# Pairs of scans to estimate the scale of Doppler, the number from which on they are chosen to be apart, and their minimum.
+_COMPARED, _SOME_COMPARED, _FEW_COMPARED = 24, 12, 6
 _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
 _FREE_SCALE = 0.15  # prior deviation of that scale: from half or twice the true one, returns of most scenes converge to it
 _SCALES = np.geomspace(0.4, 2.5, 33)
@@ -414,7 +415,8 @@ def doppler_scale(drive: Drive, config: FitConfig, num_threads: int) -> tuple[fl
         return unknown
     lengths_m = np.linalg.norm(drive.velocities.mean_mps[:-1], axis=1) * durations_s
     lengths_m[durations_s > 2 * np.median(durations_s)] = 0.0
-    every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, len(lengths_m) // _FEW_COMPARED))
+    most_apart = max(len(lengths_m) // _SOME_COMPARED, 1)
+    every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, most_apart))
     count = min(_COMPARED, len(lengths_m) // every) * every
     begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
     rows = slice(begin, begin + count + 1, every)
