@@ -3,6 +3,7 @@
 """Covariances, derivatives and rates of motions, against random draws, finite differences and manual values."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -452,8 +453,10 @@ def test_scans_of_walls_along_the_motion_agree_best_without_it():
     motion = np.eye(4)
     motion[0, 3] = 1.0
     walls = [np.column_stack([rng.uniform(-10, 10, 300), np.repeat([-2.0, 2.0], 150), np.zeros(300)])] * 12
-    assert motion_significance(walls, [motion] * 11) < -ERRORS  # the same clutter in each scan
+    assert (
+        motion_significance(list(itertools.pairwise(walls)), [motion] * 11) < -ERRORS
+    )  # the same clutter in each scan
     world = rng.uniform(-20, 20, (500, 3))
     scans = [world - i * motion[:3, 3] for i in range(12)]
-    assert motion_significance(scans, [motion] * 11) > ERRORS
-    assert motion_significance(scans, [None] * 11) == 0
+    assert motion_significance(list(itertools.pairwise(scans)), [motion] * 11) > ERRORS
+    assert motion_significance([(world, world)], [motion]) == 0  # too few

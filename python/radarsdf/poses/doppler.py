@@ -189,11 +189,8 @@ def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
 
 
 def scale_gains(first: Floats, second: Floats, moved_m: Floats, scales: Floats) -> Floats:
-    """Return how much nearer returns of two scans are after a motion of `scales` (K,) times `moved_m` (3,) than after its reverse.
-
-    The scans have common axes. What they have in common wherever they were taken, such as their density, clutter, or walls along the
-    motion, does not contribute.
-    """
+    """Return how much nearer returns of scans in common axes are after `scales` (K,) times `moved_m` (3,) than after the reverse."""
+    # What scans have in common wherever they were taken, such as density, clutter, or walls along the motion, cancels.
     shifts_m = np.multiply.outer(np.concatenate([scales, -scales]), moved_m)
     ahead, back = np.split(log_distances(first, second, shifts_m).mean(axis=1), 2)
     found: Floats = back - ahead
@@ -203,10 +200,7 @@ def scale_gains(first: Floats, second: Floats, moved_m: Floats, scales: Floats) 
 def sign_significance(
     scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats
 ) -> tuple[float, Floats]:
-    """Return by how many standard errors neighbouring scans agree better with all velocities than with these reversed.
-
-    Also return the yaws (F - 1,) between scans in the likelier direction, rad; NaN: unknown.
-    """
+    """Return the standard errors by which scans agree better with velocities than reversed, and the yaws (F - 1,) between them."""
     durations_s = np.diff(times_s)
     moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
     usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
@@ -227,20 +221,18 @@ def sign_significance(
     return float(means.mean() / np.sqrt(max(variance, 1e-12))), yaws
 
 
-def motion_significance(scans: Sequence[Floats], motions: Sequence[Floats | None]) -> float:
-    """Return by how many standard errors neighbouring scans agree better after `motions` (4, 4) than after their rotations alone.
-
-    Negative where a pattern that moves with the sensor, such as that of a straight wall, explains the returns better. 0 if unknown.
-    """
-    gains = []
-    for first, second, motion in zip(scans, scans[1:], motions, strict=False):
-        if motion is not None and min(len(first), len(second)) > 0:
-            turned = second @ motion[:3, :3].T
-            logs = log_distances(first, turned, np.outer([0.0, 1.0], motion[:3, 3])).mean(axis=1)
-            gains.append(logs[0] - logs[1])
+def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Sequence[Floats]) -> float:
+    """Return by how many standard errors pairs of scans agree better after `motions` (4, 4) than after their rotations alone."""
+    # Negative where a pattern that moves with the sensor, such as that of a straight wall, explains the returns better.
+    gains = [
+        log_distances(first, second @ motion[:3, :3].T, np.outer([0.0, 1.0], motion[:3, 3])).mean(axis=1)
+        for (first, second), motion in zip(pairs, motions, strict=True)
+        if min(len(first), len(second)) > 0
+    ]
     if len(gains) < _FEW_PAIRS:
         return 0.0
-    return float(np.mean(gains) / max(np.std(gains, ddof=1) / np.sqrt(len(gains)), 1e-6))
+    still, moved = np.transpose(gains)
+    return float((still - moved).mean() / max((still - moved).std(ddof=1) / np.sqrt(len(gains)), 1e-6))
 
 
 def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> tuple[Floats, tuple[float, float]]:

@@ -221,27 +221,31 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
     doppler = "their Doppler (doppler_mps)"
     if any(note.startswith(NOT_USED) for note in notes):
         doppler = "Doppler that most returns of a scan agree on"
-    turns_known = drive.gyroscope is not None or drive.turns_slowly
-    for observed, least, measured, moved, missing in (
-        (way, LEAST_OBSERVED, drive.velocities is not None, "moved", doppler),
-        (turn, _LEAST_OBSERVED_TURN, turns_known, "turned", "a gyroscope (imu)"),
+    by_doppler, turns_known = drive.velocities is not None, drive.gyroscope is not None or drive.turns_slowly
+    share = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
+    steps = [between(a.pose[None], b.pose[None])[0] for a, b in pairwise(tracked) if a.segment == b.segment]
+    pairs = [
+        (a, b)
+        for (a, b), (x, y) in zip(pairwise(drive.scans), pairwise(tracked), strict=True)
+        if x.segment == y.segment
+    ]
+    for refused, moved, why, missing in (
+        (not by_doppler and way < LEAST_OBSERVED, "moved", share.format(way, LEAST_OBSERVED), doppler),
+        (
+            not turns_known and turn < _LEAST_OBSERVED_TURN,
+            "turned",
+            share.format(turn, _LEAST_OBSERVED_TURN),
+            "a gyroscope (imu)",
+        ),
+        (
+            not by_doppler and motion_significance(pairs, steps) < -ERRORS,
+            "moved",
+            "scans agree better without any motion",
+            doppler,
+        ),
     ):
-        if not measured and observed < least:
-            msg = (
-                f"the returns alone do not observe how the sensor {moved}: of a step's variance, they remove {observed:.1%}, and "
-                f"{least:.0%} is needed. Give {missing}, or poses"
-            )
-            raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
-    if drive.velocities is None:
-        steps = [
-            between(a.pose[None], b.pose[None])[0] if a.segment == b.segment else None
-            for a, b in pairwise(tracked)
-        ]
-        if motion_significance(drive.scans, steps) < -ERRORS:
-            msg = (
-                "the returns alone do not observe how the sensor moved: neighbouring scans agree better without any motion. "
-                f"Give {doppler}, or poses"
-            )
+        if refused:
+            msg = f"the returns alone do not observe how the sensor {moved}: {why}. Give {missing}, or poses"
             raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
     if drive.gyroscope is None and turn < _LEAST_OBSERVED_TURN:
         notes.append(

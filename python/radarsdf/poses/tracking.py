@@ -404,11 +404,8 @@ def followed(
 
 
 def doppler_scale(drive: Drive, config: FitConfig, num_threads: int) -> tuple[float, float, float]:
-    """Estimate the ratio of the speed from returns to that from Doppler, with its lower and upper confidence limit.
-
-    The fastest scans are tracked with a free scale. The limits are those of the scales at which pairs of scans agree not
-    significantly worse than at the best one.
-    """
+    """Estimate the ratio of the speed from returns to that from Doppler, with its lower and upper confidence limit."""
+    # The fastest scans are tracked with a free scale. Possible is where pairs agree not significantly worse than at the best one.
     unknown = 1.0, float(_SCALES[0]), float(_SCALES[-1])
     durations_s = np.diff(drive.times_s)
     if drive.velocities is None or len(durations_s) < _FEW_COMPARED:
