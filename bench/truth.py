@@ -4,11 +4,17 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from radarsdf._core import cell_keys
+from radarsdf.evaluation import surface_metrics
 from radarsdf.simulate import Scene as World
+from radarsdf.simulate.radar import generator, unit_vectors
+from radarsdf.simulate.simulation import Lidar
 from scipy.spatial import cKDTree
 
 from bench.scenes import Scene
@@ -29,6 +35,15 @@ _THIN = 0.1  # variance across a flat neighbourhood, as a share of the smaller o
 _WIDE = 0.03  # smaller variance along a neighbourhood, over its squared radius. A single ring is a line
 _LEAST_COS = 0.5  # surfaces with normals more than 60 degrees from that of the mesh are other ones
 _SLACK_M = 1e-6  # rounding of distances
+
+NEAR_M = 0.2
+"""Distance of correct points, as for the F-score with nothing discarded."""
+
+_FILLED_CELL_M = 0.1
+_FIRST_RAYS = 4_000  # from each pose
+_MOST_RAYS = 100  # that follow one of them
+_GRAZING_COS = 0.01
+_STREAM = 2**31 + 3  # of random numbers, which no scan, kind or lidar uses
 
 
 class Truth(NamedTuple):
@@ -119,3 +134,43 @@ def _flat_piece(lidar: FloatArray, rows: list[int], radius_m: float) -> tuple[Fl
     variances, directions = np.linalg.eigh(spread.T @ spread / (len(piece) - 1))
     thin = variances[0] < min(_THICKNESS_M**2, _THIN * variances[1])
     return (middle, directions[:, 0]) if thin and variances[1] > _WIDE * radius_m**2 else None
+
+
+@lru_cache(maxsize=1)
+def filled_truth(lidar: Lidar) -> FloatArray:
+    """Points (M, 3), world, m, one per cell of 0.1 m, of all surface that the radar typically detects.
+
+    The lidar's own points leave holes where its rays are sparse. Here, as many rays follow each ray of a grid as there are
+    cells in the surface that it stands for.
+    """
+    rng, sensor, found = generator(lidar.seed, _STREAM), lidar.sensor, np.zeros((0, 3))
+    half = np.array([sensor.azimuth_fov_rad / 2, np.sin(sensor.elevation_fov_rad / 2)])
+    columns = max(1, round(np.sqrt(_FIRST_RAYS * half[0] / half[1])))
+    shape = np.array([columns, -(-_FIRST_RAYS // columns)])
+    grid = np.indices(shape).reshape(2, -1).T
+    for T_world_sensor in lidar.poses[:: max(1, len(lidar.poses) // 40)]:
+        rays, before, origin = grid, cell_keys(found, _FILLED_CELL_M), T_world_sensor[:3, 3]
+        for is_last in (False, True):
+            u = half * (2 * (rays + rng.random(rays.shape)) / shape - 1)
+            angles = np.stack([u[:, 0], np.arcsin(u[:, 1])], axis=1)
+            directions = unit_vectors(angles) @ T_world_sensor[:3, :3].T
+            hits = lidar.scene.raycast(origin, directions, sensor.max_range_m)
+            detected = sensor.echo_power_db(lidar.scene, origin, directions, hits) >= sensor.threshold_db
+            rows = np.flatnonzero(detected & (hits.range_m >= sensor.min_range_m))
+            points = origin + hits.range_m[rows, None] * directions[rows]
+            new = ~np.isin(cell_keys(points, _FILLED_CELL_M), before)
+            found, rows = np.concatenate([found, points[new]]), rows[new]
+            if not is_last:
+                cos = -np.einsum("ni,ni->n", directions[rows], hits.normals[rows])
+                area_m2 = 4 * half.prod() / shape.prod() * hits.range_m[rows] ** 2
+                counts = area_m2 / np.maximum(cos, _GRAZING_COS) / _FILLED_CELL_M**2
+                rays = np.repeat(rays[rows], np.minimum(np.ceil(counts), _MOST_RAYS).astype(int), axis=0)
+        found = found[np.unique(cell_keys(found, _FILLED_CELL_M), return_index=True)[1]]
+    return found
+
+
+def score_without_holes(lidar: Lidar, mesh: trimesh.Trimesh, x: FloatArray, samples: int) -> float:
+    """F-score with nothing discarded: precision of points `x` (N, 3) by the scene, completeness by :func:`filled_truth`."""
+    precision = float(np.mean(np.abs(lidar.scene.signed_distance(x)) <= NEAR_M))
+    completion: float = surface_metrics(mesh, filled_truth(lidar), samples=samples)["completion_ratio"]
+    return 2 * precision * completion / max(precision + completion, 1e-9)

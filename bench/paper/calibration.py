@@ -190,6 +190,7 @@ WHOLE: dict[str, Any] = {"min_confidence": 0.0, "max_uncertainty": np.inf, "min_
 
 KINDS_COLUMNS = {
     "f_score_all": Column("F-score, %", 100, 1, "highest"),
+    "f_score_without_holes": Column("by a truth without holes, %", 100, 1, "highest"),
     "true_share": Column("true share"),
     "worst_gap": Column("worst gap"),
     "mean_gap": Column("mean gap"),

@@ -22,8 +22,11 @@ from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
 from bench.runner import Column, Row, figure, groups
 from bench.scenes import QUICK, Scene, chosen_scenes
 from bench.settings import Changes, merged, words_of
+from bench.truth import NEAR_M, score_without_holes
 
 Floats = NDArray[np.float64]
+
+_MOST_EXACT = 100_000  # points with distances to the simulated scene
 
 COLUMNS = {
     "accuracy_error_m": Column("acc. error, cm", 100, 2, "lowest"),
@@ -33,6 +36,7 @@ COLUMNS = {
     "completion_ratio": Column("compl. ratio, %", 100, 2, "highest"),
     "f_score": Column("F-score, %", 100, 2, "highest"),
     "f_score_all": Column("F-score, nothing discarded, %", 100, 2, "highest"),
+    "f_score_without_holes": Column("F-score by a truth without holes, %", 100, 2, "highest"),
     "gamma_shape": Column("Gamma shape"),
     "gamma_mean": Column("mean, rad", 1, 3, "lowest"),
     "gamma_variance": Column("variance", 1, 3, "lowest"),
@@ -79,6 +83,10 @@ def measured(options: argparse.Namespace, peer: Peer, scene: Scene, held_out: Sc
         metrics = surface_metrics(result.mesh, scene.ground_truth, box=scene.box, samples=samples_of(options))
     except ValueError as error:  # no part of the mesh is in the box
         return row | {"why_not": str(error)}
+    if scene.simulation is not None and scene.box is None:
+        x = sampled(result.mesh, samples_of(options, _MOST_EXACT), None)[0]
+        lidar, samples = scene.simulation.lidar, samples_of(options)
+        metrics["f_score_without_holes"] = score_without_holes(lidar, result.mesh, x, samples)
     return row | {"triangles": len(result.mesh.faces), **metrics}
 
 
@@ -109,9 +117,6 @@ def sparse(options: argparse.Namespace) -> Iterator[Row]:
             for name in options.peers:
                 yield measured(options, PEERS[name], scene.every_nth(n)) | {"n": n}
 
-
-NEAR_M = 0.2
-"""Distance of correct points, as for the F-score with nothing discarded."""
 
 _EDGES_M = (2.5, 10.0, 20.0, 30.0, 60.0)
 RANGE_COLUMNS = {"precision": Column("precision, %", 100, 0), "completion": Column("completion, %", 100, 0)}

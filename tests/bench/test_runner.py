@@ -114,6 +114,7 @@ def test_surface(tmp_path):
     ball, poisson = values["rows"]
     assert ball["seconds"] == 5.0
     assert 0 <= ball["f_score"] <= 1
+    assert 0 <= ball["f_score_without_holes"] <= 1
     assert ball["num_mesh_samples"] == 3_000
     assert poisson["why_not"] == "Open3D is not here"
     assert "- Poisson: Open3D is not here" in table

@@ -6,15 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.testing import assert_array_equal
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
 from radarsdf.simulate import Box, Pole, Terrain, materials
 from radarsdf.simulate import Scene as World
+from radarsdf.simulate.radar import unit_vectors
+from scipy.spatial import cKDTree
 
 from bench.kinds import KINDS
 from bench.scenes import load_scene
-from bench.truth import along_normals, to_planes, truth_of
+from bench.truth import along_normals, filled_truth, score_without_holes, to_planes, truth_of
 
 
 @pytest.fixture(scope="module")
@@ -156,3 +159,34 @@ def test_points_beyond_an_edge_have_no_error():
     truth = truth_of(scene, x, np.broadcast_to(Z, x.shape))
     np.testing.assert_allclose(truth.error_m, [0.05, np.nan, 0.02], atol=1e-6)
     np.testing.assert_allclose(truth.distance_m, [0.05, 0.05, 0.02], atol=1e-6)
+
+
+def test_the_filled_truth_has_no_holes_on_detectable_surface(wall):
+    lidar = wall.simulation.lidar
+    truth = filled_truth(lidar)
+    assert np.abs(lidar.scene.signed_distance(truth)).max() < 1e-3
+    assert len(np.unique(np.floor(truth / 0.1), axis=0)) == len(truth)
+    rng, T = np.random.default_rng(0), lidar.poses[3]
+    angles = rng.uniform(-0.5, 0.5, (3000, 2)) * [
+        lidar.sensor.azimuth_fov_rad,
+        lidar.sensor.elevation_fov_rad,
+    ]
+    directions = unit_vectors(angles) @ T[:3, :3].T
+    hits = lidar.scene.raycast(T[:3, 3], directions, lidar.sensor.max_range_m)
+    detected = (
+        lidar.sensor.echo_power_db(lidar.scene, T[:3, 3], directions, hits) >= lidar.sensor.threshold_db
+    )
+    found = T[:3, 3] + hits.range_m[detected, None] * directions[detected]
+    assert len(found) > 300
+    assert (cKDTree(truth).query(found)[0] < 0.15).mean() > 0.999
+
+
+def test_the_score_without_holes_is_of_the_scene_and_the_filled_truth(wall):
+    lidar = wall.simulation.lidar
+    truth = filled_truth(lidar)
+    corners = truth[:, None] + 0.01 * np.eye(3)
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(truth)).reshape(-1, 3), process=False)
+    x = np.concatenate([truth, truth[::3] + [0, 0, 50.0]])  # a quarter is in the sky
+    assert score_without_holes(lidar, mesh, x, 300_000) == pytest.approx(2 * 0.75 / 1.75, abs=1e-3)
+    far = trimesh.Trimesh(mesh.vertices + [0, 0, 50.0], mesh.faces, process=False)
+    assert score_without_holes(lidar, far, x, 300_000) == 0
