@@ -146,8 +146,8 @@ def filled_truth(lidar: Lidar) -> FloatArray:
     rng, sensor, found = generator(lidar.seed, _STREAM), lidar.sensor, np.zeros((0, 3))
     half = np.array([sensor.azimuth_fov_rad / 2, np.sin(sensor.elevation_fov_rad / 2)])
     columns = max(1, round(np.sqrt(_FIRST_RAYS * half[0] / half[1])))
-    shape = np.array([columns, -(-_FIRST_RAYS // columns)])
-    grid = np.indices(shape).reshape(2, -1).T
+    lines = -(-_FIRST_RAYS // columns)
+    shape, grid = np.array([columns, lines]), np.indices((columns, lines)).reshape(2, -1).T
     for T_world_sensor in lidar.poses[:: max(1, len(lidar.poses) // 40)]:
         rays, before, origin = grid, cell_keys(found, _FILLED_CELL_M), T_world_sensor[:3, 3]
         for is_last in (False, True):
