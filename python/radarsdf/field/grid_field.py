@@ -45,8 +45,7 @@ class GridField(Field):
         return self._closed_form(points, directions, ranges_m).clamp(0, 1)
 
     def corner_distances_m(self) -> NDArray[np.float32]:
-        found: NDArray[np.float32] = self.distances_m.detach().numpy()
-        return found
+        return np.asarray(self.distances_m.detach().numpy())
 
     @cached_property
     def _corners_of_cells(self) -> Tensor:

@@ -192,42 +192,33 @@ def extract_triangles(
 
     Returns vertices (V, 3), local frame, m, faces (F, 3), and the number of leaf cells searched.
     """
+    config, table, num_threads = contents.config, contents.field.table, torch.get_num_threads()
+    options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": num_threads}
+    parts, even = per_cell(voxel_size, config.leaf_size_m)
     stored_m = contents.field.corner_distances_m()
-    if stored_m is not None and per_cell(voxel_size, contents.config.leaf_size_m)[1]:
-        return _between_corners(contents, stored_m, voxel_size, box)
-    corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
-    options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": torch.get_num_threads()}
-    return *extract_cells(corners, distances_m, voxel_corners, **options), searched
-
-
-def _between_corners(
-    contents: MapContents, stored_m: NDArray[np.float32], voxel_size: float, box: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.int32], int]:
-    """Triangulate distances stored at the corners of leaf cells, in voxels that divide these evenly."""
-    table, num_threads = contents.field.table, torch.get_num_threads()
+    if stored_m is None or not even:
+        corners, voxel_corners, distances_m, searched = sample_lattice(contents, voxel_size, box, progress)
+        return *extract_cells(corners, distances_m, voxel_corners, **options), searched
+    if parts == 1 and box is None:  # on the corners themselves, in two thirds of the time
+        corners, of_cells = table.leaf_vertices(num_threads)
+        return *extract_cells(corners, stored_m, of_cells, **options), len(of_cells)
     rows = table.cells_near_surface(stored_m, 0.0, num_threads)
-    limits = np.array([[-np.inf] * 3, [np.inf] * 3])
+    within = np.full((2, 3), [[-np.inf], [np.inf]])  # voxels
     if box is not None:
-        rows = rows[_overlap(table.leaf_cells()[rows], contents.config.leaf_size_m, box)]
-        limits = box / voxel_size - 0.5
-    parts, _ = per_cell(voxel_size, contents.config.leaf_size_m)
-    _check_voxels(len(rows), voxel_size, parts, True, contents.config)
-    lowest, highest = np.clip([np.ceil(limits[0]), np.floor(limits[1])], -_MAX_VOXELS, _MAX_VOXELS).astype(
-        int
-    )
+        rows = rows[_overlap(table.leaf_cells()[rows], config.leaf_size_m, box)]
+        within = box / voxel_size - 0.5
+    _check_voxels(len(rows), voxel_size, parts, even, config)
+    ends = np.ceil(within[0]), np.floor(within[1])
+    lowest, highest = np.clip(ends, -_MAX_VOXELS, _MAX_VOXELS).astype(int)
     return *table.surface(stored_m, rows, parts, voxel_size, lowest, highest, num_threads), len(rows)
 
 
 def sample_lattice(
     contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], int]:
-    """Sample the voxels of leaf cells that may contain surface. `box` (2, 3), local frame, m, limits their centres.
-
-    Returns lattice coordinates of corners (K, 3), their rows for each voxel (M, 8), signed distances at the corners (K,), m,
-    and the number of leaf cells searched.
-    """
-    config, num_threads = contents.config, torch.get_num_threads()
-    leaf_size_m = config.leaf_size_m
+    """Return lattice coordinates of the corners (K, 3) of voxels in leaf cells that may contain surface, the rows of each
+    voxel (M, 8), signed distances at the corners (K,), m, and the number of these cells."""
+    config, leaf_size_m, num_threads = contents.config, contents.config.leaf_size_m, torch.get_num_threads()
     parts, even = per_cell(voxel_size, leaf_size_m)
     cells = contents.field.table.leaf_cells()
     stored_m = contents.field.corner_distances_m()
@@ -243,8 +234,9 @@ def sample_lattice(
         voxels = voxels[((centres >= box[0]) & (centres <= box[1])).all(axis=1)]
     if voxel_size < leaf_size_m and not even:
         # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
-        centre = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-        voxels = voxels[_occupied(contents, centre)]
+        voxels = voxels[
+            _occupied(contents, (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
+        ]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return corners, voxel_corners, distances_m, len(cells)
@@ -252,10 +244,8 @@ def sample_lattice(
 
 def _overlap(cells: NDArray[np.int32], leaf_size_m: float, box: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask (M,) of the leaf cells (M, 3) that overlap a box (2, 3), m."""
-    found: NDArray[np.bool_] = (((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])).all(
-        axis=1
-    )
-    return found
+    found = ((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])
+    return np.asarray(found.all(axis=1))
 
 
 def crossed(
