@@ -4,8 +4,6 @@
 // The features of one vertex as a SIMD vector.
 #pragma once
 
-#include <stdint.h>
-
 #include "kernels/vector.hpp"
 #include "lattice/cell.hpp"
 
@@ -26,10 +24,8 @@ inline void store(T* row, Features<T> features) {
 }
 
 // The same for a row in bfloat16, rounded to nearest even.
-#if defined(__GNUC__)
-typedef std::uint32_t FeatureBits __attribute__((vector_size(kFeatureDim * sizeof(std::uint32_t))));
-typedef std::uint16_t RoundedBits __attribute__((vector_size(kFeatureDim * sizeof(std::uint16_t))));
-#endif
+using FeatureBits = VectorOf<std::uint32_t, kFeatureDim>::Type;
+using RoundedBits = VectorOf<std::uint16_t, kFeatureDim>::Type;
 
 inline Features<float> load_rounded(const std::uint16_t* row) {
 #if defined(__GNUC__)

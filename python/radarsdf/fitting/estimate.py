@@ -161,8 +161,7 @@ def seconds_of(
     if not config.train:
         return seconds
     iterations = schedule.sdf_iterations
-    joint = schedule.joint_iterations
-    later = max(0, schedule.intensity_iterations - joint) if with_network else 0
+    later = max(0, schedule.intensity_iterations - schedule.joint_iterations) if with_network else 0
     # A forward and a backward pass cost as much as three forward ones, and nine if the loss has normals.
     passes = 9 if config.networks.normals and with_network else 3
     of_field = passes * (iterations * schedule.batch_size + later * schedule.intensity_batch_size / 3)
@@ -170,7 +169,8 @@ def seconds_of(
         _S_PER_INPUT * sdf_widths(config)[0] + _S_PER_MULTIPLICATION * weights_of(sdf_widths(config))
     )
     if with_network:
-        seen = joint * seen_jointly(config, schedule.batch_size) + later * schedule.intensity_batch_size
+        joint_seen = schedule.joint_iterations * seen_jointly(config, schedule.batch_size)
+        seen = joint_seen + later * schedule.intensity_batch_size
         shared += 3 * seen * _S_PER_MULTIPLICATION * weights_of(intensity_widths(config))
     moved = 0 if config.moves_rows(with_network) else rows * iterations
     threads = min(resolve_num_threads(config.num_threads), os.cpu_count() or 1)
