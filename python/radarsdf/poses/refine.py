@@ -37,9 +37,9 @@ _FIRST_WINDOW = 8
 _OF_WINDOWS = (4, 2)  # cell edges for windows, relative to a map's surfels
 _OF_ALL = (4, 4, 2, 2)  # cell edges for all scans
 _MOST_ROUNDS = 12  # maximum number of rounds with the cells of a map's surfels
-# Log ratio of the variances of steps with fine cells to those with coarse ones from which on coarse ones are kept: few returns
-# constrain the steps less in fine cells, but surfaces are less flat in coarse ones, which no variance includes.
-_COARSER = np.log(2)
+# Coarse planes are kept if fine ones double the standard deviation of a component of the steps, of few returns. By less, they do not
+# lose: surfaces are less flat in coarse cells, which no variance includes.
+_COARSER = np.log(4)
 # Convergence threshold on the step, standard deviations. Planes change in each round, so that 0.1 is often never reached;
 # 0.3 results in the same errors in half the time.
 _SETTLED = 0.3
@@ -210,7 +210,7 @@ class PosesEstimate:
     ) -> PosesEstimate:
         """Estimate from `given` (F, 4, 4) and measured motions by the Gauss-Newton method, with new planes in each round."""
         poses, count, noise, motions = given, len(given), None, list(motions)
-        plan, finest, spread = _plan(count, first_window), 1, np.inf
+        plan, finest, spread = _plan(count, first_window), 1, np.zeros(6)
         rounds = 0
         for window, planned in tqdm(plan, desc="poses", unit="round", disable=hides_bar(progress)):
             cells = max(planned, finest)
@@ -222,8 +222,8 @@ class PosesEstimate:
                 *_prior(motions, poses), _TOLERANCE, _MOST_ITERATIONS, True, num_threads
             )
             rounds += 1
-            coarser, spread = spread, float(np.log(step_variances(poses, inverse, inverse_below)).mean())
-            if rounds == len(plan) - _MOST_ROUNDS + 1 and spread > coarser + _COARSER:
+            coarser, spread = spread, np.log(step_variances(poses, inverse, inverse_below)).mean(axis=0)
+            if rounds == len(plan) - _MOST_ROUNDS + 1 and (spread - coarser > _COARSER).any():
                 finest = _OF_ALL[-1]
                 continue
             before, poses = poses, aligned(moved(poses, steps), given)
