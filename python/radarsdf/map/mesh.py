@@ -243,7 +243,6 @@ def sample_lattice(
 
 
 def _overlap(cells: NDArray[np.int32], leaf_size_m: float, box: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask (M,) of the leaf cells (M, 3) that overlap a box (2, 3), m."""
     found = ((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])
     return np.asarray(found.all(axis=1))
 
