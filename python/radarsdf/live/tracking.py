@@ -20,6 +20,7 @@ from radarsdf.poses.doppler import (
     CLEAR,
     LEAST_MPS,
     NOT_USED,
+    YAW_STEP_RAD,
     NoVelocityError,
     SensorVelocities,
     sign_significance,
@@ -251,7 +252,7 @@ class Follower:
             durations_s = np.diff(drive.times_s)
             rates = [
                 MotionRate(np.array([0.0, 0.0, yaw]), np.zeros((3, 3))) if np.isfinite(yaw) else None
-                for yaw in yaws / durations_s
+                for yaw in np.sign(yaws) * np.maximum(np.abs(yaws) - YAW_STEP_RAD, 0.0) / durations_s
             ]
             turns = drive.turns.learnt(rates, durations_s)
             drive = dataclasses.replace(drive, velocities=_signed(velocities, likelier), turns=turns)

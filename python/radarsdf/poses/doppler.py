@@ -20,7 +20,9 @@ from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
 _FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
-_TURNS_RAD = np.linspace(-0.4, 0.4, 13)  # possible yaws between neighbouring scans
+YAW_STEP_RAD = 0.07
+"""Resolution of the yaws between neighbouring scans."""
+_TURNS_RAD = YAW_STEP_RAD * np.arange(-6, 7)
 CLEAR = 4.0
 """Standard errors by which scans must agree better with one sign of the Doppler."""
 _LEAST_M = 0.05  # minimum distance between returns that counts, below the noise of any radar
