@@ -254,17 +254,10 @@ def crossed(
 ) -> NDArray[np.int32]:
     """Return the leaf cells among (M, 3) with corners, by `distances_at`, not all clearly on one side of the surface."""
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
-    found: NDArray[np.int32] = unique[
-        _near_surface(distances_at(unique, corners, cell_corners)[cell_corners], leaf_size_m)
-    ]
-    return found
-
-
-def _near_surface(values_m: NDArray[Any], leaf_size_m: float) -> NDArray[np.bool_]:
-    """Return a mask (M,) of the leaf cells with corner distances (M, 8) not all clearly on one side."""
+    values_m = distances_at(unique, corners, cell_corners)[cell_corners]
+    columns = np.ascontiguousarray(values_m.T)  # reductions along rows of eight are slow
     margin_m = _CLEARLY * leaf_size_m
-    corners = np.ascontiguousarray(values_m.T)  # reductions along rows of eight are slow
-    found: NDArray[np.bool_] = (corners.min(axis=0) <= margin_m) & (corners.max(axis=0) >= -margin_m)
+    found: NDArray[np.int32] = unique[(columns.min(axis=0) <= margin_m) & (columns.max(axis=0) >= -margin_m)]
     return found
 
 
@@ -287,9 +280,7 @@ def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.
 
 
 def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config: FitConfig) -> None:
-    if (
-        max(cells, 1) * (parts + 1) ** 3 > _MAX_VOXELS
-    ):  # with the number of a cell, so that coordinates are int32, too
+    if max(cells, 1) * (parts + 1) ** 3 > _MAX_VOXELS:  # so that coordinates are int32, too
         msg = f"voxels of {voxel_size} m are too many for {cells} cells of {config.leaf_size_m} m: use larger ones"
         raise ValueError(msg)
     check_mesh(cells * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
