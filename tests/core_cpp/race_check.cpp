@@ -271,8 +271,8 @@ void before_the_training(int threads, Results& results) {
   const std::vector<std::uint64_t> bridged = radarsdf::bridge_cells(
       keys.data(), num_keys, ends.data(), support.data(), static_cast<std::int64_t>(ends.size()), 4, 9.0, threads);
   results.add(bridged.data(), static_cast<std::int64_t>(bridged.size()));
-  std::vector<double> around(keys.size());
-  const std::vector<double> ones(keys.size(), 1.0);
+  std::vector<double> around(keys.size()), ones;
+  ones.assign(keys.size(), 1.0);
   radarsdf::neighbour_sums(radarsdf::CellBlocks(keys.data(), num_keys), keys.data(), num_keys, ones.data(), 1, 1.0,
                            around.data(), threads);
   results.add(around.data(), num_keys);
