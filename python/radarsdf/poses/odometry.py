@@ -221,32 +221,31 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
     doppler = "their Doppler (doppler_mps)"
     if any(note.startswith(NOT_USED) for note in notes):
         doppler = "Doppler that most returns of a scan agree on"
-    by_doppler, turns_known = drive.velocities is not None, drive.gyroscope is not None or drive.turns_slowly
+    turns_known = drive.gyroscope is not None or drive.turns_slowly
     share = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
-    steps = [between(a.pose[None], b.pose[None])[0] for a, b in pairwise(tracked) if a.segment == b.segment]
-    pairs = [
-        (a, b)
-        for (a, b), (x, y) in zip(pairwise(drive.scans), pairwise(tracked), strict=True)
-        if x.segment == y.segment
+    followed_by = [
+        rows for rows in pairwise(range(len(tracked))) if len({tracked[i].segment for i in rows}) == 1
     ]
+    steps = [between(tracked[i].pose[None], tracked[j].pose[None])[0] for i, j in followed_by]
+    pairs = [(drive.scans[i], drive.scans[j]) for i, j in followed_by]
+    moves = np.inf if drive.velocities is not None else motion_significance(pairs, steps)
     for refused, moved, why, missing in (
-        (not by_doppler and way < LEAST_OBSERVED, "moved", share.format(way, LEAST_OBSERVED), doppler),
+        (np.isfinite(moves) and way < LEAST_OBSERVED, "moved", share.format(way, LEAST_OBSERVED), doppler),
         (
             not turns_known and turn < _LEAST_OBSERVED_TURN,
             "turned",
             share.format(turn, _LEAST_OBSERVED_TURN),
             "a gyroscope (imu)",
         ),
-        (
-            not by_doppler and motion_significance(pairs, steps) < -ERRORS,
-            "moved",
-            "scans agree better without any motion",
-            doppler,
-        ),
+        (moves < -ERRORS, "moved", "scans agree better without any motion", doppler),
     ):
         if refused:
             msg = f"the returns alone do not observe how the sensor {moved}: {why}. Give {missing}, or poses"
             raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
+    if moves < ERRORS:
+        notes.append(
+            "Assumed: the sensor moved as estimated; neighbouring scans agree as well without any motion."
+        )
     if drive.gyroscope is None and turn < _LEAST_OBSERVED_TURN:
         notes.append(
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
