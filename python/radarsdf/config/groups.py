@@ -147,7 +147,7 @@ class TrainingConfig:
     """Iterations of the sdf stage. It trains features and SDF network, which are then frozen (3QFPI: 1000).
     None: from the size of the data and `effort`."""
     intensity_iterations: _Count | None = None
-    """Iterations that train the intensity network, including those of the sdf stage, which train both (3QFPI: 4000).
+    """Iterations that train the intensity network, including those of the sdf stage that train both (3QFPI: 4000).
     None: from the size of the data and `effort`."""
     cross_range_noise_rad: _NotNegative = 0.005
     """Standard deviation of the noise across the beam that is added to the samples of the intensity stage, since the
