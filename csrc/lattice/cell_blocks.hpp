@@ -29,6 +29,15 @@ struct Occupancy {
   }
 };
 
+// Morton bits of a coordinate in its block, and the number of a cell in its block, 0 to 63.
+inline std::uint64_t part_bits(std::int32_t coordinate) {
+  constexpr std::uint64_t kSpread[1 << kBlockBits] = {0, 1, 8, 9};
+  return kSpread[coordinate & ((1 << kBlockBits) - 1)];
+}
+inline std::uint64_t part_of(const std::int32_t* cell) {
+  return part_bits(cell[0]) | part_bits(cell[1]) << 1 | part_bits(cell[2]) << 2;
+}
+
 // Masks of the parts of a block at even positions along an axis (0 and 2), at position 1, and at position 3. The
 // position of a part has bit `axis` of its Morton number as low bit and bit `axis + 3` as high bit.
 constexpr std::uint64_t parts_where(int axis, bool low_bit, bool any_high_bit, bool high_bit) {
@@ -61,6 +70,9 @@ class CellBlocks {
 
   static std::uint64_t block_key(std::uint64_t key) { return key >> (3 * kBlockBits); }
   static std::uint64_t region_key(std::uint64_t key) { return key >> (3 * kRegionBits); }
+  static std::uint64_t key_in_block(std::uint64_t block_key, int part) {
+    return block_key << (3 * kBlockBits) | static_cast<std::uint64_t>(part);
+  }
 
   // The blocks of a region, and the cells of one of its blocks; nullptr if empty.
   const Occupancy* region(std::uint64_t region_key) const { return at(regions_, numbers_.find(region_key)); }

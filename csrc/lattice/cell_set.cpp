@@ -79,18 +79,13 @@ std::size_t CellSet::partition_of(std::uint64_t block) {
 class CellSet::Marks {
  public:
   void add(const std::int32_t* cell) {
-    constexpr std::uint64_t kSpread[1 << kBlockBits] = {0, 1, 8, 9};
-    std::uint64_t part = 0;
     bool moved = false;
-    for (int axis = 0; axis < 3; ++axis) {
-      part |= kSpread[cell[axis] & ((1 << kBlockBits) - 1)] << axis;
-      moved = moved || cell[axis] >> kBlockBits != block_[axis];
-    }
+    for (int axis = 0; axis < 3; ++axis) moved = moved || cell[axis] >> kBlockBits != block_[axis];
     if (moved) {  // consecutive cells along a ray often share a block
       finish();
       for (int axis = 0; axis < 3; ++axis) block_[axis] = cell[axis] >> kBlockBits;
     }
-    mask_ |= std::uint64_t{1} << part;
+    mask_ |= std::uint64_t{1} << part_of(cell);
   }
 
   void finish() {
@@ -219,7 +214,7 @@ std::vector<std::uint64_t> CellSet::sorted_keys(int num_threads) const {
     const Partition& own = partitions_[partition_of(block)];
     std::uint64_t mask = own.masks[static_cast<std::size_t>(own.numbers.find(block))];
     for (; mask != 0; mask &= mask - 1) {
-      keys.push_back(block << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(mask)));
+      keys.push_back(CellBlocks::key_in_block(block, lowest_bit(mask)));
     }
   }
   return keys;

@@ -328,7 +328,7 @@ LeafVertices leaf_vertices(const VertexTable& table, int num_threads) {
     for (auto block = blocks.begin() + begin; block != blocks.begin() + end; ++block) {
       std::int32_t* to = vertices.coordinates.data() + 3 * std::int64_t{block->parts.first};
       for (std::uint64_t bits = block->parts.mask; bits != 0; bits &= bits - 1) {
-        const std::uint64_t key = block->key << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(bits));
+        const std::uint64_t key = CellBlocks::key_in_block(block->key, lowest_bit(bits));
         for (int axis = 0; axis < 3; ++axis)
           *to++ = static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias;
       }

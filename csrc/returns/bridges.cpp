@@ -84,11 +84,6 @@ class Neighbourhood {
     const auto block = [&](int axis) { return at[axis] >> kBlockBits; };
     return static_cast<std::size_t>((block(0) * edge_ + block(1)) * edge_ + block(2));
   }
-  static std::uint64_t part_of(const std::int32_t* at) {
-    constexpr std::uint64_t kSpread[kBlockEdge] = {0, 1, 8, 9};
-    const auto part = [&](int axis) { return kSpread[at[axis] & (kBlockEdge - 1)] << axis; };
-    return part(0) | part(1) | part(2);
-  }
 
   const CellBlocks* ends_;
   std::int32_t halo_, edge_;  // blocks
@@ -96,6 +91,19 @@ class Neighbourhood {
   std::vector<Occupancy> there_;
   std::vector<std::uint64_t> marked_;
 };
+
+// Calls visit(first, last) for each run of equal group_of(i), of i below count, that begins in [begin, end).
+template <typename GroupOf, typename Visit>
+void for_each_run(std::int64_t begin, std::int64_t end, std::int64_t count, const GroupOf& group_of,
+                  const Visit& visit) {
+  std::int64_t i = begin;
+  while (i > 0 && i < count && group_of(i) == group_of(i - 1)) ++i;
+  while (i < std::min(end, count)) {
+    const std::int64_t first = i;
+    while (i < count && group_of(i) == group_of(first)) ++i;
+    visit(first, i);
+  }
+}
 
 struct Direction {
   std::int32_t step[3];
@@ -121,12 +129,9 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
   parallel_tasks(static_cast<std::int64_t>(parts.size()), num_threads, [&](std::int64_t task) {
     Neighbourhood near(cells, max_cells + 1);
     const auto region_of = [&](std::int64_t i) { return CellBlocks::region_key(ends[i]); };
-    std::int64_t i = task * kEnds;
-    while (i > 0 && i < num_ends && region_of(i) == region_of(i - 1)) ++i;
-    while (i < std::min(num_ends, (task + 1) * kEnds)) {
-      const std::uint64_t region = region_of(i);
-      near.move_to(region);
-      for (; i < num_ends && region_of(i) == region; ++i) {
+    for_each_run(task * kEnds, (task + 1) * kEnds, num_ends, region_of, [&](std::int64_t first, std::int64_t last) {
+      near.move_to(region_of(first));
+      for (std::int64_t i = first; i < last; ++i) {
         std::int32_t own[3];
         for (int axis = 0; axis < 3; ++axis) {
           const auto cell = static_cast<std::int32_t>(morton_coordinate(ends[i], axis));
@@ -145,7 +150,7 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
         }
       }
       near.take(parts[static_cast<std::size_t>(task)]);
-    }
+    });
   });
   std::vector<Marks> between;
   for (std::vector<Marks>& part : parts) {
@@ -168,8 +173,7 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
         mask |= std::uint64_t{1} << (leaf_keys[leaf] & 63);
       }
     }
-    for (; mask != 0; mask &= mask - 1)
-      all.push_back(block << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(mask)));
+    for (; mask != 0; mask &= mask - 1) all.push_back(CellBlocks::key_in_block(block, lowest_bit(mask)));
   }
   all.insert(all.end(), leaf_keys + leaf, leaf_keys + num_leaves);
   return all;
@@ -181,12 +185,9 @@ void block_medians(const std::uint64_t* keys, const double* values, std::int64_t
   constexpr std::int64_t kCells = 1 << 14;  // per task, which processes the blocks that begin there
   parallel_tasks((count + kCells - 1) / kCells, num_threads, [&](std::int64_t task) {
     std::vector<double> positive;
-    std::int64_t i = task * kCells;
-    while (i > 0 && i < count && block_of(i) == block_of(i - 1)) ++i;
-    while (i < std::min(count, (task + 1) * kCells)) {
-      const std::int64_t begin = i;
+    for_each_run(task * kCells, (task + 1) * kCells, count, block_of, [&](std::int64_t first, std::int64_t last) {
       positive.clear();
-      for (; i < count && block_of(i) == block_of(begin); ++i) {
+      for (std::int64_t i = first; i < last; ++i) {
         if (values[i] > 0) positive.push_back(values[i]);
       }
       double median = 0;
@@ -195,8 +196,8 @@ void block_medians(const std::uint64_t* keys, const double* values, std::int64_t
         std::nth_element(positive.begin(), upper, positive.end());
         median = positive.size() % 2 == 1 ? *upper : (*std::max_element(positive.begin(), upper) + *upper) / 2;
       }
-      std::fill(medians + begin, medians + i, median);
-    }
+      std::fill(medians + first, medians + last, median);
+    });
   });
 }
 

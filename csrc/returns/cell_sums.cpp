@@ -59,7 +59,6 @@ class BlocksRound {
   explicit BlocksRound(const CellBlocks& cells) : cells_(&cells) {}
 
   void move_to(std::uint64_t block_key) {
-    constexpr std::uint64_t kSpread[kEdge] = {0, 1, 8, 9};
     const std::uint64_t region_key = CellBlocks::block_key(block_key);  // a region is a block of blocks
     if (region_key != region_key_) find_regions(region_key);
     int regions[3][3];  // of the 27, along each axis
@@ -68,7 +67,7 @@ class BlocksRound {
       for (int i = 0; i < 3; ++i) {
         const int at = part_coordinate(static_cast<int>(block_key & 63), axis) + i - 1;
         regions[axis][i] = (at + kEdge) / kEdge;
-        parts[axis][i] = kSpread[at & (kEdge - 1)] << axis;
+        parts[axis][i] = part_bits(at) << axis;
       }
     }
     count_ = 0;

@@ -76,7 +76,7 @@ void SumsChange::collect(const RaysOfScan& rays, std::int64_t sign) {
   }
   reached.for_each_block([&](std::uint64_t block_key, std::uint64_t mask) {
     for (; mask != 0; mask &= mask - 1) {
-      const std::uint64_t cube = block_key << (3 * kBlockBits) | static_cast<std::uint64_t>(lowest_bit(mask));
+      const std::uint64_t cube = CellBlocks::key_in_block(block_key, lowest_bit(mask));
       const auto number = static_cast<std::int32_t>(visibility_.size());
       if (number_of_cube_.insert(cube, number)) visibility_.push_back({cube, 0});
       visibility_[static_cast<std::size_t>(number_of_cube_.find(cube))].visibility += sign;

@@ -95,17 +95,16 @@ void count_visibility(const std::uint64_t* leaf_keys, std::int64_t num_leaves, d
   const CellBlocks cubes(keys.data(), static_cast<std::int64_t>(keys.size()));
   check_whole_rays(points, directions, ranges_m, count, leaf_size_m);
   const auto of_rays = [&](std::int64_t begin, std::int64_t end, std::vector<std::uint32_t>& counts) {
+    NearbyRows near(cubes);
     ReachedCubes reached;  // by rays of the current scan
     for (std::int64_t i = begin; i < end; ++i) {
       if (i % (1 << 12) == 0) check_interrupt();
       reached.trace(points + 3 * i, directions + 3 * i, ranges_m[i], leaf_size_m);
       if (i + 1 < end && scans[i + 1] == scans[i]) continue;
       reached.for_each_block([&](std::uint64_t block_key, std::uint64_t mask) {
-        const Occupancy* region = cubes.region(CellBlocks::block_key(block_key));  // a region is a block of blocks
-        const Occupancy* block = region != nullptr ? cubes.block(*region, block_key) : nullptr;
-        if (block == nullptr) return;
-        for (mask &= block->mask; mask != 0; mask &= mask - 1)
-          ++counts[static_cast<std::size_t>(block->row(static_cast<std::uint64_t>(lowest_bit(mask))))];
+        const Occupancy& block = near.block(block_key);
+        for (mask &= block.mask; mask != 0; mask &= mask - 1)
+          ++counts[static_cast<std::size_t>(block.row(static_cast<std::uint64_t>(lowest_bit(mask))))];
       });
       reached.clear();
     }
