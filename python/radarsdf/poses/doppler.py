@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -178,23 +178,28 @@ def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
     return squares / max(float((given**2).sum()), float((measured**2).sum()))
 
 
-def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
-    """Return log distances (K, M) from returns of two scans to the nearest one of the other, if `second` is shifted by (K, 3)."""
-    trees = cKDTree(first), cKDTree(second)
-    some = [scan[:: max(1, len(scan) // _SAMPLED)] for scan in (second, first)]
-    distances = [
-        tree.query(points + towards * shifts_m[:, None])[0]
-        for tree, points, towards in zip(trees, some, (1, -1), strict=True)
-    ]
-    found: Floats = np.log(np.maximum(np.concatenate(distances, axis=1), _LEAST_M))
-    return found
+class _Pair:
+    """Two scans, whose returns are compared with the nearest one of the other."""
+
+    def __init__(self, first: Floats, second: Floats) -> None:
+        self._trees = cKDTree(first), cKDTree(second)
+        self._sampled = [scan[:: max(1, len(scan) // _SAMPLED)] for scan in (first, second)]
+
+    def log_distances(self, turn: Floats, shifts_m: Floats) -> Floats:
+        """Return log distances (K, M) to the nearest returns, if the second scan is turned by (3, 3) and shifted by (K, 3)."""
+        # Queries are turned back, since trees are dearer.
+        first, second = self._sampled
+        of_second = self._trees[0].query(second @ turn.T + shifts_m[:, None])[0]
+        of_first = self._trees[1].query((first - shifts_m[:, None]) @ turn)[0]
+        found: Floats = np.log(np.maximum(np.concatenate([of_second, of_first], axis=1), _LEAST_M))
+        return found
 
 
 def scale_gains(first: Floats, second: Floats, moved_m: Floats, scales: Floats) -> Floats:
     """Return how much nearer returns of scans in common axes are after `scales` (K,) times `moved_m` (3,) than after the reverse."""
     # What scans have in common wherever they were taken, such as density, clutter, or walls along the motion, cancels.
     shifts_m = np.multiply.outer(np.concatenate([scales, -scales]), moved_m)
-    ahead, back = np.split(log_distances(first, second, shifts_m).mean(axis=1), 2)
+    ahead, back = np.split(_Pair(first, second).log_distances(np.eye(3), shifts_m).mean(axis=1), 2)
     found: Floats = back - ahead
     return found
 
@@ -223,11 +228,11 @@ def sign_significance(
     return float(means.mean() / np.sqrt(max(variance, 1e-12))), yaws
 
 
-def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Sequence[Floats]) -> float:
+def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Iterable[Floats]) -> float:
     """Return by how many standard errors pairs of scans agree better after `motions` (4, 4) than after their rotations alone."""
     # Negative where a pattern that moves with the sensor, such as that of a straight wall, explains the returns better.
     gains = [
-        log_distances(first, second @ motion[:3, :3].T, np.outer([0.0, 1.0], motion[:3, 3])).mean(axis=1)
+        _Pair(first, second).log_distances(motion[:3, :3], np.outer([0.0, 1.0], motion[:3, 3])).mean(axis=1)
         for (first, second), motion in zip(pairs, motions, strict=True)
         if min(len(first), len(second)) > 0
     ]
@@ -239,10 +244,10 @@ def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Sequenc
 
 def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> tuple[Floats, tuple[float, float]]:
     """Return how much nearer each return (M,) is after this motion than after its reverse, each with its best yaw, and these."""
-    both = []
+    pair, both = _Pair(first, second), []
     for turn in _TURNS_RAD:
         whole, half = rotation(np.multiply.outer([turn, 0.5 * turn], [0.0, 0.0, 1.0]))
-        both.append(log_distances(first, second @ whole.T, np.multiply.outer([1.0, -1.0], half @ moved_m)))
+        both.append(pair.log_distances(whole, np.multiply.outer([1.0, -1.0], half @ moved_m)))
     ahead, back = np.swapaxes(both, 0, 1)
     i, j = int(ahead.mean(axis=1).argmin()), int(back.mean(axis=1).argmin())
     return back[j] - ahead[i], (float(_TURNS_RAD[i]), float(_TURNS_RAD[j]))

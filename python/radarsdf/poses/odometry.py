@@ -8,7 +8,6 @@ import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance,
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
-from radarsdf.poses.rigid import Floats, between
+from radarsdf.poses.rigid import Floats, steps
 from radarsdf.poses.tracking import (
     LATERAL_MPS2,
     LEAST_OBSERVED,
@@ -221,28 +220,24 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
     doppler = "their Doppler (doppler_mps)"
     if any(note.startswith(NOT_USED) for note in notes):
         doppler = "Doppler that most returns of a scan agree on"
+    by_returns = drive.velocities is None
+    significance = _significance_of_steps(tracked, drive) if by_returns else np.inf
     turns_known = drive.gyroscope is not None or drive.turns_slowly
     share = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
-    followed_by = [
-        rows for rows in pairwise(range(len(tracked))) if len({tracked[i].segment for i in rows}) == 1
-    ]
-    steps = [between(tracked[i].pose[None], tracked[j].pose[None])[0] for i, j in followed_by]
-    pairs = [(drive.scans[i], drive.scans[j]) for i, j in followed_by]
-    moves = np.inf if drive.velocities is not None else motion_significance(pairs, steps)
     for refused, moved, why, missing in (
-        (np.isfinite(moves) and way < LEAST_OBSERVED, "moved", share.format(way, LEAST_OBSERVED), doppler),
+        (by_returns and way < LEAST_OBSERVED, "moved", share.format(way, LEAST_OBSERVED), doppler),
         (
             not turns_known and turn < _LEAST_OBSERVED_TURN,
             "turned",
             share.format(turn, _LEAST_OBSERVED_TURN),
             "a gyroscope (imu)",
         ),
-        (moves < -ERRORS, "moved", "scans agree better without any motion", doppler),
+        (significance < -ERRORS, "moved", "scans agree better without any motion", doppler),
     ):
         if refused:
             msg = f"the returns alone do not observe how the sensor {moved}: {why}. Give {missing}, or poses"
             raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
-    if moves < ERRORS:
+    if significance < ERRORS:
         notes.append(
             "Assumed: the sensor moved as estimated; neighbouring scans agree as well without any motion."
         )
@@ -251,6 +246,13 @@ def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> N
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
             "trajectory make of its speed; the returns of a scan hardly measure it."
         )
+
+
+def _significance_of_steps(tracked: list[Tracked], drive: Drive) -> float:
+    """Return :func:`motion_significance` of the steps within segments."""
+    followed_by = np.flatnonzero(np.diff([found.segment for found in tracked]) == 0)
+    motions = steps(np.stack([found.pose for found in tracked]))[followed_by]
+    return motion_significance([(drive.scans[i], drive.scans[i + 1]) for i in followed_by], motions)
 
 
 def _verdict(segments: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
