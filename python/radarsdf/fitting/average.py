@@ -69,12 +69,9 @@ class SurfaceReturns:
         means = None if config.train else MeanRays.of_sums(sums, num_threads)
         del sums  # frees memory: a hundred bytes a cell
         noise = sensor_noise(surfels, rays, config.returns, num_threads)
-        drop, asked = (
-            config.returns.drop_ghosts,
-            config.train or config.returns.free_space or inside is not None,
-        )
+        drop = config.returns.drop_ghosts
         cell_of_ray = None  # row of surfels
-        if config.train or (drop and asked):
+        if config.train or (drop and (config.returns.free_space or inside is not None)):
             if cells is None:
                 cell_of_ray = surfels.cells_at(rays.points, num_threads)
             else:
