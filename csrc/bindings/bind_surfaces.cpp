@@ -28,11 +28,11 @@ py::array_t<T> adopt(std::unique_ptr<T[]> data, const std::vector<py::ssize_t>& 
 
 // Return types, explicit for the type stub.
 template <typename... T>
-using Arrays = py::typing::Tuple<py::array_t<T>...>;
+using ArrayTuple = py::typing::Tuple<py::array_t<T>...>;
 
-using DenseEdges = Arrays<double, std::int32_t, std::int64_t>;
+using DenseEdges = ArrayTuple<double, std::int32_t, std::int64_t>;
 
-Arrays<double, std::int32_t> adopt_mesh(Mesh mesh) {
+ArrayTuple<double, std::int32_t> adopt_mesh(Mesh mesh) {
   return py::make_tuple(adopt(std::move(mesh.vertices), {mesh.num_vertices, 3}),
                         adopt(std::move(mesh.faces), {mesh.num_faces, 3}));
 }
@@ -65,9 +65,9 @@ Mesh dense_mesh(const Array<T>& volume, const std::optional<Array<bool>>& mask, 
 }
 
 template <typename T>
-Arrays<double, std::int32_t> dense(const Array<T>& volume, const std::optional<Array<bool>>& mask,
-                                   const std::array<double, 3>& spacing, const std::array<double, 3>& origin,
-                                   double level, int num_threads) {
+ArrayTuple<double, std::int32_t> dense(const Array<T>& volume, const std::optional<Array<bool>>& mask,
+                                       const std::array<double, 3>& spacing, const std::array<double, 3>& origin,
+                                       double level, int num_threads) {
   return adopt_mesh(dense_mesh(volume, mask, spacing, origin, level, num_threads, false));
 }
 
@@ -79,9 +79,9 @@ DenseEdges dense_with_edges(const Array<T>& volume, const std::optional<Array<bo
 }
 
 template <typename T>
-Arrays<double, std::int32_t> sparse(const Array<std::int32_t>& corners, const Array<T>& values,
-                                    const Array<std::int32_t>& cells, const std::array<double, 3>& spacing,
-                                    const std::array<double, 3>& origin, double level, int num_threads) {
+ArrayTuple<double, std::int32_t> sparse(const Array<std::int32_t>& corners, const Array<T>& values,
+                                        const Array<std::int32_t>& cells, const std::array<double, 3>& spacing,
+                                        const std::array<double, 3>& origin, double level, int num_threads) {
   check_columns(corners, 3, "corners must have shape (K, 3)");
   check_columns(cells, 8, "cells must have shape (M, 8)");
   const std::int64_t num_corners = corners.shape(0);
@@ -122,7 +122,7 @@ void dense_backward(const Array<T>& volume, const Array<std::int64_t>& edges, co
   marching_cubes_dense_backward(samples, shape, edge_data, grad_data, num_vertices, spacing, level, out, num_threads);
 }
 
-Arrays<std::int32_t, std::int32_t, std::int32_t> lattice(const Array<std::int32_t>& cells, int num_threads) {
+ArrayTuple<std::int32_t, std::int32_t, std::int32_t> lattice(const Array<std::int32_t>& cells, int num_threads) {
   check_columns(cells, 3, "cells must have shape (M, 3)");
   const std::int32_t* data = cells.data();
   const std::int64_t num_cells = cells.shape(0);
@@ -136,7 +136,7 @@ Arrays<std::int32_t, std::int32_t, std::int32_t> lattice(const Array<std::int32_
                         adopt(std::move(result.cell_corners), {result.num_cells, 8}));
 }
 
-Arrays<std::int32_t, std::int64_t> components(const Array<std::int32_t>& faces, std::int64_t num_vertices) {
+ArrayTuple<std::int32_t, std::int64_t> components(const Array<std::int32_t>& faces, std::int64_t num_vertices) {
   check_columns(faces, 3, "faces must have shape (F, 3)");
   const std::int32_t* data = faces.data();
   const std::int64_t num_faces = faces.shape(0);
@@ -181,10 +181,10 @@ Array<std::int32_t> near_surface(const VertexTable& table, const Array<float>& d
   return to_array(std::move(rows));
 }
 
-Arrays<double, std::int32_t> surface_of_grid(const VertexTable& table, const Array<float>& distances_m,
-                                             const Array<std::int32_t>& cells, int parts, double voxel_size,
-                                             const std::array<std::int32_t, 3>& lowest,
-                                             const std::array<std::int32_t, 3>& highest, int num_threads) {
+ArrayTuple<double, std::int32_t> surface_of_grid(const VertexTable& table, const Array<float>& distances_m,
+                                                 const Array<std::int32_t>& cells, int parts, double voxel_size,
+                                                 const std::array<std::int32_t, 3>& lowest,
+                                                 const std::array<std::int32_t, 3>& highest, int num_threads) {
   const float* distances = stored_distances(table, distances_m);
   const std::int64_t num_cells = check_column(cells, "cells");
   const std::int32_t* rows = cells.data();
