@@ -55,31 +55,34 @@ void bind_visibility(py::module_& m) {
       "cell; `scans` (N,) int32, ascending.");
   m.def(
       "scan_rays",
-      [](const Array<double>& points, const Array<double>& rotation, const Array<double>& position,
-         const Array<double>& seen_from, double min_range_m, double max_range_m) {
-        const std::int64_t count = check_points(points);
-        check_shape(rotation, 3, 3, "rotation");
-        if (check_column(position, "position") != 3 || check_column(seen_from, "seen_from") != 3)
-          throw std::invalid_argument("position and seen_from must have shape (3,)");
+      [](const Array<double>& points, const Array<std::int32_t>& scans, const Array<double>& rotations,
+         const Array<double>& positions, const Array<double>& seen_from, double min_range_m,
+         const Array<double>& max_ranges_m, int num_threads) {
+        const std::int64_t count = check_points(points), num_scans = check_column(max_ranges_m, "max_ranges_m");
+        if (check_cells_of_returns(scans, num_scans) != count) throw std::invalid_argument("scans must be (N,)");
+        check_shape(rotations, num_scans, 9, "rotations");
+        check_shape(positions, num_scans, 3, "positions");
+        check_shape(seen_from, num_scans, 3, "seen_from");
         Array<bool> kept(static_cast<py::ssize_t>(count));
-        std::vector<float> to(static_cast<std::size_t>(3 * count)), along(to.size());
-        std::vector<float> ranges(static_cast<std::size_t>(count));
-        const PlacedScan scan{points.data(), count, rotation.data(), position.data(), seen_from.data()};
-        const auto rows = static_cast<std::size_t>(
-            scan_rays(scan, min_range_m, max_range_m, kept.mutable_data(), to.data(), along.data(), ranges.data()));
-        to.resize(3 * rows);
-        along.resize(3 * rows);
-        ranges.resize(rows);
-        const auto shape = {static_cast<py::ssize_t>(rows), py::ssize_t{3}};
-        return py::make_tuple(kept, to_array(std::move(to)).reshape(shape), to_array(std::move(along)).reshape(shape),
-                              to_array(std::move(ranges)));
+        Array<float> to({count, std::int64_t{3}}), along({count, std::int64_t{3}}), ranges(count);
+        const PlacedScans placed{points.data(),    scans.data(),       count, rotations.data(), positions.data(),
+                                 seen_from.data(), max_ranges_m.data()};
+        bool* k = kept.mutable_data();
+        float *p = to.mutable_data(), *d = along.mutable_data(), *r = ranges.mutable_data();
+        std::int64_t rows = 0;
+        {
+          const py::gil_scoped_release release;
+          rows = scan_rays(placed, min_range_m, k, p, d, r, num_threads);
+        }
+        const py::slice used(0, rows, 1);
+        return py::make_tuple(kept, Array<float>(to[used]), Array<float>(along[used]), Array<float>(ranges[used]));
       },
-      "points"_a.noconvert(), "rotation"_a.noconvert(), "position"_a.noconvert(), "seen_from"_a.noconvert(),
-      "min_range_m"_a, "max_range_m"_a,
-      "Selects `points` (N, 3) of a scan, sensor frame, m, by range from the sensor: mask (N,) bool, and the K "
-      "selected returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. `rotation` "
-      "(3, 3) from sensor to world, `position` (3,) of the sensor and `seen_from` (3,), the origin of the rays, local "
-      "frame, m, float64.");
+      "points"_a.noconvert(), "scans"_a.noconvert(), "rotations"_a.noconvert(), "positions"_a.noconvert(),
+      "seen_from"_a.noconvert(), "min_range_m"_a, "max_ranges_m"_a.noconvert(), "num_threads"_a = 0,
+      "Selects `points` (N, 3) of `scans` (N,) int32, sensor frame, m, by range from the sensor: mask (N,) bool, and "
+      "the K selected returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. "
+      "`rotations` (F, 9) from sensor to world, `positions` (F, 3) of the sensor and `seen_from` (F, 3), the origins "
+      "of the rays, local frame, m, `max_ranges_m` (F,), float64.");
 }
 
 }  // namespace radarsdf

@@ -1,24 +1,26 @@
 // SPDX-FileCopyrightText: 2026 the radarsdf authors
 // SPDX-License-Identifier: MIT
 //
-// Conversion of the returns of a scan to rays in the local frame.
+// Conversion of the returns of scans to rays in the local frame.
 #pragma once
 
 #include <cstdint>
 
 namespace radarsdf {
 
-struct PlacedScan {
-  const double* points;  ///< (count, 3), sensor frame, m
+struct PlacedScans {
+  const double* points;       ///< (count, 3), sensor frame, m
+  const std::int32_t* scans;  ///< (count), scan of each return
   std::int64_t count;
-  const double* rotation;   ///< (3, 3), from the sensor to the world
-  const double* position;   ///< of the sensor, local frame, m
-  const double* seen_from;  ///< origin of the rays, local frame, m
+  const double* rotations;     ///< (scans, 3, 3), from the sensor to the world
+  const double* positions;     ///< (scans, 3), of the sensor, local frame, m
+  const double* seen_from;     ///< (scans, 3), origin of the rays, local frame, m
+  const double* max_ranges_m;  ///< (scans)
 };
 
-// kept: (count,), whether a return is within the range limits and not at the sensor. Returns their number, and writes
-// as many rows of points and unit directions (·, 3) and ranges (·).
-std::int64_t scan_rays(const PlacedScan& scan, double min_range_m, double max_range_m, bool* kept, float* points,
-                       float* directions, float* ranges_m);
+// kept: (count), whether a return is within the range limits and not at the sensor. Returns their number, and writes
+// as many rows of points and unit directions (count, 3) and ranges (count).
+std::int64_t scan_rays(const PlacedScans& scans, double min_range_m, bool* kept, float* points, float* directions,
+                       float* ranges_m, int num_threads);
 
 }  // namespace radarsdf

@@ -1340,16 +1340,21 @@ def random_bytes(
 
 def scan_rays(
     points: numpy.typing.NDArray[numpy.float64],
-    rotation: numpy.typing.NDArray[numpy.float64],
-    position: numpy.typing.NDArray[numpy.float64],
+    scans: numpy.typing.NDArray[numpy.int32],
+    rotations: numpy.typing.NDArray[numpy.float64],
+    positions: numpy.typing.NDArray[numpy.float64],
     seen_from: numpy.typing.NDArray[numpy.float64],
     min_range_m: typing.SupportsFloat | typing.SupportsIndex,
-    max_range_m: typing.SupportsFloat | typing.SupportsIndex,
+    max_ranges_m: numpy.typing.NDArray[numpy.float64],
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
 ) -> tuple[
-    numpy.typing.NDArray[numpy.bool], numpy.ndarray, numpy.ndarray, numpy.typing.NDArray[numpy.float32]
+    numpy.typing.NDArray[numpy.bool],
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
+    numpy.typing.NDArray[numpy.float32],
 ]:
     """
-    Selects `points` (N, 3) of a scan, sensor frame, m, by range from the sensor: mask (N,) bool, and the K selected returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. `rotation` (3, 3) from sensor to world, `position` (3,) of the sensor and `seen_from` (3,), the origin of the rays, local frame, m, float64.
+    Selects `points` (N, 3) of `scans` (N,) int32, sensor frame, m, by range from the sensor: mask (N,) bool, and the K selected returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. `rotations` (F, 9) from sensor to world, `positions` (F, 3) of the sensor and `seen_from` (F, 3), the origins of the rays, local frame, m, `max_ranges_m` (F,), float64.
     """
 
 def set_instruction_set(name: str) -> None:

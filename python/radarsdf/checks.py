@@ -62,6 +62,8 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
 
 def refuse_masked(values: Any, name: str) -> None:
     """Refuse masked values: NumPy would use the data under the mask."""
+    if type(values) is np.ndarray:
+        return
     parts = values if isinstance(values, (list, tuple)) else [values]
     masked = any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts)
     check(not masked, f"{name} has masked values: leave them out")
@@ -92,8 +94,9 @@ def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
 
 
 def check_scan_shape(scan: NDArray[Any], number: int) -> None:
-    fits = scan.ndim == 2 and scan.shape[1] == 3
-    check(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
+    if scan.ndim != 2 or scan.shape[1] != 3:
+        msg = f"scan {number} must have shape (N, 3), not {scan.shape}"
+        raise ValueError(msg)
 
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:

@@ -17,6 +17,7 @@ from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.moving import StaticReturns
 from radarsdf.returns.rays import prepare
 from radarsdf.scans import Scans, filled
+from radarsdf.threads import resolve_num_threads
 
 
 def fit(
@@ -101,7 +102,8 @@ def fit(
         if poses_ is None:
             raise ValueError(MISSING_POSES)
         static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns)
-        rays = prepare(static.points, poses_, static.intensities, origin=origin, **config.preparation)
+        options = config.preparation | {"num_threads": resolve_num_threads(config.num_threads)}
+        rays = prepare(static.points, poses_, static.intensities, origin=origin, **options)
         scale = IntensityScale.of(rays.intensities)
         if intensity_range is not None and scale is not None:
             scale = IntensityScale.between(intensity_range)

@@ -90,10 +90,12 @@ class Rays:
 
 def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
     """Return a mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor, not padding."""
-    # By column: NumPy takes ten times as long along rows of three.
-    finite, other = np.abs(scan) <= MAX_POSITION_M, scan != 0
-    returns: NDArray[np.bool_] = finite[:, 0] & finite[:, 1] & finite[:, 2]
-    returns &= other[:, 0] | other[:, 1] | other[:, 2]
+    returns = np.ones(len(scan), np.bool_)
+    if not (scan.all() and np.abs(scan).max(initial=0.0) <= MAX_POSITION_M):
+        # By column: NumPy takes ten times as long along rows of three.
+        finite, other = np.abs(scan) <= MAX_POSITION_M, scan != 0
+        returns = finite[:, 0] & finite[:, 1] & finite[:, 2]
+        returns &= other[:, 0] | other[:, 1] | other[:, 2]
     # Drivers pad a cloud of fixed size with one point: a long run of equal rows among other rows.
     again = scan[1:, 0] == scan[:-1, 0]
     if np.count_nonzero(again) >= _PADDING:
@@ -188,6 +190,7 @@ def prepare(
     origin: ArrayLike | None = None,
     lattice: WorldLattice | None = None,
     whole: bool = True,
+    num_threads: int = 0,
 ) -> Rays:
     """Check scans and convert them to rays in the local frame, scan by scan.
 
@@ -211,24 +214,25 @@ def prepare(
         local_origin = positions.mean(axis=0)
         if lattice is not None:
             local_origin = lattice.position(lattice.nearest_block(local_origin))
-    parts: list[tuple[NDArray[Any], ...]] = []
-    values_kept: list[NDArray[np.float32]] = []
-    for i, scan in enumerate(scans):
-        seen_from = positions[middle_scan(i, num_scans, accumulate_scans)] - local_origin
-        most_m = (np.inf if max_range_m is None else max_range_m) if rigid[i] else -1.0
-        R, position = np.ascontiguousarray(T_world_sensor[i, :3, :3]), positions[i] - local_origin
-        keep, *columns = scan_rays(np.ascontiguousarray(scan), R, position, seen_from, min_range_m, most_m)
-        parts.append(tuple(columns))
-        if values is not None:
-            values_kept.append(values[i][keep])
-    counts = [len(part[0]) for part in parts]
-    if sum(counts) == 0 and whole:
-        msg = f"none of {left_out.given} returns lies between {min_range_m} m and {np.inf if max_range_m is None else max_range_m} m"
+    seen_from = positions[[middle_scan(i, num_scans, accumulate_scans) for i in range(num_scans)]]
+    most_m = np.inf if max_range_m is None else max_range_m
+    scan_of = np.repeat(np.arange(num_scans, dtype=np.int32), [len(scan) for scan in scans])
+    kept, points_m, directions, ranges_m = scan_rays(
+        np.concatenate(scans),
+        scan_of,
+        T_world_sensor[:, :3, :3].reshape(-1, 9),
+        positions - local_origin,
+        seen_from - local_origin,
+        min_range_m,
+        np.where(rigid, most_m, -1.0),
+        num_threads,
+    )
+    if len(ranges_m) == 0 and whole:
+        msg = f"none of {left_out.given} returns lies between {min_range_m} m and {most_m} m"
         raise ValueError("; ".join([msg, *left_out.notes]))
     for note in left_out.notes if whole else ():
         _LOG.warning(note)
-    intensity = None if values is None else np.concatenate(values_kept)
-    points_m, directions, ranges_m = (np.concatenate(column) for column in zip(*parts, strict=True))
+    intensity = None if values is None else np.concatenate(values)[kept]
     if intensity is not None and whole:
         intensity = Plausible.of(intensity).kept(intensity)
         if np.isnan(intensity).all():
@@ -241,7 +245,7 @@ def prepare(
         directions=directions,
         ranges_m=ranges_m,
         intensities=intensity,
-        scans=np.repeat(np.arange(num_scans, dtype=np.int32), counts),
+        scans=scan_of[kept],
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
         num_given=left_out.given,
     )
