@@ -71,9 +71,11 @@ def first_crossed(
 
     `beyond_returns`: planes extend over the whole cell of the surfel, beyond its returns.
     """
-    variances = surfels.variances[planes]
+    variances, centres, normals = (
+        column.take(planes, axis=0) for column in (surfels.variances, surfels.centres, surfels.normals)
+    )
     reach_m = np.full(len(planes), np.inf) if beyond_returns else _REACH_SIGMAS * np.sqrt(variances[:, 1])
-    chosen = (surfels.centres[planes], surfels.normals[planes], np.sqrt(variances[:, :1]), reach_m[:, None])
+    chosen = (centres, normals, np.sqrt(variances[:, :1]), reach_m[:, None])
     surfel_map = SurfelMap(
         surfels.keys[surfels.cell_of_plane[planes]],
         np.concatenate(chosen, 1).astype(np.float32),

@@ -88,11 +88,12 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
     on_flat = surfels.counts[surfels.cell_of_plane[surfels.is_flat()]].sum()
     tried = min(len(rays), int(_RETURNS * len(rays) / max(on_flat, 1.0)))
     rows = np.linspace(0, len(rays) - 1, tried).astype(np.int64)
-    plane = surfels.flat_planes_at(rays.points[rows], num_threads)
+    plane = surfels.flat_planes_at(rays.points.take(rows, axis=0), num_threads)
     rows, plane = rows[plane >= 0], plane[plane >= 0]
     if free.any() and len(rows) >= _MIN_RETURNS:
-        normals = surfels.normals[plane]
-        residual2 = np.einsum("ni,ni->n", rays.points[rows] - surfels.centres[plane], normals) ** 2
+        normals = surfels.normals.take(plane, axis=0)  # a third of the time of indexing
+        off_m = rays.points.take(rows, axis=0) - surfels.centres.take(plane, axis=0)
+        residual2 = np.einsum("ni,ni->n", off_m, normals) ** 2
         shares = _shares(rays, rows, normals)
         unexplained = residual2 - np.einsum("k,kn->n", sigma2[~free], shares[~free])
         least = np.array([0.025 * surfels.cell_size_m, 1e-3, 1e-3]) ** 2
@@ -121,9 +122,9 @@ def variances_across(
 
 def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the factors (3, M) of the three noise variances in the variance across planes."""
-    ranges2 = np.square(rays.ranges_m[rows].astype(np.float64))
-    up, normal = rays.up_of_scan[rays.scans[rows]].T, normals.T
-    along = rays.directions[rows].T.astype(np.float64)
+    ranges2 = np.square(rays.ranges_m.take(rows).astype(np.float64))
+    up, normal = rays.up_of_scan.take(rays.scans.take(rows), axis=0).T, normals.T
+    along = rays.directions.take(rows, axis=0).T.astype(np.float64)
     azimuth = _cross(up, along)  # direction of increasing azimuth
     azimuth /= np.maximum(np.sqrt(_dot(azimuth, azimuth)), _MIN_SINE)
     elevation = _cross(along, azimuth)
