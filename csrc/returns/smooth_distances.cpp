@@ -19,6 +19,7 @@
 #include "util/instruction_set.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
+#include "util/thread_pool.hpp"
 
 namespace radarsdf {
 namespace {
@@ -31,7 +32,10 @@ constexpr double kClear = 0.25;  // leaf cells: least distance of a vertex with 
 class Plates {
  public:
   Plates(const VertexTable& table, const KnownPlanes& planes, int num_threads)
-      : table_(&table), num_threads_(num_threads) {
+      : table_(&table),
+        num_threads_(num_threads),
+        pool_(static_cast<int>(std::clamp<std::int64_t>(static_cast<std::int64_t>(table.leaf_keys().size()) / kCells, 1,
+                                                        resolve_num_threads(num_threads)))) {
     number();
     place(planes);
     connect();
@@ -63,9 +67,10 @@ class Plates {
       if (k > 0) rho = next;
       sweep.before_m = before_m.data();
       sweep.after_m = after_m.data();
+      check_interrupt();
       pull(before_m.data(), static_cast<float>(table_->leaf_size_m()), pulls_m.data());
-      parallel_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks, num_threads_,
-                      [&](std::int64_t begin, std::int64_t end) { kernels_.sweep(sweep, begin, end); });
+      run_blocks(static_cast<std::int64_t>(num_blocks_), kBlocks,
+                 [&](std::int64_t begin, std::int64_t end) { kernels_.sweep(sweep, begin, end); });
       std::swap(before_m, after_m);
     }
     of_rows([&](std::size_t row, std::size_t v) { distances_m[row] = before_m[v]; });
@@ -251,15 +256,21 @@ class Plates {
   }
 
   // Accumulates the pulls of all points in pulls_m.
-  void pull(const float* distances_m, float leaf_m, float* pulls_m) const {
+  void pull(const float* distances_m, float leaf_m, float* pulls_m) {
     const PlatePlaces places{corners_.data(), first_.data(), layers_.data(), leaf_m};
     for (const std::vector<Range>& apart : regions_) {
-      parallel_blocks(static_cast<std::int64_t>(apart.size()), kRegions, num_threads_,
-                      [&](std::int64_t begin, std::int64_t end) {
-                        for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i)
-                          kernels_.pull(places, distances_m, pulls_m, apart[i].first, apart[i].second);
-                      });
+      run_blocks(static_cast<std::int64_t>(apart.size()), kRegions, [&](std::int64_t begin, std::int64_t end) {
+        for (auto i = static_cast<std::size_t>(begin); i < static_cast<std::size_t>(end); ++i)
+          kernels_.pull(places, distances_m, pulls_m, apart[i].first, apart[i].second);
+      });
     }
+  }
+
+  // As parallel_blocks, on threads that spin between jobs: nine per iteration, each shorter than it takes to wake one.
+  template <typename Body>
+  void run_blocks(std::int64_t size, std::int64_t min_block, const Body& body) {
+    const std::int64_t blocks = std::clamp<std::int64_t>(size / min_block, 1, resolve_num_threads(num_threads_));
+    pool_.run(blocks, [&](std::int64_t i) { body(size * i / blocks, size * (i + 1) / blocks); });
   }
 
   // cells: cell of each point; set to -1 for points to ignore.
@@ -364,6 +375,7 @@ class Plates {
 
   const VertexTable* table_;
   int num_threads_;
+  ThreadPool pool_;
   PlateKernels kernels_ = RADARSDF_KERNEL(plate_kernels)();
   UninitialisedVector<std::int32_t> vertices_;  // position of each row in the blocks
   std::size_t num_blocks_ = 0;

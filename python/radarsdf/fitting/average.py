@@ -170,8 +170,8 @@ def average_surface(
 def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> NDArray[np.float32]:
     """Return the normals (M, 3) of the planes at the ends of rays: of a flat surfel, else towards the sensor."""
     plane = surfels.flat_planes_of_leaves(rays.keys, num_threads)
-    of_planes = surfels.normals[plane].astype(np.float32) if len(surfels.normals) else 0
-    normals: NDArray[np.float32] = np.where(plane[:, None] >= 0, of_planes, -rays.directions)
+    flat, normals = np.flatnonzero(plane >= 0), -rays.directions
+    normals[flat] = surfels.normals.take(plane.take(flat), axis=0)
     # A surfel with returns from both sides of a thin wall faces only one side.
     away = np.einsum("ij,ij->i", normals, rays.directions) > 0
     normals[away] *= -1
