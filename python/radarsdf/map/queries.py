@@ -30,6 +30,7 @@ VOXEL_M = 0.1
 INWARD = 1e-3
 """Shift of points on the border of a map into it, edges of a cell."""
 _CHUNK = 1 << 13  # points per evaluation, so that hidden layers fit the second-level cache
+_VERTICES = 1 << 17  # vertices per evaluation of their probabilities
 _MIN_RANGE_M = 1e-6  # lower bound of the norm of a direction, for points at the sensor
 
 # Clutter ratio from which on a scene counts as fully rough.
@@ -220,7 +221,14 @@ class Probabilities(NamedTuple):
 
 def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
     """Evaluate the logistic regression on :func:`terms`. `reach` is an upper bound of the confidence."""
-    start_vector_library()
+    # A mesh of 80,000 vertices is one chunk: waking threads for each of forty operations takes longer than one thread.
+    chunks = list(zip(*(torch.split(column, _VERTICES) for column in evidence), strict=True))
+    with ThreadPool() as pool:
+        found = pool.map(lambda chunk: _probabilities(contents, EvidenceAt(*chunk)), chunks)
+        return Probabilities(*map(torch.cat, zip(*found, strict=True)))
+
+
+def _probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
     columns = terms(contents, evidence)
     logits = torch.tensor([_CONFIDENCE, _COVERING], dtype=torch.float64, device="cpu")
     true, covering = ((columns * logit).sum(1).clamp(min=_LEAST_LOGIT).sigmoid() for logit in logits)
