@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-MAX_POSITION_M = (
-    1e12  # largest coordinate: squares of it, and products of three, are far from overflow in float64
-)
-MAX_TIME_S = (
-    1e11  # latest time before or after 0: times since 1970 in milliseconds or smaller units are beyond it
-)
+# Largest coordinate: squares of it, and products of three, are far from overflow in float64.
+MAX_POSITION_M = 1e12
+# Latest time before or after 0: times since 1970 in milliseconds or smaller units are beyond it.
+MAX_TIME_S = 1e11
 MISSING_POSES = (
     "poses are missing: T_world_sensor (4, 4) of each scan; "
     "radarsdf.odometry(points, doppler_mps=..., times_s=...) finds them"
@@ -62,8 +60,6 @@ def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
 
 def refuse_masked(values: Any, name: str) -> None:
     """Refuse masked values: NumPy would use the data under the mask."""
-    if type(values) is np.ndarray:
-        return
     parts = values if isinstance(values, (list, tuple)) else [values]
     masked = any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts)
     check(not masked, f"{name} has masked values: leave them out")
@@ -94,9 +90,8 @@ def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
 
 
 def check_scan_shape(scan: NDArray[Any], number: int) -> None:
-    if scan.ndim != 2 or scan.shape[1] != 3:
-        msg = f"scan {number} must have shape (N, 3), not {scan.shape}"
-        raise ValueError(msg)
+    fits = scan.ndim == 2 and scan.shape[1] == 3
+    check(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
 def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:

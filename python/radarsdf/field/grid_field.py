@@ -32,9 +32,8 @@ class GridField(Field):
         inside = cells >= 0
         corners = self._corners_of_cells.index_select(0, cells.clamp(min=0)).view(-1)
         values = self.distances_m.index_select(0, corners).view(-1, 2, 2, 2)
-        place = points * (
-            1 / self.table.leaf_size_m
-        )  # the core's rounding, or a point could be in another cell
+        # The core's rounding, or a point could be in another cell.
+        place = points * (1 / self.table.leaf_size_m)
         x, y, z = (place - place.detach().floor()).unbind(1)
         values = torch.lerp(values[:, 0], values[:, 1], x[:, None, None])
         values = torch.lerp(values[:, 0], values[:, 1], y[:, None])

@@ -47,9 +47,8 @@ class SurfaceReturns:
     surfels: Surfels  # of all returns
     noise: SensorNoise
     means: MeanRays | None  # mean rays of the leaf cells without ghosts, to average. None for training
-    true: (
-        NDArray[np.bool_] | None
-    )  # (N,) False for ghosts. None if ghosts are not detected, or nothing needs it
+    # (N,) False for ghosts. None if ghosts are not detected, or nothing needs it.
+    true: NDArray[np.bool_] | None
 
     @classmethod
     def of(
@@ -169,7 +168,7 @@ def average_surface(
 
 def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> NDArray[np.float32]:
     """Return the normals (M, 3) of the planes at the ends of rays: of a flat surfel, else towards the sensor."""
-    plane = surfels.flat_planes_of_leaves(rays.keys, num_threads)
+    plane = surfels.flat_planes_of(surfels.cells_of_leaves(rays.keys, num_threads))
     flat, normals = np.flatnonzero(plane >= 0), -rays.directions
     normals[flat] = surfels.normals.take(plane.take(flat), axis=0)
     # A surfel with returns from both sides of a thin wall faces only one side.

@@ -71,9 +71,8 @@ def first_crossed(
 
     `beyond_returns`: planes extend over the whole cell of the surfel, beyond its returns.
     """
-    variances, centres, normals = (
-        column.take(planes, axis=0) for column in (surfels.variances, surfels.centres, surfels.normals)
-    )
+    columns = surfels.variances, surfels.centres, surfels.normals
+    variances, centres, normals = (column.take(planes, axis=0) for column in columns)
     reach_m = np.full(len(planes), np.inf) if beyond_returns else _REACH_SIGMAS * np.sqrt(variances[:, 1])
     chosen = (centres, normals, np.sqrt(variances[:, :1]), reach_m[:, None])
     surfel_map = SurfelMap(

@@ -85,10 +85,6 @@ class Surfels:
         """Return the row (N,) of the flat surfel in the cell of each of the `points` (N, 3), local, m; -1 without one."""
         return self.flat_planes_of(self.cells_at(points, num_threads))
 
-    def flat_planes_of_leaves(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.int32]:
-        """Return the row (M,) of the flat surfel in the cell that contains each leaf cell with Morton keys (M,); -1 without one."""
-        return self.flat_planes_of(self.cells_of_leaves(leaf_keys, num_threads))
-
     def flat_planes_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the row (N,) of the flat surfel of each of the `cells` (N,), -1 for none; -1 without one."""
         flat = np.flatnonzero(self.is_flat())
