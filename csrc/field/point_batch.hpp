@@ -22,8 +22,9 @@ struct PointBatch {
 
 template <typename T>
 Interpolation<T> interpolation(const VertexTable& table, const PointBatch<T>& batch) {
-  return {table.cells().data(), batch.located,      batch.points,
-          batch.directions,     table.num_levels(), static_cast<T>(1.0 / table.leaf_size_m())};
+  const T inverse_leaf_size = static_cast<T>(1.0 / table.leaf_size_m());
+  const std::int32_t *faces = table.faces().data(), *rows = table.rows().data();
+  return {faces, rows, batch.located, batch.points, batch.directions, table.num_levels(), inverse_leaf_size};
 }
 
 }  // namespace radarsdf

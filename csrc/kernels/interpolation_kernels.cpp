@@ -86,6 +86,13 @@ inline T corner_weight_gradient(const Local<T>& local, const T* direction, int g
   return sum;
 }
 
+// Rows of the corners of a group of a cell.
+template <typename C, typename T>
+inline const std::int32_t* rows_of(const Interpolation<T>& in, std::int32_t cell, int group) {
+  const std::int32_t face = C::kGroups == 1 ? cell : in.faces[std::int64_t{cell} * C::kGroups + group];
+  return in.rows + std::int64_t{face} * C::kPerGroup;
+}
+
 template <typename T>
 inline const T* direction_of(const Interpolation<T>& in, std::int64_t n) {
   return in.directions ? in.directions + 3 * n : nullptr;
@@ -96,11 +103,14 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
                  std::int64_t begin, std::int64_t end) {
   constexpr std::int64_t kAhead = 3;  // points
   for (std::int64_t n = begin; n < end; ++n) {
-    for (int level = 0; level < in.num_levels && n + kAhead < end; ++level) {
-      const std::int32_t later = in.located[(n + kAhead) * in.num_levels + level];
-      if (later < 0) continue;
-      for (int k = 0; k < C::kGroups * C::kPerGroup; ++k) {
-        prefetch(features + static_cast<std::int64_t>(in.cells[later].rows[k]) * kFeatureDim);
+    for (int level = 0; level < in.num_levels && n + 2 * kAhead < end; ++level) {
+      const std::int32_t later = in.located[(n + 2 * kAhead) * in.num_levels + level];
+      const std::int32_t soon = in.located[(n + kAhead) * in.num_levels + level];
+      for (int group = 0; group < C::kGroups; ++group) {
+        if (later >= 0) prefetch(rows_of<C>(in, later, group));
+        if (soon < 0) continue;
+        const std::int32_t* rows = rows_of<C>(in, soon, group);
+        for (int c = 0; c < C::kPerGroup; ++c) prefetch(features + std::int64_t{rows[c]} * kFeatureDim);
       }
     }
     for (int level = 0; level < in.num_levels; ++level) {
@@ -112,9 +122,10 @@ void interpolate(const Interpolation<T>& in, const T* __restrict features, T* __
         for (int group = 0; group < C::kGroups; ++group) {
           corner_weights<C, kDirectional>(local, direction_of(in, n), group, weights + group * C::kPerGroup);
         }
-        for (int k = 0; k < C::kGroups * C::kPerGroup; ++k) {
-          const T* row = features + static_cast<std::int64_t>(in.cells[cell].rows[k]) * kFeatureDim;
-          sum += weights[k] * load(row);
+        for (int group = 0; group < C::kGroups; ++group) {
+          const std::int32_t* rows = rows_of<C>(in, cell, group);
+          for (int c = 0; c < C::kPerGroup; ++c)
+            sum += weights[group * C::kPerGroup + c] * load(features + std::int64_t{rows[c]} * kFeatureDim);
         }
       }
       store(out + n * stride + level * kFeatureDim, sum);
@@ -158,10 +169,10 @@ Sums scatter(Interpolation<T> in, const T* __restrict out_grad, std::int64_t str
   for (std::int64_t n = begin; n < end; ++n) {
     if (n + kAhead < end) {
       const std::int32_t later = in.located[(n + kAhead) * in.num_levels + level];
-      if (later >= 0) prefetch(&in.cells[later]);
+      if (later >= 0) prefetch(rows_of<C>(in, later, kGroup));
       const std::int32_t soon = in.located[(n + kAhead / 2) * in.num_levels + level];
       if (soon >= 0) {
-        for (int c = 0; c < C::kPerGroup; ++c) sums.prefetch_row(in.cells[soon].rows[kGroup * C::kPerGroup + c]);
+        for (int c = 0; c < C::kPerGroup; ++c) sums.prefetch_row(rows_of<C>(in, soon, kGroup)[c]);
       }
     }
     const std::int32_t cell = in.located[n * in.num_levels + level];
@@ -169,7 +180,7 @@ Sums scatter(Interpolation<T> in, const T* __restrict out_grad, std::int64_t str
     T weights[C::kPerGroup];
     corner_weights<C, kDirectional>(local_coordinates(in, n, level), direction_of(in, n), kGroup, weights);
     const Features<T> grad = load(out_grad + n * stride + level * kFeatureDim);
-    const std::int32_t* rows = in.cells[cell].rows + kGroup * C::kPerGroup;
+    const std::int32_t* rows = rows_of<C>(in, cell, kGroup);
     for (int c = 0; c < C::kPerGroup; ++c) sums.add(rows[c], weights[c] * grad);
   }
   return sums;
@@ -200,10 +211,9 @@ void coordinate_gradient(const Interpolation<T>& in, const T* __restrict feature
       const Local<T> local = local_coordinates(in, n, level);
       const Features<T> grad = load(out_grad + n * stride + level * kFeatureDim);
       for (int group = 0; group < C::kGroups; ++group) {
+        const std::int32_t* rows = rows_of<C>(in, cell, group);
         for (int c = 0; c < C::kPerGroup; ++c) {
-          const T* row =
-              features + static_cast<std::int64_t>(in.cells[cell].rows[group * C::kPerGroup + c]) * kFeatureDim;
-          const Features<T> product = load(row) * grad;
+          const Features<T> product = load(features + std::int64_t{rows[c]} * kFeatureDim) * grad;
           for (int i = 0; i < C::kAxes; ++i) {
             const T weight = corner_weight_gradient<C, kDirectional>(local, direction_of(in, n), group, c, i);
             sum[axis_of<C>(group, i)] += weight * product;

@@ -17,7 +17,8 @@ namespace radarsdf {
 // The first and second derivatives for autograd are the same sums with other arrays in place of F and v.
 template <typename T>
 struct Interpolation {
-  const Cell* cells;            // cells of the table
+  const std::int32_t* faces;    // see VertexTable
+  const std::int32_t* rows;     // see VertexTable
   const std::int32_t* located;  // (n, num_levels) cell of each point; -1: none (VertexTable::locate)
   const T* points;              // (n, 3) local frame, m
   const T* directions;          // (n, 3), or null

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstring>
 #include <limits>
 #include <stdexcept>
 #include <utility>
@@ -126,25 +125,27 @@ struct Corners {
 };
 constexpr Corners kCorners;
 
-// Assigns a row to every vertex of the group at this level, from next_row on, and writes the rows to the cells at slot
-// `first_corner`. Returns the vertices.
-std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector<std::uint64_t>& keys, Cell* cells,
-                                     int first_corner, std::int64_t& next_row, int num_threads) {
-  const auto count = static_cast<std::int64_t>(keys.size());
+// Faces of cells on the plane of a group. In space, these are the cells.
+BlockMasks faces_of(const VertexGroup& group, const std::vector<std::uint64_t>& keys) {
   const auto block_of = [&](std::size_t i) { return CellBlocks::block_key(group.project(keys[i])); };
-  BlockMasks columns(0);
+  BlockMasks faces(0);
   for (std::size_t i = 0; i < keys.size();) {
     const std::uint64_t block_key = block_of(i);
     std::uint64_t mask = 0;
     for (; i < keys.size() && block_of(i) == block_key; ++i) mask |= std::uint64_t{1} << (group.project(keys[i]) & 63);
-    columns.add(block_key, mask);
+    faces.add(block_key, mask);
   }
+  return faces;
+}
 
-  check_interrupt();
+// Assigns a row to every vertex of the numbered faces, from next_row on, and writes the rows of their corners to `rows`
+// (faces, corners), indexed by their numbers. Returns the vertices.
+std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector<VertexBlock>& faces,
+                                     std::int32_t* rows, std::int64_t& next_row, int num_threads) {
   const int num_corners = group.num_corners;
   int axes[8] = {};  // by corner: bit `axis` is a step along the axis
-  BlockMasks vertices(2 * columns.blocks().size());
-  for (const VertexBlock& block : columns.blocks()) {
+  BlockMasks vertices(2 * faces.size());
+  for (const VertexBlock& block : faces) {
     // Masks of the block and of the next ones, numbered like the corners of a cell.
     std::uint64_t masks[8] = {block.parts.mask}, block_keys[8];
     group.corners(block.key, block_keys);
@@ -163,41 +164,49 @@ std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector
 
   check_interrupt();
   next_row += vertices.number(next_row);
-  parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    std::uint64_t block_key = kEmptyKey;
-    int steps[8] = {};
-    for (int c = 0; c < num_corners; ++c)
-      for (int axis = 0; axis < 3; ++axis) steps[c] += (axes[c] >> axis & 1) * Corners::kStrides[axis];
-    std::int32_t rows[5 * 5 * 5] = {};
-    for (std::int64_t i = begin; i < end; ++i) {
-      const std::uint64_t key = group.project(keys[static_cast<std::size_t>(i)]);
-      if (CellBlocks::block_key(key) != block_key) {
-        block_key = CellBlocks::block_key(key);
-        std::uint64_t block_keys[8];
-        group.corners(block_key, block_keys);
-        for (int c = 0; c < num_corners; ++c) {
-          const Occupancy* block = vertices.find(block_keys[c]);
-          if (block == nullptr) continue;
-          for (std::uint64_t bits = block->mask & kCorners.masks[axes[c]]; bits != 0; bits &= bits - 1) {
-            const int part = lowest_bit(bits);
-            rows[kCorners.places[part] + 4 * steps[c]] = block->row(static_cast<std::uint64_t>(part));
-          }
+  int steps[8] = {};
+  for (int c = 0; c < num_corners; ++c)
+    for (int axis = 0; axis < 3; ++axis) steps[c] += (axes[c] >> axis & 1) * Corners::kStrides[axis];
+  const auto num_blocks = static_cast<std::int64_t>(faces.size());
+  parallel_blocks(num_blocks, 1 << 7, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    std::int32_t cube[5 * 5 * 5] = {};
+    for (auto face = faces.begin() + begin; face != faces.begin() + end; ++face) {
+      std::uint64_t block_keys[8];
+      group.corners(face->key, block_keys);
+      for (int c = 0; c < num_corners; ++c) {
+        const Occupancy* block = vertices.find(block_keys[c]);
+        if (block == nullptr) continue;
+        for (std::uint64_t bits = block->mask & kCorners.masks[axes[c]]; bits != 0; bits &= bits - 1) {
+          const int part = lowest_bit(bits);
+          cube[kCorners.places[part] + 4 * steps[c]] = block->row(static_cast<std::uint64_t>(part));
         }
       }
-      const std::int32_t* first = rows + kCorners.places[key & 63];
-      for (int c = 0; c < num_corners; ++c) cells[i].rows[first_corner + c] = first[steps[c]];
+      std::int32_t* to = rows + std::int64_t{face->parts.first} * num_corners;
+      for (std::uint64_t bits = face->parts.mask; bits != 0; bits &= bits - 1) {
+        const std::int32_t* first = cube + kCorners.places[lowest_bit(bits)];
+        for (int c = 0; c < num_corners; ++c) *to++ = first[steps[c]];
+      }
     }
   });
   return std::move(vertices.blocks());
 }
 
-// Keys of the next coarser level.
-std::vector<std::uint64_t> parents_of(const std::vector<std::uint64_t>& keys) {
-  std::vector<std::uint64_t> parents;
-  for (const std::uint64_t key : keys) {
-    if (parents.empty() || parents.back() != key >> 3) parents.push_back(key >> 3);
-  }
-  return parents;
+// Writes the numbers of the faces of cells on one of three planes.
+void write_faces(const VertexGroup& group, const BlockMasks& faces, const std::vector<std::uint64_t>& keys,
+                 std::int32_t* numbers, int num_threads) {
+  const auto count = static_cast<std::int64_t>(keys.size());
+  parallel_blocks(count, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    std::uint64_t block_key = kEmptyKey;
+    const Occupancy* block = nullptr;
+    for (std::int64_t i = begin; i < end; ++i) {
+      const std::uint64_t key = group.project(keys[static_cast<std::size_t>(i)]);
+      if (CellBlocks::block_key(key) != block_key) {
+        block_key = CellBlocks::block_key(key);
+        block = faces.find(block_key);
+      }
+      numbers[3 * i] = block->row(key);
+    }
+  });
 }
 
 inline int count_eight_bits(std::uint32_t eight_bits) {
@@ -227,39 +236,43 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
     }
   }
 
-  std::vector<std::vector<std::uint64_t>> keys = {leaf_keys_};
-  for (int level = 1; level < num_levels; ++level) keys.push_back(parents_of(keys.back()));
-  std::size_t total = 0;
-  for (const auto& level_keys : keys) total += level_keys.size();
-  if (total > static_cast<std::size_t>(std::numeric_limits<std::int32_t>::max())) {
-    throw std::invalid_argument("the map needs more than 2^31 cells: use larger cells");
-  }
-  cells_.resize(total);
-  parallel_blocks(static_cast<std::int64_t>(total), 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    std::memset(static_cast<void*>(cells_.data() + begin), 0, sizeof(Cell) * static_cast<std::size_t>(end - begin));
-  });
-
+  const std::vector<VertexGroup>& groups = vertex_groups(encoding);
+  const std::size_t num_groups = groups.size(), corners = static_cast<std::size_t>(groups[0].num_corners);
+  // An upper bound: memory that is never written costs nothing, but a growing array would be copied.
+  if (num_groups > 1) faces_.reserve(num_groups * leaf_keys_.size() * static_cast<std::size_t>(num_levels));
+  std::vector<std::uint64_t> coarser;
   std::size_t first = 0;
-  for (const auto& level_keys : keys) {
-    Cell* level_cells = cells_.data() + first;
-    int corner = 0;
-    for (const VertexGroup& group : vertex_groups(encoding)) {
-      std::vector<VertexBlock> blocks = assign_rows(group, level_keys, level_cells, corner, num_rows_, num_threads);
-      if (first == 0 && encoding == Encoding::kOctree) leaf_vertex_blocks_ = std::move(blocks);
-      corner += group.num_corners;
-    }
-    if (&level_keys != &keys.back()) {
-      // Children of a parent are consecutive in Morton order, and parents are in the order of their children.
-      Cell* parent = level_cells + level_keys.size();
-      for (std::size_t i = 0; i < level_keys.size(); ++i) {
-        if (i > 0 && level_keys[i] >> 3 != level_keys[i - 1] >> 3) ++parent;
-        if (parent->child_mask == 0) parent->first_child = static_cast<std::int32_t>(first + i);
-        parent->child_mask |= 1u << (level_keys[i] & 7);
+  for (int level = 0; level < num_levels; ++level) {
+    const std::vector<std::uint64_t>& keys = level == 0 ? leaf_keys_ : coarser;
+    const std::size_t count = keys.size();
+    if (first + count > static_cast<std::size_t>(std::numeric_limits<std::int32_t>::max()))
+      throw std::invalid_argument("the map needs more than 2^31 cells: use larger cells");
+    if (num_groups > 1) faces_.resize(num_groups * (first + count));
+    for (std::size_t g = 0; g < num_groups; ++g) {
+      BlockMasks faces = faces_of(groups[g], keys);
+      check_interrupt();
+      const std::int64_t num_faces = faces.number(static_cast<std::int64_t>(rows_.size() / corners));
+      rows_.resize(rows_.size() + corners * static_cast<std::size_t>(num_faces));
+      std::vector<VertexBlock> blocks = assign_rows(groups[g], faces.blocks(), rows_.data(), num_rows_, num_threads);
+      if (num_groups > 1) {
+        write_faces(groups[g], faces, keys, &faces_[num_groups * first + g], num_threads);
+      } else if (level == 0) {
+        leaf_vertex_blocks_ = std::move(blocks);
       }
     }
-    first += level_keys.size();
+    if (level + 1 == num_levels) break;
+    std::vector<std::uint64_t> parents;
+    for (std::size_t i = 0; i < count; ++i) {
+      if (parents.empty() || parents.back() != keys[i] >> 3) {
+        parents.push_back(keys[i] >> 3);
+        children_.push_back({static_cast<std::int32_t>(first + i), 0});
+      }
+      children_.back().mask |= 1u << (keys[i] & 7);
+    }
+    coarser = std::move(parents);
+    first += count;
   }
-  if (num_levels > 1) roots_ = CellBlocks(keys.back().data(), static_cast<std::int64_t>(keys.back().size()));
+  if (num_levels > 1) roots_ = CellBlocks(coarser.data(), static_cast<std::int64_t>(coarser.size()));
 }
 
 template <typename T>
@@ -268,6 +281,11 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
   const std::int32_t first_root = num_levels_ == 1 ? 0 : static_cast<std::int32_t>(num_cells() - roots_.size());
   const T inverse = static_cast<T>(1.0 / leaf_size_m_), limit = static_cast<T>(kAxisBias);
   const int coarsest = num_levels_ - 1;
+  const std::int64_t num_leaves = leaves_.size();
+  const auto prefetch_cell = [&](std::int32_t cell, int level) {
+    if (level > 0) prefetch(children_.data() + (cell - num_leaves));
+    prefetch(faces_.empty() ? rows_of(cell) : faces_.data() + 3 * std::int64_t{cell});
+  };
   // In stages over blocks that fit the L1 cache, so that the cache misses of many points overlap.
   constexpr std::int64_t kBlock = 64;
   std::uint32_t leaf[kBlock][3];
@@ -287,19 +305,19 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
       const std::int32_t row = root_key[i] == kEmptyKey ? -1 : roots.row(root_key[i]);
       const std::int32_t root = row >= 0 ? first_root + row : -1;
       cells[(first + i) * num_levels_ + coarsest] = root;
-      if (root >= 0) prefetch(&cells_[static_cast<std::size_t>(root)]);
+      if (root >= 0) prefetch_cell(root, coarsest);
     }
     for (int level = coarsest; level-- > 0;) {
       for (std::int64_t i = 0; i < size; ++i) {
         std::int32_t* found = cells + (first + i) * num_levels_ + level;
         found[0] = -1;
         if (found[1] < 0) continue;
-        const Cell& parent = cells_[static_cast<std::size_t>(found[1])];
+        const Children& parent = children_[static_cast<std::size_t>(found[1] - num_leaves)];
         const auto bit = [&](int axis) { return leaf[i][axis] >> level & 1u; };
         const std::uint32_t child = bit(0) | bit(1) << 1 | bit(2) << 2;
-        if (!(parent.child_mask >> child & 1u)) continue;
-        found[0] = parent.first_child + count_eight_bits(parent.child_mask & ((1u << child) - 1));
-        prefetch(&cells_[static_cast<std::size_t>(found[0])]);
+        if (!(parent.mask >> child & 1u)) continue;
+        found[0] = parent.first + count_eight_bits(parent.mask & ((1u << child) - 1));
+        prefetch_cell(found[0], level);
       }
     }
   }
@@ -336,7 +354,7 @@ LeafVertices leaf_vertices(const VertexTable& table, int num_threads) {
   });
   parallel_blocks(num_cells, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
-      const std::int32_t* rows = table.cells()[static_cast<std::size_t>(i)].rows;
+      const std::int32_t* rows = table.rows_of(i);
       std::int32_t* to = vertices.of_cells.data() + 8 * i;
       // x is the fastest axis of the table's corners, z that of corners in C order.
       for (int c = 0; c < 8; ++c) to[c] = rows[(c & 1) << 2 | (c & 2) | c >> 2];

@@ -4,8 +4,9 @@
 // Look-up of the rows of the feature matrix from which a point is interpolated.
 //
 // Occupied cells of all levels form a forest: one exact hash look-up finds the cell of the coarsest level, child masks
-// lead down from there. A cell stores the rows of its vertices, so that the 12 (tri-quadtree: four vertices on each of
-// the planes xy, xz, yz) or 8 (octree) rows of a level cost one cache line instead of as many hash look-ups.
+// lead down from there. A cell of an octree stores the rows of its 8 vertices. A cell of a tri-quadtree stores the
+// numbers of its faces, its projections on the planes xy, xz and yz, which store the rows of four vertices each: many
+// cells share a face.
 #pragma once
 
 #include <cstdint>
@@ -27,6 +28,12 @@ struct VertexBlock {
   Occupancy parts;
 };
 
+// Children of a cell.
+struct Children {
+  std::int32_t first;  // cell; the others follow in Morton order
+  std::uint32_t mask;  // bit i: child i in Morton order is occupied
+};
+
 class VertexTable {
  public:
   // leaf_keys: unique ascending Morton keys of the occupied leaf cells (CellSet::sorted_keys). Rows are numbered by
@@ -35,12 +42,17 @@ class VertexTable {
               int num_threads);
 
   std::int64_t num_rows() const { return num_rows_; }
-  std::int64_t num_cells() const { return static_cast<std::int64_t>(cells_.size()); }
+  std::int64_t num_cells() const { return static_cast<std::int64_t>(leaf_keys_.size() + children_.size()); }
   int num_levels() const { return num_levels_; }
   double leaf_size_m() const { return leaf_size_m_; }
   Encoding encoding() const { return encoding_; }
   const std::vector<std::uint64_t>& leaf_keys() const { return leaf_keys_; }
-  const UninitialisedVector<Cell>& cells() const { return cells_; }
+  // Faces of each cell, (cells, 3), empty for an octree: there, a cell is its only face.
+  const UninitialisedVector<std::int32_t>& faces() const { return faces_; }
+  // Rows of the feature matrix of the corners of each face: (faces, 4), for an octree (cells, 8).
+  const UninitialisedVector<std::int32_t>& rows() const { return rows_; }
+  // Rows of the corners of a cell of an octree.
+  const std::int32_t* rows_of(std::int64_t cell) const { return rows_.data() + 8 * cell; }
   const CellBlocks& leaves() const { return leaves_; }
   // Vertices of the leaf cells of an octree, in Morton order: their rows are the first of the feature matrix.
   const std::vector<VertexBlock>& leaf_vertex_blocks() const { return leaf_vertex_blocks_; }
@@ -55,7 +67,8 @@ class VertexTable {
   double leaf_size_m_;
   int num_levels_;
   Encoding encoding_;
-  UninitialisedVector<Cell> cells_;
+  UninitialisedVector<std::int32_t> faces_, rows_;
+  LargeVector<Children> children_;         // of the cells coarser than leaf cells
   CellBlocks leaves_, roots_{nullptr, 0};  // roots_ only with more than one level
   std::vector<VertexBlock> leaf_vertex_blocks_;
   std::int64_t num_rows_ = 0;

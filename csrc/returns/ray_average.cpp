@@ -65,7 +65,7 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
     for (; cell.inside(); cell.next()) {
       const std::int32_t leaf = leaf_rows.row(cell.key());
       if (leaf < 0) continue;
-      const std::int32_t* rows = table.cells()[static_cast<std::size_t>(leaf)].rows;
+      const std::int32_t* rows = table.rows_of(leaf);
       float lower_m = 0;
       for (int axis = 0; axis < 3; ++axis)
         lower_m += n[axis] * (static_cast<float>(cell.coordinate(axis)) * size_m - p[axis]);

@@ -236,7 +236,7 @@ class Plates {
     std::fill_n(blocks, 8, -1);
     for (std::size_t cell = cells.first; cell < cells.second; ++cell) {
       const auto at = static_cast<unsigned>(table_->leaf_keys()[cell] & 7);
-      const std::int32_t* rows = table_->cells()[cell].rows;
+      const std::int32_t* rows = table_->rows_of(static_cast<std::int64_t>(cell));
       // Corners beyond the upper faces are in the next blocks.
       for (unsigned c = 0; c < 8; ++c) blocks[at & c] = block_of(rows[c]);
     }

@@ -179,7 +179,7 @@ class GridSurface {
     });
   }
 
-  const int32_t* rows_of(int64_t i) const { return table_->cells()[static_cast<size_t>(cells_[i])].rows; }
+  const int32_t* rows_of(int64_t i) const { return table_->rows_of(cells_[i]); }
 
   void number_vertices_of_cells() {
     numbers_.assign(static_cast<size_t>(table_->num_rows()), 0);
@@ -310,7 +310,7 @@ std::vector<int32_t> cells_near_surface(const VertexTable& table, const float* d
   std::vector<std::uint8_t> is_near(static_cast<size_t>(count));
   parallel_blocks(count, 1 << 14, num_threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
-      const int32_t* rows = table.cells()[static_cast<size_t>(i)].rows;
+      const int32_t* rows = table.rows_of(i);
       bool any_below = false, any_above = false, all_known = true;
       for (int c = 0; c < 8; ++c) {
         const float distance_m = distances_m[rows[c]];
