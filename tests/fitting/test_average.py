@@ -7,7 +7,9 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.field.grid_field import GridField
+from radarsdf.fitting import average
 from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from scipy.spatial import cKDTree
 
@@ -63,6 +65,22 @@ def test_intensities_have_a_closed_form():
     world = scene.points[0] @ scene.poses[0, :3, :3].T + scene.poses[0, :3, 3]
     error = np.abs(radar_map.intensity(world, scene.poses[0, :3, 3]) - scene.intensities[0])
     assert np.median(error) < 2.0  # of about 20 dB from near to far
+
+
+def test_of_many_returns_a_sample_is_even_among_scans_and_places(monkeypatch):
+    scans = radarsdf.simulate.wall(frames=12, seed=2)
+    rays = prepare(scans.points, scans.poses)
+    surfels = Surfels.of(rays, 0.2)
+    assert average._sample(rays, surfels, 1) is rays
+    monkeypatch.setattr(average, "_ENOUGH_RETURNS", 1)
+    planes = np.count_nonzero(surfels.is_flat())
+    monkeypatch.setattr(average, "_ENOUGH_PER_PLANE", len(rays) // (3 * planes))
+    sample = average._sample(rays, surfels, 1)
+    assert len(rays) / 5 < len(sample) < len(rays) / 2
+    share = len(sample) / len(rays)
+    for groups in (lambda r: r.scans, lambda r: (r.points[:, 1] // 4).astype(int) + 100):
+        given, kept = (np.bincount(groups(r), minlength=200) for r in (rays, sample))
+        np.testing.assert_allclose(kept[given > 300] / given[given > 300], share, rtol=0.15)
 
 
 @pytest.mark.parametrize("voxel_size", [0.1, 0.2])

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from radarsdf._core import CellSet, VertexTable, count_scans
+from radarsdf._core import CellSet, VertexTable, cell_keys, count_scans, stable_order
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.field.grid_field import GridField
@@ -36,6 +36,9 @@ are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real one
 _SMOOTHINGS = 24
 CELLS_SMOOTHED = _SMOOTHINGS * VertexTable.SMOOTHING_REACH
 """Reach of the smoothing in :func:`average_at_corners` along each axis, leaf cells."""
+# Of more returns than both of these, closed-form intensities use an even sample. Measured on a street of 10⁷ returns: every
+# second has an error larger by 0.1 % of the noise in half the time, every fourth 0.3 %, every seventh 0.4 %.
+_ENOUGH_RETURNS, _ENOUGH_PER_PLANE = 1_000_000, 16
 
 
 @dataclass(frozen=True)
@@ -210,6 +213,7 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     known = rays.with_intensity
     if known.any() and not known.all():  # a tile without any counts as the middle of the range
         rays = rays.select(known)
+    rays = _sample(rays, surfels, num_threads)
     assert rays.intensities is not None
 
     def network(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
@@ -219,3 +223,13 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
     ask = network if contents.config.trains_intensity else None
     return Reflectance.of(rays, unit, surfels, contents.config.leaf_size_m, ask, num_threads)
+
+
+def _sample(rays: Rays, surfels: Surfels, num_threads: int) -> Rays:
+    """Select every n-th ray in Morton order of the returns: evenly among places, and among the scans of each."""
+    enough = max(_ENOUGH_RETURNS, _ENOUGH_PER_PLANE * np.count_nonzero(surfels.is_flat()))
+    every = -(-len(rays) // enough)
+    if every <= 1:
+        return rays
+    keys = cell_keys(np.ascontiguousarray(rays.points), surfels.cell_size_m, num_threads)
+    return rays.select(stable_order(keys)[::every])

@@ -59,7 +59,7 @@ class Rays:
             return np.zeros(len(self), np.bool_)
         return ~np.isnan(self.intensities)
 
-    def select(self, part: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Rays:
+    def select(self, part: slice | NDArray[np.bool_] | NDArray[np.integer[Any]]) -> Rays:
         """Select rays by a slice, a mask (N,) or row indices (M,), in this order."""
         rows = part
         if isinstance(part, np.ndarray) and part.dtype == np.bool_:
