@@ -104,22 +104,39 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
       bool inside = range_m > 0;
       for (int axis = 0; axis < 3; ++axis) inside = inside && std::abs(points[3 * i + axis]) + range_m < limit_m;
       if (!inside || -range_m > last_m) continue;
-      // Most of the way is empty: only where blocks hold surfels nearby is the ray followed from cell to cell.
+      // Most of the way is empty: only where regions and blocks hold surfels nearby is the ray followed from cell to
+      // cell.
       Line line;
       for (int axis = 0; axis < 3; ++axis) {
         line.position[axis] = points[3 * i + axis] / cell_size_m_;
         line.cells_per_m[axis] = directions[3 * i + axis] / cell_size_m_;
       }
       double begin_m = -range_m;
-      CellWalk block(points + 3 * i, directions + 3 * i, -range_m, last_m, kBlockEdge * cell_size_m_,
-                     kAxisBias >> kBlockBits);
+      const auto walk = [&](int bits) {
+        return CellWalk(points + 3 * i, directions + 3 * i, begin_m, last_m, (1 << bits) * cell_size_m_,
+                        kAxisBias >> bits);
+      };
+      CellWalk block = walk(kBlockBits);
+      std::uint64_t last_region = kEmptyKey;
       while (block.inside() && crossed[i] < 0) {
+        if (const std::uint64_t key = CellBlocks::block_key(block.key()); key != last_region) {
+          last_region = key;
+          if (cells_.region(key) == nullptr) {
+            CellWalk region = walk(kRegionBits);
+            for (; region.inside() && cells_.region(region.key()) == nullptr; region.next())
+              begin_m = region.leaves_m();
+            if (!region.inside()) break;
+            if (begin_m > block.leaves_m()) {
+              block = walk(kBlockBits);
+              continue;
+            }
+          }
+        }
         const double leaves_m = block.leaves_m();
         const std::uint64_t cells = rows.block(block.key()).mask;
         if (cells != 0 && (cells & line.cells_near(block, begin_m, std::min(leaves_m, last_m))) != 0) {
           int on_end = 0;
-          for (CellWalk cell(points + 3 * i, directions + 3 * i, begin_m, last_m, cell_size_m_); cell.inside();
-               cell.next()) {
+          for (CellWalk cell = walk(0); cell.inside(); cell.next()) {
             const double end_m = cell.leaves_m();
             const std::int32_t row = rows.row(cell.key());
             on_end = row < 0 ? on_end + 1 : 0;
