@@ -227,7 +227,7 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
 
 def _sample(rays: Rays, surfels: Surfels, num_threads: int) -> Rays:
     """Select every n-th ray in Morton order of the returns: evenly among places, and among the scans of each."""
-    enough = max(_ENOUGH_RETURNS, _ENOUGH_PER_PLANE * np.count_nonzero(surfels.is_flat()))
+    enough = max(_ENOUGH_RETURNS, _ENOUGH_PER_PLANE * int(surfels.is_flat().sum()))
     every = -(-len(rays) // enough)
     if every <= 1:
         return rays
