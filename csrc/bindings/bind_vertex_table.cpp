@@ -12,10 +12,7 @@ VertexTableClass bind_vertex_table(py::module_& m) {
   using namespace py::literals;
   py::enum_<Encoding>(m, "Encoding", "Vertices of a cell that have features.")
       .value("TRI_QUADTREE", Encoding::kTriQuadtree)
-      .value("OCTREE", Encoding::kOctree)
-      .def_property_readonly("num_vertex_groups", &num_vertex_groups,
-                             "Number of groups of a cell's corners: three planes, or one for an octree.")
-      .def_property_readonly("corners_per_group", &corners_per_group, "Number of corners of a cell in each group.");
+      .value("OCTREE", Encoding::kOctree);
 
   VertexTableClass table(m, "VertexTable", "Look-up of rows of the feature matrix (num_rows, 8) for points.");
   table

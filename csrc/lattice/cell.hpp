@@ -4,8 +4,6 @@
 // Constants of occupied cells. Kernels include them once for each instruction set.
 #pragma once
 
-#include <cstdint>
-
 namespace radarsdf {
 
 constexpr int kFeatureDim = 8;  // floats per vertex: one AVX register, as in the paper

@@ -13,15 +13,11 @@
 #include "surface/marching_cubes_common.hpp"
 #include "surface/marching_cubes_table.hpp"
 #include "util/bits.hpp"
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int32_t;
-using std::int64_t;
-using std::size_t;
-using std::uint64_t;
 
 constexpr int64_t kCells = 1 << 11;  // per task, whatever the number of threads: faces are in the order of the tasks
 

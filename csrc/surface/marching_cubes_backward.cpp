@@ -14,13 +14,11 @@
 
 #include "surface/marching_cubes.hpp"
 #include "surface/marching_cubes_common.hpp"
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int64_t;
-using std::size_t;
 
 constexpr int64_t min_parallel_samples = 1 << 14;
 

@@ -12,17 +12,12 @@
 #include "surface/marching_cubes_table.hpp"
 #include "surface/volume_signs.hpp"
 #include "util/bits.hpp"
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 #include "util/prefetch.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int32_t;
-using std::int64_t;
-using std::size_t;
-using std::uint32_t;
-using std::uint64_t;
 
 // Signs at 32 samples of row (i, j), cut edges that start there, and cells that have their lower corner there.
 struct CutWindow {

@@ -11,14 +11,11 @@
 #include "surface/marching_cubes_common.hpp"
 #include "surface/marching_cubes_table.hpp"
 #include "util/bits.hpp"
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int32_t;
-using std::int64_t;
-using std::size_t;
 
 constexpr int64_t block_size = 1 << 14;
 constexpr int32_t no_vertex = -1;

@@ -8,13 +8,11 @@
 #include <numeric>
 #include <stdexcept>
 
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int32_t;
-using std::int64_t;
 
 constexpr int64_t faces_between_checks = 1 << 16;
 

@@ -5,11 +5,10 @@
 #include <algorithm>
 #include <cmath>
 
+#include "util/integers.hpp"
+
 namespace radarsdf {
 namespace {
-
-using std::int64_t;
-using std::size_t;
 
 constexpr int kRays = RayPacket::kRays;
 constexpr int kStack = 64;                 // boxes: more than the depth of the tree

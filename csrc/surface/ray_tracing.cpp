@@ -11,15 +11,11 @@
 
 #include "lattice/morton.hpp"
 #include "surface/ray_packet.hpp"
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int32_t;
-using std::int64_t;
-using std::size_t;
-using std::uint64_t;
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr int64_t kSortedRays = int64_t{1} << 22;  // per pass: 16 bytes each

@@ -12,16 +12,12 @@
 #include <stdexcept>
 #include <vector>
 
+#include "util/integers.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int32_t;
-using std::int64_t;
-using std::size_t;
-using std::uint64_t;
 
 using Keys = UninitialisedVector<uint64_t>;
 constexpr int64_t min_block = 1 << 14;  // smaller blocks do not repay a thread

@@ -7,14 +7,11 @@
 #include <limits>
 #include <stdexcept>
 
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int32_t;
-using std::int64_t;
-using std::size_t;
 
 constexpr int64_t kLeafTriangles = 4;  // maximum
 constexpr int64_t kMinBlock = 1 << 10;

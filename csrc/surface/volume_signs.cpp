@@ -7,15 +7,11 @@
 #include <limits>
 #include <vector>
 
+#include "util/integers.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
-
-using std::int64_t;
-using std::size_t;
-using std::uint32_t;
-using std::uint64_t;
 
 // flags: word_bits bytes, 0 or 1. The product gathers the lowest bits of eight bytes in its top byte.
 inline uint32_t pack_flags(const std::uint8_t* flags) {

@@ -165,17 +165,7 @@ class Encoding:
     def __setstate__(self, state: typing.SupportsInt | typing.SupportsIndex) -> None: ...
     def __str__(self) -> str: ...
     @property
-    def corners_per_group(self) -> int:
-        """
-        Number of corners of a cell in each group.
-        """
-    @property
     def name(self) -> str: ...
-    @property
-    def num_vertex_groups(self) -> int:
-        """
-        Number of groups of a cell's corners: three planes, or one for an octree.
-        """
     @property
     def value(self) -> int: ...
 
