@@ -246,7 +246,7 @@ def test_rates_of_a_step_lead_to_the_next_one():
 def test_a_gyroscope_learns_from_turns_with_the_covariance_of_their_rates(monkeypatch):
     rate, asked = MotionRate(np.array([0.1, -0.2, 0.3]), spread(12, 3)), []
     passed = [begun(np.eye(4))] * 3, [(rate, rate), (None, None)]
-    monkeypatch.setattr("radarsdf.poses.tracking._tracked", lambda *_: passed)
+    monkeypatch.setattr("radarsdf.poses.tracking.tracked_once", lambda *_: passed)
     gyroscope = SimpleNamespace(learnt=lambda *turns: asked.append(turns))
     followed(Drive([np.eye(3)] * 3, np.array([0, 0.5, 0.7]), None, gyroscope), FitConfig(), 1, False)
     ((vectors, covariance),) = asked

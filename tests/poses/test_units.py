@@ -10,9 +10,10 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Imu
 from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.doppler_tests import DopplerTests
 from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.rigid import aligned
-from radarsdf.poses.tracking import Drive, doppler_scale
+from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
 
 from bench.kinds import KINDS
@@ -71,10 +72,28 @@ def test_the_scale_of_the_doppler_is_estimated(factor):
     speeds = [factor * speeds for speeds in motion.doppler_mps]
     checked = CheckedScans.of(yard.points, speeds, motion.times_s)
     drive = Drive(checked.scans, checked.times_s, checked.velocities, None)
-    scale, least, most = doppler_scale(drive, FitConfig(num_threads=1), 1)
-    assert scale * factor == pytest.approx(1, abs=0.08)
-    assert least <= 1.01 / factor <= 1.02 * most
-    assert (least < 1.1 and most > 1 / 1.1) == (factor == 1)
+    tests = DopplerTests.of(drive, FitConfig(num_threads=1), 1)
+    assert tests.scale * factor == pytest.approx(1, abs=0.08)
+    assert tests.least <= 1.01 / factor <= 1.02 * tests.most
+    assert (tests.least < 1.1 and tests.most > 1 / 1.1) == (factor == 1)
+    assert tests.delay == 0 or factor != 1
+
+
+@pytest.mark.parametrize(("late", "named"), [(3, "3 scans later"), (-5, "5 scans earlier")])
+def test_doppler_of_other_scans_is_excluded(late, named):
+    """Regression: velocities of three scans ago were believed, with poses 12 standard deviations off."""
+    slope = first(KINDS["slope"], 24, seed=2, frames=40)
+    motion = measured_motion(slope, seed=2)
+    checked = CheckedScans.of(slope.points, motion.doppler_mps, motion.times_s)
+    velocities = checked.velocities
+    others = velocities.mean_mps[np.clip(np.arange(24) - late, 0, 23)]
+    velocities = dataclasses.replace(velocities, mean_mps=others)
+    drive = Drive(checked.scans, checked.times_s, velocities, None)
+    tests = DopplerTests.of(drive, FitConfig(num_threads=1), 1)
+    assert tests.delay == late
+    unused, (note,) = tests.applied(velocities)
+    assert unused is None
+    assert named in note
 
 
 def test_too_few_scans_do_not_measure_the_scale_of_the_doppler(drive, motion):

@@ -18,6 +18,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
+from radarsdf.poses.doppler_tests import DopplerTests
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
@@ -28,7 +29,6 @@ from radarsdf.poses.tracking import (
     WINDOW,
     Drive,
     Tracked,
-    doppler_scale,
     followed,
 )
 from radarsdf.returns.rays import within_ranges
@@ -38,9 +38,6 @@ from radarsdf.threads import ThreadPool
 # Minimum share of the prior variance of a step's rotation that the returns must remove: over the window of scans, it adds up to
 # all. A hand-held radar of 41 returns a scan, which turns by up to 100 degrees a second: 0.007; all others: 0.06 to 0.9.
 _LEAST_OBSERVED_TURN = 1 / WINDOW
-# Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
-_SAME_SCALE = 1.1
-_SCALE_MEASURED = 1.2  # beyond which confidence limits of that ratio leave the scale of the Doppler open
 
 
 class UnobservedMotionError(ValueError):
@@ -149,16 +146,9 @@ def odometry(
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, None)
         if velocities is not None:
-            scale, least, most = doppler_scale(drive, config, pool.num_threads)
-            if least > _SAME_SCALE or most < 1 / _SAME_SCALE:
-                velocities = None
-                why = f"the returns show {scale:.1f} times its speeds. Give it in m/s, and times in s"
-                notes.append(f"{NOT_USED}: {why}.")
-            elif most > _SCALE_MEASURED or least < 1 / _SCALE_MEASURED:
-                shown = f"{least:.1f} to {most:.1f} times its speeds"
-                notes.append(f"Assumed: the Doppler is in m/s; the returns agree with {shown}.")
-                off = max(most - 1, 1 - least) / ERRORS
-                velocities = dataclasses.replace(velocities, common_sigma=off)
+            tests = DopplerTests.of(drive, config, pool.num_threads)
+            velocities, assumed = tests.applied(velocities)
+            notes += assumed
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
         drive = dataclasses.replace(drive, velocities=velocities, gyroscope=inertial.gyroscope)
         try:

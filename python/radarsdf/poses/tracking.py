@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.stats import t as student
 from tqdm import tqdm
 
 from radarsdf._core import LocalPlanes
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.doppler import DopplerMotion, SensorVelocities, scale_gains
+from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.imu import Gyroscope
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, SteadyMotion
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
@@ -54,12 +53,6 @@ LATERAL_MPS2 = 2.0
 # Maximum standard deviation of a turn rate that may remain unobserved between scans, that of a sensor faster than 20 m/s: the joint
 # estimate and the covariance are valid for small rotations.
 _SLOW_TURN_RAD_S = 0.1
-# Pairs of scans to estimate the scale of Doppler, the number from which on they are chosen to be apart, and their minimum.
-_COMPARED, _SOME_COMPARED, _FEW_COMPARED = 24, 12, 6
-_COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
-_FREE_SCALE = 0.15  # prior deviation of that scale: from half or twice the true one, returns of most scenes converge to it
-_SCALES = np.geomspace(0.4, 2.5, 33)
-_BY_CHANCE = 0.01  # significance level of another scale than 1
 _GYROSCOPE_RAD = 0.003  # initial deviation of a step's rotation by a gyroscope
 
 
@@ -361,7 +354,7 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRat
 Rates = tuple[MotionRate, MotionRate] | tuple[None, None]  # rotation, rad/s, and translation, m/s, if known
 
 
-def _tracked(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]]:
+def tracked_once(drive: Drive, tracker: Tracker) -> tuple[list[Tracked], list[Rates]]:
     """Track all scans in one pass; return them, and the rates of each step."""
     tracked = [tracker.follow(drive.scans[0], None)]
     rates: list[Rates] = []
@@ -384,7 +377,7 @@ def followed(
     cell_m, durations_s = plane_cell_m(drive.scans, config.leaf_size_m), np.diff(drive.times_s)
     tracked: list[Tracked] = []
     for i in tqdm(range(_PASSES), desc="odometry", unit="pass", disable=hides_bar(progress)):
-        tracked, rates = _tracked(drive, Tracker(cell_m, config.returns, num_threads))
+        tracked, rates = tracked_once(drive, Tracker(cell_m, config.returns, num_threads))
         turn_prior = drive.turns
         if i == 0 and drive.turns_slowly and tracked[-1].segment > 0:
             # Tracking was lost. Narrow the search of the next passes.
@@ -401,37 +394,3 @@ def followed(
             covariance = np.stack([turn.covariance for turn in known]) * durations_s[:, None, None] ** 2
             drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(vectors, covariance))
     return drive, tracked
-
-
-def doppler_scale(drive: Drive, config: FitConfig, num_threads: int) -> tuple[float, float, float]:
-    """Estimate the ratio of the speed from returns to that from Doppler, with its lower and upper confidence limit."""
-    # The fastest scans are tracked with a free scale. Possible is where pairs agree not significantly worse than at the best one.
-    unknown = 1.0, float(_SCALES[0]), float(_SCALES[-1])
-    durations_s = np.diff(drive.times_s)
-    if drive.velocities is None or len(durations_s) < _FEW_COMPARED:
-        return unknown
-    lengths_m = np.linalg.norm(drive.velocities.mean_mps[:-1], axis=1) * durations_s
-    lengths_m[durations_s > 2 * np.median(durations_s)] = 0.0
-    most_apart = max(len(lengths_m) // _SOME_COMPARED, 1)
-    every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, most_apart))
-    count = min(_COMPARED, len(lengths_m) // every) * every
-    begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
-    rows = slice(begin, begin + count + 1, every)
-    velocities, scans, times_s = drive.velocities.select(rows), drive.scans[rows], drive.times_s[rows]
-    free = Drive(scans, times_s, velocities.scaled(1.0, _FREE_SCALE), None)
-    tracked, _ = _tracked(free, Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads))
-    motion = DopplerMotion.by(velocities, times_s, np.stack([found.pose for found in tracked]))
-    gains = []
-    for i, step in enumerate(motion.steps):
-        if tracked[i].segment == tracked[i + 1].segment and min(len(scans[i]), len(scans[i + 1])) > 0:
-            turned = scans[i + 1] @ step[:3, :3].T
-            gains.append(scale_gains(scans[i], turned, step[:3, 3], _SCALES))
-    if len(gains) < _FEW_COMPARED:
-        return unknown
-    best = int(np.argmax(np.mean(gains, axis=0)))
-    losses = np.array(gains)[:, best, None] - gains
-    errors = losses.std(axis=0, ddof=1) / np.sqrt(len(gains))
-    # The best of many scales is compared with each.
-    needed = float(student.ppf(1 - _BY_CHANCE / len(_SCALES), len(gains) - 1))
-    possible = _SCALES[losses.mean(axis=0) <= needed * errors]
-    return float(_SCALES[best]), float(possible[0]), float(possible[-1])
