@@ -23,6 +23,7 @@ _FEW_PAIRS = 8  # pairs from which on their spread determines the standard error
 YAW_STEP_RAD = 0.07
 """Resolution of the yaws between neighbouring scans."""
 _TURNS_RAD = YAW_STEP_RAD * np.arange(-6, 7)
+_TURNS, _HALF_TURNS = (rotation(np.multiply.outer(share * _TURNS_RAD, [0.0, 0.0, 1.0])) for share in (1, 0.5))
 CLEAR = 4.0
 """Standard errors by which scans must agree better with one sign of the Doppler."""
 _LEAST_M = 0.05  # minimum distance between returns that counts, below the noise of any radar
@@ -157,9 +158,8 @@ class DopplerMotion(KnownMotion):
     def at(self, poses: Floats) -> DopplerMotion:
         """Update the translations for the rotations of `poses`."""
         between, means = steps(poses), self.velocities.mean_mps
-        for i, step in enumerate(between):
-            turn = rotation_vector(step[:3, :3], self.turns[i])
-            step[:3, 3] = way(turn, means[i], means[i + 1], float(self.durations_s[i]))
+        turns = rotation_vector(between[:, :3, :3], self.turns)
+        between[:, :3, 3] = way(turns, means[:-1], means[1:], self.durations_s[:, None])
         return dataclasses.replace(self, steps=between)
 
 
@@ -245,8 +245,7 @@ def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Iterabl
 def _reversal_gains(first: Floats, second: Floats, moved_m: Floats) -> tuple[Floats, tuple[float, float]]:
     """Return how much nearer each return (M,) is after this motion than after its reverse, each with its best yaw, and these."""
     pair, both = _Pair(first, second), []
-    for turn in _TURNS_RAD:
-        whole, half = rotation(np.multiply.outer([turn, 0.5 * turn], [0.0, 0.0, 1.0]))
+    for whole, half in zip(_TURNS, _HALF_TURNS, strict=True):
         both.append(pair.log_distances(whole, np.multiply.outer([1.0, -1.0], half @ moved_m)))
     ahead, back = np.swapaxes(both, 0, 1)
     i, j = int(ahead.mean(axis=1).argmin()), int(back.mean(axis=1).argmin())

@@ -77,20 +77,19 @@ class DopplerTests:
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if returns contradict them; and notes."""
-        why = ""
         if self.least > _SAME_SCALE or self.most < 1 / _SAME_SCALE:
-            why = f"the returns show {self.scale:.1f} times its speeds. Give it in m/s, and times in s"
-        elif self.delay:
+            shown = f"the returns show {self.scale:.1f} times its speeds. Give it in m/s, and times in s"
+            return None, [f"{NOT_USED}: {shown}."]
+        if self.delay:
             other = f"{abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
-            why = f"the returns agree better with that of {other}. Give each scan its own"
-        if why:
-            return None, [f"{NOT_USED}: {why}."]
+            return None, [
+                f"{NOT_USED}: the returns agree better with that of {other}. Give each scan its own."
+            ]
         if self.most <= _SCALE_MEASURED and self.least >= 1 / _SCALE_MEASURED:
             return velocities, []
-        off = max(self.most - 1, 1 - self.least) / ERRORS
         shown = f"{self.least:.1f} to {self.most:.1f} times its speeds"
-        note = f"Assumed: the Doppler is in m/s; the returns agree with {shown}."
-        return dataclasses.replace(velocities, common_sigma=off), [note]
+        velocities = dataclasses.replace(velocities, common_sigma=max(self.most - 1, 1 - self.least) / ERRORS)
+        return velocities, [f"Assumed: the Doppler is in m/s; the returns agree with {shown}."]
 
 
 def _scale(gains: Floats) -> tuple[float, float, float]:
@@ -111,38 +110,36 @@ def _delay(
     tracked: Sequence[Tracked],
     followed: NDArray[np.bool_],
 ) -> int:
-    """Return the delay, scans, of the Doppler with which steps (K,) by returns agree best, if significantly. Else 0.
-
-    The steps by delayed Doppler are a regressor of the residuals (a J test, Davidson and MacKinnon 1981).
-    """
+    """Return the delay, scans, of the Doppler with which steps by returns agree best, if significantly; else 0."""
+    # The steps by delayed Doppler explain the residuals of those by its own (J test, Davidson and MacKinnon 1981).
     poses = np.stack([found.pose for found in tracked])
     axes, of_steps = poses[:-1, :3, :3], np.stack([found.covariance[:3, :3] for found in tracked[1:]])
     covariance = np.einsum("fji,fjk,fkl->fil", axes, of_steps, axes)
     covariance += [motion.velocities.step_covariance(i, d) for i, d in enumerate(motion.durations_s.tolist())]
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    own, shown = motion.steps[:, :3, 3], steps(poses)[:, :3, 3]
     found, last = [(np.inf, 0)], len(velocities.mean_mps) - 1
     for delay in set(range(-_MOST_LATE, _MOST_LATE + 1)) - {0}:
         at = rows + delay
         used = followed & (at[:-1] >= 0) & (at[1:] <= last)
         if (count := int(used.sum())) < _FEW_COMPARED:
             continue
-        later = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[np.clip(at, 0, last)])
-        given, left, change = (
-            np.einsum("fij,fj->fi", whitening[used], moves[used, :3, 3])
-            for moves in (
-                motion.steps,
-                steps(poses) - motion.steps,
-                dataclasses.replace(motion, velocities=later).at(poses).steps - motion.steps,
-            )
+        delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[np.clip(at, 0, last)])
+        later = dataclasses.replace(motion, velocities=delayed).at(poses).steps[:, :3, 3]
+        scaled, left, change = (
+            np.einsum("fij,fj->fi", whitening, moves)[used] for moves in (own, shown - own, later - own)
         )
-        # An error of the scale is no delay.
-        left, change = (v - given * (v * given).sum() / max((given**2).sum(), 1e-12) for v in (left, change))
-        share = (left * change).sum() / max((change**2).sum(), 1e-12)
+        # Without the part that a wrong scale explains.
+        left, change = (
+            v - scaled * (v * scaled).sum() / max((scaled**2).sum(), 1e-12) for v in (left, change)
+        )
+        square = max(float((change**2).sum()), 1e-12)
+        share = float((left * change).sum()) / square
         # Errors of the components of a step depend on each other (cluster-robust).
-        error = np.sqrt(np.square((change * (left - share * change)).sum(axis=1)).sum() * count / (count - 1))
+        scores = (change * (left - share * change)).sum(axis=1)
+        error = np.sqrt((scores**2).sum() * count / (count - 1)) / square
         needed = student.ppf(1 - _BY_CHANCE / (2 * _MOST_LATE), 2 * count - 2)
         remaining = float(((left - change) ** 2).sum())
-        clear = share * (change**2).sum() > needed * error
-        if clear and (left**2).sum() > _SAME_RESIDUALS * remaining:
+        if share > needed * error and (left**2).sum() > _SAME_RESIDUALS * remaining:
             found.append((remaining / count, delay))
     return min(found)[1]

@@ -81,11 +81,11 @@ class MotionRate:
     covariance: Floats  # (3, 3)
 
 
-def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float) -> Floats:
+def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats) -> Floats:
     """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
     and linearly changing velocity."""
-    middle = np.einsum("...ij,j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
-    end = np.einsum("...ij,j->...i", rotation(turn), end_mps)
+    middle = np.einsum("...ij,...j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
+    end = np.einsum("...ij,...j->...i", rotation(turn), end_mps)
     found: Floats = duration_s / 6 * (begin_mps + 4 * middle + end)
     return found
 

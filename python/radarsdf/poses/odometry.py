@@ -23,14 +23,7 @@ from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats, steps
-from radarsdf.poses.tracking import (
-    LATERAL_MPS2,
-    LEAST_OBSERVED,
-    WINDOW,
-    Drive,
-    Tracked,
-    followed,
-)
+from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
@@ -146,9 +139,8 @@ def odometry(
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, None)
         if velocities is not None:
-            tests = DopplerTests.of(drive, config, pool.num_threads)
-            velocities, assumed = tests.applied(velocities)
-            notes += assumed
+            velocities, tested = DopplerTests.of(drive, config, pool.num_threads).applied(velocities)
+            notes += tested
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
         drive = dataclasses.replace(drive, velocities=velocities, gyroscope=inertial.gyroscope)
         try:

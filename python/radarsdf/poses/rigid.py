@@ -121,12 +121,12 @@ def transform(turn: Floats, translation: Floats) -> Floats:
 
 
 def rotation_vector(matrix: Floats, near: Floats | None = None) -> Floats:
-    """Convert a rotation (3, 3) to the rotation vector (3,), rad, nearest to `near`, or to 0, up to whole turns."""
+    """Convert rotations (..., 3, 3) to the rotation vectors (..., 3), rad, nearest to `near`, or to 0, up to whole turns."""
     found: Floats = Rotation.from_matrix(matrix).as_rotvec()
-    angle = float(np.linalg.norm(found))
-    if near is None or angle == 0:
+    if near is None:
         return found
-    axis = found / angle
-    whole_turns = np.round((np.einsum("i,i->", axis, near) - angle) / (2 * np.pi))
+    angle = np.linalg.norm(found, axis=-1, keepdims=True)
+    axis = found / np.where(angle > 0, angle, 1.0)
+    whole_turns = np.round((np.einsum("...i,...i->...", axis, near)[..., None] - angle) / (2 * np.pi))
     unwound: Floats = found + 2 * np.pi * whole_turns * axis
     return unwound
