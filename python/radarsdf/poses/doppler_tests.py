@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,22 +56,26 @@ class DopplerTests:
         rows = slice(begin, begin + count + 1, every)
         compared, scans, times_s = velocities.select(rows), drive.scans[rows], drive.times_s[rows]
         free = compared.scaled(1.0, _FREE_SCALE)
-        across = (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
-        free = dataclasses.replace(free, covariance=free.covariance + across)
+        free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads)
         tracked, _ = tracked_once(Drive(scans, times_s, free, None), tracker)
-        followed = np.array([a.segment == b.segment for a, b in itertools.pairwise(tracked)], bool)
-        followed &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
+        segments, counts = np.array(
+            [(found.segment, len(scan)) for found, scan in zip(tracked, scans, strict=True)]
+        ).T
+        followed = (np.diff(segments) == 0) & (np.minimum(counts[1:], counts[:-1]) > 0)
         if followed.sum() < _FEW_COMPARED:
             return cls()
         motion = DopplerMotion.by(compared, times_s, np.stack([found.pose for found in tracked]))
-        gains = [
-            scale_gains(scans[i], scans[i + 1] @ step[:3, :3].T, step[:3, 3], _SCALES)
-            for i, step in enumerate(motion.steps)
-            if followed[i]
-        ]
+        pairs = [(scans[i], scans[i + 1], motion.steps[i]) for i in np.flatnonzero(followed)]
+        gains = np.array([scale_gains(a, b @ step[:3, :3].T, step[:3, 3], _SCALES) for a, b, step in pairs])
+        best = int(np.argmax(gains.mean(axis=0)))
+        losses = gains[:, best, None] - gains
+        errors = losses.std(axis=0, ddof=1) / np.sqrt(len(gains))
+        # The best of many scales is compared with each.
+        needed = float(student.ppf(1 - _BY_CHANCE / len(_SCALES), len(gains) - 1))
+        possible = _SCALES[losses.mean(axis=0) <= needed * errors]
         delay = _delay(velocities, np.arange(len(drive.scans))[rows], motion, tracked, followed)
-        return cls(*_scale(np.array(gains)), delay)
+        return cls(float(_SCALES[best]), float(possible[0]), float(possible[-1]), delay)
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if returns contradict them; and notes."""
@@ -81,10 +83,10 @@ class DopplerTests:
             shown = f"the returns show {self.scale:.1f} times its speeds. Give it in m/s, and times in s"
             return None, [f"{NOT_USED}: {shown}."]
         if self.delay:
-            other = f"{abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
-            return None, [
-                f"{NOT_USED}: the returns agree better with that of {other}. Give each scan its own."
-            ]
+            shown = (
+                f"the returns suit that of {abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
+            )
+            return None, [f"{NOT_USED}: {shown}. Give each scan its own."]
         if self.most <= _SCALE_MEASURED and self.least >= 1 / _SCALE_MEASURED:
             return velocities, []
         shown = f"{self.least:.1f} to {self.most:.1f} times its speeds"
@@ -107,7 +109,7 @@ def _delay(
     velocities: SensorVelocities,
     rows: NDArray[np.int64],
     motion: DopplerMotion,
-    tracked: Sequence[Tracked],
+    tracked: list[Tracked],
     followed: NDArray[np.bool_],
 ) -> int:
     """Return the delay, scans, of the Doppler with which steps by returns agree best, if significantly; else 0."""

@@ -399,13 +399,8 @@ class Inertial:
         """Entry of the report of the poses. None without alignment."""
         if (found := self.alignment) is None:
             return None
-        R, lever_m = found.R_sensor_imu.tolist(), found.lever_m.tolist()
-        return {
-            "R_sensor_imu": R,
-            "sigma_rad": found.sigma_rad,
-            "time_offset_s": found.time_offset_s,
-            "lever_m": lever_m,
-        }
+        keys = ("R_sensor_imu", "sigma_rad", "time_offset_s", "lever_m")
+        return {key: np.asarray(getattr(found, key)).tolist() for key in keys}
 
 
 def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
