@@ -29,7 +29,7 @@ _SAME_SCALE = 1.1
 _SCALE_MEASURED = 1.2  # beyond which confidence limits of that ratio leave the scale of the Doppler open
 _MOST_LATE = 10  # scans
 _BY_CHANCE = 0.01  # significance level of another scale than 1, and of a delay
-_SAME_RESIDUALS = 1.1  # ratio of squared residuals up to which a delay does not matter
+_SAME_RESIDUALS = 1.25  # ratio of squared residuals up to which a delay does not matter
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,7 @@ class DopplerTests:
             shown = f"the returns show {self.scale:.1f} times its speeds. Give it in m/s, and times in s"
             return None, [f"{NOT_USED}: {shown}."]
         if self.delay:
-            shown = (
-                f"the returns suit that of {abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
-            )
+            shown = f"the returns agree with that of {abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
             return None, [f"{NOT_USED}: {shown}. Give each scan its own."]
         if self.most <= _SCALE_MEASURED and self.least >= 1 / _SCALE_MEASURED:
             return velocities, []
@@ -137,11 +135,11 @@ def _delay(
         )
         square = max(float((change**2).sum()), 1e-12)
         share = float((left * change).sum()) / square
+        remaining = left - share * change
         # Errors of the components of a step depend on each other (cluster-robust).
-        scores = (change * (left - share * change)).sum(axis=1)
+        scores = (change * remaining).sum(axis=1)
         error = np.sqrt((scores**2).sum() * count / (count - 1)) / square
         needed = student.ppf(1 - _BY_CHANCE / (2 * _MOST_LATE), 2 * count - 2)
-        remaining = float(((left - change) ** 2).sum())
-        if share > needed * error and (left**2).sum() > _SAME_RESIDUALS * remaining:
-            found.append((remaining / count, delay))
+        if share > needed * error and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
+            found.append((float((remaining**2).sum()) / count, delay))
     return min(found)[1]
