@@ -68,14 +68,8 @@ class DopplerTests:
         motion = DopplerMotion.by(compared, times_s, np.stack([found.pose for found in tracked]))
         pairs = [(scans[i], scans[i + 1], motion.steps[i]) for i in np.flatnonzero(followed)]
         gains = np.array([scale_gains(a, b @ step[:3, :3].T, step[:3, 3], _SCALES) for a, b, step in pairs])
-        best = int(np.argmax(gains.mean(axis=0)))
-        losses = gains[:, best, None] - gains
-        errors = losses.std(axis=0, ddof=1) / np.sqrt(len(gains))
-        # The best of many scales is compared with each.
-        needed = float(student.ppf(1 - _BY_CHANCE / len(_SCALES), len(gains) - 1))
-        possible = _SCALES[losses.mean(axis=0) <= needed * errors]
         delay = _delay(velocities, np.arange(len(drive.scans))[rows], motion, tracked, followed)
-        return cls(float(_SCALES[best]), float(possible[0]), float(possible[-1]), delay)
+        return cls(*_scale(gains), delay)
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if returns contradict them; and notes."""
@@ -94,7 +88,7 @@ class DopplerTests:
 
 def _scale(gains: Floats) -> tuple[float, float, float]:
     """Return the best scale by gains (K, S), and the limits of those that are not significantly worse."""
-    best = int(np.argmax(np.mean(gains, axis=0)))
+    best = int(np.argmax(gains.mean(axis=0)))
     losses = gains[:, best, None] - gains
     errors = losses.std(axis=0, ddof=1) / np.sqrt(len(gains))
     # The best of many scales is compared with each.
