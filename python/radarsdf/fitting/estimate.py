@@ -35,8 +35,8 @@ _S_PER_INPUT, _S_PER_MULTIPLICATION = 2.2e-9, 2.6e-11  # of a network, which all
 _ALWAYS = 35e6  # loaded code, stacks and arenas of the threads
 _PER_RETURN, _PER_RETURN_CLEANED = 30.0, 200.0
 _PER_RETURN_OF_INTENSITY = 150.0
-_PER_CELL = 230.0
-_COPIES = 4  # numbers for each feature: value, two moments of Adam, last finite value
+_PER_CELL, _PER_CELL_AVERAGED = 60.0, 230.0
+_COPIES = 3  # numbers for each feature: value, state of Adam, last finite value
 
 # Ratio of leaf cells to cells with returns, and of feature rows to leaf cells: in dense scans, and the addition in sparse
 # ones. Measured on `hugin`, `oculii` and `wall`, with 4 to all scans and cells of 0.1 to 0.5 m: within a factor of 2.
@@ -133,7 +133,7 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
     schedule = Schedule.of(
         config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=with_network
     )
-    memory = _ALWAYS + returns * _PER_RETURN + cells * _PER_CELL
+    memory = _ALWAYS + returns * _PER_RETURN + cells * (_PER_CELL if config.train else _PER_CELL_AVERAGED)
     if config.train:
         # Gradients of all rows, unless only touched rows move; with normals two for each thread, and their sum.
         normals = with_network and config.networks.normals
