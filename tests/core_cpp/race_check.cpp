@@ -74,7 +74,8 @@ template <typename T>
 void encodings(radarsdf::Encoding encoding, int threads, Results& results) {
   const auto points = test::normal_numbers<T>(3 * kPoints, 4.0, 1);
   const radarsdf::VertexTable table = table_of(points, encoding, threads);
-  results.add(table.cells().data(), table.num_cells());
+  results.add(table.faces().data(), static_cast<std::int64_t>(table.faces().size()));
+  results.add(table.rows().data(), static_cast<std::int64_t>(table.rows().size()));
 
   const auto features = test::normal_numbers<T>(8 * table.num_rows(), 1.0, 2);
   const auto grad = test::normal_numbers<T>(8 * kLevels * kPoints, 1.0, 3),
