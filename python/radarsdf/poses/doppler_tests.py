@@ -48,7 +48,8 @@ class DopplerTests:
         if velocities is None or len(durations_s) < _FEW_COMPARED:
             return cls()
         lengths_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * durations_s
-        lengths_m[durations_s > 2 * np.median(durations_s)] = 0.0
+        after_gap = durations_s > 2 * np.median(durations_s)
+        lengths_m[after_gap] = 0.0
         most_apart = max(len(lengths_m) // _SOME_COMPARED, 1)
         every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, most_apart))
         count = min(_COMPARED, len(lengths_m) // every) * every
@@ -68,7 +69,8 @@ class DopplerTests:
         motion = DopplerMotion.by(compared, times_s, np.stack([found.pose for found in tracked]))
         pairs = [(scans[i], scans[i + 1], motion.steps[i]) for i in np.flatnonzero(followed)]
         gains = np.array([scale_gains(a, b @ step[:3, :3].T, step[:3, 3], _SCALES) for a, b, step in pairs])
-        delay = _delay(velocities, np.arange(len(drive.scans))[rows], motion, tracked, followed)
+        runs = np.r_[0, np.cumsum(after_gap)]
+        delay = _delay(velocities, runs, np.arange(len(runs))[rows], motion, tracked, followed)
         return cls(*_scale(gains), delay)
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
@@ -99,6 +101,7 @@ def _scale(gains: Floats) -> tuple[float, float, float]:
 
 def _delay(
     velocities: SensorVelocities,
+    runs: NDArray[np.int64],  # of scans without a gap
     rows: NDArray[np.int64],
     motion: DopplerMotion,
     tracked: list[Tracked],
@@ -114,11 +117,12 @@ def _delay(
     own, shown = motion.steps[:, :3, 3], steps(poses)[:, :3, 3]
     found, last = [(np.inf, 0)], len(velocities.mean_mps) - 1
     for delay in set(range(-_MOST_LATE, _MOST_LATE + 1)) - {0}:
-        at = rows + delay
-        used = followed & (at[:-1] >= 0) & (at[1:] <= last)
+        at = np.clip(rows + delay, 0, last)
+        known = (at == rows + delay) & (runs[at] == runs[rows])
+        used = followed & known[:-1] & known[1:]
         if (count := int(used.sum())) < _FEW_COMPARED:
             continue
-        delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[np.clip(at, 0, last)])
+        delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[at])
         later = dataclasses.replace(motion, velocities=delayed).at(poses).steps[:, :3, 3]
         scaled, left, change = (
             np.einsum("fij,fj->fi", whitening, moves)[used] for moves in (own, shown - own, later - own)
@@ -130,10 +134,10 @@ def _delay(
         square = max(float((change**2).sum()), 1e-12)
         share = float((left * change).sum()) / square
         remaining = left - share * change
-        # Errors of the components of a step depend on each other (cluster-robust).
+        # Errors of the components of a step depend on each other: cluster-robust, with as many degrees of freedom as steps less one.
         scores = (change * remaining).sum(axis=1)
         error = np.sqrt((scores**2).sum() * count / (count - 1)) / square
-        needed = student.ppf(1 - _BY_CHANCE / (2 * _MOST_LATE), 2 * count - 2)
+        needed = student.ppf(1 - _BY_CHANCE / (2 * _MOST_LATE), count - 1)
         if share > needed * error and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))
     return min(found)[1]
