@@ -190,9 +190,9 @@ def prepare(
     origin: ArrayLike | None = None,
     lattice: WorldLattice | None = None,
     whole: bool = True,
-    num_threads: int = 0,
+    num_threads: int = 1,
 ) -> Rays:
-    """Check scans and convert them to rays in the local frame, scan by scan.
+    """Check scans and convert them to rays in the local frame.
 
     `points`, `intensities`: F arrays (N_i, 3), sensor frame, m, and (N_i,), sensor units; `poses` (F, 4, 4) T_world_sensor, m.
     The default `origin` is the mean sensor position, rounded to the nearest block corner of the `lattice`, so that maps of
