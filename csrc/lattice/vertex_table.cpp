@@ -238,8 +238,8 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
 
   const std::vector<VertexGroup>& groups = vertex_groups(encoding);
   const std::size_t num_groups = groups.size(), corners = static_cast<std::size_t>(groups[0].num_corners);
-  // An upper bound: memory that is never written costs nothing, but a growing array would be copied.
-  if (num_groups > 1) faces_.reserve(num_groups * leaf_keys_.size() * static_cast<std::size_t>(num_levels));
+  // Mostly enough for all levels: a growing array would be copied.
+  if (num_groups > 1) faces_.reserve(num_groups * 2 * leaf_keys_.size());
   std::vector<std::uint64_t> coarser;
   std::size_t first = 0;
   for (int level = 0; level < num_levels; ++level) {
