@@ -105,3 +105,12 @@ def test_the_motion_prior_is_estimated_from_a_drive(habits):
     # Mean of 8000 squares; turn rates decay within 4 s, so that their changes in 0.1 s are 2.5 % smaller.
     np.testing.assert_allclose(found.change, habits.change, rtol=4 * np.sqrt(2 / 8000) + 0.025)
     assert first.learnt([None, None], durations_s[:2]) == first
+
+
+def test_errors_of_rates_are_part_of_the_motion_prior():
+    """Rates damped by half have errors of three quarters of the variance: without these, a sensor would seem steady."""
+    rng = np.random.default_rng(1)
+    damped = [MotionRate(0.5 * rates, 0.75 * np.eye(3)) for rates in rng.normal(size=(2000, 3))]
+    found = MotionPrior(np.ones(3), np.ones(3), True).learnt(damped, np.ones(2000), with_errors=True)
+    np.testing.assert_allclose(found.usual, 1.0, rtol=0.1)
+    np.testing.assert_allclose(found.change, 2.0, rtol=0.1)

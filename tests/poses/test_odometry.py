@@ -72,6 +72,22 @@ def test_errors_of_tracked_steps_do_not_persist():
     assert errors(found.poses, street.poses)[0] < 0.05
 
 
+def test_damped_rolls_are_not_expected():
+    """A motion prior of tracked rates, which returns hardly measure, left 0.69 degrees."""
+    lap = radarsdf.simulate.oculii(seed=2)
+    motion = measured_motion(lap, seed=2)
+    found = radarsdf.odometry(lap.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+    assert errors(found.poses, lap.poses)[1] < np.radians(0.5)
+
+
+def test_a_scan_without_a_clear_match_is_not_lost_if_its_velocity_is_known():
+    street = radarsdf.simulate.astyx(seed=6)
+    motion = measured_motion(street, seed=6)
+    found = radarsdf.odometry(street.points, doppler_mps=motion.doppler_mps, times_s=motion.times_s)
+    assert found.report["segments"] == 1
+    assert errors(found.poses, street.poses)[0] < 0.03
+
+
 def test_planes_of_few_returns_are_coarse():
     """Regression: fine planes hardly constrained steps of 15 degrees, and the prior flattened them: an error of 0.5 m."""
     hall = KINDS["hall"](seed=1, frames=24)

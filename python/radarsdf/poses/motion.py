@@ -57,15 +57,22 @@ class MotionPrior:
         information, total = before + after
         return total / information, 1 / information
 
-    def learnt(self, rates: Sequence[MotionRate | None], durations_s: Floats) -> MotionPrior:
-        """Update from the rates of a drive's steps and their durations. Rate None: tracking was lost."""
-        known = [rate.mean for rate in rates if rate is not None]
+    def learnt(
+        self, rates: Sequence[MotionRate | None], durations_s: Floats, *, with_errors: bool = False
+    ) -> MotionPrior:
+        """Update from the rates of a drive's steps and their durations. Rate None: tracking was lost.
+
+        `with_errors`: from expected squares, which include the errors of the rates, instead of squares of expected rates.
+        """
+        errors = float(with_errors)
+        known = [rate.mean**2 + errors * rate.covariance.diagonal() for rate in rates if rate is not None]
         if not known:
             return self
-        usual = (_PRIOR_STEPS * self.usual + np.square(known).sum(axis=0)) / (_PRIOR_STEPS + len(known))
+        usual = (_PRIOR_STEPS * self.usual + np.sum(known, axis=0)) / (_PRIOR_STEPS + len(known))
         elapsed_s = (durations_s[:-1] + durations_s[1:]) / 2
         changes = [
-            (second.mean - first.mean) ** 2 / after_s
+            ((second.mean - first.mean) ** 2 + errors * (first.covariance + second.covariance).diagonal())
+            / after_s
             for first, second, after_s in zip(rates, rates[1:], elapsed_s, strict=False)
             if first is not None and second is not None and after_s > 0
         ]

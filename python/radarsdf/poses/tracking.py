@@ -130,16 +130,23 @@ class Tracker:
     def _sought(self, scan: Floats, expected: PredictedStep) -> Tracked | None:
         scan = thinned(scan, _MOST_RETURNS)
         if len(scan) == 0:
-            covariance = self._in_world(expected.covariance())
-            pose = self.last.pose @ expected.pose()
-            return Tracked(pose, covariance, 0.0, self.last.segment, expected.turn.mean)
+            return self._reckoned(expected)
         radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
         capture_m = 0.5 * _CELLS[0] * self.cell_size_m
         if expected.spread_m(radius_m) <= capture_m:
             return self._fitted(scan, expected, expected.turn.mean)
         if expected.spread_m(0.0) > _MOST_RADII * radius_m:
             return None  # too few candidates to find an overlap with the previous scans, if any
-        return self._searched(scan, expected, capture_m, radius_m)
+        found = self._searched(scan, expected, capture_m, radius_m)
+        # Without a clear match, a scan whose position is predicted is no more lost than one without returns.
+        return self._reckoned(expected) if found is None and expected.spread_m(0.0) <= capture_m else found
+
+    def _reckoned(self, expected: PredictedStep) -> Tracked:
+        """Return the predicted step."""
+        pose = self.last.pose @ expected.pose()
+        return Tracked(
+            pose, self._in_world(expected.covariance()), 0.0, self.last.segment, expected.turn.mean
+        )
 
     def _in_world(self, covariance: Floats) -> Floats:
         found: Floats = covariance_in(covariance[None], self.last.pose[:3, :3])[0]
@@ -284,6 +291,9 @@ class Drive:
     gyroscope: Gyroscope | None
     turns: MotionPrior = _TURNS  # in the sensor frame
     moves: MotionPrior = _MOVES
+    # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
+    # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
+    steady: tuple[MotionPrior, MotionPrior] = _MOVES, _TURNS
 
     def expected(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
         """Predict the step to scan `i` from the rates of the previous one; None if unknown."""
@@ -323,7 +333,7 @@ class Drive:
         duration_s, turn_sigma_rad_s = float(np.median(np.diff(times_s))), np.full(3, self.usual_turn_rad_s)
         usual = np.array([self.moves.usual.max(), self.usual_turn_rad_s**2])
         measured = np.repeat([self.velocities is not None, self.gyroscope is not None], 3)
-        motions: list[Motion] = [SteadyMotion.by((self.moves, self.turns), usual, times_s, poses, measured)]
+        motions: list[Motion] = [SteadyMotion.by(self.steady, usual, times_s, poses, measured)]
         if self.gyroscope is not None:
             turned = Motion.of(poses, 0.0, _GYROSCOPE_RAD, times_s)
             turned.shares[:, :3] = np.inf
@@ -383,13 +393,17 @@ def followed(
             # Tracking was lost. Narrow the search of the next passes.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turn_prior = MotionPrior(usual, usual, True)
-        turns = turn_prior.learnt([turn for turn, _ in rates], durations_s)
-        moves = drive.moves.learnt([move for _, move in rates], durations_s)
-        drive = dataclasses.replace(drive, turns=turns, moves=moves)
+        turn_rates, move_rates = [turn for turn, _ in rates], [move for _, move in rates]
+        steady = (
+            drive.moves.learnt(move_rates, durations_s, with_errors=True),
+            turn_prior.learnt(turn_rates, durations_s, with_errors=True),
+        )
+        turns, moves = turn_prior.learnt(turn_rates, durations_s), drive.moves.learnt(move_rates, durations_s)
+        drive = dataclasses.replace(drive, turns=turns, moves=moves, steady=steady)
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.
             lost = MotionRate(np.full(3, np.nan), np.eye(3))
-            known = [turn or lost for turn, _ in rates]
+            known = [turn or lost for turn in turn_rates]
             vectors = np.stack([turn.mean for turn in known]) * durations_s[:, None]
             covariance = np.stack([turn.covariance for turn in known]) * durations_s[:, None, None] ** 2
             drive = dataclasses.replace(drive, gyroscope=gyroscope.learnt(vectors, covariance))
