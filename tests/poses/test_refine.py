@@ -3,6 +3,7 @@
 """Poses that returns refine, and poses that they keep."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import radarsdf
 from radarsdf import FitConfig, RefinedPoses
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.map.storage import checked_report
+from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, unbiased_normals
 from radarsdf.poses.posed import trajectory_report
 from radarsdf.poses.rigid import aligned, turned_by
@@ -58,6 +60,25 @@ def test_a_bias_is_no_noise(street):
     assert found.improved
     assert found.report["bias"][5] == pytest.approx(-0.01, abs=0.001)
     assert found.report["sigma_rad"] < 0.003
+
+
+def test_the_returns_of_many_scans_measure_a_bias_in_yaw():
+    """Those of one step hardly do: half of the bias remained."""
+    hall = KINDS["hall"](seed=3)
+    given = drifted(hall.poses, 0.02, 0.001, 2, yaw_rad=0.0035)
+    assert radarsdf.refine_poses(hall.points, given).report["bias"][5] == pytest.approx(-0.0035, rel=0.1)
+
+
+def test_an_open_loop_is_reported():
+    lap = KINDS["yard"](seed=1)
+    returns, noise = SensorReturns.of(lap.points, 0.1, None), SensorNoise(0.1, 0.015, 0.02)
+    assert open_loops(returns, lap.poses, noise) == []
+    (note,) = open_loops(returns, drifted(lap.poses, 0.02, 0.001, 1, yaw_rad=0.0035), noise, 1000)
+    scans = [int(word) for word in re.findall(r"\b1\d{3}\b", note)]
+    assert scans[1] == 1099
+    assert scans[2] == 1000
+    assert scans[3] - scans[2] < 15
+    assert "A loop is open" in note
 
 
 def test_true_poses_are_returned_unchanged(street):

@@ -20,6 +20,7 @@ from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
 from radarsdf.poses.doppler_tests import DopplerTests
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
+from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats, steps
@@ -52,7 +53,7 @@ class Odometry:
     """`verdict` in words; `length_m` of the trajectory; `segments`, their number; `doppler` and `gyroscope`, whether used;
     `doppler_sign`, -1 if Doppler is positive for approaching objects; `gyroscope_bias`, rad/s; `imu`, None or its `R_sensor_imu`
     with `sigma_rad`, `time_offset_s`, the delay of the times of scans in its clock, and `lever_m`, from it to the radar in its
-    axes; `moving`, number of moving returns; `notes` on unused input and assumptions; `scans`, `seconds`."""
+    axes; `moving`, number of moving returns; `notes` on unused input, assumptions and open loops; `scans`, `seconds`."""
 
     def longest_segment(self) -> slice:
         """Return the scans of the segment with the most scans, from which to fit a map."""
@@ -152,7 +153,8 @@ def odometry(
         notes += inertial.notes
         _check_measured(tracked, drive, notes)
         segments = np.array([found.segment for found in tracked])
-        poses, covariance = _together(drive, tracked, segments, config, pool.num_threads)
+        poses, covariance, loops = _together(drive, tracked, segments, config, pool.num_threads)
+        notes += loops
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -177,10 +179,10 @@ def odometry(
 
 def _together(
     drive: Drive, tracked: list[Tracked], segments: NDArray[np.int64], config: FitConfig, num_threads: int
-) -> tuple[Floats, Floats]:
-    """Jointly estimate poses and covariances of all scans of each segment."""
+) -> tuple[Floats, Floats, list[str]]:
+    """Jointly estimate poses and covariances of all scans of each segment; return them with notes on open loops."""
     poses = np.stack([found.pose for found in tracked])
-    covariance = np.zeros((len(poses), 6, 6))
+    covariance, notes = np.zeros((len(poses), 6, 6)), []
     limits, cell_m = config.returns, plane_cell_m(drive.scans, config.leaf_size_m)
     for segment in range(segments[-1] + 1):
         rows = slice(*np.searchsorted(segments, [segment, segment + 1]).tolist())
@@ -191,7 +193,8 @@ def _together(
         # Tracked poses are close to the truth: no short windows are needed.
         found = PosesEstimate.of(returns, poses[rows], motions, cell_m, limits, num_threads, len(poses))
         poses[rows], covariance[rows] = found.poses, found.covariance
-    return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance
+        notes += open_loops(returns, found.poses, found.noise, rows.start)
+    return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance, notes
 
 
 def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> None:

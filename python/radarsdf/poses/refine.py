@@ -18,6 +18,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
+from radarsdf.poses.loops import open_loops
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
 from radarsdf.poses.rigid import Floats, aligned, increments, moved, moved_by, steps
@@ -65,7 +66,7 @@ class RefinedPoses:
     report: dict[str, Any]
     """`verdict` in words; `gain`, the mean increase of the log density of other scans' returns at held-out ones, and its
     `gain_error`; `sigma_m`, `sigma_rad` and `bias` of a given step; `moved_m` and `moved_rad`, root mean square change of the
-    poses; `noise` of the sensor; `moving`, number of returns excluded by Doppler; `notes` on unused input; `scans`, `returns`,
+    poses; `noise` of the sensor; `moving`, number of returns excluded by Doppler; `notes` on unused input and open loops; `scans`, `returns`,
     `rounds`, `seconds`."""
 
 
@@ -163,6 +164,7 @@ def refine_poses(
         used = returns.select(~held)
         found = PosesEstimate.of(used, given, motions, cell_m, limits, pool.num_threads, progress=progress)
         verdict = Verdict.of(returns.select(held), used, given, found.poses, found.noise)
+        notes += open_loops(used, found.poses if verdict.improved else given, found.noise)
     sigma_m, sigma_rad = np.sqrt(found.motions[0].variances).tolist()
     report |= {
         "verdict": verdict.words,

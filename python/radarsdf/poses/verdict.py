@@ -17,7 +17,7 @@ from radarsdf.poses.planes import SensorReturns
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise
 
-_NEIGHBOURS = 16  # nearest neighbours of a return; those of other scans contribute to the density
+NEIGHBOURS = 16  # nearest neighbours of a return; those of other scans contribute to the density
 _MOST_RETURNS = 20_000  # maximum number of held-out returns
 _BY_CHANCE = 1e-3  # significance level: probability that true poses seem improved
 # Minimum relevant gain, however significant. Measured: up to 0.0006 with true poses, 0.0015 and more where a drift of 0.01 m and
@@ -117,21 +117,31 @@ def _gains(
     densities, apart_m2 = [], 0.0
     for poses in (before, after):
         tree = cKDTree(used.posed(poses).points)
-        distances, rows = tree.query(held.posed(poses).points, min(_NEIGHBOURS, len(used)))
+        distances, rows = tree.query(held.posed(poses).points, min(NEIGHBOURS, len(used)))
         distances, rows = distances.reshape(len(held), -1), rows.reshape(len(held), -1)
         others = used.scans[rows] != held.scans[:, None]
         if poses is before:
-            first = np.where(others.any(axis=1), others.argmax(axis=1), -1)
-            apart_m2 = float(np.median(distances[np.arange(len(first)), first])) ** 2
+            apart_m2 = median_apart_m(distances, others) ** 2
         variance = variances[0][:, None] + apart_m2 + variances[1][rows]
-        with np.errstate(under="ignore"):
-            kernel = np.exp(-0.5 * distances**2 / variance) / variance**1.5
-        densities.append(np.where(others, kernel, 0.0).sum(axis=1))
+        densities.append(np.where(others, density(distances, variance), 0.0).sum(axis=1))
     floor = float(np.median(densities[0]))
     if floor == 0:  # the scans do not overlap
         return np.zeros(len(held))
     gains: Floats = np.log((densities[1] + floor) / (densities[0] + floor))
     return gains
+
+
+def density(distances_m: Floats, variances_m2: Floats) -> Floats:
+    """Return normal densities of errors of these lengths, up to a factor."""
+    with np.errstate(under="ignore"):
+        found: Floats = np.exp(-0.5 * distances_m**2 / variances_m2) / variances_m2**1.5
+    return found
+
+
+def median_apart_m(distances_m: Floats, others: NDArray[np.bool_]) -> float:
+    """Return the median distance to the nearest neighbour of another scan, else to the last one, of neighbours (N, K)."""
+    nearest = np.where(others.any(axis=1), others.argmax(axis=1), -1)
+    return float(np.median(distances_m[np.arange(len(nearest)), nearest]))
 
 
 def _crowding(held: SensorReturns, used: SensorReturns, before: Floats, after: Floats) -> Floats:
