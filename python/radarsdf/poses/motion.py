@@ -161,7 +161,7 @@ def step_variances(poses: Floats, diagonal: Floats, below: Floats) -> Floats:
     first, second = _jacobians(poses)
     blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
     found: Floats = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
-    return found
+    return np.maximum(found, _LEAST_RAD**2)  # of a weak prior, blocks cancel
 
 
 @dataclass(frozen=True)
