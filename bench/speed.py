@@ -23,11 +23,7 @@ from typing import Any
 
 import numpy as np
 import radarsdf
-import radarsdf.fitting.fit
-import radarsdf.map.mesh
-from radarsdf import FitConfig
 
-from bench.measure import timed
 from bench.peers.interface import PEERS, reconstruct
 from bench.runner import Column, Experiment, Row, main
 
@@ -44,8 +40,7 @@ class Version:
 
     def __init__(self, packages: Path, scans: Path) -> None:
         self._child = subprocess.Popen(
-            [sys.executable, "-m", "bench.speed", "--child", str(scans)],
-            cwd=Path(__file__).parents[1],
+            [sys.executable, str(Path(__file__).with_name("speed_child.py")), str(scans)],
             env=os.environ | {"PYTHONPATH": str(packages)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -60,23 +55,6 @@ class Version:
 
     def close(self) -> None:
         self._child.communicate()
-
-
-def _child(path: Path) -> None:
-    """Answer each line, a case, with its seconds."""
-    with np.load(path) as file:
-        poses, own = file["poses"], np.cumsum(file["counts"])[:-1]
-        points, intensities = np.split(file["points"], own), np.split(file["intensities"], own)
-    for line in sys.stdin:
-        case = json.loads(line)
-        config = FitConfig.quick() if case["preset"] == "quick" else FitConfig()
-        values = intensities if case.get("intensities") else None
-        with timed() as taken:
-            config = config.override(num_threads=case["threads"])
-            radar_map = radarsdf.fit(points, poses, values, config=config, progress=False)
-            if "voxel_m" in case:
-                radar_map.mesh(case["voxel_m"], progress=False)
-        print(taken.wall_s, flush=True)
 
 
 def speed(options: argparse.Namespace) -> Iterator[Row]:
@@ -144,7 +122,4 @@ EXPERIMENT = Experiment(
 )
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--child"]:
-        _child(Path(sys.argv[2]))
-    else:
-        main("bench.speed", EXPERIMENT)
+    main("bench.speed", EXPERIMENT)
