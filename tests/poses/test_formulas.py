@@ -371,14 +371,14 @@ def test_motions_of_a_tracked_drive():
 def test_information_independent_of_the_pose_is_subtracted():
     """Of 100 along x at the pose and 40 on average near it, 60 remain."""
     tracker = Tracker(0.4, FitConfig().returns, 1)
-    tracker._planes, asked = [None, None], []
+    asked = []
 
-    def equations(_, __, pose):
+    def agreement(_, pose, __):
         asked.append(pose[0, 3])
         along = {5: 100.0, 5.8: 70, 4.2: 30, 6.6: 50, 3.4: 10}[round(pose[0, 3], 6)]
-        return np.diag([along, 1e6, 1e6, 1e6, 1e6, 1e6]), None, None
+        return np.diag([along, 1e6, 1e6, 1e6, 1e6, 1e6]), np.zeros(6), np.zeros((6, 6)), 1.0
 
-    tracker._normal_equations = equations
+    tracker._planes = [None, SimpleNamespace(agreement=agreement)]
     prior, pose = np.eye(6), transform(np.zeros(3), np.array([5.0, 0, 0]))
     covariance = np.diag([1 / 101] + [1e-6] * 5)
     found = tracker._without_chance(None, pose, prior, covariance)

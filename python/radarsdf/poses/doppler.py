@@ -19,6 +19,7 @@ from radarsdf.poses.rigid import Floats, rotation, rotation_vector, step_vectors
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
 
 _SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
+_FIRST_PAIRS = 12
 _FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
 YAW_STEP_RAD = 0.07
 """Resolution of the yaws between neighbouring scans."""
@@ -212,20 +213,30 @@ def sign_significance(
     moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
     usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
-    # The longest steps are most informative.
+    # The longest steps are most informative: if the first are twice as clear as needed, the others are not compared.
     pairs = sorted(np.flatnonzero(usable).tolist(), key=lambda i: -float(moved_m[i] @ moved_m[i]))[:_PAIRS]
     yaws = np.full(len(durations_s), np.nan)
-    if not pairs:
-        return 0.0, yaws
-    gains, turns = zip(*(_reversal_gains(scans[i], scans[i + 1], moved_m[i]) for i in pairs), strict=True)
+    gains, turns, significance = [], [], 0.0
+    for some in (pairs[:_FIRST_PAIRS], pairs[_FIRST_PAIRS:]):
+        for i in some:
+            gain, both_turns = _reversal_gains(scans[i], scans[i + 1], moved_m[i])
+            gains.append(gain)
+            turns.append(both_turns)
+        if not gains or abs(significance := _significance(gains)) > 2 * CLEAR:
+            break
+    yaws[pairs[: len(turns)]] = [of_both[0 if significance >= 0 else 1] for of_both in turns]
+    return significance, yaws
+
+
+def _significance(gains: Sequence[Floats]) -> float:
+    """Return the mean gain of pairs of scans, from those of their returns, in standard errors."""
     means = np.array([gain.mean() for gain in gains])
     if len(gains) < _FEW_PAIRS:
         # Returns of both scans count, mostly on the same objects: half of them are independent.
         variance = sum(2 * gain.var() / len(gain) for gain in gains) / len(gains) ** 2
     else:
         variance = means.var(ddof=1) / len(gains)
-    yaws[pairs] = np.array(turns)[:, 0 if means.mean() >= 0 else 1]
-    return float(means.mean() / np.sqrt(max(variance, 1e-12))), yaws
+    return float(means.mean() / np.sqrt(max(variance, 1e-12)))
 
 
 def motion_significance(pairs: Sequence[tuple[Floats, Floats]], motions: Iterable[Floats]) -> float:

@@ -165,16 +165,6 @@ class Tracker:
         turn_share = _removed_share(prior[3:, 3:], covariance[3:, 3:])
         return Tracked(pose, covariance, agreeing, self.last.segment, turned, (move_share, turn_share))
 
-    def _normal_equations(
-        self, planes: LocalPlanes, scan: Floats, pose: Floats
-    ) -> tuple[Floats, Floats, float]:
-        """Return Hessian and gradient of an increment of `pose`, and the weight of the inliers."""
-        # The contribution of errors of the normals is removed: along a wall, slightly tilted normals would seem to observe the
-        # position along it.
-        hessian, gradient, doubt, weight = planes.agreement(scan, np.ascontiguousarray(pose), self._variances)
-        M = reduction(hessian, doubt)
-        return M @ hessian @ M.T, M @ (M @ gradient), weight
-
     def _without_chance(self, scan: Floats, pose: Floats, prior: Floats, covariance: Floats) -> Floats:
         """Remove the spurious information along the least certain axis that returns have for any shift of the scan."""
         # In a tunnel, returns match the walls everywhere, and some matches constrain the scan by chance.
@@ -183,14 +173,13 @@ class Tracker:
         before, left = axis @ prior[:3, :3] @ axis, axis @ covariance[:3, :3] @ axis
         if before < (_SURE * cell_m) ** 2:
             return covariance
-        information = []
-        for shift in _SHIFTS:
-            shifted = pose.copy()
-            shifted[:3, 3] += shift * cell_m * axis
-            hessian = self._normal_equations(self._planes[-1], scan, shifted)[0]
-            variance = axis @ np.linalg.pinv(hessian, hermitian=True)[:3, :3] @ axis
-            information.append(1 / variance if variance > 0 else 0.0)
-        chance = min(1.0, float(np.mean(information[1:])) / max(information[0], 1e-12))
+        shifted = np.tile(pose, (len(_SHIFTS), 1, 1))
+        shifted[:, :3, 3] += cell_m * np.outer(_SHIFTS, axis)
+        matches = [self._planes[-1].agreement(scan, at, self._variances)[:3] for at in shifted]
+        hessians = _reduced(*(np.stack(parts) for parts in zip(*matches, strict=True)))[0]
+        variances = np.einsum("i,kij,j->k", axis, np.linalg.pinv(hessians, hermitian=True)[:, :3, :3], axis)
+        information = np.where(variances > 0, 1 / np.where(variances > 0, variances, 1.0), 0.0)
+        chance = min(1.0, float(np.mean(information[1:])) / max(float(information[0]), 1e-12))
         widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
         covariance = covariance.copy()
         covariance[:3, :3] += max(widened, 0.0) * np.outer(axis, axis)
@@ -203,7 +192,8 @@ class Tracker:
         information, weight, covariance = np.linalg.inv(prior), 0.0, prior
         for planes in self._planes:
             for _ in range(_ITERATIONS):
-                hessian, gradient, weight = self._normal_equations(planes, scan, pose)
+                *match, weight = planes.agreement(scan, pose, self._variances)
+                hessian, gradient = _reduced(*match)
                 total = hessian + information
                 off = increments(middle[None], pose[None])[0]
                 step = -np.linalg.solve(total, gradient + information @ off)
@@ -256,6 +246,14 @@ class Tracker:
 def begun(pose: Floats, segment: int = 0) -> Tracked:
     """Return the first scan of a segment, at this pose (4, 4)."""
     return Tracked(pose, np.zeros((6, 6)), np.nan, segment, np.zeros(3))
+
+
+def _reduced(hessian: Floats, gradient: Floats, doubt: Floats) -> tuple[Floats, Floats]:
+    """Return Hessians (..., 6, 6) and gradients (..., 6) without the contribution of errors of the normals."""
+    # Along a wall, slightly tilted normals would seem to observe the position along it.
+    M = reduction(hessian, doubt)
+    found: Floats = np.einsum("...ij,...j->...i", M @ M, gradient)
+    return M @ hessian @ M.swapaxes(-1, -2), found
 
 
 def _removed_share(prior: Floats, covariance: Floats) -> float:
