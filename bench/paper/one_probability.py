@@ -60,6 +60,7 @@ class Example:
     voxel_m: float
     surface: Surface
     columns: FloatArray  # (V, K) regressors
+    own: FloatArray  # (V,) factor of the probability, see queries.own_surface
     reach: FloatArray  # (V,) upper limit of a probability; 0 without returns
     areas_m2: FloatArray  # (V,)
     is_true: NDArray[np.bool_]  # (V,)
@@ -86,6 +87,7 @@ class Example:
             VOXEL_M[preset],
             surface,
             queries.terms(contents, surface.evidence).numpy(),
+            queries.own_surface(surface.evidence).numpy(),
             queries.probabilities(contents, surface.evidence).reach.numpy(),
             vertex_areas(surface.vertices, surface.faces),
             distance_m <= leaf_m,
@@ -94,10 +96,10 @@ class Example:
         )
 
     def predicted(self, numbers: FloatArray) -> FloatArray:
-        """(V,) logistic regression with coefficients (K,); 0 without returns."""
+        """(V,) logistic regression with coefficients (K,), times `own`; 0 without returns."""
         known = self.reach > 0
         predicted = np.zeros(len(known))
-        predicted[known] = expit(self.columns[known] @ numbers)
+        predicted[known] = expit(self.columns[known] @ numbers) * self.own[known]
         return predicted
 
     def added(self, p: FloatArray) -> FloatArray:
@@ -118,13 +120,14 @@ class Example:
 
 
 def learnt(examples: list[Example], targets: list[FloatArray]) -> FloatArray:
-    """Fit a logistic regression in which each kind has the same weight."""
+    """Fit a logistic regression in which each kind has the same weight, and places as far as their returns are their own."""
     rng = np.random.default_rng(0)
     known = [np.flatnonzero(e.reach > 0) for e in examples]
     rows = [rng.choice(own, min(_LEARNT, len(own)), replace=False) for own in known]
     kinds = [e.kind for e in examples]
     weights = [
-        e.areas_m2[r] / e.areas_m2[r].sum() / kinds.count(e.kind) for e, r in zip(examples, rows, strict=True)
+        e.areas_m2[r] * e.own[r] / e.areas_m2[r].sum() / kinds.count(e.kind)
+        for e, r in zip(examples, rows, strict=True)
     ]
     return logistic_regression(
         np.concatenate([e.columns[r] for e, r in zip(examples, rows, strict=True)]),

@@ -11,10 +11,11 @@ import pytest
 import radarsdf
 import torch
 from radarsdf import FitConfig
+from radarsdf._core import cell_keys
 from radarsdf.map import queries
 from radarsdf.map.queries import EvidenceAt, _floor_m
 from radarsdf.map.radar_map import RadarMap
-from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.evidence import Evidence, usual_information
 from radarsdf.returns.noise import SensorNoise
 
 from ..conftest import ground_and_wall
@@ -44,9 +45,10 @@ def confidence(radar_map, information, hits, visibility, clutter_ratio=0.1, retu
     return found.numpy()
 
 
-def at(information, hits, visibility):
-    """Evidence at places."""
-    columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in (information, hits, visibility)))
+def at(information, hits, visibility, usual=0.0):
+    """Evidence at places. `usual`: information nearby, by default less than at the places."""
+    given = (information, hits, visibility, usual)
+    columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in given))
     return EvidenceAt(*(torch.from_numpy(np.atleast_1d(column).copy()) for column in columns))
 
 
@@ -98,19 +100,45 @@ def test_confidence_is_logistic_in_missing_evidence_and_clutter(radar_map, clutt
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
+def test_few_of_many_returns_nearby_are_no_surface(radar_map):
+    """Noise spreads returns beyond an edge: of a hundredth of the density there, hundreds of scans are no evidence."""
+    information, hits = np.full(4, 1e4), [400.0, 400, 400, 1]
+    usual = 1e4 * np.array([1, 5, 100, 100])
+    found = queries.confidence(radar_map._contents, at(information, hits, 400.0, usual)).numpy()
+    alone = queries.confidence(radar_map._contents, at(information, hits, 400.0)).numpy()
+    shares = np.array([1, 0.2, 0.01, 0.01]) * (1 + 4 / np.sqrt(hits))
+    np.testing.assert_allclose(found / alone, 1 / (1 + (0.25 / shares) ** 3), rtol=1e-5)
+    assert found[2] < 0.01
+
+
+def test_usual_information_is_that_of_most_returns_nearby():
+    rng = np.random.default_rng(0)
+    cells = np.unique(rng.integers(0, 12, (300, 3)), axis=0)
+    keys = cell_keys((cells + 0.5).astype(np.float32), 1.0, 1)
+    order = np.argsort(keys)
+    cells, information = cells[order], rng.lognormal(0, 2, len(cells)).astype(np.float32)
+    found = usual_information(information, keys[order])
+    pairs = cells // 2
+    for i in range(0, len(cells), 17):
+        near = information[(np.abs(pairs - pairs[i]) <= 1).all(axis=1)].astype(np.float64)
+        assert found[i] == pytest.approx((near**2).sum() / near.sum(), rel=1e-5)
+    assert len(usual_information(information[:0], keys[:0])) == 0
+
+
 def test_places_have_the_evidence_of_their_cells(radar_map):
     """In the middle of a cell, its neighbours have no weight."""
     contents, evidence = radar_map._contents, radar_map.evidence
     centres = (radar_map.field.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
     found = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
-    for column, expected in zip(found, dataclasses.astuple(evidence), strict=True):
+    columns = *dataclasses.astuple(evidence), contents.usual_information
+    for column, expected in zip(found, columns, strict=True):
         assert expected.max() > 0
         np.testing.assert_allclose(column, expected, rtol=1e-3, atol=1e-3 * expected.max())
     known = evidence.information > 0  # elsewhere, rounded positions have a small share of the next cell
     assert 0.5 < known.mean() < 1
     np.testing.assert_allclose(
         radar_map.confidence(centres + radar_map.origin)[known],
-        queries.confidence(contents, at(*dataclasses.astuple(evidence))).numpy()[known],
+        queries.confidence(contents, at(*columns)).numpy()[known],
         atol=1e-3,
     )
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.returns.evidence import Evidence
+from radarsdf.returns.evidence import Evidence, usual_information
 from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
@@ -56,3 +57,8 @@ class MapContents(WholeMap):
     report: dict[str, Any]  # counts, losses, sensor noise and times of the fit, s
     free_space: Callable[[], FreeSpace] = FreeSpace.none  # free-space crossings, or none
     view_statistics: Callable[[], ViewStatistics] = ViewStatistics.none  # of intensity, or none
+
+    @cached_property
+    def usual_information(self) -> NDArray[np.float32]:
+        """(C,) see :func:`radarsdf.returns.evidence.usual_information`."""
+        return usual_information(self.evidence.information, self.field.table.leaf_keys())

@@ -14,6 +14,7 @@ from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_visibi
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.rays import Rays
+from radarsdf.returns.sums import merged_keys
 
 CELLS_OF_SURFACE = 9
 """Approximate number of cells that a plane crosses in a 3 × 3 × 3 neighbourhood."""
@@ -105,6 +106,18 @@ def evidence_sums(
         part = slice(first, first + _AT_ONCE)
         information[part], hits[part] = blocks.neighbour_sums(leaf_keys[part], columns, 1.0, num_threads).T
     return information, hits
+
+
+def usual_information(information: NDArray[np.float32], leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+    """Return the mean `information` (C,) of cells within two to four leaf cells of each, weighted by itself: that of most returns."""
+    pairs = merged_keys(leaf_keys)
+    begins = np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]
+    first, weights = np.flatnonzero(begins), information.astype(np.float64)
+    sums = np.add.reduceat(np.stack([weights, weights**2], axis=1), first) if len(first) else np.zeros((0, 2))
+    near = CellBlocks(pairs[first]).neighbour_sums(pairs[first], sums, 1.0)
+    usual = (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32)
+    found: NDArray[np.float32] = usual[np.cumsum(begins) - 1]
+    return found
 
 
 _AT_ONCE = 1 << 20  # leaf cells: float64 sums of all would be the peak of a large fit's memory

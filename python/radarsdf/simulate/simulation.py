@@ -99,9 +99,8 @@ class Simulation:
     def intensity_noise_floor(self) -> float:
         """Mean absolute difference between measured and noiseless intensities of the surface returns, dB.
 
-        It is the error of a perfect model of scene and sensor: speckle and noise are unpredictable. The error of a
-        fit can be slightly lower. Near the detection threshold, only returns with positive noise are detected, and a
-        fit learns this bias.
+        It is the error of a perfect model of scene and sensor. That of a fit can be slightly lower: near the detection threshold,
+        only returns with positive noise are detected, and a fit learns this bias.
         """
         error = np.abs(np.concatenate(self.intensities) - np.concatenate(self.noiseless_intensities))
         surface = self.is_surface()

@@ -177,7 +177,7 @@ class TileBlend(Map):
         def of_tile(share: Share) -> Tensor:
             return torch.stack(list(queries.evidence(share.contents, share.local)), 1)
 
-        found = np.nan_to_num(_averages(self._shares(positions), len(positions), of_tile, columns=3))
+        found = np.nan_to_num(_averages(self._shares(positions), len(positions), of_tile, columns=4))
         return queries.EvidenceAt(*torch.from_numpy(found).float().unbind(1))
 
     def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
