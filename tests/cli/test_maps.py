@@ -53,7 +53,7 @@ def test_stricter_limits_make_smaller_meshes(map_file, tmp_path, capsys):
         ]
 
     default = triangles()
-    assert 0 < triangles("--min-confidence", 0.995) < default
+    assert 0 < triangles("--min-confidence", 0.98) < default
     assert triangles("--min-confidence", 0) >= default
     assert 0 < triangles("--max-uncertainty", 0.015) < default
 

@@ -21,10 +21,8 @@ _PART, _SAME_PLACE, _AWAY, _LONGEST = 0.5, 0.5, 4.0, 4.0
 _SHIFT = 3.0  # standard deviations of the distance between returns of one surface
 _ANGLES = np.arange(8) * (np.pi / 4)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(8)], axis=1)  # of shifts
-_FEWEST_SCANS, _ERRORS = (
-    3,
-    3.0,
-)  # of an accepted agreement: minimum number of scans, and of its standard errors
+_FEWEST_SCANS = 3  # of a visit that is judged
+_ERRORS = 3.0  # minimum agreement, standard errors
 
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:

@@ -66,8 +66,8 @@ class RefinedPoses:
     report: dict[str, Any]
     """`verdict` in words; `gain`, the mean increase of the log density of other scans' returns at held-out ones, and its
     `gain_error`; `sigma_m`, `sigma_rad` and `bias` of a given step; `moved_m` and `moved_rad`, root mean square change of the
-    poses; `noise` of the sensor; `moving`, number of returns excluded by Doppler; `notes` on unused input and open loops; `scans`, `returns`,
-    `rounds`, `seconds`."""
+    poses; `noise` of the sensor; `moving`, number of returns excluded by Doppler; `notes` on unused input and open
+    loops; `scans`, `returns`, `rounds`, `seconds`."""
 
 
 def refine_poses(
