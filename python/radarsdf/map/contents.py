@@ -19,6 +19,7 @@ from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatistics
+from radarsdf.threads import resolve_num_threads
 
 _Part = TypeVar("_Part")
 
@@ -61,4 +62,5 @@ class MapContents(WholeMap):
     @cached_property
     def usual_information(self) -> NDArray[np.float32]:
         """(C,) see :func:`radarsdf.returns.evidence.usual_information`."""
-        return usual_information(self.evidence.information, self.field.table.leaf_keys())
+        keys = self.field.table.leaf_keys()
+        return usual_information(self.evidence.information, keys, resolve_num_threads(0))

@@ -46,8 +46,8 @@ _ROUGH_FLOOR_CELLS = 1.1
 _CONFIDENCE = (3.29, -1.25, -0.87, -3.77, -3.50)
 _COVERING = (-0.21, -0.79, -1.47, -2.68, -2.46)
 _CROWDED_RETURNS = 4.0  # returns per cell at which crowding has half of its maximal effect
-# Share of the usual information at which returns as likely belong to a surface beside, steepness of their log odds, and standard
-# errors by which few hits may show too small a share. Measured on twelve kinds: F-scores rise by 0.1 points, with six times as
+# Share of the usual information at which returns are as likely those of a surface next to them, slope of the log odds over the
+# logarithm of the share, and standard errors of a share of few hits. Measured on twelve kinds: F-scores rise by 0.1 points, with six times as
 # many returns by 0.8, on another simulator's scenes by 0.0 and 1.4, on drives by -0.2 to 0.1.
 _EDGE_SHARE, _EDGE_STEEPNESS, _SHARE_ERRORS = 0.25, 3, 4.0
 _BEND_CELLS = 2.0  # bending allowed by the smoothness term, leaf cells: a slope turns from -1 to 1
@@ -178,8 +178,7 @@ class EvidenceAt(NamedTuple):
 
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
-    keys = contents.field.table.leaf_keys()
-    usual = contents.usual_information
+    keys, usual = contents.field.table.leaf_keys(), contents.usual_information
     return interpolated(contents.evidence, keys, contents.config.leaf_size_m, points, usual)
 
 
@@ -191,13 +190,14 @@ def interpolated(
     usual: NDArray[np.float32] | None = None,
 ) -> EvidenceAt:
     """Interpolate the evidence of leaf cells with ascending keys (C,) at points (N, 3), local frame, m. `usual` (C,), if known."""
-    usual = usual_information(found.information, leaf_keys) if usual is None else usual
+    num_threads = resolve_num_threads(0)
+    usual = usual_information(found.information, leaf_keys, num_threads) if usual is None else usual
     of_cells = np.stack([found.information, found.hits, found.visibility, usual], 1, dtype=np.float32)
     # Points beyond the range of keys are clamped to its limit, where there are no cells.
     limit_m = MAX_CELLS_FROM_ORIGIN * leaf_size_m
     near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
     # Trilinear, because a vertex of a mesh may lie on the face between two cells.
-    at_points = CellBlocks(leaf_keys).interpolate(leaf_size_m, of_cells, near.numpy(), resolve_num_threads(0))
+    at_points = CellBlocks(leaf_keys).interpolate(leaf_size_m, of_cells, near.numpy(), num_threads)
     return EvidenceAt(*torch.from_numpy(at_points).unbind(1))
 
 
@@ -249,9 +249,9 @@ def _probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
 
 
 def own_surface(evidence: EvidenceAt) -> Tensor:
-    """Return the probability (N,) that the returns at places belong to a surface there, and not to one beside it."""
-    # Noise spreads returns beyond the edges of surfaces. With more data they are more, there as on the surface: their share tells
-    # both apart, if not too few by chance.
+    """Return the probability (N,) that the returns at places belong to a surface there, not to one next to them."""
+    # Noise spreads returns beyond the edges of surfaces. More data increase their number there and on the surface alike, but not
+    # their share, of which few hits determine only an upper limit.
     share = evidence.information.double() / evidence.usual.double().clamp(min=1e-30)
     at_most = share * (1 + _SHARE_ERRORS / evidence.hits.double().clamp(min=0.1).sqrt())
     return 1 / (1 + (_EDGE_SHARE / at_most.clamp(min=1e-6)).pow(_EDGE_STEEPNESS))

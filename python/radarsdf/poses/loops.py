@@ -51,11 +51,11 @@ def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_
             distances_m, found = tree.query(points[rows] + shift, NEIGHBOURS)
             variances = variances_m2[rows, None] + apart_m2 + variances_m2[known][found]
             densities.append(density(distances_m, variances).sum(axis=1))
-        here, beside = densities[0], np.mean(densities[1:], axis=0)
-        floor = float(np.median([here, beside]))
+        here, shifted = densities[0], np.mean(densities[1:], axis=0)
+        floor = float(np.median([here, shifted]))
         if floor == 0:  # they see different surfaces
             continue
-        agreement = Verdict.by_groups(np.log((here + floor) / (beside + floor)), returns.scans[rows])
+        agreement = Verdict.by_groups(np.log((here + floor) / (shifted + floor)), returns.scans[rows])
         if agreement.parts >= _FEWEST_SCANS and agreement.gain < _ERRORS * agreement.error:
             now, before = later + first_scan, earlier + first_scan
             notes.append(

@@ -178,7 +178,7 @@ class Tracker:
         matches = [self._planes[-1].agreement(scan, at, self._variances)[:3] for at in shifted]
         hessians = _reduced(*(np.stack(parts) for parts in zip(*matches, strict=True)))[0]
         variances = np.einsum("i,kij,j->k", axis, np.linalg.pinv(hessians, hermitian=True)[:, :3, :3], axis)
-        information = np.where(variances > 0, 1 / np.where(variances > 0, variances, 1.0), 0.0)
+        information = np.divide(1.0, variances, out=np.zeros_like(variances), where=variances > 0)
         chance = min(1.0, float(np.mean(information[1:])) / max(float(information[0]), 1e-12))
         widened = 1 / (1 / before + (1 - chance) * max(1 / left - 1 / before, 0.0)) - left
         covariance = covariance.copy()

@@ -108,16 +108,17 @@ def evidence_sums(
     return information, hits
 
 
-def usual_information(information: NDArray[np.float32], leaf_keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+def usual_information(
+    information: NDArray[np.float32], leaf_keys: NDArray[np.uint64], num_threads: int = 0
+) -> NDArray[np.float32]:
     """Return the mean `information` (C,) of cells within two to four leaf cells of each, weighted by itself: that of most returns."""
     pairs = merged_keys(leaf_keys)
     begins = np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]
     first, weights = np.flatnonzero(begins), information.astype(np.float64)
     sums = np.add.reduceat(np.stack([weights, weights**2], axis=1), first) if len(first) else np.zeros((0, 2))
-    near = CellBlocks(pairs[first]).neighbour_sums(pairs[first], sums, 1.0)
-    usual = (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32)
-    found: NDArray[np.float32] = usual[np.cumsum(begins) - 1]
-    return found
+    near = CellBlocks(pairs[first]).neighbour_sums(pairs[first], sums, 1.0, num_threads)
+    usual: NDArray[np.float32] = (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32)
+    return usual.take(np.cumsum(begins) - 1)
 
 
 _AT_ONCE = 1 << 20  # leaf cells: float64 sums of all would be the peak of a large fit's memory
