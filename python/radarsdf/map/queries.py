@@ -46,9 +46,9 @@ _ROUGH_FLOOR_CELLS = 1.1
 _CONFIDENCE = (3.29, -1.25, -0.87, -3.77, -3.50)
 _COVERING = (-0.21, -0.79, -1.47, -2.68, -2.46)
 _CROWDED_RETURNS = 4.0  # returns per cell at which crowding has half of its maximal effect
-# Share of the usual information at which returns are as likely those of a surface next to them, slope of the log odds over the
-# logarithm of the share, and standard errors of a share of few hits. Measured on twelve kinds: F-scores rise by 0.1 points, with six times as
-# many returns by 0.8, on another simulator's scenes by 0.0 and 1.4, on drives by -0.2 to 0.1.
+# Share of the usual information at which returns are as likely those of a surface next to them, slope of the log odds over
+# the logarithm of the share, and standard errors of a share of few hits. Measured: F-scores of twelve kinds rise by 0.1
+# points, with six times as many returns by 0.8, of another simulator's scenes by 0.0 and 1.4, of drives by -0.2 to 0.1.
 _EDGE_SHARE, _EDGE_STEEPNESS, _SHARE_ERRORS = 0.25, 3, 4.0
 _BEND_CELLS = 2.0  # bending allowed by the smoothness term, leaf cells: a slope turns from -1 to 1
 _LEAST_LOGIT = -80.0  # so that the probability of an observed surface does not underflow in float32

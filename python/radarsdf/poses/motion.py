@@ -61,7 +61,7 @@ class MotionPrior:
     def learnt(
         self, rates: Sequence[MotionRate | None], durations_s: Floats, *, with_errors: bool = False
     ) -> MotionPrior:
-        """Update from rates (None: lost) and durations of a drive's steps; `with_errors`: squares include the errors of the rates."""
+        """Update from rates (None: lost) and durations of steps; `with_errors`: squares include the errors of the rates."""
         errors = float(with_errors)
         known = [rate.mean**2 + errors * rate.covariance.diagonal() for rate in rates if rate is not None]
         if not known:

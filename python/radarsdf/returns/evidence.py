@@ -111,7 +111,7 @@ def evidence_sums(
 def usual_information(
     information: NDArray[np.float32], leaf_keys: NDArray[np.uint64], num_threads: int = 0
 ) -> NDArray[np.float32]:
-    """Return the mean `information` (C,) of cells within two to four leaf cells of each, weighted by itself: that of most returns."""
+    """Return the mean `information` (C,) of cells within two to four cells of each, weighted by itself: that of most returns."""
     pairs = merged_keys(leaf_keys)
     begins = np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]
     first, weights = np.flatnonzero(begins), information.astype(np.float64)
