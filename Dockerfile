@@ -1,6 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
-#
 # docker build -t radarsdf .
 # docker run --rm -v "$PWD:/data" radarsdf                                  the demo; it writes /data/radarsdf_demo
 # docker run --rm -v "$PWD:/data" radarsdf fit scans.npz -o map.safetensors any other command

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``python -m bench.changes [KIND ...]``: detection of cubes that appear, disappear, move or change their reflectance.
 
 The second of two simulated drives has other noise and another path: half a metre aside, between the scans, and slightly rotated.

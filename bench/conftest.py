@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Data shared by benchmarks, fixed by seeds, with memory accesses as in a real fit."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Memory and time of fits compared with their estimates: `python -m bench.estimates memory|durations`, on Linux."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``python -m bench.grids [SCENE ...]``: occupied places that planners' grids report as free, and errors of distances.
 
 A place is a point on a true surface that the radar can detect from one of its poses, in a box of 50 × 50 × 10 m round the

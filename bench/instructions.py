@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Instruction counts of a small fit and of training steps by callgrind: `python -m bench.instructions`.
 
 Load on the machine does not change counts. Two checks end with an error: the core executes 1.15 times the instructions that

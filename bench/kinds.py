@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scenes of many kinds, each with another radar and drive, so that results do not depend on one scene."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Time and memory of a block, and functions in new processes. Standard library only: a peer's Python may be old."""
 
 from __future__ import annotations

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Lower bound for the time of the interpolation: the same rows are read, and gradients are added to the same rows, but
 // rows and weights are known in advance. Point n has, at each of 3 levels, 12 rows of 8 floats and their weights.
 // test_kernels.py compiles this file for the machine, and checks its results.

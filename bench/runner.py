@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Runner of all experiments: an :class:`Experiment` lays out the rows that its function yields.
 
 Rows are printed as they come, and written as JSON with everything needed to repeat them, and as Markdown tables.

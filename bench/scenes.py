@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scenes of the experiments: simulated ones, and recorded ones from files and folders."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Noise and false returns of a radar, measured against lidar, on recorded and simulated drives.
 
 `python -m bench.sensor FILE.npz ...`.

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Presets by name, and changes of their settings as nested dicts."""
 
 from __future__ import annotations

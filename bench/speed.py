@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fits alternating with VDBFusion and with another version of radarsdf: `python -m bench.speed --against PATH`, in two minutes.
 
 PATH is a wheel, or a checkout built in place. Ratios within a round are of consecutive runs, so that other load on the

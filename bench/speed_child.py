@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Times fits of any version of radarsdf: a program of its own for `bench.speed`, that uses only its public functions."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Speed of the encoding kernels against the same computation in PyTorch, and against a simple loop in C++.
 
 Each case checks its result against NumPy in double precision, so that a wrong result cannot be the fastest. Compare

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Speed of marching cubes against other programs on the same float32 samples, on one thread unless the case says more.
 
 Groups: two fields; lattice and extraction of a shell; a real map by its cells. Each case checks the number of triangles or

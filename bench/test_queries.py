@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Query times of a fitted map: signed distances near its returns, and meshes."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Rays per second through the surface of a map, from a sensor's pose, on one thread and on two.
 
 The extra information lists rays per second. Each case checks that most rays end near a return's range or nowhere, so

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Time of a training step on one of two threads: the whole step, and its matrix products alone.
 
 There is a group per stage of the schedule: geometry alone, geometry and intensity together, and intensity with

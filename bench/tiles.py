@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Maps in tiles compared with one fit, and their scaling with returns: `python -m bench.tiles seams|growth`, on Linux."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Distances of a mesh from the true surface: from simulated solids exactly, from lidar points by planes."""
 
 from __future__ import annotations

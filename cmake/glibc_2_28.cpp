@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // What a newer glibc adds under old names: with these the extension asks for nothing newer than glibc 2.28. The linker
 // sends calls of `pow` to `__wrap_pow`, which calls the version that every glibc has; the bits of the results are
 // equal.

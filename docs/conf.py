@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The site: ``sphinx-build -W --keep-going docs build/docs``, and build/docs/index.html is its first page."""
 
 import os

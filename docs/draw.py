@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Draws the figures of the pages: ``python docs/draw.py`` writes them to docs/figures.
 
 All but `changes.png` are of one simulated drive and one fit of it. It takes half a minute and needs the extra `plot`.

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Read a folder of point clouds with a pose file, check and fit it.
 
     python examples/folder.py [FOLDER]

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Update a live map in a driver callback while another thread reads it.
 
     python examples/live.py

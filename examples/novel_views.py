@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Predict a scan from another pose, and compare a predicted scan with a held-out one.
 
     python examples/novel_views.py [FOLDER]

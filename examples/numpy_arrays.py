@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fit a map to NumPy arrays, query it, and write a mesh.
 
 python examples/numpy_arrays.py [FOLDER]

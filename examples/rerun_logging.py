@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Log scans, poses and the map to the rerun viewer. Requires the extra `rerun`.
 
 python examples/rerun_logging.py [FOLDER]      # then: rerun drive.rrd

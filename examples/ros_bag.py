@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Write a ROS 2 bag with rosbags, then read and fit it. Requires the extra `ros`, but not ROS.
 
     python examples/ros_bag.py [FOLDER]

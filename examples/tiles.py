@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fit a street in tiles, resume after a tile was lost, and export one mesh.
 
 python examples/tiles.py [FOLDER]

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Compute the clearance of a path from certain surfaces and from all possible ones.
 
     python examples/uncertainty_for_planning.py

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Small analytic scenes shared by several tests."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Plain marching cubes: cell by cell, with a dictionary from edges to vertices.
 
 The compiled core is used only for the triangles of a pattern, on a single cell.

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Plain visibility counts: cube by cube along each ray."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Small valid files of every format, and malicious ones whose container is valid."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Settings by name without groups, for tests that vary single ones."""
 
 from __future__ import annotations

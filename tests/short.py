@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Short fits and drives for pages and examples, which test text and files, not quality."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Any arguments of public functions give a result with the documented properties, or a ValueError or TypeError.
 
 The examples are the same in every run; RADARSDF_EXAMPLES=5000 tries more of them.

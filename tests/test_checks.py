@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Modules below all subpackages: the limits of checks, the lattice of the world, and the memory that is left."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Settings are validated at construction, with errors of one line, and saved without loss."""
 
 import copy

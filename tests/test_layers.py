@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Imports of the package go from higher to lower layers, without cycles."""
 
 import ast

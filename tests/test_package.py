@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The names of the package: complete, imported only when they are used, and with examples that run."""
 
 import doctest

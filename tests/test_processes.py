@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Forked and spawned processes, pickles, many threads, other platforms: correct results, and never a deadlock."""
 
 import copy

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Maps do not depend on the number of BLAS threads, because only `products` multiplies matrices."""
 
 import ast

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Worker threads: PyTorch's settings are restored, order is kept, and concurrent fits are independent."""
 
 import threading

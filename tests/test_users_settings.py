@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Users' settings of PyTorch and NumPy do not change results."""
 
 import contextlib

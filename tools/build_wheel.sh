@@ -1,7 +1,4 @@
 #!/usr/bin/env bash
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
-#
 # The wheel for Linux on x86-64 as it is released, from a machine that may be newer than manylinux_2_28: built, repaired,
 # looked at. Elsewhere, and for all Pythons, the workflow "Wheels" does it by cibuildwheel.
 #

@@ -1,7 +1,4 @@
 #!/usr/bin/env bash
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
-#
 # tools/check_instruction_sets.sh BUILD_DIR: looks at the compiled objects of an x86-64 build and fails
 #  - if code that runs on every processor uses AVX;
 #  - if a copy of the kernels for a newer processor exports an inline function, which the linker could choose for all.

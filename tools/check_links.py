@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Look at the links of the built site: ``python tools/check_links.py build/docs``.
 
 Links within it must lead to a file, and to an anchor that is there. Links that lead away are only looked at: they must be

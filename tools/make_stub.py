@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Writes python/radarsdf/_core.pyi, the types of the compiled core, from the core itself; with --check, compares.
 
     python tools/make_stub.py [--check]

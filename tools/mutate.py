@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Puts faults into the package or the core at random, one at a time, and says which of them the tests catch.
 
     python tools/mutate.py --count 100 --seed 1

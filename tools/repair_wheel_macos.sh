@@ -1,7 +1,4 @@
 #!/usr/bin/env bash
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
-#
 # Puts libomp into a wheel for macOS, as cibuildwheel calls it there (see [tool.cibuildwheel.macos] in pyproject.toml).
 #
 #   tools/repair_wheel_macos.sh ARCHS FOLDER WHEEL

@@ -1,7 +1,4 @@
 #!/usr/bin/env bash
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
-#
 # tools/sanitize.sh [pytest arguments]   the Python tests of the core under AddressSanitizer and UBSan (gcc)
 #
 # The C++ tests and ThreadSanitizer are in tools/test_core.sh.

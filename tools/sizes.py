@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Print the sizes of the project, and fail where one exceeds its limit by more than 5 %: growth is a decision.
 
     python tools/sizes.py            # compare with tools/sizes.json

@@ -1,7 +1,4 @@
 #!/usr/bin/env bash
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
-#
 # tools/test_core.sh            the C++ tests, and a project that uses the installed core; without Python
 # tools/test_core.sh address    the same under AddressSanitizer and UBSan (gcc)
 # tools/test_core.sh thread     the same results on several threads, under ThreadSanitizer (clang, libomp, Archer)

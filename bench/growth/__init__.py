@@ -1,3 +1,1 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scaling of time and memory with the returns and the size of the scene: `python -m bench.growth`, on Linux."""

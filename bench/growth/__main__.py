@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Growth of time and memory: `python -m bench.growth fits|surfels|poses`, on Linux."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Time and memory of fits, of their stages, and of pose refinement. Each row is measured in a new process, on Linux."""
 
 from __future__ import annotations

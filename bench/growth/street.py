@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A simulated street of any length with any number of returns: fast to compute, with a known true surface.
 
 There are walls 25 m to the left and right of a straight path and one at each end, and flat ground 2 m below the sensor.

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Live maps: `python -m bench.live EXPERIMENT`."""
 
 from __future__ import annotations

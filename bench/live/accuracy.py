@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Surface and intensities of live maps, compared with fits of the same scans."""
 
 from __future__ import annotations

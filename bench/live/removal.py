@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Removal and correction of scans in random order: bits and time."""
 
 from __future__ import annotations

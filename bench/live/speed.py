@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Time and memory of live maps and of odometry. Times are CPU times unless stated."""
 
 from __future__ import annotations

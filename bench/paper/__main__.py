@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Experiments of the paper, and ours of the same kind: `python -m bench.paper EXPERIMENT [SCENE ...]`."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Calibration of a map: `uncertainty` against distances to the truth, `confidence` against true surface."""
 
 from __future__ import annotations

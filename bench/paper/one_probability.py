@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fit the coefficients of `Map.confidence` and of the coverage of the truth, with cross-validation over kinds of scenes.
 
     python -m bench.paper.one_probability [FILE.npz …] [--presets quick default] [--seed 141] [--judge 391]

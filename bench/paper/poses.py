@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Effect of pose errors, and results of `refine_poses` and `odometry`."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Predicted intensities and scans, compared with held-out ones."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Surfaces of this package and its peers: errors, time, memory, and size."""
 
 from __future__ import annotations

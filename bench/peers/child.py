@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """One reconstruction in a separate process: `python -m bench.peers.child METHOD OPTIONS SCANS RESULT`.
 
 METHOD is a `module:function` of this package that returns a `Made` or its first fields. OPTIONS are its keywords as

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Install peers in separate environments: `python -m bench.peers.install [PYTHON]` or `... install odometry`.
 
 The first form installs VDBFusion, whose wheels (0.1.6) need CPython 3.8 to 3.10 and NumPy below 2. PYTHON is the interpreter;

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Peers, the methods to compare with, and `reconstruct`, which runs one of them.
 
 Each peer runs in a child process (see `child`), and nothing of it is imported here. If it cannot run, the result states

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Odometry compared with that of peers on the same scans: `python -m bench.peers.odometry [FILE.npz ...]`.
 
 `kiss-icp` and `small_gicp` come from their wheels (`python -m bench.peers.install odometry`). Both are made for lidars, so

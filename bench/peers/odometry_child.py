@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Odometry of a peer in its own environment: `python -m bench.peers.odometry_child NAME VOXEL_M SCANS POSES`.
 
 SCANS is an .npz of `points` (N, 3), sensor frame, m, and `counts` (F,), returns per scan; POSES is the .npy output of

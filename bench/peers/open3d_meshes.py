@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """α-shapes, ball pivoting and Poisson reconstruction by Open3D, on all returns together."""
 
 from __future__ import annotations

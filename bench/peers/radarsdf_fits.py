@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """This package as a peer: its default, the published configurations, and the representation of SHINE-Mapping."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """VDBFusion: the weighted average of truncated signed distances in a sparse grid (Vizzo et al., Sensors 2022)."""
 
 from __future__ import annotations

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Shapes are validated here, once, so that the core may trust its pointers. Arrays are never converted: a wrong dtype
 // or layout is an error of the caller (the package's own Python), not a silent copy.
 #pragma once

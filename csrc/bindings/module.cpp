@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Table of contents of the Python bindings. Each subject has its own file; the core itself is independent of Python.
 #include "bindings/subjects.hpp"
 

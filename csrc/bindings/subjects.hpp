@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // One function for each subject, called by module.cpp. Kernels that use a table are methods of its class.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Multi-threaded encodings of a batch of points, by the kernels of the instruction set in use. All arrays are in C
 // order; `stride` is the distance between rows, so that encodings can be written side by side into one matrix.
 #pragma once

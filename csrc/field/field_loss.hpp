@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Both losses of a batch and the gradients of all parameters, in one call. As dozens of PyTorch operations, two threads
 // of a fit waited for the GIL during half of each iteration.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Losses and gradients of one part of a batch, computed by one thread for `FieldLoss`.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Partition of row sums of the feature matrix into tasks: one for each level and group of corners, so that neither
 // atomics nor private copies are needed, and each row is summed in the order of the points.
 #pragma once

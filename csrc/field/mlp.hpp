@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Multi-layer perceptron with ReLU, forward and backward. A few rows at a time go through all layers, so that
 // activations stay in the cache.
 #pragma once

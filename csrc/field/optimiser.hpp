@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Sparse optimiser steps on the rows of the feature matrix that a batch of points touches.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Padded row length of matrices for the product kernels.
 #pragma once
 

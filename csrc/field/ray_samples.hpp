@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Random samples on rays with labels of their signed distances: a training batch in one call.
 #pragma once
 

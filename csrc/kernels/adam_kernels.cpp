@@ -1,5 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
 #include "kernels/adam_kernels.hpp"
 
 #include <math.h>  // not <cmath>: see fourier_kernels.cpp

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Sparse Adam (Kingma and Ba, ICLR 2015) on rows of the feature matrix, compiled once for each instruction set (see
 // interpolation_kernels.hpp).
 #pragma once

@@ -1,5 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
 #include "kernels/fourier_kernels.hpp"
 
 #include <math.h>  // not <cmath>, whose inline overloads could leave this copy's instruction set

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Fourier features of positions, compiled once for each instruction set (see interpolation_kernels.hpp).
 #pragma once
 

@@ -1,5 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
 #include "kernels/interpolation_kernels.hpp"
 
 #include "kernels/feature_vector.hpp"

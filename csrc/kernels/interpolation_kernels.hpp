@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Serial interpolation kernels on a range of points, compiled once for each instruction set from one source
 // (interpolation_kernels.cpp). Only plain data here: the linker might keep the copy of an inline library function that
 // was compiled for a newer processor.

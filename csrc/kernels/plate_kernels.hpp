@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // One iteration of returns/smooth_distances.cpp, compiled once for each instruction set (see
 // interpolation_kernels.hpp). Vertices are stored in blocks of 2 x 2 x 2, x fastest: a block is one vector, and the two
 // vertices before and after it along an axis are those of the adjacent block. Missing vertices are 0 throughout, as is

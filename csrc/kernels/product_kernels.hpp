@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Products of small matrices that fit the cache, with the prologue and epilogue of a network layer, compiled once for
 // each instruction set (see interpolation_kernels.hpp).
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Kernels of a SOAP step besides matrix products, compiled once for each instruction set (see
 // interpolation_kernels.hpp).
 #pragma once

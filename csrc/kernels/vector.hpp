@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // SIMD vectors for kernels that are compiled once for each instruction set. Internal linkage, so that the linker does
 // not merge copies.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Constants of occupied cells. Kernels include them once for each instruction set.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Two-level bit masks of cells: blocks of 4 x 4 x 4 cells in regions of 4 x 4 x 4 blocks. The cells of a block are
 // consecutive in Morton order, so the row of a cell is that of the block's first cell plus the number of set bits below
 // its own; likewise the blocks of a region. Only regions are looked up in a hash table, which thus stays small and

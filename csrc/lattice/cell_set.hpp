@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Set of occupied leaf cells, filled from points in parallel, chunk by chunk.
 #pragma once
 

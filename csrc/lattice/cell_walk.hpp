@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Traversal of the cells along a line segment (Amanatides and Woo 1987). The intersection with a face of the lattice
 // depends on that face alone, so a longer segment of the same line crosses all cells of a shorter one.
 #pragma once

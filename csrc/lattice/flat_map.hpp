@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Flat open-addressing map from 64-bit keys to 32-bit values: power-of-two capacity, linear probing, load factor at
 // most one half. Exact: full keys are compared, so two keys never share a value.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Integer lattice coordinates as one sortable 64-bit key: 21 bits per axis, interleaved (Morton order), so that spatial
 // neighbours are close in memory and the key of the parent cell is `key >> 3`.
 #pragma once

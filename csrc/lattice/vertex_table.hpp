@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Look-up of the rows of the feature matrix from which a point is interpolated.
 //
 // Occupied cells of all levels form a forest: one exact hash look-up finds the cell of the coarsest level, child masks

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Symmetric band matrices of 6 x 6 blocks, one row of blocks for each scan's pose: Cholesky factors, and the band of
 // the inverse.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Normal equations of the poses of scans, from returns on common planes.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Bridges over gaps: empty cells between two cells with returns, along the axes and diagonals of the lattice.
 #pragma once
 

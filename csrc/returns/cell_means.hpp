@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Additive model of a quantity of returns: means in cells of several kinds, by position and view, coarse to fine.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Sums over the returns of cells, and over their neighbourhoods.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Incremental sums over scans: adding or removing a scan takes time proportional to its returns, independent of the
 // size of the table. All numbers are integers, so that removal is exact, in any order.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Shrinks noisy returns towards the planes of their neighbourhood (Wiener 1949).
 #pragma once
 

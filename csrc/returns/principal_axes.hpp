@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Eigendecomposition of many symmetric 3 x 3 matrices by Jacobi rotations. For such small matrices, call overhead
 // dominates in LAPACK.
 #pragma once

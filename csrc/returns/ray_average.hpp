@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Average over rays of truncated signed distances at the vertices of an octree's leaf cells (Curless and Levoy 1996).
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Noise of a return's position along the beam, in azimuth and in elevation.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Thin-plate smoothing of signed distances at the vertices of an octree's leaf cells: they agree with the planes of
 // returns, interpolated as in the map, and minimise bending in between. Zero crossings are excluded where rays passed,
 // and in occluded space behind surfaces.

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Surface crossings of rays before their ends: the signature of a ghost, a return reflected by a mirror, which the
 // sensor places behind it.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Visibility counts: scans with rays reaching a place, and scans with returns there.
 #pragma once
 

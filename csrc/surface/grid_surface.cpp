@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // An edge of a voxel is known by the leaf cell's vertex at or below its lower end, and a bit of a mask there. A vertex
 // of the mesh is numbered by the bits set before its own, so that cells which share it agree without a search.
 #include "surface/grid_surface.hpp"

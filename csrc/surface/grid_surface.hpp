@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Marching cubes on the distances at the corners of leaf cells, in voxels that divide these cells evenly: the mesh of
 // marching_cubes_sparse on trilinear interpolation, without a lattice of voxels.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Marching cubes on a dense volume and on a list of cells, with identical meshes for identical samples:
 //  - a sample is positive iff it is > level; triangles face the positive side (in this project: free space);
 //  - one vertex per cut edge of the cells in use, so the mesh is closed and manifold except at their border;

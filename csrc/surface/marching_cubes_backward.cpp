@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Derivatives of the vertices of marching cubes by the samples. A vertex depends on two samples, and up to six vertices
 // depend on a sample. Each sample gathers its own sum in the order of the vertices: threads write to disjoint samples,
 // and results do not depend on the number of threads.

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Shared code of dense and sparse marching cubes: cuts of edges, checks, allocation of the result.
 #pragma once
 

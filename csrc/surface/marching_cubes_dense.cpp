@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Dense marching cubes in three passes, as in flying edges: signs, counts, output. The first reads the volume once and
 // keeps one bit per sample; later passes process 32 cells at a time, and read the volume again only at cut edges. Each
 // pass runs over planes of constant x; counts determine their offsets in the output.

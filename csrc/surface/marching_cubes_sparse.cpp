@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Marching cubes on a list of cells. An edge is indexed by its lower corner and its axis, so a plain array with three
 // elements per corner replaces a map from edges to vertices. Passes run over blocks of fixed size; counts determine
 // their offsets in the output, so results do not depend on the number of threads.

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Two properties make the meshes closed and manifold, and the code below implements exactly these:
 //  1. Where the surface crosses a cell's face depends on the four signs of that face alone, so the two cells that
 //     share it draw the same segments. The segments chain into loops; each cut edge lies on exactly one of them.

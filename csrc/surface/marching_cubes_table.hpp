@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Triangles of a cell for each of the 256 sign patterns of its corners.
 //
 // Corners are numbered in the C order of a 2x2x2 block: corner c sits at (c >> 2, (c >> 1) & 1, c & 1), which is the

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Packets of rays that traverse a tree of triangles together. Loops over the rays are vectorised, and coherent rays
 // mostly visit the same nodes.
 #pragma once

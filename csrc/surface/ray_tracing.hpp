@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // First hits of rays on a triangle mesh. Rays are sorted by direction, and traverse the tree of triangles in packets.
 #pragma once
 

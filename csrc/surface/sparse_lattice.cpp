@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // A lattice point is packed into a 64-bit key, x, y, z from the top. A step along an axis adds a constant to the key,
 // so sorted cells stay sorted when shifted by a step: corners are unions of sorted lists, computed in linear time with
 // sequential memory access and without a hash table.

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Unique cells of a list, their unique corners, and the corners of each cell.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Balanced bounding-box tree of the triangles of a mesh.
 #pragma once
 

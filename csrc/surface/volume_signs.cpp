@@ -1,5 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
 #include "surface/volume_signs.hpp"
 
 #include <algorithm>

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Signs of a volume's samples, one bit each, for marching cubes.
 #pragma once
 

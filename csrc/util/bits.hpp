@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Bit operations that C++17 lacks (C++20: std::countr_zero and std::popcount).
 #pragma once
 

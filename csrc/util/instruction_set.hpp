@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Dispatch of the kernels: the instruction set is chosen once, at load time, by the capabilities of the processor.
 #pragma once
 

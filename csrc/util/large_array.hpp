@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Large arrays in huge pages, as in NumPy. With small pages, page faults took a quarter of the time of a large mesh,
 // and address translation a quarter of that of a look-up in a large map.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Parallelism as a policy: the kernels are serial functions on a range, and this file runs them on threads.
 // The split depends on the sizes alone, never on timing, so results are deterministic.
 #pragma once

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Counter-based random bytes: each thread generates those that it needs, independent of the number of threads.
 #pragma once
 

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Thread pool for a sequence of short jobs, such as the halves of a training step.
 #pragma once
 

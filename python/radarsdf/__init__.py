@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """From 3D radar scans with known poses to a surface and a reflectance map, on a CPU.
 
 The public names are listed in ``__init__.pyi``. Each is imported at its first use, so that ``import radarsdf`` alone imports

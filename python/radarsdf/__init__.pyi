@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 # The public names and where they are, for `__init__.py`, which reads the lines as they are, and for type checkers.
 
 from . import evaluation as evaluation

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Validation of numbers and arrays from users. Errors name the argument."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Optional dependencies, and how to install missing ones."""
 
 from __future__ import annotations

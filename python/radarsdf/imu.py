@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Data of an inertial measurement unit (IMU)."""
 
 from __future__ import annotations

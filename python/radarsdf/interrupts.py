@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Deferral of Ctrl-C during critical work."""
 
 from __future__ import annotations

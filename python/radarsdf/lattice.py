@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The lattice of the world, shared by all maps, so that their cells coincide."""
 
 from __future__ import annotations

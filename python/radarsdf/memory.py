@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Available memory, and errors for meshes and views that need more."""
 
 from __future__ import annotations

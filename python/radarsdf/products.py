@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Matrix products with bits that do not depend on threads: `np.einsum` without `optimize` calls no BLAS.
 
 BLAS, which NumPy calls for `@`, splits a large product among its threads, and their number determines the order of the sums

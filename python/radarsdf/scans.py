@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scans with poses, streamed from files of any size or held in memory."""
 
 from __future__ import annotations

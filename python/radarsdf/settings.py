@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Frozen dataclasses of settings, validated by pydantic."""
 
 from __future__ import annotations

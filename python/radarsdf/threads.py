@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A pool of Python threads that replaces PyTorch's own threads.
 
 PyTorch splits every operation over OpenMP threads, which spin while they wait for each other. Next to another busy

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The calibration experiment, with uncertainties that are known to be correct, too small, or missing."""
 
 import numpy as np

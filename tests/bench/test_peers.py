@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Peers run in separate processes with the same interface, and report why they cannot run."""
 
 import importlib.util

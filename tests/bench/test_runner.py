@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The runner writes rows and tables of each experiment, with the reason for missing results."""
 
 import json

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scenes of the experiments: of each kind what their name says, in one form, with the distances to their true surfaces."""
 
 import dataclasses

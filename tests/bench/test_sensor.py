@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The simulated `astyx` is as noisy as the recorded drives, and each part of its noise is needed for that."""
 
 from __future__ import annotations

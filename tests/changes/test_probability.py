@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Probabilities of changes against numerical integrals, random draws, and brute-force searches."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Two drives through one place: in between, the reflectance of boxes changes."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Ways to break good data, each with the finding of `radarsdf.check` that reports it, and good recordings."""
 
 from __future__ import annotations

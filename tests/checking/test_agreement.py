@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Hypotheses move the scans as described, and the agreement of scans against a plain calculation."""
 
 import re

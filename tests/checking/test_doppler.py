@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Sensor velocity from Doppler, against the ground truth of a simulation and the flags of recorded drives."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Good data have no finding worse than a note; each breakage has its finding."""
 
 import numpy as np

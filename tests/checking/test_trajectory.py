@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Findings about poses alone, duplicate scans, and invalid numbers."""
 
 import numpy as np

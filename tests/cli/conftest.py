@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A file of scans and a file of a map, made once for all commands."""
 
 from functools import partial

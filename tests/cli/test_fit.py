@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf fit`` and ``demo``: the map, the printed report, and failures to write."""
 
 import re

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf live`` replays a recording, reports whether the map kept up, and writes it."""
 
 from unittest.mock import Mock

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf info``, ``mesh``, ``render`` and ``eval``; other folders have ``grid`` and ``compare``."""
 
 from importlib.util import find_spec

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """`radarsdf poses`, and fits of scans with refined or missing poses."""
 
 import numpy as np

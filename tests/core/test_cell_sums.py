@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Rows of cells by key, and sums over returns and over neighbourhoods."""
 
 import itertools

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Average distances over rays, and smoothed ones, against their definition and their least sum of squares."""
 
 import itertools

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Losses and gradients of the core, against autograd of the definitions of field and losses."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The compiled kernels against plain references, their gradients, and determinism on threads."""
 
 import math

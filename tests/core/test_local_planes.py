@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Planes that scans are tracked by while others come and go, and planes common to scans, against dense least squares."""
 
 import numpy as np

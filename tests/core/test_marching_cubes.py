@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Marching cubes by property: topology, geometry, agreement of dense, sparse and reference."""
 
 import os

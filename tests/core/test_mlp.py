@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The kernel of the networks, against a sequence of PyTorch operations."""
 
 import functools

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Rays meet the first triangle, as a loop over all finds it, and cross the same cells and surfels as cell by cell."""
 
 import numpy as np

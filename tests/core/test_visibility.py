@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Visibility counts, and numbers of scans with returns."""
 
 import numpy as np

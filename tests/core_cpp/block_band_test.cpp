@@ -1,5 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
 #include "poses/block_band.hpp"
 
 #include <doctest/doctest.h>

@@ -1,6 +1,3 @@
-// SPDX-FileCopyrightText: 2026 the radarsdf authors
-// SPDX-License-Identifier: MIT
-//
 // Runs every parallel function of the core with more threads than processors, for ThreadSanitizer (tools/test_core.sh
 // thread), and compares the results with one thread; then runs all from several threads concurrently, as if each fitted
 // its own map.

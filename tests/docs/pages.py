@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Read and run the fenced code blocks of a page."""
 
 from __future__ import annotations

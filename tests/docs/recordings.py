@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Write the files that the pages use, from a short simulated drive."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Every block of the pages runs and prints what the page shows; figures are drawn, and references exist."""
 
 import re

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Contents of each part of an encoding, and the support of features."""
 
 import numpy as np

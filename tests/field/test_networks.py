@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Inputs and outputs of the networks, and the parameters trained by each loss."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Training with extreme settings or for very long: a map stays finite, or the fit raises `Diverged`."""
 
 from __future__ import annotations

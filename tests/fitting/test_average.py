@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Averaged fits: exact for consistent rays, else their mean, and smooth on smooth surfaces."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Resuming a fit from its checkpoint changes no bit, and other files are rejected."""
 
 import dataclasses

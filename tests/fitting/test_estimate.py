@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Estimates of memory, size and time hold, and impossible fits are rejected before the work."""
 
 import sys

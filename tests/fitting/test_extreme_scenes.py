@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scenes far away, tiny, huge, flat, dense, empty or corrupted: a meaningful map, or a clear error."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A fit reconstructs surface and intensities of an analytic scene, rejects bad input, and is deterministic."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Adam equals PyTorch's, without its imports; sparse Adam equals a dense one if all rows are touched; SOAP."""
 
 import subprocess

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Samples along rays: labels are geometric, and all rays are sampled equally."""
 
 import tracemalloc

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A fit stopped by Ctrl-C or by values that are not finite ends promptly and returns its map."""
 
 import math

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Losses of a training: their history, detection of divergence, and the partition of batches."""
 
 import math

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Grids of a plane and a wall: occupied, free and unknown voxels, and files for planners."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Writes bags of ROS 1 and ROS 2 Messages are serialised by rosbags, not by our own code."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Damaged and malicious files: every reader must read a file, or raise a ValueError or OSError that names it."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Bags of several sensors: frames of messages, the topic of poses, and damaged messages."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Bags of ROS 1 and ROS 2: each kind of message, each source of poses, clocks, several bags, and damaged ones."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Published data sets: a tiny folder or bag in the layout of each is read as the expected scans and poses."""
 
 import json

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fields of radars are identified by name, in any case and order, by unit, or by choice."""
 
 import numpy as np

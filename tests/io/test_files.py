@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Outputs are checked before the work, and written whole; meshes in UTM coordinates survive their files."""
 
 import os

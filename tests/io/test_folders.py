@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Folders of recorded scans: tiny ones of each layout are read exactly; and damaged ones."""
 
 import numpy as np

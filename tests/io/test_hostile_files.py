@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Damaged and malicious files are read, or rejected by an error that names them."""
 
 import itertools

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Inertial measurements of bags, on the clock of the scans, and of scan files."""
 
 import numpy as np

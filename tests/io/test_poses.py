@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Pose files of each format, notes on assumptions, and interpolation."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Reading files and folders: scans, their order, their poses, and notes."""
 
 import logging

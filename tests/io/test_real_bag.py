@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A real ROS 1 bag of a handheld radar, with header stamps of zero, is read completely."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Text of other programs is read without loss of a line, or rejected."""
 
 import numpy as np

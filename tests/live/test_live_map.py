@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A live map depends only on its present scans, not on how they were added, moved and removed."""
 
 import errno

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Maps that were saved, or put away region by region, go on as if nothing had happened; damaged files are refused."""
 
 import io

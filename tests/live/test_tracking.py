@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scans without poses are placed at their true poses, or rejected."""
 
 import numpy as np

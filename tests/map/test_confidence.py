@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The probability of a mapped surface: from information, hits, visibility counts, and statistics of all returns."""
 
 import dataclasses

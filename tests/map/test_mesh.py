@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Meshes of the plane z = 0 and the wall x = 20: position, orientation and extent."""
 
 import functools

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The confidence threshold of a mesh maximises its expected F-score, and is reported with its expectations."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Views of a map of a plane and a wall: returns and beams are on the surface, within the limits of the sensor."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Trajectories, and errors that accumulate with steps."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Covariances, derivatives and rates of motions, against random draws, finite differences and manual values."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Rotation of an IMU on a radar, up direction, and clock offset, estimated from the drive."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Poses of simulated drives, from measurements of radar and gyroscope alone."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Times, ranges, speeds and rates in wrong units, signs and axes are reported, and long gaps end a segment."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Least quality of a fit, measured on small scenes that were not used to choose defaults.
 
 These are tests, and no bench, so that plain `pytest` runs them and a recorded drive that is not here skips with a

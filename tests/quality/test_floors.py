@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Default and quick fits are not significantly worse than before, and degradations are detected."""
 
 import functools

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Pictures: occlusion, no holes, and colours that match the colour bar."""
 
 import sys

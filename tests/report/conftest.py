@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A report of the small scene, with held-out scans and ground truth, written once."""
 
 import numpy as np

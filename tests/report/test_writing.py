@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The report of a map: all sections have figures, and the page neither loads nor executes its contents."""
 
 import dataclasses

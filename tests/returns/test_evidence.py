@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """What the returns show of each leaf cell, how many scans see it, and which gaps between returns are bridged."""
 
 import dataclasses

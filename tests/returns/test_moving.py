@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Returns that move are left out, and only these: velocities by Doppler, folded or not measured."""
 
 import numpy as np

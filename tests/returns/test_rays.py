@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Preparation: from sensor frames to rays of one local frame."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Intensities in closed form: by range, elevation, incidence and kind of surface, and means of what that leaves."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Cells that hold returns, and integer sums in them: the same in any order, and after a scan was removed."""
 
 import dataclasses

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A sensor is what its scans show: noise along the beam, in azimuth and in elevation, ranges and angles."""
 
 import dataclasses

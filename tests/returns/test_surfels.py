@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Planes through returns: what lies behind them, how many returns support a place, and returns moved onto them."""
 
 import numpy as np

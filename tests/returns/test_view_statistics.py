@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """View statistics of intensity: means of returns that are close and have similar views."""
 
 import dataclasses

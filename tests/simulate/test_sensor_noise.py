@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Noise by axis, range and strength, and false returns, each according to its setting."""
 
 from dataclasses import replace

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The simulator: exact geometry, the radar equation, and correct labels."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A cluster of dask.distributed with scheduler and workers in separate processes, as on many machines."""
 
 from __future__ import annotations

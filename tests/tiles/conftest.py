@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A small city for tests: a wall along a drive, averaged in tiles of 12.8 m."""
 
 import pytest

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Tiles on dask.distributed: no bit changes, and finished tiles are kept."""
 
 from concurrent.futures import Future

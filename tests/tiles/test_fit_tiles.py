@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fits in tiles: the same steps as one fit, with any executor and after failures."""
 
 import dataclasses

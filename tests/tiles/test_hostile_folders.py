@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Damaged and malicious folders of tiles: the fault is named, and no other file is changed."""
 
 import json

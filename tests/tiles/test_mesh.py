@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The mesh of a map in tiles, against one extracted from all cells at once."""
 
 import json

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Unobserved places are NaN, for every kind of map and quantity."""
 
 import numpy as np

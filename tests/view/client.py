@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A client of the viewer without a browser: it responds, drags the sensor and records messages."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A page in a headless browser: drags, clicks, drawn frames, requests and errors."""
 
 from __future__ import annotations

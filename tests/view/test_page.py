@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The page in a headless browser: a drag and a click, all frames meanwhile, and a narrow screen."""
 
 import numpy as np

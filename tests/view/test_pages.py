@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Pages of a growing surface and of changes, in coordinates representable in float32."""
 
 from contextlib import nullcontext

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Contents of the page during and after updates. viser is not needed: the scene only records its nodes."""
 
 import contextlib

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Address of the page, and when it has been drawn. viser is not needed."""
 
 import socket

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Thinning, colours, framing and picking of the surface."""
 
 import numpy as np

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The viewer from its clients' side: messages that they receive, and rejected requests."""
 
 import gc

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Result of a comparison of two maps, as coloured surfaces."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Comparison of two maps of one place, or of a map with new scans."""
 
 from __future__ import annotations

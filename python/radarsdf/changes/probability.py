@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Probability that a place changed, from the evidence of two maps.
 
 Each probability follows from Bayes' rule for two hypotheses, no change or a change. The prior share of changes is

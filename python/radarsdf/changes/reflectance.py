@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Comparison of mean intensities between two drives, at places and from views that both have."""
 
 from __future__ import annotations

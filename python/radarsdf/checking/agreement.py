@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Agreement of returns of different scans, and hypotheses about mistakes in the data."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Check of scans and poses before a fit: all findings, worst first."""
 
 from __future__ import annotations

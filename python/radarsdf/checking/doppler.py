@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Checks of Doppler velocities: their consistency, and their agreement with poses, axes and intensities."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Checks of frames, axes, units and clocks by the agreement of scans."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Checks of the intensities: missing measurements, outliers, quantisation, an offset, clipping."""
 
 from __future__ import annotations

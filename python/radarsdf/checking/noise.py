@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Elevation, ground, noise and drift of a recording, and the cost of a fit."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Input of a check, with consistent shapes, and its findings."""
 
 from __future__ import annotations

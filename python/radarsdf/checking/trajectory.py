@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Checks of the trajectory: rigid transforms, rounding, units, times, duplicates, jumps."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The command line: ``radarsdf COMMAND``.
 
 `commands` lists them, `app` runs one and prints its error, `options` and `results` are shared; the other modules are the

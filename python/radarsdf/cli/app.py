@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Run one command and print its error: the only module that prints errors."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Table of commands: module, arguments, and one line of help."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf info``: versions, and what a map holds."""
 
 from __future__ import annotations

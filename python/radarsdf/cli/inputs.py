@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Inputs of a command: scans, a configuration, a map."""
 
 from __future__ import annotations

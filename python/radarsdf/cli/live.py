@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf live``: replay a recording as if its scans arrived now."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf mesh``, ``eval`` and ``render``: outputs of a map, and its errors."""
 
 from __future__ import annotations

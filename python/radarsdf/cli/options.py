@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Arguments and options of all commands, as tables apart from the commands, so that help imports none of them."""
 
 from __future__ import annotations

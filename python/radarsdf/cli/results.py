@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Output of commands: lines and tables for people, or one JSON object for programs."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf check``, ``poses`` and ``convert``: scans before a fit."""
 
 from __future__ import annotations

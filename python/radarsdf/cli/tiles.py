@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf tiles``: large maps in tiles, locally or on a cluster."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """``radarsdf compare`` and ``grid``: changes between two maps, and occupancy for planners."""
 
 from __future__ import annotations

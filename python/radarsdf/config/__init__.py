@@ -1,3 +1,1 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The settings of a fit, and their file."""

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The configuration of a fit: the settings changed most often, the groups, and the presets."""
 
 from __future__ import annotations

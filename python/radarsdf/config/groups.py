@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The groups of settings of a fit, with unit, range and source.
 
 "3QFP" (ICRA 2024) and "3QFPI" (Neural Surface and Reflectance Modelling from 3D Radar Data) are the papers

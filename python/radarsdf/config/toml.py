@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Settings as a TOML file, with a table for each group."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Errors of a map: its surface against lidar points, its intensity against held-out radar scans, its uncertainty
 and confidence against both; of a trajectory against the true one.
 

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Calibration of a map: standard errors in metres, and confidences as probabilities."""
 
 from __future__ import annotations

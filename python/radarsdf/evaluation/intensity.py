@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Errors of intensities on held-out scans, and the paper's nearest-neighbour baseline."""
 
 from __future__ import annotations

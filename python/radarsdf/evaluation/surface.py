@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Errors of a mesh against lidar points: accuracy, completion, F-score and smoothness; metrics as text."""
 
 from __future__ import annotations

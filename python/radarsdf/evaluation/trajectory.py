@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Errors of a trajectory against the true one, by the definitions of evo and KITTI."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Interface of fields: signed distance, its gradient, and intensity, at points of the local frame."""
 
 from __future__ import annotations

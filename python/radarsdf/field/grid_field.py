@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The field of stage 1: signed distances at the corners of leaf cells."""
 
 from __future__ import annotations

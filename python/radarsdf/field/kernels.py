@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Autograd functions over the compiled core: interpolation in cells, Fourier encoding, multi-layer perceptrons.
 
 They are :class:`torch.autograd.Function`, not ``torch.library`` operators. Measured at 16, 1024 and 8192

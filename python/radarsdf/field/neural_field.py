@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The field of stage 2: encodings and networks, with widths set by the configuration."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fitting of a map to scans with poses: the steps of a fit, its two stages, and estimates of its cost."""
 
 import torch  # noqa: F401 - before the compiled core, so that both share one OpenMP runtime

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Stage 1, without training: leaf cells, signed distances at their corners, evidence, and closed-form reflectance."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Checkpoints of a fit. A resumed fit is bit-identical to an uninterrupted one."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Estimates of the memory and time of a fit, its skipped parts, and checks of its feasibility."""
 
 from __future__ import annotations

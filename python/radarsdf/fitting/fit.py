@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Entry point of fitting: checks the input and converts it to rays."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Losses and gradients of a batch, by the compiled core or by PyTorch's autograd.
 
 :class:`AutogradGradients` is the reference: PyTorch differentiates the losses of this module. Only it supports

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Optimisers: Adam (Kingma and Ba, ICLR 2015) by PyTorch, sparse Adam for touched feature rows, SOAP for networks."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Sampling of labelled points on rays, on demand."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Batch sizes and iterations of a fit, from the configuration and the size of the data."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Stage 2: training of a field. First the surface, then reflectance on the frozen surface."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """File formats of grids: OctoMap's binary octree, and ROS's map_server (YAML and PGM)."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Voxel grid of a box of the world, occupied, free and unknown, and the quantities that planners derive from it."""
 
 from __future__ import annotations

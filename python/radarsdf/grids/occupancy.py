@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Conversion of a map to a grid: occupied where a surface is probable, free only where rays crossed."""
 
 from __future__ import annotations

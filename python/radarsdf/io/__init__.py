@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Reads and writes files of scans, poses, point clouds and meshes."""
 
 from radarsdf.imu import Imu

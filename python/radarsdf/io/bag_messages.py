@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Message streams of ROS 1 and ROS 2 bags, without ROS: scans, poses and inertial measurements.
 
 Message types are those of rosbags and the definitions below, never those in a bag: rosbags generates Python code from

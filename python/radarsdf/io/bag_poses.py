@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Poses of the scans in a bag: from odometry, stamped poses, a path, or the tree of transforms (TF)."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scans, poses and inertial measurements from bags: choice of topics and clocks, and streaming in bounded memory."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Write all returns of all scans as one point cloud in the world frame; also the parts of PLY files."""
 
 from __future__ import annotations

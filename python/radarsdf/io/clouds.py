@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Readers of point cloud files: PCD, PLY, KITTI's .bin, NumPy, text, LAS and LAZ. All return named columns."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Published data sets, recognised by the layout of their folders; `DATASETS` lists them.
 
 Each reader states where the scans, the poses and the pose of the radar on its platform are. Arguments of

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Roles of the fields of a radar's point cloud: the names that sensors use, and the returns of a scan."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Atomic writes of files, locks of folders, and the limit of float32 coordinates."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """LZF decompression, for the PCD files that PCL calls ``binary_compressed``."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Read and write meshes, in double precision if the format has it; read ground truth of any kind."""
 
 from __future__ import annotations

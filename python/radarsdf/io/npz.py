@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scans in ``.npz`` files, and arrays in ``.npy`` and ``.npz`` files of any kind."""
 
 from __future__ import annotations

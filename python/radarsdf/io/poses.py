@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Poses by time and in files: tables with named columns, TUM, KITTI, and 4 x 4 matrices; matching to scans."""
 
 from __future__ import annotations

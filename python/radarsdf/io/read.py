@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Read scans from files, folders and bags of any supported kind."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Build scans with poses from the files of a recording.
 
 Each format yields :class:`RawScan`; :func:`posed` finds the pose of each, reads its columns, and assigns their

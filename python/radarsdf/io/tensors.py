@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Safetensors files whose arrays are read on demand."""
 
 from __future__ import annotations

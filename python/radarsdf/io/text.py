@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Tables of numbers in text files, without silent loss of lines, and the units of their columns."""
 
 from __future__ import annotations

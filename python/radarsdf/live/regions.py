@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Columns of cells, partitioned into regions of 64³ leaf cells for local access near changes."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Files of a live map: scans and regions moved out of memory, and its saved state."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Surface of a live map: a quick fit of the sums, updated incrementally."""
 
 from __future__ import annotations

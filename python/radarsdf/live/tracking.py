@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Online tracking: registers scans without poses with the last ones, predicted by Doppler or the motion so far."""
 
 from __future__ import annotations

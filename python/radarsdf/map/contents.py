@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The contents of a map, shared by its file, its queries and its mesh."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The interface of maps: public queries, and the abstract methods behind them."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Marching cubes: triangle meshes of level sets of sampled fields, differentiable for tensors.
 
 A cell is a cube of eight neighbouring samples; corner ``4 * dx + 2 * dy + dz`` has the offset ``(dx, dy, dz)`` from the

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Mesh extraction: distances at the corners of voxels, triangles, and filtering by evidence."""
 
 from __future__ import annotations

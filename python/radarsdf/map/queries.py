@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Queries of a map at positions (N, 3) float32, local frame, m: the one place that evaluates the field."""
 
 from __future__ import annotations

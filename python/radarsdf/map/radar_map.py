@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The map that a fit returns, stored in one file."""
 
 from __future__ import annotations

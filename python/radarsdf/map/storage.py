@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Serialisation of a map to a safetensors file, and to a pickle."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Limits of the triangles that a mesh keeps, and the confidence threshold of the highest expected F-score."""
 
 from __future__ import annotations

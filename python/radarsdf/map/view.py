@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Predicted scans: the returns of a radar at a pose, and the first surface along its beams."""
 
 from __future__ import annotations

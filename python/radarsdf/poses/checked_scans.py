@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Validation of scans, times and Doppler: shapes, values and units."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Velocities of the sensor from Doppler, and the motion between scans that they imply."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Tests of Doppler against returns: the scale of its speeds, and its delay."""
 
 from __future__ import annotations

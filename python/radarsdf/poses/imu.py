@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Rotations from a gyroscope, and the alignment of an IMU with a radar: axes, vertical, and time offset.
 
 Changes of the Doppler velocity match the accelerometer once the gyroscope rotates both into one frame. With R the rotation

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Motion between scans: priors, predictions, and measurements."""
 
 from __future__ import annotations

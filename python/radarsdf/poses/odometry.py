@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Radar odometry: poses of scans from returns, Doppler and an IMU."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Refined or estimated poses for maps and reports."""
 
 from __future__ import annotations

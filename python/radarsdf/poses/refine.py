@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Joint estimation of the poses of all scans, from common planes and measured motion."""
 
 from __future__ import annotations

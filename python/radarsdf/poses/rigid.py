@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Rigid motions: increments of poses, relative motions, and alignment of trajectories."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Tracking of a drive without poses: each scan is registered with the planes of the previous ones."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Figures by matplotlib, an extra: views, grids and trajectories. They need no display and do not change its settings."""
 
 from __future__ import annotations

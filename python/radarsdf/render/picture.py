@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Ray-cast pictures of a mesh, which need no display and no OpenGL."""
 
 from __future__ import annotations

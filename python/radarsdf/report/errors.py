@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Errors of surface, uncertainty and intensity."""
 
 from __future__ import annotations

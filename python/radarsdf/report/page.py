@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Write pages from the templates in `templates/`, which hold all prose. Jinja escapes every value."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Subject of a report: a map and the data it is compared with."""
 
 from __future__ import annotations

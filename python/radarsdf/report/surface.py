@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Pictures of the surface, and the 3D scene."""
 
 from __future__ import annotations

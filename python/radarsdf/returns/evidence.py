@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Evidence of a surface in each leaf cell, and the leaf cells that bridge gaps."""
 
 from __future__ import annotations

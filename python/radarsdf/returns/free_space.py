@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Free-space crossings: the leaf cells that rays crossed before their returns."""
 
 from __future__ import annotations

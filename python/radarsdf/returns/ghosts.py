@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Detection of ghosts: returns behind a surface that their rays crossed.
 
 A mirror, such as a metal wall, reflects the radar's beam to an object. The radar places the object behind the

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Detection of intensity outliers, and the scale of the inliers."""
 
 from __future__ import annotations

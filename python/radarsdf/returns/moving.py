@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Velocity of the sensor from the Doppler of a scan, and moving returns.
 
 A static return in direction d of a sensor with velocity v has the Doppler ``-d·v``, negative where the sensor approaches.

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Noise of the sensor, estimated from its returns, and noise reduction by moving returns onto planes."""
 
 from __future__ import annotations

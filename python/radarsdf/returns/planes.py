@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Surfels: planes fitted to the returns of a cell and its neighbourhood."""
 
 from __future__ import annotations

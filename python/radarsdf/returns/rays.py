@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Validation of radar scans and their conversion to rays in one local frame."""
 
 from __future__ import annotations

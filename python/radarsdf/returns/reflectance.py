@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Closed-form intensities: a regression on the terms of the radar equation, plus cell means of its residuals."""
 
 from __future__ import annotations

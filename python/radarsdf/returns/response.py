@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Robust regression of intensity on range, elevation and incidence, independent of the place."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Sensor model: field of view, resolution, detection threshold and noise, estimated from scans."""
 
 from __future__ import annotations

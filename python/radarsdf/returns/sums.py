@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Integer sums over the returns of each leaf cell, and mean rays computed from them."""
 
 from __future__ import annotations

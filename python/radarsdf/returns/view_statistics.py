@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """View statistics of intensity: mean intensities by place and view, comparable between maps."""
 
 from __future__ import annotations

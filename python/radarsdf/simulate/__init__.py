@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Simulated radar scans of worlds whose true surface is known.
 
 `SCENES` holds the ready-made simulations by name. `simulate` scans your own `Scene` with a `RadarSensor`.

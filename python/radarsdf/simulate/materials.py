@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Radar properties of surfaces: strength of the echo, its angular dependence, and its fading."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Measurements of a radar, a gyroscope and an IMU on a simulated drive, and drifting poses."""
 
 from __future__ import annotations

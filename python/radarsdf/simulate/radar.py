@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Radar sensor model: radar equation, speckle, noise in range and angle, detection threshold and false returns."""
 
 from __future__ import annotations

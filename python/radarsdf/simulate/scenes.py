@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Ready-made simulations: a lane among buildings, a sports court, a corner reflector on a wall, and a street."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Radar scans of a scene from given poses, and lidar points of the same scene as ground truth."""
 
 from __future__ import annotations

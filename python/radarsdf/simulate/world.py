@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """A world of ground and solids: exact ray hits, signed distances, and the echoes of hits.
 
 World frame: z up, m. Signed distances are positive in free space and negative inside a solid.

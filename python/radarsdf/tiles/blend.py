@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The fields of many tiles blended into one, with few tiles in memory."""
 
 from __future__ import annotations

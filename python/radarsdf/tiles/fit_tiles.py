@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Fits of maps of any size: scans to tiles, a fit per tile, and one map."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Mesh of a tiled map: one part per tile, cut on the common lattice, so that parts fit to the bit."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Plan of a tiled map: one JSON file shared by all tasks, and the paths of the tiles' files."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Planning: one pass over the scans that writes the rays crossing each tile to its file."""
 
 from __future__ import annotations

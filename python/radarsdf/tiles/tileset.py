@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Mesh of a tiled map as 3D Tiles 1.1 (Open Geospatial Consortium, 22-025r4): a GLB file per tile, and a JSON file."""
 
 from __future__ import annotations

@@ -1,3 +1,1 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """The viewer in the browser: the surface, the scans, and a sensor to drag. It needs the extra `view`."""

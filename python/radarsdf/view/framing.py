@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Camera poses from which a whole mesh is visible and fills the frame."""
 
 from __future__ import annotations

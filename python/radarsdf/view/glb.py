@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """GLB encoding of coloured meshes, the one format in which viser takes vertex colours, and compensation of tone mapping."""
 
 from __future__ import annotations

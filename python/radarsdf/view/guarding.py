@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Refuse requests from other web pages in the same browser, which could reach this machine, even by DNS rebinding.
 
 Browsers report the requested name as `Host`, and the requesting page as `Origin`.

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Quantities that can colour the surface, and legends as HTML."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Scene of a viewer's page: the surface and one scan, redrawn by a thread from the newest state of the controls.
 
 viser takes vertex colours only with a whole mesh, which is too much for each step of a drag and leaves the page blank

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Server of a page and its address. The only module that imports viser."""
 
 from __future__ import annotations

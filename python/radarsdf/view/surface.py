@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Surface of a page, thinned to what a browser can draw, and hits of clicks on it."""
 
 from __future__ import annotations

@@ -1,5 +1,3 @@
-# SPDX-FileCopyrightText: 2026 the radarsdf authors
-# SPDX-License-Identifier: MIT
 """Interactive viewer of a map in the browser."""
 
 from __future__ import annotations
