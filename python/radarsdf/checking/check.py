@@ -16,7 +16,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import measured, too_far
 from radarsdf.scans import Scans, filled
 
-_RANGE_DECIMALS = 3  # float32 resolves 4 mm at 65,535 m
+_EQUAL = 1e-6  # relative difference of equal ranges, from float32
 _NEXT, _LEAST_EQUAL, _ABOVE_NEXT = (
     10,
     8,
