@@ -11,17 +11,18 @@ from radarsdf import LiveMap
 
 from bench.live.removal import state
 
-from .test_live_map import SCENE, mesh_bits
+from .test_live_map import mesh_bits
 
 PACKAGE = str(pathlib.Path(radarsdf.__file__).parent / "live")
-POINTS = [points[::20] for points in SCENE.points]
+SCENE = radarsdf.simulate.wall(frames=6)
+POINTS = [points[::8] for points in SCENE.points]
 ORIGIN = SCENE.poses[0, :3, 3]
 
 
 def live_map(ids=range(4), **settings):
     live = LiveMap(origin=[0, 0, 0], **settings)
     for i in ids:
-        live.integrate(POINTS[i], SCENE.poses[i], time_s=i)
+        live.integrate(POINTS[i], SCENE.poses[i], time_s=SCENE.times_s[i])
     return live
 
 
@@ -53,7 +54,7 @@ def interrupted(change, line):
     ("change", "stored"),
     [
         (lambda live: live.integrate(POINTS[4], SCENE.poses[4]), True),
-        (lambda live: live.integrate(POINTS[3], time_s=4), False),
+        (lambda live: live.integrate(POINTS[4], time_s=SCENE.times_s[4]), False),
         (lambda live: live.remove(1), True),
         (lambda live: live.move(1, SCENE.poses[2]), False),
         (lambda live: live.clear_outside(ORIGIN, 1.0), True),

@@ -163,19 +163,17 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
 
 def _far(recording: Scans, returns: list[NDArray[np.bool_]], num_far: int) -> Iterator[Finding]:
     """Report returns that a fit leaves out as too far away, and a farthest range that is much too frequent."""
-    ranges = [
+    lengths = [
         np.linalg.norm(scan[mask], axis=1) for scan, mask in zip(recording.points, returns, strict=True)
     ]
-    levels, counts = np.unique(
-        np.concatenate(ranges).astype(np.float64).round(_RANGE_DECIMALS), return_counts=True
-    )
+    ranges = np.concatenate(lengths)
+    most = ranges.max(initial=0.0)
+    counts = np.unique((np.log(ranges / most) / _EQUAL).round(), return_counts=True)[1]
     if num_far:
-        evidence = f"{num_far} of {counts.sum()} returns are beyond 100 times the median range of their scan."
+        evidence = f"{num_far} of {len(ranges)} returns are beyond 100 times the median range of their scan."
         yield Finding("far_returns", "note", evidence)
-    if len(levels) > _NEXT and counts[-1] > _LEAST_EQUAL + _ABOVE_NEXT * counts[-1 - _NEXT : -1].max():
-        evidence = (
-            f"{counts[-1]} of {counts.sum()} returns are at exactly the largest range, {levels[-1]:g} m."
-        )
+    if len(counts) > _NEXT and counts[-1] > _LEAST_EQUAL + _ABOVE_NEXT * counts[-1 - _NEXT : -1].max():
+        evidence = f"{counts[-1]} of {len(ranges)} returns are at exactly the largest range, {most:g} m."
         yield Finding("range_sentinel", "warning", evidence)
 
 
