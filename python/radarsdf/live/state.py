@@ -29,6 +29,7 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
+_Scans = dict[ScanId, LoggedScan]
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # placeholder until it is estimated from scans
 _NOISE_RETURNS = 100_000  # sample for the noise, enough to include the required returns on flat surfels
 
@@ -77,12 +78,7 @@ class GrowingState:
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
-    def exchange(
-        self,
-        come: dict[ScanId, LoggedScan],
-        gone: Iterable[ScanId],
-        **new: Any,
-    ) -> Keys:
+    def exchange(self, come: _Scans, gone: Iterable[ScanId], **new: Any) -> Keys:
         """Remove and insert scans, possibly of the same ids, atomically. Return the keys of the changed blocks.
 
         `new`: attributes to set with them.
@@ -90,28 +86,22 @@ class GrowingState:
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         new = {"origin": self.origin, "log": self.log.exchanged(come, left)} | new
         before = {name: getattr(self, name) for name in new}
-        blocks = self._apply(come, left, new["origin"], new)
+        blocks = self._apply(come, left, new)
         try:
             if come:
                 self._bound()
         except BaseException:  # such as a full disk
-            self._apply(left, come, new["origin"], before)
+            self._apply(left, come, before)
             raise
         before["log"].unlink(left)
         return blocks
 
-    def _apply(
-        self,
-        come: dict[ScanId, LoggedScan],
-        gone: dict[ScanId, LoggedScan],
-        origin: NDArray[np.float64] | None,
-        new: dict[str, Any],
-    ) -> Keys:
+    def _apply(self, come: _Scans, gone: _Scans, new: dict[str, Any]) -> Keys:
         """Change the sums and set attributes atomically. Return the keys of the changed blocks."""
         change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
         for scans, sign in ((gone, -1), (come, 1)):
             for scan in scans.values():
-                rays = _rays_of([scan], self.config, origin)
+                rays = _rays_of([scan], self.config, self.origin if new["origin"] is None else new["origin"])
                 change.collect(rays.points, rays.directions, rays.ranges_m, sign)
         self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
         return self._commit(partial(self.sums.apply, change), None, **new)

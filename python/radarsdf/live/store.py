@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -258,11 +258,9 @@ class RegionStore:
 
 def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write a file in the locked folder. It is used only once it is complete, so that it needs no temporary one."""
-    try:
-        with path.open("wb") as file:
-            np.savez(file, **arrays)
-    except OSError as error:  # a full disk names no file
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    save: Callable[..., None] = np.savez
+    with path.open("wb") as file:
+        save(file, **arrays)
 
 
 def _sums_of(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], ...]:

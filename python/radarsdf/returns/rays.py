@@ -122,7 +122,8 @@ def too_far(scan: NDArray[Any], returns: NDArray[np.bool_]) -> NDArray[np.bool_]
         ordered = ordered[np.diff(ordered, prepend=0.0) > _SAME_SQUARE * ordered]
         while ordered[-1] > (most := _MOST_RATIO**2 * ordered[len(ordered) // 2]):
             ordered = ordered[ordered <= most]
-        return returns & (squares > ordered[-1] * (1 + _SAME_SQUARE))
+        far: NDArray[np.bool_] = returns & (squares > ordered[-1] * (1 + _SAME_SQUARE))
+        return far
     return np.zeros(len(scan), np.bool_)
 
 
