@@ -22,7 +22,7 @@ ORIGIN = SCENE.poses[0, :3, 3]
 def live_map(ids=range(4), **settings):
     live = LiveMap(origin=[0, 0, 0], **settings)
     for i in ids:
-        live.integrate(POINTS[i], SCENE.poses[i], time_s=SCENE.times_s[i])
+        live.integrate(POINTS[i], SCENE.poses[i], time_s=0.1 * i)
     return live
 
 
@@ -54,7 +54,7 @@ def interrupted(change, line):
     ("change", "stored"),
     [
         (lambda live: live.integrate(POINTS[4], SCENE.poses[4]), True),
-        (lambda live: live.integrate(POINTS[4], time_s=SCENE.times_s[4]), False),
+        (lambda live: live.integrate(POINTS[4], time_s=0.4), False),
         (lambda live: live.remove(1), True),
         (lambda live: live.move(1, SCENE.poses[2]), False),
         (lambda live: live.clear_outside(ORIGIN, 1.0), True),

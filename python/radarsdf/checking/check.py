@@ -17,11 +17,8 @@ from radarsdf.returns.rays import measured, too_far
 from radarsdf.scans import Scans, filled
 
 _EQUAL = 1e-6  # relative difference of equal ranges, from float32
-_NEXT, _LEAST_EQUAL, _ABOVE_NEXT = (
-    10,
-    8,
-    5,
-)  # equal largest ranges: as many as this, and as times the next levels have
+# A largest range is too frequent if more than 8 returns, and 5 times as many as at each of the next 10 ranges, have it.
+_NEXT, _LEAST_EQUAL, _ABOVE_NEXT = 10, 8, 5
 
 
 def check(
@@ -131,7 +128,8 @@ def _of_poses(
 
 def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
     """Findings about unusable rows, scans and poses, the recording without them, and the numbers (F,) of its scans."""
-    found, numbers = [], np.arange(len(recording))
+    found: list[Finding] = []
+    numbers = np.arange(len(recording))
     returns = [measured(scan) for scan in recording.points]
     far = [too_far(*each) for each in zip(recording.points, returns, strict=True)]
     found += _far(recording, returns, sum(int(mask.sum()) for mask in far))
