@@ -7,6 +7,7 @@ from radarsdf.evaluation import KNNIntensity, holdout
 from radarsdf.returns import intensities as plausible
 from radarsdf.returns import reflectance
 from radarsdf.returns.intensities import Intensities, Plausible
+from radarsdf.returns.sampling import hashes
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.reflectance import Reflectance
@@ -213,9 +214,10 @@ def test_limits_of_parts_equal_those_of_the_whole(monkeypatch, most):
     intensities = decibels(np.random.default_rng(0)).astype(np.float32)
     intensities[12_345] = 1e9  # a sample may miss it
     parts = Intensities()
-    for part in np.split(intensities, [10, 10, 3000, 9001]):
-        parts.add(part)
+    keys = hashes(np.arange(len(intensities), dtype=np.uint32))
+    for rows in np.split(np.arange(len(intensities))[::-1], [10, 10, 3000, 9001]):
+        parts.add(intensities[rows], keys[rows])
     found = parts.plausible()
-    assert found == Plausible.of(intensities)
+    assert found == Plausible.of(intensities, keys)
     assert np.flatnonzero(~found.holds(intensities)).tolist() == [12_345]
     assert (parts.low, parts.high) == (45, 1e9)

@@ -216,7 +216,8 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
 
     def network(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
         sensors = torch.from_numpy(points - directions * ranges_m[:, None])
-        return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
+        places = torch.from_numpy(points)
+        return scale.to_unit(queries.intensity(contents, places, sensors, extrapolate=True).numpy())
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
     ask = network if contents.config.trains_intensity else None

@@ -154,7 +154,9 @@ class Sensor:
         if len(rays) == 0:
             msg = "no return lies within the ranges: a sensor cannot be estimated from its scans"
             raise ValueError(msg)
-        return cls.of_rays(rays.without_outliers(), poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise)
+        return cls.of_rays(
+            rays.without_outliers(), poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise
+        )
 
     @classmethod
     def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
