@@ -121,7 +121,7 @@ class _Planner:
                 msg = f"either all scans have intensities, or none has: scan {number} is not like those before it"
                 raise ValueError(msg)
             self._with_intensities = has
-            self._samples.append((zlib.crc32(np.ascontiguousarray(scan.points)), scan))
+            self._samples.append((zlib.crc32(np.asarray(scan.points).tobytes()), scan))
             self._samples = sorted(self._samples, key=itemgetter(0))[:_SENSOR_SCANS]
         rays = self._rays(scans, first)
         poses = np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans])
