@@ -155,7 +155,9 @@ def _poses(words: list[str]) -> NDArray[np.float64]:
     except ValueError:
         path = Path(" ".join(words))
         found: Any = read_poses(path, Notes(str(path)))
-        poses = found.poses(found.times_s) if isinstance(found, Trajectory) else found
+        poses = (
+            found.poses(found.times_s) if isinstance(found, Trajectory) else getattr(found, "matrices", found)
+        )
         return np.asarray(poses[np.isfinite(poses).all(axis=(1, 2))])
     refuse_if(len(numbers) not in (3, 7), "--pose takes x y z, x y z qx qy qz qw, or a file")
     return pose_matrices_of(np.array([numbers if len(numbers) == 7 else [*numbers, 0, 0, 0, 1]]))

@@ -31,7 +31,7 @@ from radarsdf.io.bag_messages import (
     topics_with,
 )
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
-from radarsdf.io.poses import UNPOSED, Poses, poses_of
+from radarsdf.io.poses import UNPOSED, NumberedPoses, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
 from radarsdf.scans import Scans
 
@@ -85,7 +85,7 @@ def _user_poses(
     request: Request,
 ) -> FindPoses:
     """Poses passed by the user: in the order of the scans, or by time, of the most frequent frame among the first scans."""
-    if isinstance(poses, np.ndarray):
+    if isinstance(poses, (np.ndarray, NumberedPoses)):
         count = topics[0].num_messages if len(topics) == 1 else sum(1 for _ in raw_scans())
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
         return lambda _: numbered_poses

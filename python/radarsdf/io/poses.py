@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -17,7 +18,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, pose_matrices, real_array
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import SCALES, in_seconds, read_numbers, read_table, without_unit
+from radarsdf.io.text import in_seconds, read_numbers, read_table
+from radarsdf.io.units import factor_of, without_unit
 from radarsdf.scans import Columns, Notes
 
 MAX_GAP_S = 0.5  # longest gap to interpolate across, by default
@@ -29,6 +31,7 @@ FIND_POSES = "radarsdf poses estimates them from the radar alone"  # ends messag
 
 _MAX_NORM_ERROR = 1e-2  # tolerance for unit quaternions: three digits suffice, other columns are refused
 _ROUNDING_S = 1e-3
+_MAX_NUMBER = 1e9  # limit of numbers of scans; larger integers are times since 1970
 
 _POSITION = "(?:t|p|pos|position|trans|translation|loc|location|pose)"
 _QUATERNION = "(?:q|quat|quaternion|orientation|rot|rotation)"
@@ -106,10 +109,23 @@ class TransformChain:
         return ", ".join(link.span() for link in self.links if not isinstance(link, np.ndarray))
 
 
+@dataclass(frozen=True, eq=False)
+class NumberedPoses:
+    """P poses T_world_sensor with the numbers of their scans, which may have gaps."""
+
+    numbers: NDArray[np.int64]  # (P,)
+    matrices: NDArray[np.float64]  # (P, 4, 4)
+
+    def of(self, numbers: Sequence[int]) -> NDArray[np.float64]:
+        """T_world_sensor (F, 4, 4) of scans; NaN for those without a pose."""
+        rows = dict(zip(self.numbers.tolist(), self.matrices, strict=True))
+        return np.array([rows.get(number, np.full((4, 4), np.nan)) for number in numbers])
+
+
 StampedPoses: TypeAlias = Trajectory | TransformChain
 
-Poses: TypeAlias = StampedPoses | NDArray[np.float64]
-"""Poses by time, or (F, 4, 4) in the order of the scans."""
+Poses: TypeAlias = StampedPoses | NumberedPoses | NDArray[np.float64]
+"""Poses by time, by number of the scan, or (F, 4, 4) in the order of the scans."""
 
 UNPOSED: StampedPoses = TransformChain(())
 """Passed as `poses`, reads scans without poses, such as for :func:`radarsdf.odometry`: each pose is the identity."""
@@ -183,6 +199,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     - KITTI: lines of twelve numbers, the first three rows of a matrix. If ``calib.txt`` next to it has a ``Tr``,
       T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
+    - Lines of a number of a scan, or a time, and one of these matrices.
 
     Times may be in ms, µs or ns since 1970, or in the unit of their column's name.
     """
@@ -195,44 +212,69 @@ def read_poses(path: Path, notes: Notes) -> Poses:
         check(len(values), "it has no rows of numbers")
     heads = [head for head in reversed(table.heads) if len(head) == width]
     for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
-        columns = _pose_columns(names, values)
+        with reading(path, "a table of poses"):
+            columns = _pose_columns(names, values)
         if columns:
             return _from_columns(columns, path, notes)
-    if width == 12:
-        poses = np.tile(np.eye(4), (len(values), 1, 1))
-        poses[:, :3] = values.reshape(-1, 3, 4)
-        P = rigid_or_nan(poses, str(path), notes)
-        calibration = path.with_name("calib.txt")
-        Tr = read_calibration(calibration) if calibration.is_file() else None
-        found = (
-            "are camera poses, by Tr of calib.txt"
-            if Tr is not None
-            else "are taken as T_world_sensor: no calib.txt"
-        )
-        notes.add(f"{path.name}: KITTI poses {found}")
-        return P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
-    if width == 16 or (width == 4 and len(values) % 4 == 0):
-        return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
+    names = heads[0] if heads else [""] * width
+    units = [without_unit(name)[1] for name in names]
+    lead, values = (values[:, 0], values[:, 1:]) if width in (13, 17) else (None, values)
+    with reading(path, "a table of poses"):
+        for at in (3, 7, 11) if values.shape[1] in (12, 16) else ():
+            values[:, at] *= factor_of(units[at - len(names)], "length", names[at - len(names)])
+    if values.shape[1] in (12, 16) or (width == 4 and len(values) % 4 == 0):
+        rows = values.reshape(-1, 3 if values.shape[1] == 12 else 4, 4)
+        P = np.tile(np.eye(4), (len(rows), 1, 1))
+        P[:, : rows.shape[1]] = rows
+        P = rigid_or_nan(P, str(path), notes)
+        if rows.shape[1] == 3:
+            calibration = path.with_name("calib.txt")
+            Tr = read_calibration(calibration) if calibration.is_file() else None
+            known = "are camera poses, by Tr of calib.txt"
+            found = "are taken as T_world_sensor: no calib.txt" if Tr is None else known
+            notes.add(f"{path.name}: KITTI poses {found}")
+            P = P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
+        return P if lead is None else _led_by(lead, P, path, notes)
     msg = f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
     raise ValueError(msg)
 
 
+def _led_by(lead: NDArray[np.float64], P: NDArray[np.float64], path: Path, notes: Notes) -> Poses:
+    """Poses by the first column of a table: numbers of scans if it holds small integers, else times."""
+    known = np.isfinite(lead) & np.isfinite(P).all(axis=(1, 2))
+    numbers = np.where(known, lead, 0)
+    if (numbers == numbers.round()).all() and (np.abs(numbers) < _MAX_NUMBER).all():
+        notes.add(f"the first column of {path.name} is taken as the number of the scan")
+        return NumberedPoses(numbers[known].astype(np.int64), P[known])
+    table = np.full((len(P), 8), np.nan)
+    quaternions = Rotation.from_matrix(P[known, :3, :3]).as_quat()
+    table[known] = np.column_stack([in_seconds(lead[known], path.name, notes), P[known, :3, 3], quaternions])
+    return trajectory_of(table, str(path), notes)
+
+
 def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
-    """Columns by role, times in s; empty if the names are not those of a pose."""
-    found: Columns = {}
+    """Columns by role, in s and m; empty if the names are not those of a pose."""
+    found: dict[str, tuple[str, str, NDArray[np.float64]]] = {}
     for name, column in zip(names, table.T, strict=True):
         bare, unit = without_unit(name)
         words = re.sub(r"[\W_]+", " ", bare).strip()
         for pattern, template in _ROLES:
             if match := re.fullmatch(pattern, words):
-                role = template.format(*match.groups())
-                found.setdefault(role, column * SCALES.get(unit, 1.0) if role in _TIMES else column)
+                found.setdefault(template.format(*match.groups()), (name, unit, column))
                 break
+    if not set(_TUM[1:]) <= set(found):
+        return {}
+
+    def scaled(role: str, dimension: str) -> NDArray[np.float64]:
+        name, unit, column = found[role]
+        return column * factor_of(unit, dimension, name)
+
+    columns = {role: scaled(role, "length") for role in "xyz"} | {role: found[role][2] for role in _TUM[4:]}
     if {"sec", "nsec"} <= set(found):
-        found["time"] = found["sec"] + 1e-9 * found["nsec"]
-    elif times := [found[name] for name in (*_TIMES, "sec") if name in found]:
-        found["time"] = times[0]
-    return found if set(_TUM[1:]) <= set(found) else {}
+        columns["time"] = found["sec"][2] + 1e-9 * found["nsec"][2]
+    elif times := [name for name in (*_TIMES, "sec") if name in found]:
+        columns["time"] = scaled(times[0], "time")
+    return columns
 
 
 def _from_columns(columns: Columns, path: Path, notes: Notes) -> Poses:

@@ -7,9 +7,11 @@ roles. Unusable data are counted in the notes, and never abort the reading. Fold
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +19,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check
-from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
+from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, check_kitti, read_columns, read_points
 from radarsdf.io.fields import Fields
 from radarsdf.io.files import reading
+from radarsdf.io.name_times import times_in
 from radarsdf.io.poses import (
     FIND_POSES,
     MAX_GAP_S,
     POSE_FILES,
     NoPoses,
+    NumberedPoses,
     Poses,
     Trajectory,
     TransformChain,
     poses_of,
     read_transform,
 )
-from radarsdf.io.text import in_seconds, read_numbers, unit_since_1970
+from radarsdf.io.text import in_seconds, read_numbers, read_table
+from radarsdf.io.units import factor_of, without_unit
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
 BASE_T_RADAR = "base_T_radar.txt"
@@ -42,8 +47,6 @@ TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.t
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, "calib.txt", BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
-_SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
-_TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
 Truth = Callable[[], NDArray[np.float64] | None]
 """Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
@@ -159,6 +162,8 @@ def scan_poses(
 ) -> tuple[Poses, Sequence[float] | None]:
     """Return the poses T_world_sensor of `count` scans, and their times, s, if known."""
     about = request.notes.about
+    if isinstance(poses, NumberedPoses):
+        poses = _by_number(poses, range(count), request.notes)
     if isinstance(poses, np.ndarray):
         what = "give as many, or poses with time stamps for scans with time stamps"
         check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
@@ -178,7 +183,7 @@ def scan_poses(
 
 def read_folder(folder: Path, request: Request) -> Scans:
     """Read the scans of a folder; see :func:`radarsdf.io.read`."""
-    return read_files(cloud_files(folder), folder, request, partial(lidar_map, folder))
+    return read_files(cloud_files(folder, request.notes), folder, request, partial(lidar_map, folder))
 
 
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
@@ -215,18 +220,43 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     return Scans.of_source(source, notes, truth)
 
 
-def cloud_files(folder: Path) -> list[Path]:
-    """Files of scans in a folder or its subfolder of `SCAN_FOLDERS`, in natural order: those of the most frequent suffix."""
+def cloud_files(folder: Path, notes: Notes) -> list[Path]:
+    """Files of scans in a folder or its subfolder of `SCAN_FOLDERS`, in natural order: the longest series of one suffix.
+
+    Notes and labels next to them are left out: text named as a scan, and single files whose names are unlike the others.
+    """
+    text: list[Path] = []
     for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
         kinds: dict[str, list[Path]] = {}
         for path in inner.iterdir() if inner.is_dir() else ():
             other = path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM or path.name.startswith(".")
             if path.suffix.lower() in CLOUD_SUFFIXES and not other and path.is_file():
                 kinds.setdefault(path.suffix.lower(), []).append(path)
-        if kinds:
-            most = max(kinds.values(), key=len)
-            return sorted(most, key=natural)
-    return []
+        clouds = {
+            path.stem for suffix, paths in kinds.items() if suffix not in TEXT_SUFFIXES for path in paths
+        }
+        found = []
+        for suffix, paths in kinds.items():
+            labels = clouds if suffix in TEXT_SUFFIXES else ()
+            words = Counter(map(_words, kept := [path for path in paths if path.stem not in labels]))
+            found.append((max(words.values(), default=0), suffix not in TEXT_SUFFIXES, kept, words))
+        length, is_cloud, kept, words = max(found, key=itemgetter(0, 1), default=(0, False, text, Counter()))
+        if 2 * length > len(kept) > 2:
+            odd = [path for path in kept if words[_words(path)] == 1]
+            kept = [path for path in kept if path not in odd]
+            if odd:
+                notes.add(
+                    f"{len(odd)} files left out: their names are unlike those of the scans; the first: {odd[0]}"
+                )
+        if is_cloud or length > 1:
+            return sorted(kept, key=natural)
+        text = text or kept
+    return sorted(text, key=natural)
+
+
+def _words(path: Path) -> str:
+    """Letters of the name of a file: those of scans differ only in their digits."""
+    return re.sub(r"[\d\W_]+", "", path.stem)
 
 
 def natural(path: Path) -> tuple[Any, ...]:
@@ -247,30 +277,55 @@ def _in_order_of_time(
     """Sort scans by time; return files, times, s, or None if there are none, and poses."""
     # Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
     # file of times.
-    times = [time for path in files if (time := _time_in(path.stem)) is not None]
+    times = times_in([path.stem for path in files], notes)
     listed = None
-    if len(set(times)) < len(files):
+    if times is None:
+        if isinstance(poses, NumberedPoses):
+            poses = _by_number(poses, _numbers_in(files), notes)
         places = [
             folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES
         ]
         listed = next((path for path in places if path.is_file()), None)
         if listed is None:
             return files, None, poses
-        table = read_numbers(listed)
-        numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1]
-        check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
-        times = in_seconds(numbers, listed.name, notes).tolist()
+        times = _listed_times(listed, notes)
+        check(len(times) == len(files), f"{listed} has {len(times)} times for {len(files)} scans")
     order = np.argsort(times, kind="stable")
     if listed is not None and isinstance(poses, np.ndarray) and len(poses) == len(files):
         poses = poses[order]
     return [files[i] for i in order], [times[i] for i in order], poses
 
 
-def _time_in(stem: str) -> float | None:
-    """Time, s, at the end of a name: in s with a point; in ms, µs or ns with at least 12, 15 or 18 digits; else None."""
-    if parts := _SECONDS_AND_NANOSECONDS.search(stem):
-        return int(parts[1]) + 1e-9 * int(parts[2])
-    found = _TIME.search(stem)
-    if found is None:
-        return None
-    return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
+def _listed_times(path: Path, notes: Notes) -> list[float]:
+    """Times, s, of a file with one line per scan, in the unit of their column's name, if it has one."""
+    table = read_numbers(path)
+    names = next((head for head in reversed(read_table(path).heads) if len(head) == table.shape[1]), [""])
+    with reading(path, "a list of times"):
+        factor = factor_of(without_unit(names[-1])[1], "time", names[-1])
+    numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1] * factor
+    return in_seconds(numbers, path.name, notes).tolist()
+
+
+def _numbers_in(files: list[Path]) -> Sequence[int]:
+    """Numbers of scans: the last ones in the names of their files that all differ, or else counted from 0."""
+    groups = [re.findall(r"\d+", path.stem) for path in files]
+    for place in range(1, min(map(len, groups)) + 1):
+        numbers = [int(group[-place]) for group in groups]
+        if len(set(numbers)) == len(files):
+            return numbers
+    return range(len(files))
+
+
+def _by_number(poses: NumberedPoses, numbers: Sequence[int], notes: Notes) -> NDArray[np.float64]:
+    """T_world_sensor (F, 4, 4) of the scans with these numbers; NaN for those without a pose, which are counted."""
+    if all(np.ptp(of) + 1 == len(numbers) == len(of) for of in (numbers, poses.numbers)):
+        numbers = np.sort(poses.numbers).tolist()  # one of them counts from 0, the other one from 1
+    matrices = poses.of(numbers)
+    missing = int(np.isnan(matrices[:, 0, 0]).sum())
+    check(
+        missing < len(numbers),
+        f"{notes.about}: no scan has a number of the poses, such as {poses.numbers[:3]}",
+    )
+    if missing:
+        notes.add(f"{missing} scans left out: there is no pose of their number")
+    return matrices
