@@ -10,7 +10,7 @@ import heapq
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from functools import cache
+from functools import cache, partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,8 @@ from radarsdf.checks import check
 from radarsdf.extras import require
 from radarsdf.io.files import check_regular_file
 from radarsdf.scans import Columns, Notes
+
+FloatArray = NDArray[np.float64]
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
@@ -123,9 +125,9 @@ def _point_cloud2(message: Any) -> Columns:
     check(fits, f"{height} x {width} points of {step} bytes do not fit into its {len(data)} bytes")
     columns: Columns = {}
     for field in message.fields:
-        kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")
-        check(field.offset + int(kind[1:]) <= step, f"its field {field.name} exceeds the size of a point")
-        if field.count > 1 or not field.name or field.name in columns:  # some drivers write 0 for 1
+        kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")  # a type that no role can have
+        known = field.offset + int(kind[1:]) <= step and field.count <= 1  # some drivers write 0 for 1
+        if not known or not field.name or field.name in columns:
             continue
         dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
         column = np.zeros(0, dtype)
@@ -296,15 +298,35 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
         notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
 
 
-def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes) -> bool:
-    """Whether record times replace the header stamps of `what`: if requested, or if the stamps are zero or constant."""
-    if wanted is not None:
-        return wanted == "record"
-    if stamps.any() and (len(stamps) == 1 or (stamps != stamps[0]).any()):
-        return False
-    why = "are constant" if stamps.any() else "are zero"
-    notes.add(f"the header stamps of {what} {why}: the record time is used instead")
-    return True
+class Clock(NamedTuple):
+    """Times of the messages of a topic."""
+
+    recorded: bool  # by record time, not by header stamp
+    delay_s: float  # from a stamp to its record
+    zeros: Callable[[], None]  # called for stamps of zero
+
+    @classmethod
+    def of(
+        cls, stamps_s: FloatArray, recorded_s: FloatArray, what: str, wanted: str | None, notes: Notes
+    ) -> Clock:
+        """Clock of messages: the one that is requested, or else the header stamps unless they are zero or constant."""
+        known = stamps_s[stamps_s != 0]
+        if wanted is None and (len(known) == 0 or (len(stamps_s) > 1 and np.ptp(stamps_s) == 0)):
+            why = "are constant" if len(known) else "are zero"
+            notes.add(f"the header stamps of {what} {why}: the record time is used instead")
+            wanted = "record"
+        delay_s = float(np.median((recorded_s - stamps_s)[stamps_s != 0])) if len(known) else np.nan
+        zero = f"header stamps of {what} are zero: record times less the usual delay, {delay_s:.3f} s, replace them"
+        return cls(wanted == "record", delay_s, partial(notes.add, zero))
+
+    def times(self, stamps_s: Any, recorded_s: Any) -> Any:
+        """Times, s, of one or several messages."""
+        if self.recorded:
+            return recorded_s
+        zero = np.equal(stamps_s, 0) & np.isfinite(self.delay_s)
+        if zero.any():
+            self.zeros()
+        return np.where(zero, recorded_s - self.delay_s, stamps_s)
 
 
 def _stream(

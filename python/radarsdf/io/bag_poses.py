@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf.checks import check
 from radarsdf.io.bag_messages import (
     PATH,
     POSE_TYPES,
     TRANSFORM_TYPES,
-    by_record,
+    Clock,
+    FloatArray,
     read_messages,
     topics_of,
     topics_with,
@@ -42,7 +44,22 @@ _DESIRED_POSE = re.compile(
 )
 _CONSTANT = 1e-9  # largest change of a constant transform that is published repeatedly
 
-FloatArray = NDArray[np.float64]
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Transforms T_parent_child (P, 4, 4) that each hold from their time, s, until the next one."""
+
+    times_s: FloatArray
+    matrices: FloatArray
+
+    def pose_at(self, time_s: float, _max_gap_s: float) -> FloatArray | None:
+        """T_parent_child (4, 4) at a time; None before the first one."""
+        before = int(np.searchsorted(self.times_s, time_s, "right")) - 1
+        return None if before < 0 else np.asarray(self.matrices[before])
+
+    def span(self) -> str:
+        """First and last time, for messages."""
+        return f"{self.times_s[0]} s on"
 
 
 @dataclass
@@ -63,13 +80,17 @@ class Track:
     @cached_property
     def constant(self) -> bool:
         """Whether all poses are the same."""
-        return self.static or bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
+        return bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
+
+    @property
+    def mounted(self) -> bool:
+        """Whether the frames do not move against each other, or only from one static transform to the next."""
+        return self.static or self.constant
 
     @cached_property
     def matrix(self) -> FloatArray:
         """T_parent_child (4, 4) of a constant transform."""
-        matrix: NDArray[np.float64] = pose_matrices_of(self.table[-1:, 2:])[0]
-        return matrix
+        return np.asarray(pose_matrices_of(self.table[-1:, 2:])[0])
 
     def trajectory(self, name: str, request: Request) -> Trajectory:
         """Trajectory of the poses. Damaged ones are left out and noted."""
@@ -78,8 +99,26 @@ class Track:
             request.notes.add(
                 f"poses of {name} left out: {damaged} of {count} are not finite, with a unit quaternion"
             )
-        clock = int(by_record(self.table[:, 0], name, request.stamps, request.notes))
-        return trajectory_of(self.table[:, [clock, *range(2, 9)]], name)
+        stamps_s, recorded_s = self.table[:, :2].T
+        times_s = Clock.of(stamps_s, recorded_s, name, request.stamps, request.notes).times(
+            stamps_s, recorded_s
+        )
+        return trajectory_of(np.column_stack([times_s, self.table[:, 2:]]), name)
+
+    def link(self, request: Request) -> StampedPoses | Held | FloatArray:
+        """T_parent_child: constant, static from one time to the next, or moving."""
+        name = f"TF from {self.parent} to {self.child}"
+        if self.constant:
+            return self.matrix
+        if not self.static:
+            return self.trajectory(name, request)
+        changed = np.abs(np.diff(self.table[:, 2:], axis=0)).max(axis=1) > _CONSTANT
+        table = self.table[np.r_[True, changed]]
+        by_stamp = request.stamps != "record" and (np.diff(table[:, 0]) > 0).all() and table[1, 0] > 0
+        times_s = np.r_[-np.inf, table[1:, 0 if by_stamp else 1]]
+        listed = ", ".join(f"{time_s:.3f} s" for time_s in times_s[1:4])
+        request.notes.add(f"{name} is static, and changes {len(times_s) - 1} times: at {listed}")
+        return Held(times_s, pose_matrices_of(table[:, 2:]))
 
 
 class TransformTree:
@@ -112,6 +151,11 @@ class TransformTree:
         (top, T_top_base), (other, T_top_sensor) = self.rigid_top(base), self.rigid_top(sensor)
         return np.linalg.inv(T_top_base) @ T_top_sensor if top == other else None
 
+    def mounted_on(self, frame: str) -> str:
+        """Return the highest frame that moves with this one, apart from changes of static transforms."""
+        chain = self.chain(frame)
+        return next(top for top in chain if top not in self.tracks or not self.tracks[top].mounted)
+
     def attach(self, poses: StampedPoses, base: str, request: Request) -> FindPoses:
         """Assign poses to `base` and to all frames below the highest one rigidly attached to it."""
         top, T_top_base = self.rigid_top(base)
@@ -135,20 +179,40 @@ class TransformTree:
 
         return find
 
-    def _links(
-        self, frame: str, world: str, request: Request
-    ) -> tuple[StampedPoses | FloatArray, ...] | None:
+    def _links(self, frame: str, world: str, request: Request) -> tuple[Any, ...] | None:
         """Transforms from the world down to a frame; None if there are none, or one of them has a single pose."""
-        links: list[StampedPoses | FloatArray] = []
         try:
             chain = self.chain(frame)
-            for child in reversed(chain[: chain.index(world)]):
-                track = self.tracks[child]
-                name = f"TF from {track.parent} to {child}"
-                links.append(track.matrix if track.constant else track.trajectory(name, request))
+            tracks = [self.tracks[child] for child in reversed(chain[: chain.index(world)])]
+            links: list[Any] = [track.link(request) for track in tracks]
         except ValueError:
             return None
+        moving = [i for i, link in enumerate(links) if isinstance(link, Trajectory)]
+        for i, below in itertools.pairwise(moving):
+            links[i] = _held_corrections(links[i], links[below], tracks[i], request)
         return tuple(links)
+
+
+def _held_corrections(
+    slow: Trajectory, below: Trajectory, track: Track, request: Request
+) -> Trajectory | Held:
+    """Poses that correct those of the frame below so rarely that they cannot be interpolated: the last one holds, as in tf2."""
+    gap_s = float(np.median(np.diff(slow.times_s)))
+    if gap_s <= request.max_gap_s:
+        return slow
+    T = slow.poses(slow.times_s)
+    base = np.stack([np.interp(slow.times_s, below.times_s, axis) for axis in below.positions.T], axis=1)
+    at = np.einsum("pij,pj->pi", T[:, :3, :3], base) + T[:, :3, 3]
+    uncorrected = np.einsum("pij,pj->pi", T[:-1, :3, :3], base[1:]) + T[:-1, :3, 3]
+    if (
+        np.linalg.norm(at[1:] - uncorrected, axis=1).sum()
+        > np.linalg.norm(uncorrected - at[:-1], axis=1).sum()
+    ):
+        return slow  # it moves more than the frame below
+    request.notes.add(
+        f"TF from {track.parent} to {track.child} comes every {gap_s:.3g} s: the last one before a scan holds"
+    )
+    return Held(slow.times_s, T)
 
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
@@ -172,28 +236,24 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     names = {n for n in fitting if not _DESIRED_POSE.search(n)} if wanted is None else fitting & {wanted}
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
-    name = wanted if wanted is not None else _choose(tracks, tree, sensor, preferred)
-    if wants_tf or name is None:
+    find = None
+    name = None if wants_tf else wanted or _choose(tracks, tree, sensor, preferred)
+    if name is None:
         try:
             find = _tree_poses(tree, sensor, request)
         except ValueError:
             if wants_tf or not tracks:
                 raise
-            one = len(tracks) == 1
             listed = ", ".join(sorted(tracks))
-            check(
-                one,
-                f"{notes.about} has several topics with poses: choose one with pose_topic, of {listed}",
-            )
+            what = "has several topics with poses: choose one with pose_topic"
+            check(len(tracks) == 1, f"{notes.about} {what}, of {listed}")
             (name,) = tracks
-        else:
-            for other in sorted(fitting):
-                notes.add(f"poses of {other} are ignored; pose_topic selects them")
-            return find
-    check(name in tracks, f"{paths[0]}: {name} holds no poses")
-    trajectory = tracks[name].trajectory(name, request)
     for other in sorted(fitting - {name}):
         notes.add(f"poses of {other} are ignored; pose_topic selects them")
+    if find is not None:
+        return find
+    check(name in tracks, f"{paths[0]}: {name} holds no poses")
+    trajectory = tracks[name].trajectory(name, request)
     notes.add(f"poses: {len(trajectory.times_s)} of {name}")
     base = sensor if request.extrinsic is not None else _base(tracks[name].child, name, tree, sensor, notes)
     return tree.attach(trajectory, base, request)
@@ -235,14 +295,16 @@ def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferre
         return preferred
     known = sensor in tree.tracks
     children = {name: track.child for name, track in tracks.items() if track.child}
-    leading = [n for n, child in children.items() if not known or tree.fixed(child, sensor) is not None]
+    leading = [
+        n for n, child in children.items() if not known or tree.mounted_on(child) == tree.mounted_on(sensor)
+    ]
     return leading[0] if len(leading) == 1 else None
 
 
 def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes) -> str:
     """Frame of the poses of a topic; if it names none, the one that moves with the sensor."""
-    base = child or tree.rigid_top(sensor)[0]
-    if tree.fixed(base, sensor) is None or (not child and base == sensor):
+    base = child or tree.mounted_on(sensor)
+    if tree.mounted_on(base) != tree.mounted_on(sensor) or (not child and base == sensor):
         notes.add(
             f"no extrinsic is known between the frame of {name}, {child or '(unnamed)'}, and that of the scans, "
             f"{sensor or '(unnamed)'}: the poses are taken as those of the radar; give extrinsic if they are not"
@@ -256,7 +318,7 @@ def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes)
 def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about = request.notes.about
-    moving = {frame for frame, track in tree.tracks.items() if not track.constant}
+    moving = {frame for frame, track in tree.tracks.items() if not track.mounted}
     if not moving:
         what = "TF that moves" if tree.tracks else "Odometry, PoseStamped, Path or TF"
         msg = f"{about} has no poses ({what}): give a file of poses, such as TUM; {FIND_POSES}"

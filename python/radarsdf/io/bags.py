@@ -22,9 +22,9 @@ from radarsdf.io.bag_messages import (
     CLOUD_TYPES,
     IMU,
     PACKETS,
+    Clock,
     Message,
     Topic,
-    by_record,
     is_bag,
     read_messages,
     topics_of,
@@ -55,13 +55,15 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
-    by_recording = {
-        name: by_record(np.array([c.stamp_s for c in clouds]), name, request.stamps, request.notes)
+    clocks = {
+        name: Clock.of(
+            *np.array([(c.stamp_s, c.recorded_s) for c in clouds]).T, name, request.stamps, request.notes
+        )
         for name, clouds in peeked.items()
     }
 
     def raw_scans() -> Iterator[RawScan]:
-        streams = [_raw_scans(paths, topic, by_recording[topic.name], request) for topic in scan_topics]
+        streams = [_raw_scans(paths, topic, clocks[topic.name], request) for topic in scan_topics]
         merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
         return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
@@ -71,7 +73,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
         find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
-    recorded = by_recording[scan_topics[0].name]
+    recorded = clocks[scan_topics[0].name].recorded
     imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
@@ -137,9 +139,9 @@ def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
     return peeked
 
 
-def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
+def _raw_scans(paths: list[Path], topic: Topic, clock: Clock, request: Request) -> Iterator[RawScan]:
     for message in read_messages(paths, {topic.name}, request.notes):
-        time_s = message.recorded_s if recorded else message.stamp_s
+        time_s = float(clock.times(message.stamp_s, message.recorded_s))
         name = f"{message.bag}: message {message.number} of {topic.name}"
         yield RawScan(partial(dict, message.content), time_s, name, message.frame, topic.name, message.number)
 
@@ -177,9 +179,8 @@ def _read_imu(
     if len(table) == 0:
         return None
     times_s, recorded_s = table[:, 0], table[:, 1]
-    if by_record(times_s, topic, None, request.notes):
-        times_s = recorded_s
-    elif recorded:
+    times_s = Clock.of(times_s, recorded_s, topic, None, request.notes).times(times_s, recorded_s)
+    if recorded:
         times_s = times_s + np.median(recorded_s - times_s)
     order = np.argsort(times_s, kind="stable")
     forces = table[order, 5:]
