@@ -9,7 +9,7 @@ from radarsdf.io.clouds import read_columns
 START_S = 1706001766.0
 TURN_LEFT = np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # by 90 degrees about z, qx qy qz qw
 STRAIGHT = np.array([0, 0, 0, 1.0])
-KINDS = {"f": "F", "i": "I", "u": "U"}
+KINDS = {"f": "F", "i": "I", "u": "U", "V": "B"}
 
 
 def write_pcd(path, columns, data="binary", **header):
@@ -153,6 +153,17 @@ def test_pcd_with_padding_and_fields_of_several_values(tmp_path):
         "x": [1, 1],
         "z": [3, 3],
     }
+    for size, count, kind in (
+        ("4 8 4", "1 0 1", "F I F"),
+        ("4 3 4", "1 1 1", "F U F"),
+        ("4 4 4", "1 1 1", "F B F"),
+    ):
+        cloud["_"] = np.zeros(2, f"V{int(size[2]) * int(count[2])}") if count[2] == "1" else np.zeros(2, "V0")
+        write_pcd(tmp_path / "cloud.pcd", cloud, FIELDS="x y z", SIZE=size, COUNT=count, TYPE=kind)
+        assert {n: c.tolist() for n, c in read_columns(tmp_path / "cloud.pcd").items()} == {
+            "x": [1, 1],
+            "z": [3, 3],
+        }
     write_pcd(tmp_path / "cloud.pcd", {"x": np.ones(6, np.float32)}, WIDTH="3", HEIGHT="2", COUNT=None)
     assert read_columns(tmp_path / "cloud.pcd")["x"].tolist() == [1] * 6
 

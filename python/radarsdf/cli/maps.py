@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from radarsdf import evaluation
 from radarsdf.cli.app import refuse_if
-from radarsdf.cli.inputs import is_map, load_map, mesh_limits, read_scans, split
+from radarsdf.cli.inputs import is_map, load_map, mesh_limits, read_scans, refuse_reading_options, split
 from radarsdf.cli.results import Results
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.io.bag_messages import is_bag
@@ -66,6 +66,8 @@ def evaluate(given: Namespace, results: Results) -> None:
     if radar_map is None:
         check_regular_file(what)
     scans = read_scans(given) if given.poses is not None or _holds_scans(truth) else None
+    if scans is None:
+        refuse_reading_options(given, f"{truth} holds no scans")
     lacking = holdout is not None and (radar_map is None or scans is None)
     refuse_if(lacking, f"--holdout {holdout} needs a map and scans, not {what} and {truth}")
     ground_truth = scans.ground_truth if scans is not None else read_ground_truth(truth)

@@ -8,7 +8,15 @@ from pathlib import Path
 
 from radarsdf import check
 from radarsdf.cli.app import refuse_if
-from radarsdf.cli.inputs import check_address, inputs_of, load_map, mesh_limits, read_scans, split
+from radarsdf.cli.inputs import (
+    check_address,
+    inputs_of,
+    load_map,
+    mesh_limits,
+    read_scans,
+    refuse_reading_options,
+    split,
+)
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.io.files import check_outputs
 from radarsdf.report.page import require_extras
@@ -21,6 +29,8 @@ from radarsdf.view.viewer import Viewer
 def view(given: Namespace, results: Results) -> None:
     """Serve the page until Ctrl-C, after printing its address."""
     check_address(given)
+    if not given.scans:
+        refuse_reading_options(given, "no scans are named")
     radar_map = load_map(given.map)
     with Viewer(
         radar_map,
@@ -43,7 +53,8 @@ def report(given: Namespace, results: Results) -> None:
     """Write the page."""
     lacking = given.holdout and not given.scans
     refuse_if(lacking, f"--holdout {given.holdout} needs the scans: name them after the map")
-
+    if not given.scans:
+        refuse_reading_options(given, "no scans are named")
     require_extras()
     check_outputs([given.out], inputs_of(given))
     radar_map = load_map(given.map)

@@ -50,6 +50,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     """Read scans of one drive from one or several bags; see :func:`radarsdf.io.read`."""
     others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
     check(paths and all(map(is_bag, paths)), f"{others} is not a bag: only bags can be read together")
+    request.refuse(f"{request.notes.about}: messages have names of columns", "columns")
     topics = topics_of(paths)
     scan_topics = _scan_topics(topics, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
@@ -72,9 +73,13 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
+        request.refuse("poses are given", "pose_topic", "world_frame")
         find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     recorded = clocks[scan_topics[0].name].recorded
-    imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
+    imu_topic = _imu_topic(topics, request)
+    if imu_topic is None:
+        request.refuse("no IMU is read", "R_sensor_imu")
+    imu = partial(_read_imu, paths, imu_topic, frames[0], recorded, request)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
 

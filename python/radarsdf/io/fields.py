@@ -53,8 +53,9 @@ _COLUMNS: dict[int, tuple[str, ...]] = {
 
 def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
     """Names of `width` columns that have none in their file."""
+    names = range(columns) if isinstance(columns, int) else columns or range(width)
+    check(len(names) == width, f"there are {width} columns, not the {len(names)} that are given")
     if columns is not None and not isinstance(columns, int):
-        check(len(columns) == width, f"there are {width} columns, but {len(columns)} names")
         return list(columns)
     return list(_COLUMNS.get(width, ("x", "y", "z", *(f"column_{i}" for i in range(3, width)))[:width]))
 

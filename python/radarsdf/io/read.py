@@ -147,6 +147,8 @@ def read(
         max_gap_s=positive(max_gap_s, "max_gap_s"),
         notes=Notes(str(path) if single else "the bags"),
     )
+    if poses is UNPOSED:
+        request.refuse("scans are read without poses", "extrinsic", "pose_topic", "world_frame")
     scans = _read(paths[0], request) if single else read_bags(paths, request)
     if ground_truth is None:
         return scans
@@ -158,21 +160,24 @@ def read(
 
 def _read(path: Path, request: Request) -> Scans:
     """Dispatch on the kind of path: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
+    dataset = datasets.find(path) if path.is_dir() and not is_bag(path) else None
     if is_bag(path):
         return read_bags([path], request)
-    if path.is_dir():
-        if (dataset := datasets.find(path)) is not None:
-            return dataset.read(path, request)
-        if bags := bags_in(path):  # NTU4DRadLM and Viking Hill have files next to them
-            if request.extrinsic is None:
-                request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
-            file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
-            if file is not None and request.poses is None and request.pose_topic is None:
-                request.notes.add(f"poses: of {file.name}")
-                request = dataclasses.replace(request, poses=file)
-            return read_bags(bags, request)
-    for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
-        check(getattr(request, name) in (None, ()), f"{path} is not a bag: {name} applies only to bags")
+    if (
+        dataset is None and path.is_dir() and (bags := bags_in(path))
+    ):  # NTU4DRadLM and Viking Hill have files next to them
+        if request.extrinsic is None:
+            request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
+        file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
+        if file is not None and request.poses is None and request.pose_topic is None:
+            request.notes.add(f"poses: of {file.name}")
+            request = dataclasses.replace(request, poses=file)
+        return read_bags(bags, request)
+    request.refuse(f"{path} is not a bag", "topic", "pose_topic", "imu_topic", "world_frame", "stamps")
+    if path.suffix.lower() != ".npz":
+        request.refuse(f"{path} has no IMU", "R_sensor_imu")
+    if dataset is not None:
+        return dataset.read(path, request)
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path, request)
@@ -189,8 +194,9 @@ def _npz(path: Path, request: Request) -> Scans:
     """Read our own file, with its poses or those passed by the user."""
     notes = request.notes
     others = None if request.poses is UNPOSED else request.poses
-    what = "contains its own poses T_world_sensor: extrinsic applies only to poses passed as an argument"
-    check(others is not None or request.extrinsic is None, f"{path} {what}")
+    request.refuse(f"{path} has names of columns", "columns")
+    if others is None:
+        request.refuse(f"{path} contains its own poses T_world_sensor", "extrinsic")
     scans = read_scans(path)
     truth = scans.ground_truth
     if others is None:
@@ -203,7 +209,9 @@ def _npz(path: Path, request: Request) -> Scans:
     matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
     raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
     imu = scans.imu
-    if imu is not None and request.R_sensor_imu is not None:
+    if imu is None:
+        request.refuse(f"{path} has no IMU", "R_sensor_imu")
+    elif request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
     return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu)
 

@@ -19,7 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check
-from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, check_kitti, read_columns, read_points
+from radarsdf.io.clouds import (
+    CLOUD_SUFFIXES,
+    NAMED_SUFFIXES,
+    TEXT_SUFFIXES,
+    check_kitti,
+    read_columns,
+    read_points,
+)
 from radarsdf.io.fields import Fields
 from radarsdf.io.files import reading
 from radarsdf.io.name_times import times_in
@@ -70,6 +77,12 @@ class Request:
     stamps: str | None = None
     world_frame: str | None = None
     notes: Notes = field(default_factory=Notes)
+
+    def refuse(self, why: str, *names: str) -> None:
+        """Raise a ValueError for arguments that would have no effect."""
+        given = {name: getattr(self, name) for name in names}
+        useless = ", ".join(name for name, value in given.items() if value is not None and np.size(value))
+        check(not useless, f"{why}: {useless} would have no effect; leave it out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +178,8 @@ def scan_poses(
     if isinstance(poses, NumberedPoses):
         poses = _by_number(poses, range(count), request.notes)
     if isinstance(poses, np.ndarray):
+        if request.max_gap_s != MAX_GAP_S:
+            request.notes.add("max_gap_s has no effect: the poses have no times")
         what = "give as many, or poses with time stamps for scans with time stamps"
         check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
     elif times_s is None:
@@ -207,6 +222,8 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     if T_base_sensor is None:
         T_base_sensor = read_transform(folder / BASE_T_RADAR)
     columns = request.columns
+    if files[0].suffix.lower() in NAMED_SUFFIXES:
+        request.refuse(f"{files[0]} has names of columns", "columns")
     if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
         with reading(notes.about, "points of KITTI"):
             check_kitti(raw)

@@ -89,6 +89,13 @@ def read_text(path: Path) -> str:
     return path.read_bytes().decode("utf-8-sig", errors="replace")
 
 
+def as_numbers(words: NDArray[Any]) -> NDArray[np.float64]:
+    """Convert words (N,) to numbers; NaN for those that are none."""
+    with contextlib.suppress(ValueError):
+        return words.astype(np.float64)
+    return np.array([float(word) if _is_number(word) else np.nan for word in words.tolist()])
+
+
 def _is_number(word: str) -> bool:
     try:
         float(word)
