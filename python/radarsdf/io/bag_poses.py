@@ -252,6 +252,7 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
         notes.add(f"poses of {other} are ignored; pose_topic selects them")
     if find is not None:
         return find
+    assert name is not None
     request.refuse(f"the poses are those of {name}, and not of TF", "world_frame")
     check(name in tracks, f"{paths[0]}: {name} holds no poses")
     trajectory = tracks[name].trajectory(name, request)

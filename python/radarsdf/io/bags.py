@@ -56,12 +56,10 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
-    clocks = {
-        name: Clock.of(
-            *np.array([(c.stamp_s, c.recorded_s) for c in clouds]).T, name, request.stamps, request.notes
-        )
-        for name, clouds in peeked.items()
-    }
+    clocks = {}
+    for name, clouds in peeked.items():
+        stamps_s, recorded_s = np.array([(cloud.stamp_s, cloud.recorded_s) for cloud in clouds]).T
+        clocks[name] = Clock.of(stamps_s, recorded_s, name, request.stamps, request.notes)
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, clocks[topic.name], request) for topic in scan_topics]

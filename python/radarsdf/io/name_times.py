@@ -62,9 +62,9 @@ def times_in(stems: list[str], notes: Notes) -> list[float] | None:
 def _split(stem: str) -> tuple[str, float, str, str] | None:
     """Kind and whole seconds of the time at the end of a name, and the separator and digits of its fraction."""
     if (found := _DATE.search(stem)) and (found[1] or found[6]):
-        numbers = [int(found[i] or 1) for i in (3, 4, 5, 7, 8)]
+        month, day, hour, minute, second = (int(found[i] or 1) for i in (3, 4, 5, 7, 8))
         try:
-            date = datetime(int(found[1] or 1970), *numbers, tzinfo=timezone.utc)
+            date = datetime(int(found[1] or 1970), month, day, hour, minute, second, tzinfo=timezone.utc)
         except ValueError:  # the 31st of February, or minute 61: an index
             return None
         return "dates", date.timestamp(), found[9] or "", found[10] or found[11] or ""

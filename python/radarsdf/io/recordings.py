@@ -37,6 +37,7 @@ from radarsdf.io.poses import (
     NoPoses,
     NumberedPoses,
     Poses,
+    StampedPoses,
     Trajectory,
     TransformChain,
     poses_of,
@@ -58,7 +59,7 @@ _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their groun
 Truth = Callable[[], NDArray[np.float64] | None]
 """Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
 
-FindPoses = Callable[[str], Poses | None]
+FindPoses = Callable[[str], StampedPoses | NDArray[np.float64] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +173,7 @@ def scan_poses(
     times_s: Sequence[float] | None,
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
-) -> tuple[Poses, Sequence[float] | None]:
+) -> tuple[StampedPoses | NDArray[np.float64], Sequence[float] | None]:
     """Return the poses T_world_sensor of `count` scans, and their times, s, if known."""
     about = request.notes.about
     if isinstance(poses, NumberedPoses):
@@ -320,7 +321,7 @@ def _listed_times(path: Path, notes: Notes) -> list[float]:
     with reading(path, "a list of times"):
         factor = factor_of(without_unit(names[-1])[1], "time", names[-1])
     numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1] * factor
-    return in_seconds(numbers, path.name, notes).tolist()
+    return [float(time_s) for time_s in in_seconds(numbers, path.name, notes)]
 
 
 def _numbers_in(files: list[Path]) -> Sequence[int]:
