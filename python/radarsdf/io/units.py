@@ -8,39 +8,38 @@ from scipy import constants
 
 from radarsdf.checks import check
 
-_SI = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
-_LENGTHS = {
-    **{f"{prefix}m": factor for prefix, factor in (_SI | {"c": 1e-2, "d": 0.1, "k": 1e3}).items()},
-    **{f"{long}{m}": x for long, x in (("", 1.0), ("milli", 1e-3), ("centi", 1e-2), ("kilo", 1e3)) for m in ("meter", "metre")},
-    **dict.fromkeys(("in", "inch", "inches"), constants.inch), **dict.fromkeys(("ft", "foot", "feet"), constants.foot),
-    **dict.fromkeys(("yd", "yds", "yard"), constants.yard), **dict.fromkeys(("mi", "mile"), constants.mile), "nmi": constants.nautical_mile,
+_NAMES = {
+    "length": {
+        1.0: "m meter metre", 0.1: "dm", 1e-2: "cm centimeter centimetre", 1e-3: "mm millimeter millimetre", 1e-6: "um µm μm", 1e-9: "nm",
+        1e3: "km kilometer kilometre", constants.inch: "in inch inches", constants.foot: "ft foot feet", constants.yard: "yd yds yard",
+        constants.mile: "mi mile", constants.nautical_mile: "nmi",
+    },
+    "time": {
+        1.0: "s sec second", 1e-3: "ms msec millisec millisecond", 1e-6: "us µs μs usec microsec microsecond",
+        1e-9: "ns nsec nanosec nanosecond", constants.minute: "min minute", constants.hour: "h hr hrs hour", constants.day: "d day",
+    },
+    "speed": {
+        1.0: "m/s mps", constants.kmh: "km/h kmh kph kmph", constants.mph: "mph", constants.foot: "fps", constants.knot: "kn kt kts knot",
+    },
+    "angle": {
+        1.0: "rad radian", 1e-3: "mrad milliradian", 1e-6: "urad µrad μrad", constants.degree: "deg degree ° º",
+        constants.pi / 200: "gon grad gradian", constants.arcminute: "arcmin arcminute", constants.arcsecond: "arcsec arcsecond",
+        2 * constants.pi: "rev revolution turn",
+    },
 }  # fmt: skip
-_TIMES = {
-    **{f"{prefix}{s}": x for prefix, x in _SI.items() for s in ("s", "sec", "second")},
-    **dict.fromkeys(("millisec", "millisecond"), 1e-3), **dict.fromkeys(("microsec", "microsecond"), 1e-6),
-    **dict.fromkeys(("nanosec", "nanosecond"), 1e-9), **dict.fromkeys(("min", "minute"), constants.minute),
-    **dict.fromkeys(("h", "hr", "hrs", "hour"), constants.hour), **dict.fromkeys(("d", "day"), constants.day),
-}  # fmt: skip
-_SPEEDS = {
-    **dict.fromkeys(("m/s", "mps"), 1.0), **dict.fromkeys(("km/h", "kmh", "kph", "kmph"), constants.kmh), "mph": constants.mph, "fps": constants.foot,
-    **dict.fromkeys(("kn", "kt", "kts", "knot"), constants.knot),
-}  # fmt: skip
-_ANGLES = {
-    **{f"{prefix}rad": factor for prefix, factor in _SI.items()}, "radian": 1.0, "milliradian": 1e-3,
-    **dict.fromkeys(("deg", "degree", "°", "º"), constants.degree), **dict.fromkeys(("gon", "grad", "gradian"), constants.pi / 200),
-    **dict.fromkeys(("arcmin", "arcminute"), constants.arcminute), **dict.fromkeys(("arcsec", "arcsecond"), constants.arcsecond),
-    **dict.fromkeys(("rev", "revolution", "turn"), 2 * constants.pi),
-}  # fmt: skip
-_FACTORS = {"length": _LENGTHS, "time": _TIMES, "speed": _SPEEDS, "angle": _ANGLES}
+_FACTORS = {
+    dimension: {word: factor for factor, words in names.items() for word in words.split()}
+    for dimension, names in _NAMES.items()
+}
 
 # Words of a name that are taken for its unit without brackets. `sec` and `nsec` are columns of their own, `min` is a minimum.
 _WORDS = "|".join(
-    re.escape(word) + ("" if len(word) < 3 else "s?")
-    for word in (*_LENGTHS, *_SPEEDS, *_ANGLES, "s", "ms", "us", "µs", "ns")
+    re.escape(word) + "s?" * (len(word) > 2)
+    for word in (*_FACTORS["length"], *_FACTORS["speed"], *_FACTORS["angle"], "s", "ms", "us", "µs", "ns")
     if word not in ("rev", "turn")
 )
 _UNIT = re.compile(
-    rf"[\s_/]+(?:in[\s_]+)?((?:{_WORDS})(?:/(?:{'|'.join(_TIMES)}))?|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
+    rf"[\s_/]+(?:in[\s_]+)?((?:{_WORDS})(?:/(?:{'|'.join(_FACTORS['time'])}))?|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
 )
 _QUOTIENT = re.compile(r"(.+?)(?:\s*/\s*|\s+per\s+)(.+)|(.+?)[\s*·.]+(.+?)(?:\^|\*\*)?(?:-1|⁻¹)")
 
