@@ -65,11 +65,12 @@ def scans_or_unposed(given: Namespace, *, find: bool = False) -> tuple[Scans, bo
     return read_scans(given, UNPOSED), True
 
 
-def refuse_reading_options(given: Namespace, why: str) -> None:
-    """Refuse options for reading scans where none are read."""
-    for option in GROUPS["reading"].split()[1:]:
+def scans_if(wanted: object, given: Namespace) -> Scans | None:
+    """Read the scans, or refuse the options for reading them if none are `wanted`."""
+    for option in () if wanted else GROUPS["reading"].split()[1:]:
         value = vars(given)[option.lstrip("-").replace("-", "_")]
-        refuse_if(value not in (None, MAX_GAP_S), f"{why}: {option} {value} would have no effect")
+        refuse_if(value not in (None, MAX_GAP_S), f"no scans are read: {option} {value} would have no effect")
+    return read_scans(given) if wanted else None
 
 
 def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:

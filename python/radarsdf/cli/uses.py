@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from radarsdf.changes.compare import compare as compare_maps
-from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, read_scans, refuse_reading_options
+from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, scans_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.extras import require
 from radarsdf.grids.files import check_suffix
@@ -32,9 +32,8 @@ def compare(given: Namespace, results: Results) -> None:
         require_extras()
     if given.view:
         check_address(given)
-    if is_map(given.scans):
-        refuse_reading_options(given, f"{given.scans} is a map")
-    later = load_map(given.scans) if is_map(given.scans) else read_scans(given)
+    scans = scans_if(not is_map(given.scans), given)
+    later = load_map(given.scans) if scans is None else scans
     earlier = load_map(given.map)
     changes = compare_maps(earlier, later, align_frames=given.align, box=given.box)
     found = changes.report

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from radarsdf.checks import check
 from radarsdf.io.text import are_degrees
-from radarsdf.io.units import factor_of, has_dimension, without_unit
+from radarsdf.io.units import factor_of, known_factor, without_unit
 from radarsdf.scans import Notes, Scan, finite_returns
 
 _XYZ = ("x", "y", "z")
@@ -122,8 +122,9 @@ class Fields:
             return 1.0
         name, dimension = self.names[role], _DIMENSIONS[role]
         bare, unit = plain_name(name)
-        if not name.endswith(("]", ")")) and _squeeze(bare) not in _ALIASES[role]:
-            unit = unit if has_dimension(unit, dimension) else ""  # v_rad is a radial speed
+        named = name.endswith(("]", ")")) or _squeeze(bare) in _ALIASES[role]
+        if not named and known_factor(unit, dimension) is None:  # v_rad is a radial speed
+            unit = ""
         if not unit and self.in_degrees and dimension == "angle":
             unit = "deg"
         return factor_of(unit, dimension, name)

@@ -6,8 +6,6 @@ import re
 
 from scipy import constants
 
-from radarsdf.checks import check
-
 _NAMES = {
     "length": {
         1.0: "m meter metre", 0.1: "dm", 1e-2: "cm centimeter centimetre", 1e-3: "mm millimeter millimetre", 1e-6: "um µm μm", 1e-9: "nm",
@@ -28,20 +26,29 @@ _NAMES = {
     },
 }  # fmt: skip
 _FACTORS = {
-    dimension: {word: factor for factor, words in names.items() for word in words.split()}
+    dimension: {
+        name: factor
+        for factor, words in names.items()
+        for word in words.split()
+        for name in ((word, f"{word}s") if len(word) > 2 else (word,))
+    }
     for dimension, names in _NAMES.items()
 }
-
 # Words of a name that are taken for its unit without brackets. `sec` and `nsec` are columns of their own, `min` is a minimum.
-_WORDS = "|".join(
-    re.escape(word) + "s?" * (len(word) > 2)
-    for word in (*_FACTORS["length"], *_FACTORS["speed"], *_FACTORS["angle"], "s", "ms", "us", "µs", "ns")
-    if word not in ("rev", "turn")
-)
+_WORDS = {*_FACTORS["length"], *_FACTORS["speed"], *_FACTORS["angle"], "s", "ms", "us", "µs", "ns"} - {
+    "rev",
+    "turn",
+}
 _UNIT = re.compile(
-    rf"[\s_/]+(?:in[\s_]+)?((?:{_WORDS})(?:/(?:{'|'.join(_FACTORS['time'])}))?|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
+    rf"[\s_/]+(?:in[\s_]+)?((?:{'|'.join(map(re.escape, _WORDS))})(?:/(?:{'|'.join(_FACTORS['time'])}))?|dbs?m?|linear)$"
+    r"|[\s_]*[\[(]([^\])]*)[\])]$"
 )
-_QUOTIENT = re.compile(r"(.+?)(?:\s*/\s*|\s+per\s+)(.+)|(.+?)[\s*·.]+(.+?)(?:\^|\*\*)?(?:-1|⁻¹)")
+_QUOTIENT = re.compile(r"^(.+?)(?:\s*/\s*|\s+per\s+)(.+)$|^(.+?)[\s*·.]+(.+?)(?:\^|\*\*)?(?:-1|⁻¹)$")
+_FACTORS["speed"] |= {
+    f"{length}/{time}": a / b
+    for length, a in _FACTORS["length"].items()
+    for time, b in _FACTORS["time"].items()
+}
 
 
 def without_unit(name: str) -> tuple[str, str]:
@@ -53,30 +60,16 @@ def without_unit(name: str) -> tuple[str, str]:
     return name[: found.start()], found[1] if found[1] is not None else found[2].strip()
 
 
+def known_factor(unit: str, dimension: str) -> float | None:
+    """Return the factor from a unit to m, s, m/s or rad; None if it is no known one of this dimension."""
+    return _FACTORS[dimension].get(_QUOTIENT.sub(r"\1\3/\2\4", unit))
+
+
 def factor_of(unit: str, dimension: str, column: str) -> float:
     """Return the factor from a unit to m, s, m/s or rad; 1 without a unit. Raises a ValueError for any other unit."""
-    factor = _factor(unit, dimension) if unit else 1.0
-    known = ", ".join(_FACTORS[dimension])
-    check(
-        factor,
-        f"the column {column} has the unit {unit!r:.30}, which is no known {dimension}: name one of {known}",
-    )
-    return factor or 1.0
-
-
-def has_dimension(unit: str, dimension: str) -> bool:
-    """Whether a unit is a known one of this dimension."""
-    return _factor(unit, dimension) is not None
-
-
-def _factor(unit: str, dimension: str) -> float | None:
-    factors = _FACTORS[dimension]
-    singular = unit.removesuffix("s") if len(unit) > 3 else unit  # feet per ms, not per metres
-    if singular in factors or unit in factors:
-        return factors.get(unit, factors.get(singular))
-    if dimension != "speed" or (parts := _QUOTIENT.fullmatch(unit)) is None:
-        return None
-    length, time = (
-        _factor(part, of) for part, of in zip(filter(None, parts.groups()), ("length", "time"), strict=True)
-    )
-    return length / time if length and time else None
+    factor = known_factor(unit, dimension) if unit else 1.0
+    if factor is None:
+        known = " ".join(_NAMES[dimension].values())
+        msg = f"the column {column} has the unit {unit!r:.30}, which is no known {dimension}: name one of {known}"
+        raise ValueError(msg)
+    return factor
