@@ -6,12 +6,13 @@ import itertools
 import re
 from array import array
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check
 from radarsdf.io.bag_messages import (
@@ -43,23 +44,6 @@ _DESIRED_POSE = re.compile(
     re.IGNORECASE,
 )
 _CONSTANT = 1e-9  # largest change of a constant transform that is published repeatedly
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """Transforms T_parent_child (P, 4, 4) that each hold from their time, s, until the next one."""
-
-    times_s: FloatArray
-    matrices: FloatArray
-
-    def pose_at(self, time_s: float, _max_gap_s: float) -> FloatArray | None:
-        """T_parent_child (4, 4) at a time; None before the first one."""
-        before = int(np.searchsorted(self.times_s, time_s, "right")) - 1
-        return None if before < 0 else np.asarray(self.matrices[before])
-
-    def span(self) -> str:
-        """First and last time, for messages."""
-        return f"{self.times_s[0]} s on"
 
 
 @dataclass
@@ -100,12 +84,10 @@ class Track:
                 f"poses of {name} left out: {damaged} of {count} are not finite, with a unit quaternion"
             )
         stamps_s, recorded_s = self.table[:, :2].T
-        times_s = Clock.of(stamps_s, recorded_s, name, request.stamps, request.notes).times(
-            stamps_s, recorded_s
-        )
-        return trajectory_of(np.column_stack([times_s, self.table[:, 2:]]), name)
+        clock = Clock.of(stamps_s, recorded_s, name, request.stamps, request.notes)
+        return trajectory_of(np.column_stack([clock.times(stamps_s, recorded_s), self.table[:, 2:]]), name)
 
-    def link(self, request: Request) -> StampedPoses | Held | FloatArray:
+    def link(self, request: Request) -> Trajectory | FloatArray:
         """T_parent_child: constant, static from one time to the next, or moving."""
         name = f"TF from {self.parent} to {self.child}"
         if self.constant:
@@ -118,7 +100,7 @@ class Track:
         times_s = np.r_[-np.inf, table[1:, 0 if by_stamp else 1]]
         listed = ", ".join(f"{time_s:.3f} s" for time_s in times_s[1:4])
         request.notes.add(f"{name} is static, and changes {len(times_s) - 1} times: at {listed}")
-        return Held(times_s, pose_matrices_of(table[:, 2:]))
+        return Trajectory(times_s, table[:, 2:5], Rotation.from_quat(table[:, 5:]), held=True)
 
 
 class TransformTree:
@@ -160,59 +142,43 @@ class TransformTree:
         """Assign poses to `base` and to all frames below the highest one rigidly attached to it."""
         top, T_top_base = self.rigid_top(base)
         T_pose_base = np.eye(4) if request.extrinsic is None else request.extrinsic
-        above = (poses, T_pose_base @ np.linalg.inv(T_top_base))
+        return self.finder(top, request, (poses, T_pose_base @ np.linalg.inv(T_top_base)))
+
+    def finder(
+        self, top: str, request: Request, above: tuple[Any, ...] = ()
+    ) -> Callable[[str], TransformChain | None]:
+        """Return a function from a frame below `top`, whose poses are the product of `above`, to its poses."""
 
         @cache
         def find(frame: str) -> TransformChain | None:
-            links = self._links(frame, top, request)
-            return None if links is None else TransformChain((*above, *links))
+            try:
+                chain = self.chain(frame)
+                tracks = [self.tracks[child] for child in reversed(chain[: chain.index(top)])]
+                links: list[Any] = [track.link(request) for track in tracks]
+            except ValueError:  # it is not below, or has a single pose
+                return None
+            moving = [i for i, link in enumerate(links) if isinstance(link, Trajectory) and not link.held]
+            for i, below in itertools.pairwise(moving):
+                links[i] = _held_corrections(links[i], links[below], tracks[i], request)
+            return TransformChain((*above, *links)) if above or links else None
 
         return find
 
-    def finder(self, world: str, request: Request) -> Callable[[str], TransformChain | None]:
-        """Return a function from a frame below the world to its poses."""
 
-        @cache
-        def find(frame: str) -> TransformChain | None:
-            links = self._links(frame, world, request)
-            return TransformChain(links) if links else None
-
-        return find
-
-    def _links(self, frame: str, world: str, request: Request) -> tuple[Any, ...] | None:
-        """Transforms from the world down to a frame; None if there are none, or one of them has a single pose."""
-        try:
-            chain = self.chain(frame)
-            tracks = [self.tracks[child] for child in reversed(chain[: chain.index(world)])]
-            links: list[Any] = [track.link(request) for track in tracks]
-        except ValueError:
-            return None
-        moving = [i for i, link in enumerate(links) if isinstance(link, Trajectory)]
-        for i, below in itertools.pairwise(moving):
-            links[i] = _held_corrections(links[i], links[below], tracks[i], request)
-        return tuple(links)
-
-
-def _held_corrections(
-    slow: Trajectory, below: Trajectory, track: Track, request: Request
-) -> Trajectory | Held:
-    """Poses that correct those of the frame below so rarely that they cannot be interpolated: the last one holds, as in tf2."""
+def _held_corrections(slow: Trajectory, below: Trajectory, track: Track, request: Request) -> Trajectory:
+    """Let poses hold, as in tf2, that correct those of the frame below too rarely to be interpolated."""
     gap_s = float(np.median(np.diff(slow.times_s)))
     if gap_s <= request.max_gap_s:
         return slow
-    T = slow.poses(slow.times_s)
     base = np.stack([np.interp(slow.times_s, below.times_s, axis) for axis in below.positions.T], axis=1)
-    at = np.einsum("pij,pj->pi", T[:, :3, :3], base) + T[:, :3, 3]
-    uncorrected = np.einsum("pij,pj->pi", T[:-1, :3, :3], base[1:]) + T[:-1, :3, 3]
-    if (
-        np.linalg.norm(at[1:] - uncorrected, axis=1).sum()
-        > np.linalg.norm(uncorrected - at[:-1], axis=1).sum()
-    ):
-        return slow  # it moves more than the frame below
-    request.notes.add(
-        f"TF from {track.parent} to {track.child} comes every {gap_s:.3g} s: the last one before a scan holds"
-    )
-    return Held(slow.times_s, T)
+    at = slow.rotations.apply(base) + slow.positions
+    uncorrected = slow.rotations[:-1].apply(base[1:]) + slow.positions[:-1]
+    corrected_m, moved_m = (np.linalg.norm(uncorrected - x, axis=1).sum() for x in (at[1:], at[:-1]))
+    if corrected_m > moved_m:  # it moves more than the frame below
+        return slow
+    name = f"TF from {track.parent} to {track.child}"
+    request.notes.add(f"{name} comes every {gap_s:.3g} s: the last one before a scan holds")
+    return replace(slow, held=True)
 
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:

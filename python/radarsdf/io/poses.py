@@ -49,11 +49,12 @@ _ROLES = (
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """P poses T_world_base of a moving frame `base`."""
+    """P poses T_world_base of a frame `base` that moves, or keeps each pose until the next one."""
 
     times_s: NDArray[np.float64]  # (P,) ascending
     positions: NDArray[np.float64]  # (P, 3) world frame, m
     rotations: Rotation  # P rotations R_world_base
+    held: bool = False  # each pose holds until the next one
 
     def span(self) -> str:
         """First and last time, for messages."""
@@ -77,6 +78,10 @@ class Trajectory:
         A time up to a millisecond beyond the ends, or beyond the edge of a longer gap, gets the pose there: times in files are
         rounded.
         """
+        if self.held:
+            last = int(np.searchsorted(self.times_s, time_s, "right")) - 1
+            row = np.hstack([self.positions[last], self.rotations[last].as_quat()])
+            return None if last < 0 else np.asarray(pose_matrices_of(row[None])[0])
         after = int(np.clip(np.searchsorted(self.times_s, time_s), 1, len(self.times_s) - 1))
         first_s, last_s = self.times_s[after - 1 : after + 1]
         if not first_s <= time_s <= last_s or last_s - first_s > max_gap_s:
@@ -84,8 +89,7 @@ class Trajectory:
             if not abs(time_s - nearest_s) <= _ROUNDING_S:
                 return None
             time_s = nearest_s
-        pose: NDArray[np.float64] = self.poses(np.array([time_s]))[0]
-        return pose
+        return np.asarray(self.poses(np.array([time_s]))[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +143,7 @@ def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Mask (P,) of the rows (P, 7) x y z qx qy qz qw that are finite and have a unit quaternion."""
     with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers may overflow
         unit = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= _MAX_NORM_ERROR
-    mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
-    return mask
+    return np.asarray(unit & np.isfinite(table).all(axis=1))
 
 
 def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
