@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +18,7 @@ from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, 
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
 from radarsdf.io.text import in_seconds, read_numbers, read_table
-from radarsdf.io.units import factor_of, without_unit
+from radarsdf.io.units import scaled, without_unit
 from radarsdf.scans import Columns, Notes
 
 MAX_GAP_S = 0.5  # longest gap to interpolate across, by default
@@ -113,17 +112,11 @@ class TransformChain:
         return ", ".join(link.span() for link in self.links if not isinstance(link, np.ndarray))
 
 
-@dataclass(frozen=True, eq=False)
-class NumberedPoses:
+class NumberedPoses(NamedTuple):
     """P poses T_world_sensor with the numbers of their scans, which may have gaps."""
 
-    numbers: NDArray[np.int64]  # (P,)
+    numbers: list[int]
     matrices: NDArray[np.float64]  # (P, 4, 4)
-
-    def of(self, numbers: Sequence[int]) -> NDArray[np.float64]:
-        """T_world_sensor (F, 4, 4) of scans; NaN for those without a pose."""
-        rows = dict(zip(self.numbers.tolist(), self.matrices, strict=True))
-        return np.array([rows.get(number, np.full((4, 4), np.nan)) for number in numbers])
 
 
 StampedPoses: TypeAlias = Trajectory | TransformChain
@@ -220,24 +213,22 @@ def read_poses(path: Path, notes: Notes) -> Poses:
         if columns:
             return _from_columns(columns, path, notes)
     names = heads[0] if heads else [""] * width
-    units = [without_unit(name)[1] for name in names]
-    lead, values = (values[:, 0], values[:, 1:]) if width in (13, 17) else (None, values)
+    numbers = {12: 12, 13: 12, 16: 16, 17: 16}.get(width, 0)  # without a number of the scan, or a time
     with reading(path, "a table of poses"):
-        for at in (3, 7, 11) if values.shape[1] in (12, 16) else ():
-            values[:, at] *= factor_of(units[at - len(names)], "length", names[at - len(names)])
-    if values.shape[1] in (12, 16) or (width == 4 and len(values) % 4 == 0):
-        rows = values.reshape(-1, 3 if values.shape[1] == 12 else 4, 4)
-        P = np.tile(np.eye(4), (len(rows), 1, 1))
-        P[:, : rows.shape[1]] = rows
-        P = rigid_or_nan(P, str(path), notes)
-        if rows.shape[1] == 3:
+        for at in (3, 7, 11) if numbers else ():
+            values[:, at - numbers] = scaled(values[:, at - numbers], names[at - numbers], "length")
+    if numbers or (width == 4 and len(values) % 4 == 0):
+        rows = values[:, -numbers:].reshape(-1, 3 if numbers == 12 else 4, 4)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, : rows.shape[1]] = rows
+        P = rigid_or_nan(poses, str(path), notes)
+        if numbers == 12:
             calibration = path.with_name("calib.txt")
             Tr = read_calibration(calibration) if calibration.is_file() else None
-            known = "are camera poses, by Tr of calib.txt"
-            found = "are taken as T_world_sensor: no calib.txt" if Tr is None else known
-            notes.add(f"{path.name}: KITTI poses {found}")
+            how = "are taken as T_world_sensor: no" if Tr is None else "are camera poses, by Tr of"
+            notes.add(f"{path.name}: KITTI poses {how} calib.txt")
             P = P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
-        return P if lead is None else _led_by(lead, P, path, notes)
+        return _led_by(values[:, 0], P, path, notes) if width in (13, 17) else P
     msg = f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
     raise ValueError(msg)
 
@@ -245,38 +236,32 @@ def read_poses(path: Path, notes: Notes) -> Poses:
 def _led_by(lead: NDArray[np.float64], P: NDArray[np.float64], path: Path, notes: Notes) -> Poses:
     """Poses by the first column of a table: numbers of scans if it holds small integers, else times."""
     known = np.isfinite(lead) & np.isfinite(P).all(axis=(1, 2))
-    numbers = np.where(known, lead, 0)
-    if (numbers == numbers.round()).all() and (np.abs(numbers) < _MAX_NUMBER).all():
+    lead, P = lead[known], P[known]
+    if (lead == lead.round()).all() and (np.abs(lead) < _MAX_NUMBER).all():
         notes.add(f"the first column of {path.name} is taken as the number of the scan")
-        return NumberedPoses(numbers[known].astype(np.int64), P[known])
-    table = np.full((len(P), 8), np.nan)
-    quaternions = Rotation.from_matrix(P[known, :3, :3]).as_quat()
-    table[known] = np.column_stack([in_seconds(lead[known], path.name, notes), P[known, :3, 3], quaternions])
-    return trajectory_of(table, str(path), notes)
+        return NumberedPoses(lead.astype(int).tolist(), P)
+    quaternions = Rotation.from_matrix(P[:, :3, :3]).as_quat()
+    times_s = in_seconds(lead, path.name, notes)
+    return trajectory_of(np.column_stack([times_s, P[:, :3, 3], quaternions]), str(path), notes)
 
 
 def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
     """Columns by role, in s and m; empty if the names are not those of a pose."""
-    found: dict[str, tuple[str, str, NDArray[np.float64]]] = {}
+    found: dict[str, tuple[NDArray[np.float64], str]] = {}
     for name, column in zip(names, table.T, strict=True):
-        bare, unit = without_unit(name)
-        words = re.sub(r"[\W_]+", " ", bare).strip()
+        words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
         for pattern, template in _ROLES:
             if match := re.fullmatch(pattern, words):
-                found.setdefault(template.format(*match.groups()), (name, unit, column))
+                found.setdefault(template.format(*match.groups()), (column, name))
                 break
     if not set(_TUM[1:]) <= set(found):
         return {}
-
-    def scaled(role: str, dimension: str) -> NDArray[np.float64]:
-        name, unit, column = found[role]
-        return column * factor_of(unit, dimension, name)
-
-    columns = {role: scaled(role, "length") for role in "xyz"} | {role: found[role][2] for role in _TUM[4:]}
+    columns = {role: scaled(*found[role], "length") for role in "xyz"}
+    columns |= {role: found[role][0] for role in _TUM[4:]}
     if {"sec", "nsec"} <= set(found):
-        columns["time"] = found["sec"][2] + 1e-9 * found["nsec"][2]
+        columns["time"] = found["sec"][0] + 1e-9 * found["nsec"][0]
     elif times := [name for name in (*_TIMES, "sec") if name in found]:
-        columns["time"] = scaled(times[0], "time")
+        columns["time"] = scaled(*found[times[0]], "time")
     return columns
 
 

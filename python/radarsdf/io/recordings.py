@@ -44,7 +44,7 @@ from radarsdf.io.poses import (
     read_transform,
 )
 from radarsdf.io.text import in_seconds, read_numbers, read_table
-from radarsdf.io.units import factor_of, without_unit
+from radarsdf.io.units import scaled
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
 BASE_T_RADAR = "base_T_radar.txt"
@@ -243,33 +243,26 @@ def cloud_files(folder: Path, notes: Notes) -> list[Path]:
 
     Notes and labels next to them are left out: text named as a scan, and single files whose names are unlike the others.
     """
-    text: list[Path] = []
-    for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
+    found: list[tuple[Any, ...]] = []
+    for place, inner in enumerate((folder, *(folder / name for name in SCAN_FOLDERS))):
         kinds: dict[str, list[Path]] = {}
         for path in inner.iterdir() if inner.is_dir() else ():
             other = path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM or path.name.startswith(".")
             if path.suffix.lower() in CLOUD_SUFFIXES and not other and path.is_file():
                 kinds.setdefault(path.suffix.lower(), []).append(path)
-        clouds = {
-            path.stem for suffix, paths in kinds.items() if suffix not in TEXT_SUFFIXES for path in paths
-        }
-        found = []
+        clouds = {p.stem for suffix in kinds.keys() - set(TEXT_SUFFIXES) for p in kinds[suffix]}
         for suffix, paths in kinds.items():
-            labels = clouds if suffix in TEXT_SUFFIXES else ()
-            words = Counter(map(_words, kept := [path for path in paths if path.stem not in labels]))
-            found.append((max(words.values(), default=0), suffix not in TEXT_SUFFIXES, kept, words))
-        length, is_cloud, kept, words = max(found, key=itemgetter(0, 1), default=(0, False, text, Counter()))
-        if 2 * length > len(kept) > 2:
-            odd = [path for path in kept if words[_words(path)] == 1]
-            kept = [path for path in kept if path not in odd]
-            if odd:
-                notes.add(
-                    f"{len(odd)} files left out: their names are unlike those of the scans; the first: {odd[0]}"
-                )
-        if is_cloud or length > 1:
-            return sorted(kept, key=natural)
-        text = text or kept
-    return sorted(text, key=natural)
+            is_text = suffix in TEXT_SUFFIXES
+            kept = [path for path in paths if not (is_text and path.stem in clouds)]
+            length = max(Counter(map(_words, kept)).values(), default=0)
+            found.append((not is_text or length > 1, -place, length, not is_text, kept))
+    *_, length, _, files = max(found, key=itemgetter(0, 1, 2, 3), default=(0, []))
+    words = Counter(map(_words, files))
+    odd = [path for path in files if 2 * length > len(files) > 2 and words[_words(path)] == 1]
+    if odd:
+        what = "files left out: their names are unlike those of the scans; the first"
+        notes.add(f"{len(odd)} {what}: {min(odd)}")
+    return sorted(set(files) - set(odd), key=natural)
 
 
 def _words(path: Path) -> str:
@@ -299,7 +292,10 @@ def _in_order_of_time(
     listed = None
     if times is None:
         if isinstance(poses, NumberedPoses):
-            poses = _by_number(poses, _numbers_in(files), notes)
+            # Numbers of scans: the last ones in the names of their files that all differ, or else counted from 0.
+            groups = zip(*(map(int, re.findall(r"\d+", path.stem)[::-1]) for path in files), strict=False)
+            numbers = next((group for group in groups if len(set(group)) == len(files)), range(len(files)))
+            poses = _by_number(poses, numbers, notes)
         places = [
             folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES
         ]
@@ -319,31 +315,19 @@ def _listed_times(path: Path, notes: Notes) -> list[float]:
     table = read_numbers(path)
     names = next((head for head in reversed(read_table(path).heads) if len(head) == table.shape[1]), [""])
     with reading(path, "a list of times"):
-        factor = factor_of(without_unit(names[-1])[1], "time", names[-1])
-    numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1] * factor
-    return [float(time_s) for time_s in in_seconds(numbers, path.name, notes)]
-
-
-def _numbers_in(files: list[Path]) -> Sequence[int]:
-    """Numbers of scans: the last ones in the names of their files that all differ, or else counted from 0."""
-    groups = [re.findall(r"\d+", path.stem) for path in files]
-    for place in range(1, min(map(len, groups)) + 1):
-        numbers = [int(group[-place]) for group in groups]
-        if len(set(numbers)) == len(files):
-            return numbers
-    return range(len(files))
+        times = scaled(table[:, -1], names[-1], "time")
+    times = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else times
+    return np.asarray(in_seconds(times, path.name, notes)).tolist()
 
 
 def _by_number(poses: NumberedPoses, numbers: Sequence[int], notes: Notes) -> NDArray[np.float64]:
     """T_world_sensor (F, 4, 4) of the scans with these numbers; NaN for those without a pose, which are counted."""
     if all(np.ptp(of) + 1 == len(numbers) == len(of) for of in (numbers, poses.numbers)):
-        numbers = np.sort(poses.numbers).tolist()  # one of them counts from 0, the other one from 1
-    matrices = poses.of(numbers)
-    missing = int(np.isnan(matrices[:, 0, 0]).sum())
-    check(
-        missing < len(numbers),
-        f"{notes.about}: no scan has a number of the poses, such as {poses.numbers[:3]}",
-    )
+        numbers = sorted(poses.numbers)  # one of them counts from 0, the other one from 1
+    rows = dict(zip(*poses, strict=True))
+    missing = len(set(numbers) - set(rows))
+    what = f"{notes.about}: no scan has a number of the poses, such as {poses.numbers[:3]}"
+    check(missing < len(numbers), what)
     if missing:
         notes.add(f"{missing} scans left out: there is no pose of their number")
-    return matrices
+    return np.array([rows.get(number, np.full((4, 4), np.nan)) for number in numbers])

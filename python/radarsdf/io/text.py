@@ -26,9 +26,7 @@ _SLACK = 1.05  # tolerance for angles that exceed a limit by rounding
 class Table(NamedTuple):
     """Table of R rows of numbers in a text file."""
 
-    heads: list[
-        list[str]
-    ]  # words of the lines above the rows, including comments: one of them may name the columns
+    heads: list[list[str]]  # words of the lines and comments above the rows: one may name the columns
     values: NDArray[np.float64]  # (R, W), NaN for words that are not numbers, and for rows of another width
 
 

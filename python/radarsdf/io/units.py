@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy import constants
 
 _NAMES = {
@@ -73,3 +75,8 @@ def factor_of(unit: str, dimension: str, column: str) -> float:
         msg = f"the column {column} has the unit {unit!r:.30}, which is no known {dimension}: name one of {known}"
         raise ValueError(msg)
     return factor
+
+
+def scaled(column: NDArray[np.float64], name: str, dimension: str) -> NDArray[np.float64]:
+    """Convert a column to m, s, m/s or rad by the unit in its name, if it has one."""
+    return column * factor_of(without_unit(name)[1], dimension, name)
