@@ -74,10 +74,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         request.refuse("poses are given", "pose_topic", "world_frame")
         find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
     recorded = clocks[scan_topics[0].name].recorded
-    imu_topic = _imu_topic(topics, request)
-    if imu_topic is None:
-        request.refuse("no IMU is read", "R_sensor_imu")
-    imu = partial(_read_imu, paths, imu_topic, frames[0], recorded, request)
+    imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
 

@@ -22,7 +22,7 @@ from radarsdf.io.npz import array_in
 from radarsdf.io.text import as_numbers, read_table
 from radarsdf.scans import Columns, Notes
 
-TEXT_SUFFIXES, NAMED_SUFFIXES = (".csv", ".txt", ".xyz"), (".pcd", ".ply", ".las", ".laz")
+TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
 LAS_INTENSITY = "radar_intensity"  # an extra dimension, since LAS's own is an integer from 0 to 65535
 _PANIC = "PanicException"  # raised by lazrs, which is written in Rust; not a subclass of Exception
 _MAX_COMPRESSION = 200  # LAZ packs lidar points to a tenth of their size

@@ -96,10 +96,7 @@ class Fields:
         check(known, f"the fields {missing} are missing: there are {', '.join(names) or 'none'}")
         fields = cls(found)
         useless = [r for r in _POLAR if (overrides or {}).get(r) is not None and not fields.polar]
-        check(
-            not useless,
-            f"fields {', '.join(useless)} have no effect next to x, y and z: set one of these to None",
-        )
+        check(not useless, f"fields {useless} have no effect next to x, y and z: set one of these to None")
         for role in fields.used:  # before the first scan is read
             fields.factor(role)
         return fields

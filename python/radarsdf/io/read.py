@@ -150,6 +150,8 @@ def read(
     if poses is UNPOSED:
         request.refuse("scans are read without poses", "extrinsic", "pose_topic", "world_frame")
     scans = _read(paths[0], request) if single else read_bags(paths, request)
+    if R_sensor_imu is not None and scans.imu is None:
+        request.refuse(f"{request.notes.about} has no IMU, or several", "R_sensor_imu")
     if ground_truth is None:
         return scans
     if isinstance(ground_truth, (str, PathLike)):
@@ -160,12 +162,11 @@ def read(
 
 def _read(path: Path, request: Request) -> Scans:
     """Dispatch on the kind of path: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
-    dataset = datasets.find(path) if path.is_dir() and not is_bag(path) else None
     if is_bag(path):
         return read_bags([path], request)
-    if (
-        dataset is None and path.is_dir() and (bags := bags_in(path))
-    ):  # NTU4DRadLM and Viking Hill have files next to them
+    dataset = datasets.find(path) if path.is_dir() else None
+    bags = bags_in(path) if path.is_dir() and dataset is None else []
+    if bags:  # NTU4DRadLM and Viking Hill have files next to them
         if request.extrinsic is None:
             request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
         file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
@@ -174,8 +175,6 @@ def _read(path: Path, request: Request) -> Scans:
             request = dataclasses.replace(request, poses=file)
         return read_bags(bags, request)
     request.refuse(f"{path} is not a bag", "topic", "pose_topic", "imu_topic", "world_frame", "stamps")
-    if path.suffix.lower() != ".npz":
-        request.refuse(f"{path} has no IMU", "R_sensor_imu")
     if dataset is not None:
         return dataset.read(path, request)
     suffix = path.suffix.lower()
@@ -209,9 +208,7 @@ def _npz(path: Path, request: Request) -> Scans:
     matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
     raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
     imu = scans.imu
-    if imu is None:
-        request.refuse(f"{path} has no IMU", "R_sensor_imu")
-    elif request.R_sensor_imu is not None:
+    if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
     return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu)
 

@@ -19,14 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check
-from radarsdf.io.clouds import (
-    CLOUD_SUFFIXES,
-    NAMED_SUFFIXES,
-    TEXT_SUFFIXES,
-    check_kitti,
-    read_columns,
-    read_points,
-)
+from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, check_kitti, read_columns, read_points
 from radarsdf.io.fields import Fields
 from radarsdf.io.files import reading
 from radarsdf.io.name_times import times_in
@@ -223,7 +216,7 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     if T_base_sensor is None:
         T_base_sensor = read_transform(folder / BASE_T_RADAR)
     columns = request.columns
-    if files[0].suffix.lower() in NAMED_SUFFIXES:
+    if files[0].suffix.lower() not in (".bin", ".npy", *TEXT_SUFFIXES):
         request.refuse(f"{files[0]} has names of columns", "columns")
     if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
         with reading(notes.about, "points of KITTI"):
