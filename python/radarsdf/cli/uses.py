@@ -80,9 +80,8 @@ def grid(given: Namespace, results: Results) -> None:
     if given.picture is not None:
         require("matplotlib", what="pictures need")
     pgm = [path.with_suffix(".pgm") for path in flat]
-    outputs = [
-        path for path in (*out, *pgm, given.distances, given.costmap, given.picture) if path is not None
-    ]
+    named = (*out, *pgm, given.distances, given.costmap, given.picture)
+    outputs = [path for path in named if path is not None]
     check_outputs(outputs, [given.map])
     radar_map = load_map(given.map)
     found = grid_of(radar_map, radar_map.extent if given.box is None else given.box, given.voxel)

@@ -174,9 +174,8 @@ def _ars548_list(message: Any) -> Columns:
     flags = np.array([row.invalid for row in returns], np.uint8)
     if flags.ndim == 1:
         flags = np.unpackbits(flags[:, None], axis=1, bitorder="little")
-    return _ars548(
-        {name: _column(returns, name.removesuffix("_rad")) for name in _ARS548_VALUES}, flags.T != 0
-    )
+    columns = {name: _column(returns, name.removesuffix("_rad")) for name in _ARS548_VALUES}
+    return _ars548(columns, flags.T != 0)
 
 
 def _ars548(returns: Columns, invalid: NDArray[np.bool_]) -> Columns:
@@ -306,16 +305,14 @@ class Clock(NamedTuple):
     zeros: Callable[[], None]  # called for stamps of zero
 
     @classmethod
-    def of(
-        cls, stamps_s: FloatArray, recorded_s: FloatArray, what: str, wanted: str | None, notes: Notes
-    ) -> Clock:
-        """Clock of messages: the one that is requested, or else the header stamps unless they are zero or constant."""
-        known = stamps_s[stamps_s != 0]
-        if wanted is None and (len(known) == 0 or (len(stamps_s) > 1 and np.ptp(stamps_s) == 0)):
-            why = "are constant" if len(known) else "are zero"
+    def of(cls, times_s: FloatArray, what: str, wanted: str | None, notes: Notes) -> Clock:
+        """Clock of messages, of which `times_s` (2, N) are stamps and records: by default the stamps, unless zero or constant."""
+        stamps_s, known = times_s[0], times_s[:, times_s[0] != 0]
+        if wanted is None and (not known.size or (len(stamps_s) > 1 and np.ptp(stamps_s) == 0)):
+            why = "are constant" if known.size else "are zero"
             notes.add(f"the header stamps of {what} {why}: the record time is used instead")
             wanted = "record"
-        delay_s = float(np.median((recorded_s - stamps_s)[stamps_s != 0])) if len(known) else np.nan
+        delay_s = float(np.median(known[1] - known[0])) if known.size else np.nan
         zero = f"header stamps of {what} are zero: record times less the usual delay, {delay_s:.3f} s, replace them"
         return cls(wanted == "record", delay_s, partial(notes.add, zero))
 
@@ -329,9 +326,7 @@ class Clock(NamedTuple):
         return np.where(zero, recorded_s - self.delay_s, stamps_s)
 
 
-def _stream(
-    path: Path, names: set[str]
-) -> Generator[tuple[float, Path, Any, bytes | memoryview], None, None]:
+def _stream(path: Path, names: set[str]) -> Generator[tuple[float, Path, Any, Any], None, None]:
     """Yield record time, s, bag, connection of rosbags, and bytes of each message."""
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic in names]
@@ -369,6 +364,5 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _damaged(path: Path, error: Exception) -> ValueError:
     remedy = "if its recording was cut off, mcap recover or rosbag reindex may repair it"
-    return ValueError(
-        f"{path} is not a complete bag: {(str(error) or type(error).__name__).rstrip('.')}; {remedy}"
-    )
+    why = (str(error) or type(error).__name__).rstrip(".")
+    return ValueError(f"{path} is not a complete bag: {why}; {remedy}")

@@ -83,9 +83,9 @@ class Track:
             request.notes.add(
                 f"poses of {name} left out: {damaged} of {count} are not finite, with a unit quaternion"
             )
-        stamps_s, recorded_s = self.table[:, :2].T
-        clock = Clock.of(stamps_s, recorded_s, name, request.stamps, request.notes)
-        return trajectory_of(np.column_stack([clock.times(stamps_s, recorded_s), self.table[:, 2:]]), name)
+        times_s = self.table[:, :2].T
+        clock = Clock.of(times_s, name, request.stamps, request.notes)
+        return trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)
 
     def link(self, request: Request) -> Trajectory | FloatArray:
         """T_parent_child: constant, static from one time to the next, or moving."""
@@ -142,11 +142,9 @@ class TransformTree:
         """Assign poses to `base` and to all frames below the highest one rigidly attached to it."""
         top, T_top_base = self.rigid_top(base)
         T_pose_base = np.eye(4) if request.extrinsic is None else request.extrinsic
-        return self.finder(top, request, (poses, T_pose_base @ np.linalg.inv(T_top_base)))
+        return self.finder(top, request, poses, T_pose_base @ np.linalg.inv(T_top_base))
 
-    def finder(
-        self, top: str, request: Request, above: tuple[Any, ...] = ()
-    ) -> Callable[[str], TransformChain | None]:
+    def finder(self, top: str, request: Request, *above: Any) -> Callable[[str], TransformChain | None]:
         """Return a function from a frame below `top`, whose poses are the product of `above`, to its poses."""
 
         @cache
@@ -261,11 +259,9 @@ def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferre
     """Return the preferred topic, or the only one whose child frame is rigidly attached to that of the scans; else None."""
     if preferred in tracks:
         return preferred
-    known = sensor in tree.tracks
+    known, top = sensor in tree.tracks, tree.mounted_on(sensor)
     children = {name: track.child for name, track in tracks.items() if track.child}
-    leading = [
-        n for n, child in children.items() if not known or tree.mounted_on(child) == tree.mounted_on(sensor)
-    ]
+    leading = [n for n, child in children.items() if not known or tree.mounted_on(child) == top]
     return leading[0] if len(leading) == 1 else None
 
 

@@ -58,8 +58,8 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     frames = [frame for frame, _ in counted.most_common()]
     clocks = {}
     for name, clouds in peeked.items():
-        stamps_s, recorded_s = np.array([(cloud.stamp_s, cloud.recorded_s) for cloud in clouds]).T
-        clocks[name] = Clock.of(stamps_s, recorded_s, name, request.stamps, request.notes)
+        times_s = np.array([(cloud.stamp_s, cloud.recorded_s) for cloud in clouds]).T
+        clocks[name] = Clock.of(times_s, name, request.stamps, request.notes)
 
     def raw_scans() -> Iterator[RawScan]:
         streams = [_raw_scans(paths, topic, clocks[topic.name], request) for topic in scan_topics]
@@ -178,10 +178,9 @@ def _read_imu(
     table = table[np.isfinite(table[:, :5]).all(axis=1)]
     if len(table) == 0:
         return None
-    times_s, recorded_s = table[:, 0], table[:, 1]
-    times_s = Clock.of(times_s, recorded_s, topic, None, request.notes).times(times_s, recorded_s)
+    times_s = Clock.of(table[:, :2].T, topic, None, request.notes).times(*table[:, :2].T)
     if recorded:
-        times_s = times_s + np.median(recorded_s - times_s)
+        times_s = times_s + np.median(table[:, 1] - times_s)
     order = np.argsort(times_s, kind="stable")
     forces = table[order, 5:]
     has_force = np.isfinite(forces).all() and forces.any()

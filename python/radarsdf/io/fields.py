@@ -134,17 +134,15 @@ class Fields:
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
         in_degrees = are_degrees(azimuth, elevation)
         unit = "degrees" if in_degrees else "rad"
-        notes.add(
-            f"{' and '.join(names)} are taken as {unit} by their values: azimuth_deg or azimuth_rad would be explicit"
-        )
+        how = "by their values: azimuth_deg or azimuth_rad would be explicit"
+        notes.add(f"{' and '.join(names)} are taken as {unit} {how}")
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes) -> None:
         """Note intensities in linear units, and unused fields."""
-        if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
-            notes.add(
-                f"{self.names['intensity']} is used as intensity unchanged: in dB, 10 log10, it gives a better map"
-            )
+        name = self.names.get("intensity", "")
+        if plain_name(name)[1] == "linear":
+            notes.add(f"{name} is used as intensity unchanged: in dB, 10 log10, it gives a better map")
         if unused := [name for name in names if name and name not in self.names.values()]:
             listed = ", ".join(unused)
             notes.add(f"unused fields: {listed}; fields={{role: name}} or --field selects others")

@@ -161,12 +161,10 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    what = "are left out: not finite, no unit quaternion, or a repeated time"
-    left_out = (
-        ""
-        if kept.all()
-        else f"{(~kept).sum()} of {len(table)} poses {what}; the first: pose {np.argmin(kept)}"
+    what = (
+        f"of {len(table)} poses are left out: not finite, no unit quaternion, or a repeated time; the first"
     )
+    left_out = "" if kept.all() else f"{(~kept).sum()} {what}: pose {np.argmin(kept)}"
     if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
         msg = f"{name} holds {len(times_s)} poses at different times; at least two are needed; {left_out}"
         raise ValueError(msg)

@@ -212,7 +212,7 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
         msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
         raise NoPoses(msg)
     known = poses_of(poses, notes)
-    files, times_s, known = _in_order_of_time(files, known, notes)
+    files, times_s, known = _by_time(files, known, notes)
     if T_base_sensor is None:
         T_base_sensor = read_transform(folder / BASE_T_RADAR)
     columns = request.columns
@@ -275,9 +275,7 @@ def lidar_map(folder: Path) -> NDArray[np.float64] | None:
     return next((read_points(path) for path in found if path.is_file()), None)
 
 
-def _in_order_of_time(
-    files: list[Path], poses: Poses, notes: Notes
-) -> tuple[list[Path], Sequence[float] | None, Poses]:
+def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path], list[float] | None, Poses]:
     """Sort scans by time; return files, times, s, or None if there are none, and poses."""
     # Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
     # file of times.
@@ -289,9 +287,7 @@ def _in_order_of_time(
             groups = zip(*(map(int, re.findall(r"\d+", path.stem)[::-1]) for path in files), strict=False)
             numbers = next((group for group in groups if len(set(group)) == len(files)), range(len(files)))
             poses = _by_number(poses, numbers, notes)
-        places = [
-            folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES
-        ]
+        places = [folder / name for folder in files[0].parents[:2] for name in TIME_FILES]
         listed = next((path for path in places if path.is_file()), None)
         if listed is None:
             return files, None, poses

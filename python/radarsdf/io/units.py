@@ -37,20 +37,15 @@ _FACTORS = {
     for dimension, names in _NAMES.items()
 }
 # Words of a name that are taken for its unit without brackets. `sec` and `nsec` are columns of their own, `min` is a minimum.
-_WORDS = {*_FACTORS["length"], *_FACTORS["speed"], *_FACTORS["angle"], "s", "ms", "us", "µs", "ns"} - {
-    "rev",
-    "turn",
-}
+_WORDS = {word for of in ("length", "speed", "angle") for word in _FACTORS[of]} - {"rev", "turn"}
+_WORDS |= {"s", "ms", "us", "µs", "ns"}
 _UNIT = re.compile(
     rf"[\s_/]+(?:in[\s_]+)?((?:{'|'.join(map(re.escape, _WORDS))})(?:/(?:{'|'.join(_FACTORS['time'])}))?|dbs?m?|linear)$"
     r"|[\s_]*[\[(]([^\])]*)[\])]$"
 )
 _QUOTIENT = re.compile(r"^(.+?)(?:\s*/\s*|\s+per\s+)(.+)$|^(.+?)[\s*·.]+(.+?)(?:\^|\*\*)?(?:-1|⁻¹)$")
-_FACTORS["speed"] |= {
-    f"{length}/{time}": a / b
-    for length, a in _FACTORS["length"].items()
-    for time, b in _FACTORS["time"].items()
-}
+_LENGTHS, _TIMES = _FACTORS["length"].items(), _FACTORS["time"].items()
+_FACTORS["speed"] |= {f"{length}/{time}": a / b for length, a in _LENGTHS for time, b in _TIMES}
 
 
 def without_unit(name: str) -> tuple[str, str]:
