@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import datetime, timezone
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,24 +39,25 @@ def times_in(stems: list[str], notes: Notes) -> list[float] | None:
     if kinds == {"dates"} and not any(fractions) and (whole_s % _DAY_S < 60).all():
         return None  # 20240501_000007 is the seventh scan of a day, not one of its first minute
     decimal_point = all(part[2] in (".", ",") for part in parts if part[3])
-    readings = {how: whole_s + fraction for how, fraction in _readings(fractions, decimal_point).items()}
-    uneven = {how: cost for how, times_s in readings.items() if (cost := _unevenness(times_s)) is not None}
-    different = len({part[1:] for part in parts})
-    if not uneven or 10 * different < 9 * len(stems):  # rounded too far
+    possible: list[tuple[float, Floats, str]] = []  # deviation of the steps from their median, times, text
+    for how, fractions_s in _readings(fractions, decimal_point).items():
+        times_s = whole_s + fractions_s
+        steps_s = np.diff(np.sort(times_s))
+        median_s = float(np.median(steps_s)) if len(steps_s) else np.inf
+        if median_s > _LEAST_STEP_S * (1 + 1e-4):  # times since 1970 are rounded to 0.2 µs
+            deviations = np.abs(steps_s / median_s - 1)
+            text = f"{' '.join(kinds)}{how}" + (f", {median_s:.4g} s apart" if len(steps_s) else "")
+            if odd := int((deviations > 0.5).sum()):
+                text += f" but for {odd} of {len(steps_s)} steps"
+            possible.append((float(np.minimum(deviations, 1).sum()), times_s, text))
+    if not possible or 10 * len({part[1:] for part in parts}) < 9 * len(stems):  # rounded too far
         return None
-    best = min(uneven, key=lambda how: uneven[how])
-    times_s = readings[best]
-    note = f"times in the names of the files: {' '.join(kinds)}{best}"
-    if len(steps_s := np.diff(np.sort(times_s))):
-        note += f", {np.median(steps_s):.4g} s apart"
-        odd = int((np.abs(steps_s / np.median(steps_s) - 1) > 0.5).sum())
-        note += f" but for {odd} of {len(steps_s)} steps" if odd else ""
-    # A step in a wrong place costs up to 1.
-    same = [how for how in uneven if how != best and uneven[how] - uneven[best] < 1]
-    for how in same:
-        if (np.abs(readings[how] - times_s) > _LEAST_STEP_S).any():
-            note += f"; undecided: {' '.join(kinds)}{how} would be as even; rename the files"
-    notes.add(note)
+    least, times_s, text = min(possible, key=itemgetter(0))
+    for cost, others_s, other in possible:
+        # A step in a wrong place costs up to 1.
+        if cost - least < 1 and (np.abs(others_s - times_s) > _LEAST_STEP_S).any():
+            text += f"; undecided: {other} would be as even; rename the files"
+    notes.add(f"times in the names of the files: {text}")
     return [float(time_s) for time_s in times_s]
 
 
@@ -88,16 +90,6 @@ def _readings(fractions: list[str], decimal_point: bool) -> dict[str, Floats]:
     if not begins and (ragged or longest > 7):
         for unit, width in (("ns", 9), ("µs", 6), ("ms", 3)):
             if longest <= width:
-                values[f" and {unit} without leading zeros"] = np.array(
-                    [int(f or 0) / 10**width for f in fractions]
-                )
+                numbers = np.array([int(f or 0) for f in fractions])
+                values[f" and {unit} without leading zeros"] = numbers / 10**width
     return values
-
-
-def _unevenness(times_s: Floats) -> float | None:
-    """Sum of the relative deviations of the steps between scans from their median; None if scans cannot be so near."""
-    steps_s = np.diff(np.sort(times_s))
-    median_s = float(np.median(steps_s)) if len(steps_s) else np.inf
-    if median_s <= _LEAST_STEP_S * (1 + 1e-4):  # times since 1970 are rounded to 0.2 µs
-        return None
-    return float(np.minimum(np.abs(steps_s / median_s - 1), 1).sum())
