@@ -66,11 +66,6 @@ class Track:
         """Whether all poses are the same."""
         return bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
 
-    @property
-    def mounted(self) -> bool:
-        """Whether the frames do not move against each other, or only from one static transform to the next."""
-        return self.static or self.constant
-
     @cached_property
     def matrix(self) -> FloatArray:
         """T_parent_child (4, 4) of a constant transform."""
@@ -108,6 +103,7 @@ class TransformTree:
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
         self.tracks = dict(tracks)  # keyed by child frame
+        self.moving = {frame for frame, track in tracks.items() if not (track.static or track.constant)}
 
     def chain(self, frame: str) -> list[str]:
         """Return the frame and its ancestors up to the root. Raises a ValueError on a cycle."""
@@ -135,8 +131,7 @@ class TransformTree:
 
     def mounted_on(self, frame: str) -> str:
         """Return the highest frame that moves with this one, apart from changes of static transforms."""
-        chain = self.chain(frame)
-        return next(top for top in chain if top not in self.tracks or not self.tracks[top].mounted)
+        return next(top for top in self.chain(frame) if top in self.moving or top not in self.tracks)
 
     def attach(self, poses: StampedPoses, base: str, request: Request) -> FindPoses:
         """Assign poses to `base` and to all frames below the highest one rigidly attached to it."""
@@ -282,7 +277,7 @@ def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes)
 def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about = request.notes.about
-    moving = {frame for frame, track in tree.tracks.items() if not track.mounted}
+    moving = tree.moving
     if not moving:
         what = "TF that moves" if tree.tracks else "Odometry, PoseStamped, Path or TF"
         msg = f"{about} has no poses ({what}): give a file of poses, such as TUM; {FIND_POSES}"

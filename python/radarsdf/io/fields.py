@@ -94,12 +94,9 @@ class Fields:
         missing = ", ".join(role for role in wanted if role not in found)
         known = not missing or set(_POLAR) <= set(found)
         check(known, f"the fields {missing} are missing: there are {', '.join(names) or 'none'}")
-        fields = cls(found)
-        useless = [r for r in _POLAR if (overrides or {}).get(r) is not None and not fields.polar]
+        useless = [r for r in _POLAR if (overrides or {}).get(r) is not None and not cls(found).polar]
         check(not useless, f"fields {useless} have no effect next to x, y and z: set one of these to None")
-        for role in fields.used:  # before the first scan is read
-            fields.factor(role)
-        return fields
+        return cls(found)
 
     @property
     def polar(self) -> bool:

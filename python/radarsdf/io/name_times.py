@@ -22,8 +22,6 @@ _INTEGER = re.compile(r"(?<!\d)[1-9]\d{9,}$")
 _LEAST_STEP_S = 1e-3  # no radar scans as fast: numbers that are nearer to each other are indices
 _DAY_S = 86_400
 
-Floats = NDArray[np.float64]
-
 
 def times_in(stems: list[str], notes: Notes) -> list[float] | None:
     """Return the times, s, at the ends of names, and note how they were read; None if names have none, or indices.
@@ -39,7 +37,9 @@ def times_in(stems: list[str], notes: Notes) -> list[float] | None:
     if kinds == {"dates"} and not any(fractions) and (whole_s % _DAY_S < 60).all():
         return None  # 20240501_000007 is the seventh scan of a day, not one of its first minute
     decimal_point = all(part[2] in (".", ",") for part in parts if part[3])
-    possible: list[tuple[float, Floats, str]] = []  # deviation of the steps from their median, times, text
+    possible: list[
+        tuple[float, NDArray[np.float64], str]
+    ] = []  # deviation of the steps from their median, times, text
     for how, fractions_s in _readings(fractions, decimal_point).items():
         times_s = whole_s + fractions_s
         steps_s = np.diff(np.sort(times_s))
@@ -77,14 +77,14 @@ def _split(stem: str) -> tuple[str, float, str, str] | None:
     return None
 
 
-def _readings(fractions: list[str], decimal_point: bool) -> dict[str, Floats]:
+def _readings(fractions: list[str], decimal_point: bool) -> dict[str, NDArray[np.float64]]:
     """Possible values of the digits of fractions, s, by what they are."""
     digits = [f for f in fractions if f]
     lengths = {len(f) for f in digits} or {0}
     longest, ragged = max(lengths), len(lengths) > 1
     # Ragged decimals have lost the zeros at their ends, ragged integers those at their beginnings.
     ends, begins = (any(f[i] == "0" for f in digits if len(f) > 1) for i in (-1, 0))
-    values: dict[str, Floats] = {}
+    values: dict[str, NDArray[np.float64]] = {}
     if (not ends and decimal_point) if ragged else (decimal_point or longest > 2 or not longest):
         values[" with decimals" if longest else ""] = np.array([float(f"0.{f}0") for f in fractions])
     if not begins and (ragged or longest > 7):

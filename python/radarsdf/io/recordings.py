@@ -145,8 +145,7 @@ def _scan(
         return None
     if not scan:
         notes.count("scans left out: they hold no returns")
-        return None
-    return scan
+    return scan or None
 
 
 def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields], request: Request) -> Fields:
@@ -183,11 +182,11 @@ def scan_poses(
         request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()
         poses = poses.poses(poses.times_s)
-    if T_base_sensor is not None:
-        poses = (
-            poses @ T_base_sensor if isinstance(poses, np.ndarray) else TransformChain((poses, T_base_sensor))
-        )
-    return poses, times_s
+    if T_base_sensor is None:
+        return poses, times_s
+    if isinstance(poses, np.ndarray):
+        return poses @ T_base_sensor, times_s
+    return TransformChain((poses, T_base_sensor)), times_s
 
 
 def read_folder(folder: Path, request: Request) -> Scans:
@@ -222,11 +221,10 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
         with reading(notes.about, "points of KITTI"):
             check_kitti(raw)
         columns = 4
-    reads = [partial(read_columns, path, columns) for path in files]
-    names = [str(path) for path in files]
-    matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
-    stamps = [None] * len(reads) if known_s is None else known_s
-    raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
+    matched, known_s = scan_poses(known, len(files), times_s, T_base_sensor, request)
+    stamps: Sequence[float | None] = known_s or [None] * len(files)
+    reads = zip(files, stamps, strict=True)
+    raw_scans = [RawScan(partial(read_columns, path, columns), time_s, str(path)) for path, time_s in reads]
     source = posed(lambda: raw_scans, lambda _: matched, request)
     return Scans.of_source(source, notes, truth)
 
@@ -306,7 +304,7 @@ def _listed_times(path: Path, notes: Notes) -> list[float]:
     with reading(path, "a list of times"):
         times = scaled(table[:, -1], names[-1], "time")
     times = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else times
-    return np.asarray(in_seconds(times, path.name, notes)).tolist()
+    return [float(time_s) for time_s in in_seconds(times, path.name, notes)]
 
 
 def _by_number(poses: NumberedPoses, numbers: Sequence[int], notes: Notes) -> NDArray[np.float64]:
