@@ -251,8 +251,7 @@ def cloud_files(folder: Path, notes: Notes) -> list[Path]:
     words = Counter(map(_words, files))
     odd = [path for path in files if 2 * length > len(files) > 2 and words[_words(path)] == 1]
     if odd:
-        what = "files left out: their names are unlike those of the scans; the first"
-        notes.add(f"{len(odd)} {what}: {min(odd)}")
+        notes.add(f"{len(odd)} files left out: their names are unlike those of scans; the first: {min(odd)}")
     return sorted(set(files) - set(odd), key=natural)
 
 
@@ -313,8 +312,7 @@ def _by_number(poses: NumberedPoses, numbers: Sequence[int], notes: Notes) -> ND
         numbers = sorted(poses.numbers)  # one of them counts from 0, the other one from 1
     rows = dict(zip(*poses, strict=True))
     missing = len(set(numbers) - set(rows))
-    what = f"{notes.about}: no scan has a number of the poses, such as {poses.numbers[:3]}"
-    check(missing < len(numbers), what)
+    check(missing < len(numbers), f"{notes.about}: no scan has a number of the poses, {poses.numbers[:3]}, …")
     if missing:
         notes.add(f"{missing} scans left out: there is no pose of their number")
     return np.array([rows.get(number, np.full((4, 4), np.nan)) for number in numbers])

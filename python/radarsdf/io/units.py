@@ -28,14 +28,11 @@ _NAMES = {
     },
 }  # fmt: skip
 _FACTORS = {
-    dimension: {
-        name: factor
-        for factor, words in names.items()
-        for word in words.split()
-        for name in ((word, f"{word}s") if len(word) > 2 else (word,))
-    }
+    dimension: {word: factor for factor, words in names.items() for word in words.split()}
     for dimension, names in _NAMES.items()
 }
+for _known in _FACTORS.values():
+    _known.update({f"{word}s": factor for word, factor in _known.items() if len(word) > 2})
 # Words of a name that are taken for its unit without brackets. `sec` and `nsec` are columns of their own, `min` is a minimum.
 _WORDS = {word for of in ("length", "speed", "angle") for word in _FACTORS[of]} - {"rev", "turn"}
 _WORDS |= {"s", "ms", "us", "µs", "ns"}
