@@ -195,9 +195,8 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     names = {n for n in fitting if not _DESIRED_POSE.search(n)} if wanted is None else fitting & {wanted}
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
-    find = None
-    name = None if wants_tf else wanted or _choose(tracks, tree, sensor, preferred)
-    if name is None:
+    name = "" if wants_tf else wanted or _choose(tracks, tree, sensor, preferred)
+    if not name:
         try:
             find = _tree_poses(tree, sensor, request)
         except ValueError:
@@ -209,9 +208,8 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
             (name,) = tracks
     for other in sorted(fitting - {name}):
         notes.add(f"poses of {other} are ignored; pose_topic selects them")
-    if find is not None:
+    if not name:
         return find
-    assert name is not None
     request.refuse(f"the poses are those of {name}, and not of TF", "world_frame")
     check(name in tracks, f"{paths[0]}: {name} holds no poses")
     trajectory = tracks[name].trajectory(name, request)
@@ -250,14 +248,14 @@ def _tracks_and_tree(
     return moving, TransformTree(edges)
 
 
-def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferred: str | None) -> str | None:
-    """Return the preferred topic, or the only one whose child frame is rigidly attached to that of the scans; else None."""
-    if preferred in tracks:
+def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferred: str | None) -> str:
+    """Return the preferred topic, or the only one whose child frame is rigidly attached to that of the scans; else ``""``."""
+    if preferred is not None and preferred in tracks:
         return preferred
     known, top = sensor in tree.tracks, tree.mounted_on(sensor)
     children = {name: track.child for name, track in tracks.items() if track.child}
     leading = [n for n, child in children.items() if not known or tree.mounted_on(child) == top]
-    return leading[0] if len(leading) == 1 else None
+    return leading[0] if len(leading) == 1 else ""
 
 
 def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes) -> str:
