@@ -111,3 +111,10 @@ def test_unsupported_outputs_are_rejected(clouds, scans_file, tmp_path_factory, 
         ([out / "absent.npz", "-o", out / "scans.npz"], "absent.npz"),
     ):
         assert said in refusal(capsys, out, "convert", *words)
+
+
+def test_options_for_scans_are_refused_where_none_are_read(tmp_path, capsys):
+    trimesh.creation.box().export(tmp_path / "box.ply")
+    for option, value in (("--topic", "/radar"), ("--max-gap", 2), ("--columns", 4)):
+        words = ("convert", tmp_path / "box.ply", "-o", tmp_path / "box.stl", option, value)
+        assert option in refusal(capsys, tmp_path, *words, status=2)

@@ -188,3 +188,81 @@ def test_a_damaged_message_is_skipped_and_named(tmp_path, kind, number):
     assert "1 scans left out: they hold no returns" in scans.notes
     in_order = read(scans_path, [pose([i, 0, 0]) for i in range(10)])  # still one for each message
     assert in_order.poses[:, 0, 3].tolist() == [i for i in range(10) if i not in (8, number)]
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+@pytest.mark.parametrize("source", ["tf", "odometry"])
+def test_a_static_transform_holds_from_its_publication_on(tmp_path, kind, source):
+    mountings = [pose([1, 0, 0.5]), pose([1, 0.5, 0.5], 0.2)]
+    path = tmp_path / ("a.bag" if kind == "ros1" else "a")
+    with BagWriter(path, kind) as bag:
+        for i in range(10):
+            stamp_s = 100 + i / 10
+            if i in (0, 3, 5):
+                static = bag.transforms(0.0, {("base", "radar"): mountings[i >= 5]})
+                bag.write("/tf_static", static, stamp_s - 0.01)
+            if source == "tf":
+                bag.write("/tf", bag.transforms(stamp_s, {("odom", "base"): pose([i, 0, 0])}), stamp_s)
+            else:
+                bag.write("/odom", bag.odometry(stamp_s, pose([i, 0, 0]), child="base"), stamp_s)
+            bag.write("/radar", bag.cloud2(stamp_s, dict.fromkeys("xyz", np.ones(1))), stamp_s + 0.01)
+    scans = read(path)
+    assert_allclose(scans.poses, [pose([i, 0, 0]) @ mountings[i >= 5] for i in range(10)], atol=1e-6)
+    assert any("changes 1 times" in note for note in scans.notes)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_rare_corrections_hold_until_the_next_one(tmp_path, moves):
+    """A frame that moves more than those below it, such as a ship under a turning radar, is no correction."""
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        for i in range(31):
+            stamp_s = 100 + i / 10
+            base = pose([0, 0, 0], i / 5) if moves else pose([i, 0, 0])
+            edges = {("odom", "radar"): base}
+            if i % 10 == 0:
+                edges[("map", "odom")] = pose([i if moves else i / 100, 0, 0])
+            bag.write("/tf", bag.transforms(stamp_s, edges), stamp_s)
+            bag.write("/radar", bag.cloud2(stamp_s, dict.fromkeys("xyz", np.ones(1))), stamp_s + 0.01)
+    scans = read(tmp_path / "a.bag")
+    held = any("the last one before a scan holds" in note for note in scans.notes)
+    assert (len(scans), held) == ((4, False) if moves else (31, True))
+    if not moves:
+        assert_allclose(scans.poses[:, 0, 3], [i + i // 10 / 10 for i in range(31)], atol=1e-6)
+
+
+def test_single_zero_stamps_are_replaced(tmp_path):
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        for i in range(14):
+            stamp_s = 100 + i / 10
+            for topic, message in (("/tf", bag.transforms), ("/radar", bag.cloud2)):
+                content = (
+                    {("odom", "radar"): pose([i, 0, 0])}
+                    if topic == "/tf"
+                    else dict.fromkeys("xyz", np.ones(1))
+                )
+                zero = i in ((4, 12) if topic == "/radar" else (0, 7))
+                bag.write(topic, message(0.0 if zero else stamp_s, content), stamp_s + 0.25)
+    scans = read(tmp_path / "a.bag")
+    assert_allclose(scans.poses[:, 0, 3], np.arange(14), atol=1e-4)
+    assert sum("are zero" in note for note in scans.notes) == 2
+
+
+def test_fields_without_a_role_may_have_any_type(tmp_path):
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        message = bag.cloud2(100.0, dict.fromkeys("xyz", np.ones(2, np.float32)))
+        for fields in ((12, 99, 1), (12, 7, 0), (400, 7, 1), (0, 0, 0)):
+            message.fields.append(bag.make("sensor_msgs/msg/PointField", f"f{len(message.fields)}", *fields))
+        bag.write("/radar", message, 100.0)
+    assert_allclose(read(tmp_path / "a.bag", [np.eye(4)]).points, np.ones((1, 2, 3)))
+
+
+def test_arguments_of_bags_without_effect_are_refused(tmp_path):
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        for i in range(3):
+            bag.write("/odom", bag.odometry(100.0 + i, pose([i, 0, 0])), 100.0 + i)
+            bag.write("/radar", bag.cloud2(100.0 + i, dict.fromkeys("xyz", np.ones(1))), 100.0 + i)
+    for options in ({"world_frame": "map"}, {"columns": 4}, {"R_sensor_imu": np.eye(3)}):
+        with pytest.raises(ValueError, match=f"{next(iter(options))} would have no effect"):
+            read(tmp_path / "a.bag", **options)
+    with pytest.raises(ValueError, match="pose_topic would have no effect"):
+        read(tmp_path / "a.bag", [np.eye(4)] * 3, pose_topic="/odom")

@@ -102,6 +102,12 @@ def polar(text):
     "columns",
     [{"x_cm": 300, "y [mm]": -4000, "z_km": 0.005, "doppler (km/h)": -36, "power": 7},
      {"X(m)": 3, "Y": -4, "Z": 5, "v_r_kmh": -36, "power": 7},
+     {"x_ft": 3 / 0.3048, "y/in": -4 / 0.0254, "z [yd]": 5 / 0.9144, "v_r [knots]": -10 / 0.514444, "power [W]": 7},
+     {"x (mile)": 3 / 1609.344, "y in mm": -4000, "z (µm)": 5e6, "Doppler (ft/min)": -600 / 0.3048, "rcs [what]": 7},
+     {"range [feet]": 50**0.5 / 0.3048, "azimuth [gon]": np.arctan2(-4, 3) * 200 / np.pi, "elevation [rev]": 0.125,
+      "speed (mph)": -10 / 0.44704, "power": 7},
+     {"range": 50**0.5, "az (arcmin)": np.rad2deg(np.arctan2(-4, 3)) * 60, "el_grads": 50, "v_rad": -10, "power": 7},
+     {"x": 3, "y": -4, "z": 5, "range [bins]": 1, "sigma_range [?]": 1, "rate": 0, "doppler (m s^-1)": -10, "power": 7},
      {"range_m": 50**0.5, "azimuth_mrad": 1e3 * np.arctan2(-4, 3), "elevation_deg": 45, "rdot_mps": -10, "power": 7}],
 )  # fmt: skip
 def test_units_in_names_become_metres_rad_and_metres_per_second(columns):
@@ -111,6 +117,23 @@ def test_units_in_names_become_metres_rad_and_metres_per_second(columns):
     assert_allclose(scan.points, [[3, -4, 5]] * 2, rtol=1e-6)
     assert_allclose(scan.doppler_mps, [-10, -10], rtol=1e-6)
     assert (scan.intensities.tolist(), notes.lines) == ([7, 7], [])
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        "x [furlong],y,z",
+        "x [deg],y,z",
+        "x (ms),y,z",
+        "x,y,z,doppler [Hz]",
+        "range,azimuth [m],elevation",
+        "x_s,y,z",
+    ],
+)
+def test_an_unknown_unit_is_an_error_with_file_column_and_unit(tmp_path, columns):
+    (tmp_path / "a.csv").write_text(f"{columns}\n1,2,3,4\n".replace(",4", ",4" * columns.count("doppler")))
+    with pytest.raises(ValueError, match=r"a\.csv.*(x|doppler|azimuth).*unit '(furlong|deg|ms|hz|m|s)'"):
+        len(read(tmp_path / "a.csv", [np.eye(4)]))
 
 
 LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)

@@ -9,7 +9,7 @@ from radarsdf.io.clouds import read_columns
 START_S = 1706001766.0
 TURN_LEFT = np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # by 90 degrees about z, qx qy qz qw
 STRAIGHT = np.array([0, 0, 0, 1.0])
-KINDS = {"f": "F", "i": "I", "u": "U"}
+KINDS = {"f": "F", "i": "I", "u": "U", "V": "B"}
 
 
 def write_pcd(path, columns, data="binary", **header):
@@ -84,7 +84,7 @@ def posed(tmp_path):
 
 def test_posed_folder(posed):
     scans = read(posed)
-    assert scans.notes == []
+    assert scans.notes == ["times in the names of the files: seconds with decimals, 0.2 s apart"]
     assert [p.dtype for p in scans.points] == [np.float32] * 3
     assert_array_equal(scans.points[0], [[1, 2, 3], [4, 5, 6]])
     assert_array_equal(scans.points[1], [[7, 8, 9]])
@@ -153,5 +153,54 @@ def test_pcd_with_padding_and_fields_of_several_values(tmp_path):
         "x": [1, 1],
         "z": [3, 3],
     }
+    for size, count, kind in (
+        ("4 8 4", "1 0 1", "F I F"),
+        ("4 3 4", "1 1 1", "F U F"),
+        ("4 4 4", "1 1 1", "F B F"),
+    ):
+        cloud["_"] = np.zeros(2, f"V{int(size[2]) * int(count[2])}") if count[2] == "1" else np.zeros(2, "V0")
+        write_pcd(tmp_path / "cloud.pcd", cloud, FIELDS="x y z", SIZE=size, COUNT=count, TYPE=kind)
+        assert {n: c.tolist() for n, c in read_columns(tmp_path / "cloud.pcd").items()} == {
+            "x": [1, 1],
+            "z": [3, 3],
+        }
     write_pcd(tmp_path / "cloud.pcd", {"x": np.ones(6, np.float32)}, WIDTH="3", HEIGHT="2", COUNT=None)
     assert read_columns(tmp_path / "cloud.pcd")["x"].tolist() == [1] * 6
+
+
+def test_notes_and_labels_next_to_scans_are_not_scans(tmp_path):
+    inner = tmp_path / "velodyne"
+    inner.mkdir()
+    for i in range(3):
+        np.ones((2, 4), np.float32).tofile(inner / f"{i:06d}.bin")
+        (inner / f"{i:06d}.txt").write_text("0 0.5 0.5 0.1\n")
+    for name in (
+        "notes.txt",
+        "gps.txt",
+        "velodyne/weather.txt",
+        "velodyne/extra.txt",
+        "velodyne/merged_cloud.bin",
+    ):
+        (tmp_path / name).write_text("1 2 3\n")
+    assert len(read(tmp_path, [np.eye(4)] * 3)) == 3
+    for path in inner.glob("*.bin"):
+        path.unlink()
+    assert len(read(tmp_path, [np.eye(4)] * 3)) == 3  # text may be scans
+
+
+@pytest.mark.parametrize("width", [12, 16])
+def test_poses_with_numbers_belong_to_the_scans_of_these_numbers(tmp_path, width):
+    for i in (1, 2, 5):
+        (tmp_path / f"{i:010d}.csv").write_text("x,y,z\n5,0,0\n")
+    rows = {i: pose([i, 0, 0], np.eye(3)).ravel()[:width] for i in (1, 2, 4, 5, 6)}
+    table = tmp_path / "k.txt"
+    table.write_text("".join(f"{i} {' '.join(map(str, row))}\n" for i, row in rows.items()))
+    assert read(tmp_path, table).poses[:, 0, 3].tolist() == [1, 2, 5]
+    table.write_text(table.read_text().replace("\n2 ", "\n7 "))
+    scans = read(tmp_path, table)
+    assert scans.poses[:, 0, 3].tolist() == [1, 5]
+    assert any(note.startswith("1 scans left out") for note in scans.notes)
+    for name in (1, 2, 5):
+        (tmp_path / f"{name:010d}.csv").rename(tmp_path / f"{1.7e9 + name:.2f}.csv")
+    table.write_text("".join(f"{1.7e9 + i:.2f} {' '.join(map(str, row))}\n" for i, row in rows.items()))
+    assert read(tmp_path, table).poses[:, 0, 3].tolist() == [1, 2, 5]

@@ -105,6 +105,29 @@ def test_names_decide_what_columns_mean(tmp_path, layout):
     assert_allclose(found.poses(found.times_s), [pose([1.0, 2, 3], np.pi / 2)] * 2, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "head",
+    [
+        "x [mm],y_mm,z (mm),qx,qy,qz,qw,time [min]",
+        "p_x/mm,p_y [mm],p_z [mm],q_x [],q_y [],q_z [],q_w [],t(min)",
+    ],
+)
+def test_units_of_named_columns_of_poses(tmp_path, head):
+    (tmp_path / "a.csv").write_text(f"{head}\n1000,2000,3000,0,0,0,1,1\n2000,2000,3000,0,0,0,1,2\n")
+    found = read_poses(tmp_path / "a.csv", Notes())
+    assert_allclose(found.positions, [[1, 2, 3], [2, 2, 3]])
+    assert found.times_s.tolist() == [60, 120]
+    (tmp_path / "a.csv").write_text((tmp_path / "a.csv").read_text().replace("min", "blink"))
+    with pytest.raises(ValueError, match=r"a\.csv.*unit 'blink'"):
+        read_poses(tmp_path / "a.csv", Notes())
+
+
+def test_units_of_matrices(tmp_path):
+    names = "r11 r12 r13 t1[mm] r21 r22 r23 t2[mm] r31 r32 r33 t3[mm]"
+    (tmp_path / "a.txt").write_text(f"# {names}\n1 0 0 1000 0 1 0 2000 0 0 1 3000\n")
+    assert_allclose(read_poses(tmp_path / "a.txt", Notes())[0, :3, 3], [1, 2, 3])
+
+
 def test_one_bad_pose_is_left_out_and_named(tmp_path):
     rows = [f"{t} {t} 0 0 0 0 0 1" for t in range(10)]
     rows[2], rows[4], rows[6] = "2 nan 0 0 0 0 0 1", "4 4 0 0 0 0 0 0", "6 6 0 0 0 oops 0 1"

@@ -6,7 +6,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from radarsdf.io import Scan, Scans, read, write_poses
+from radarsdf.io import UNPOSED, Scan, Scans, read, write_poses
 from radarsdf.io.npz import read_scans, write_scans
 
 from ..conftest import pose
@@ -99,9 +99,9 @@ def test_scans_outside_of_the_poses_and_in_gaps_are_counted(tmp_path):
     (tmp_path / "poses.txt").write_text("\n".join(rows))
     scans = read(tmp_path, max_gap_s=1.5)
     assert scans.times_s.tolist() == [1, 2, 3, 6, 7]
-    assert [note.split(":")[0] for note in scans.notes] == ["3 scans left out"]
+    assert [note.split(":")[0] for note in scans.notes[1:]] == ["3 scans left out"]
     assert [len(s) for s in scans] == [2, 3, 4, 7, 8]
-    assert len(scans.notes) == 1
+    assert len(scans.notes) == 2
     assert read(tmp_path, max_gap_s=3).times_s.tolist() == [1, 2, 3, 4, 5, 6, 7]
     (tmp_path / "poses.txt").write_text("100 0 0 0 0 0 0 1\n101 0 0 0 0 0 0 1\n")
     with pytest.raises(ValueError, match=r"at 0\.0 s, poses from 100\.0 to 101\.0 s"):
@@ -165,7 +165,7 @@ def test_poses_that_are_given_win_over_those_of_an_npz(tmp_path):
     assert_allclose(read(path, ground_truth=tmp_path / "lidar.npy").ground_truth, np.full((5, 3), 2.0))
     with pytest.raises(ValueError, match="there are 4 scans but 2 poses"):
         read(path, POSES[:2])
-    with pytest.raises(ValueError, match="extrinsic applies only to poses"):
+    with pytest.raises(ValueError, match="extrinsic would have no effect"):
         read(path, extrinsic=mounting)
 
 
@@ -243,3 +243,20 @@ def test_truncated_files(tmp_path, keep):
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(ValueError, match=r"scans\.npz"):
         read_scans(path)
+
+
+def test_arguments_without_effect_are_refused_or_noted(tmp_path):
+    folder = clouds(tmp_path / "scans", 3)
+    write_scans(tmp_path / "a.npz", Scans([np.ones((1, 3))] * 3, POSES[:3]))
+    (tmp_path / "a.csv").write_text("x,y,z,range\n1,2,3,4\n")
+    for path, options in (
+        (folder, {"columns": 4}), (folder, {"topic": "/radar"}), (folder, {"R_sensor_imu": np.eye(3)}),
+        (tmp_path / "a.npz", {"columns": 4}), (tmp_path / "a.npz", {"R_sensor_imu": np.eye(3)}),
+        (folder, {"poses": UNPOSED, "extrinsic": np.eye(4)}),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=f"{list(options)[-1]} would have no effect"):
+            read(path, **({"poses": POSES[:3]} | options))
+    for options in ({"columns": 4}, {"fields": {"range": "range"}}):
+        with pytest.raises(ValueError, match=r"columns|range"):
+            len(read(tmp_path / "a.csv", POSES[:1], **options))
+    assert any("max_gap_s" in note for note in read(folder, POSES[:3], max_gap_s=1.0).notes)

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds import read_columns
+from radarsdf.io.name_times import times_in
 from radarsdf.io.poses import read_poses, trajectory_of
-from radarsdf.io.recordings import _time_in
 from radarsdf.io.text import are_degrees, in_seconds, read_numbers
 from radarsdf.scans import Notes
 
@@ -109,6 +109,8 @@ def test_times_may_be_in_other_units(folder):
     scans = read(folder, max_gap_s=1.5)
     assert pairs(scans) == [(1, 10), (2, 20), (3, 30), (4, 40)]
     assert "times of times.txt are taken as ns since 1970" in scans.notes
+    (folder / "times.txt").write_text("# time [min]\n" + "".join(f"{i}\n" for i in range(4)))
+    assert read(folder, POSES).times_s.tolist() == [0, 60, 120, 180]
 
 
 @pytest.mark.parametrize(
@@ -126,10 +128,47 @@ def test_large_times_are_in_the_unit_that_makes_them_a_date(time, time_s, unit):
 @pytest.mark.parametrize(
     ("stem", "time_s"),
     [("12.5", 12.5), ("scan_1700000000123", 1700000000.123), ("1700000000_250000000", 1700000000.25), ("1234567890", 1234567890.0),
-     ("170000000-500000000", 170000000.5), ("1700000000250000000", 1700000000.25), ("scan_123456789", None), ("7", None)],
+     ("170000000-500000000", 170000000.5), ("1700000000250000000", 1700000000.25), ("1700000000.25_radar", 1700000000.25),
+     ("2023-11-14T22:13:20.250Z", 1700000000.25), ("2023-11-14-22-13-20.25", 1700000000.25), ("20231114_221320_250", 1700000000.25),
+     ("radar_20231114221320250", 1700000000.25), ("14-11-2023_22-13-20.25", 80000.25)],
 )  # fmt: skip
 def test_names_of_files_end_in_times(stem, time_s):
-    assert _time_in(stem) == (None if time_s is None else pytest.approx(time_s, rel=1e-15))
+    notes = Notes()
+    assert times_in([stem], notes) == [pytest.approx(time_s, rel=1e-15)]
+    assert len(notes.lines) == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["scan_{:09d}", "{}", "{:010d}", "20231114_{:06d}", "20231114_221320_{:03d}", "20231114_221320_{}", "1700000000_{}",
+     "1700000000_{:06d}", "run2.{:04d}"],
+)  # fmt: skip
+def test_numbers_of_scans_are_no_times(name):
+    for count in (9, 40):
+        assert times_in([name.format(i + 1) for i in range(count)], Notes()) is None
+    assert times_in([f"5.{i + 1}" for i in range(40)], Notes()) is None
+
+
+@pytest.mark.parametrize("separator", [".", "_", "-"])
+@pytest.mark.parametrize(("unit", "jitter"), [(1, 0), (1, 3e6), (10**3, 3e6), (10**6, 3e6)])
+def test_fractions_without_leading_zeros_are_found_by_even_steps(separator, unit, jitter):
+    rng = np.random.default_rng(0)
+    times_ns = 1_700_000_899_040_000_000 + np.cumsum(103_000_000 + jitter * rng.normal(size=40)).astype(int)
+    names = [f"{t // 10**9}{separator}{t % 10**9 // unit}" for t in times_ns.tolist()]
+    notes = Notes()
+    assert_allclose(times_in(names, notes), times_ns * 1e-9, rtol=0, atol=1.1e-3)
+    assert "without leading zeros" in notes.lines[0]
+    decimals = [str(t * 1e-9) for t in times_ns.tolist()]  # loses zeros at the end
+    assert_allclose(times_in(decimals, notes), times_ns * 1e-9, rtol=0, atol=1e-6)
+    assert not any("undecided" in line for line in notes.lines)
+
+
+def test_times_that_could_be_read_in_two_ways_or_are_uneven_are_noted():
+    notes = Notes()
+    times_in([f"{1_700_000_000 + i}.40000000" for i in range(5)], notes)  # 0.4 s or 40,000,000 ns
+    assert "undecided" in notes.lines[0]
+    times_in(["1.0", "2.0", "3.0", "7.0"], notes)
+    assert "1 of 3 steps" in notes.lines[1]
 
 
 @pytest.mark.parametrize(

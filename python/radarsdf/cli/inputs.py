@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from radarsdf.cli.app import refuse_if, warn
-from radarsdf.cli.options import LIMITS
+from radarsdf.cli.options import GROUPS, LIMITS
 from radarsdf.evaluation import holdout
-from radarsdf.io.poses import UNPOSED, NoPoses, StampedPoses
+from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read
 from radarsdf.io.text import read_numbers
 from radarsdf.map.map import Map
@@ -63,6 +63,14 @@ def scans_or_unposed(given: Namespace, *, find: bool = False) -> tuple[Scans, bo
         except NoPoses:
             warn(f"note: {given.scans} has no poses: they are estimated from the radar alone")
     return read_scans(given, UNPOSED), True
+
+
+def scans_if(wanted: object, given: Namespace) -> Scans | None:
+    """Read the scans, or refuse the options for reading them if none are `wanted`."""
+    for option in () if wanted else GROUPS["reading"].split()[1:]:
+        value = vars(given)[option.lstrip("-").replace("-", "_")]
+        refuse_if(value not in (None, MAX_GAP_S), f"no scans are read: {option} {value} would have no effect")
+    return read_scans(given) if wanted else None
 
 
 def split(scans: Scans, every: int | None) -> tuple[Scans, Scans | None]:

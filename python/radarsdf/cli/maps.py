@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from radarsdf import evaluation
 from radarsdf.cli.app import refuse_if
-from radarsdf.cli.inputs import is_map, load_map, mesh_limits, read_scans, split
+from radarsdf.cli.inputs import is_map, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.results import Results
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.io.bag_messages import is_bag
@@ -65,7 +65,7 @@ def evaluate(given: Namespace, results: Results) -> None:
     radar_map = load_map(what) if is_map(what) else None
     if radar_map is None:
         check_regular_file(what)
-    scans = read_scans(given) if given.poses is not None or _holds_scans(truth) else None
+    scans = scans_if(given.poses is not None or _holds_scans(truth), given)
     lacking = holdout is not None and (radar_map is None or scans is None)
     refuse_if(lacking, f"--holdout {holdout} needs a map and scans, not {what} and {truth}")
     ground_truth = scans.ground_truth if scans is not None else read_ground_truth(truth)
@@ -154,8 +154,8 @@ def _poses(words: list[str]) -> NDArray[np.float64]:
         numbers = [float(word) for word in words]
     except ValueError:
         path = Path(" ".join(words))
-        found: Any = read_poses(path, Notes(str(path)))
-        poses = found.poses(found.times_s) if isinstance(found, Trajectory) else found
+        got: Any = read_poses(path, Notes(str(path)))
+        poses = got.poses(got.times_s) if isinstance(got, Trajectory) else getattr(got, "matrices", got)
         return np.asarray(poses[np.isfinite(poses).all(axis=(1, 2))])
     refuse_if(len(numbers) not in (3, 7), "--pose takes x y z, x y z qx qy qz qw, or a file")
     return pose_matrices_of(np.array([numbers if len(numbers) == 7 else [*numbers, 0, 0, 0, 1]]))

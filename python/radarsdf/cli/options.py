@@ -77,11 +77,8 @@ GROUPS = {
     "workers": "--processes --cluster",
 }
 
-LIMITS = (
-    "min_confidence",
-    "max_uncertainty",
-    "min_component_triangles",
-)  # options of "surface" that are arguments of Map.mesh
+# Options of "surface" that are arguments of Map.mesh.
+LIMITS = ("min_confidence", "max_uncertainty", "min_component_triangles")
 
 _Kind = dict[str, Any]
 _FLAG: _Kind = {"action": "store_true"}

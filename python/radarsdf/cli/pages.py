@@ -8,7 +8,7 @@ from pathlib import Path
 
 from radarsdf import check
 from radarsdf.cli.app import refuse_if
-from radarsdf.cli.inputs import check_address, inputs_of, load_map, mesh_limits, read_scans, split
+from radarsdf.cli.inputs import check_address, inputs_of, load_map, mesh_limits, scans_if, split
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.io.files import check_outputs
 from radarsdf.report.page import require_extras
@@ -24,7 +24,7 @@ def view(given: Namespace, results: Results) -> None:
     radar_map = load_map(given.map)
     with Viewer(
         radar_map,
-        read_scans(given) if given.scans else None,
+        scans_if(given.scans, given),
         voxel_size=given.voxel,
         box=given.box,
         host=given.host,
@@ -48,8 +48,8 @@ def report(given: Namespace, results: Results) -> None:
     check_outputs([given.out], inputs_of(given))
     radar_map = load_map(given.map)
     scans = findings = held_out = None
-    if given.scans:
-        every_scan = read_scans(given)
+    every_scan = scans_if(given.scans, given)
+    if every_scan is not None:
         findings = check(every_scan, config=radar_map.config)
         scans, held_out = split(every_scan, given.holdout)
     subject = Subject(

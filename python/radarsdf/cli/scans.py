@@ -13,7 +13,7 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.check import check_cheaply
 from radarsdf.cli.app import refuse_if, warn
-from radarsdf.cli.inputs import inputs_of, read_scans, scans_or_unposed
+from radarsdf.cli.inputs import inputs_of, read_scans, scans_if, scans_or_unposed
 from radarsdf.cli.results import Results
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
@@ -127,6 +127,7 @@ def convert(given: Namespace, results: Results) -> None:
     check_outputs([out], inputs_of(given))
     if given.poses is None and holds_mesh(given.scans):
         check_mesh_path(out)
+        scans_if(False, given)
         mesh = read_mesh(given.scans)
         write_mesh(out, mesh)
         results.add_file(f"{len(mesh.faces)} triangles", out, triangles=len(mesh.faces))

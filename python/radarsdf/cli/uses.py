@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from radarsdf.changes.compare import compare as compare_maps
-from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, read_scans
+from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, scans_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.extras import require
 from radarsdf.grids.files import check_suffix
@@ -32,7 +32,8 @@ def compare(given: Namespace, results: Results) -> None:
         require_extras()
     if given.view:
         check_address(given)
-    later = load_map(given.scans) if is_map(given.scans) else read_scans(given)
+    scans = scans_if(not is_map(given.scans), given)
+    later = load_map(given.scans) if scans is None else scans
     earlier = load_map(given.map)
     changes = compare_maps(earlier, later, align_frames=given.align, box=given.box)
     found = changes.report
@@ -79,9 +80,8 @@ def grid(given: Namespace, results: Results) -> None:
     if given.picture is not None:
         require("matplotlib", what="pictures need")
     pgm = [path.with_suffix(".pgm") for path in flat]
-    outputs = [
-        path for path in (*out, *pgm, given.distances, given.costmap, given.picture) if path is not None
-    ]
+    named = (*out, *pgm, given.distances, given.costmap, given.picture)
+    outputs = [path for path in named if path is not None]
     check_outputs(outputs, [given.map])
     radar_map = load_map(given.map)
     found = grid_of(radar_map, radar_map.extent if given.box is None else given.box, given.voxel)

@@ -10,7 +10,7 @@ import heapq
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from functools import cache
+from functools import cache, partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,8 @@ from radarsdf.checks import check
 from radarsdf.extras import require
 from radarsdf.io.files import check_regular_file
 from radarsdf.scans import Columns, Notes
+
+FloatArray = NDArray[np.float64]
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
@@ -123,9 +125,9 @@ def _point_cloud2(message: Any) -> Columns:
     check(fits, f"{height} x {width} points of {step} bytes do not fit into its {len(data)} bytes")
     columns: Columns = {}
     for field in message.fields:
-        kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")
-        check(field.offset + int(kind[1:]) <= step, f"its field {field.name} exceeds the size of a point")
-        if field.count > 1 or not field.name or field.name in columns:  # some drivers write 0 for 1
+        kind = _POINT_FIELD_TYPES.get(field.datatype, "f999")  # a type that no role can have
+        known = field.offset + int(kind[1:]) <= step and field.count <= 1  # some drivers write 0 for 1
+        if not known or not field.name or field.name in columns:
             continue
         dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
         column = np.zeros(0, dtype)
@@ -172,9 +174,8 @@ def _ars548_list(message: Any) -> Columns:
     flags = np.array([row.invalid for row in returns], np.uint8)
     if flags.ndim == 1:
         flags = np.unpackbits(flags[:, None], axis=1, bitorder="little")
-    return _ars548(
-        {name: _column(returns, name.removesuffix("_rad")) for name in _ARS548_VALUES}, flags.T != 0
-    )
+    columns = {name: _column(returns, name.removesuffix("_rad")) for name in _ARS548_VALUES}
+    return _ars548(columns, flags.T != 0)
 
 
 def _ars548(returns: Columns, invalid: NDArray[np.bool_]) -> Columns:
@@ -296,20 +297,36 @@ def read_messages(paths: list[Path], names: set[str], notes: Notes) -> Generator
         notes.add(f"messages left out: {len(texts)} of {numbers[topic]}; the first: {texts[0]}")
 
 
-def by_record(stamps: NDArray[np.float64], what: str, wanted: str | None, notes: Notes) -> bool:
-    """Whether record times replace the header stamps of `what`: if requested, or if the stamps are zero or constant."""
-    if wanted is not None:
-        return wanted == "record"
-    if stamps.any() and (len(stamps) == 1 or (stamps != stamps[0]).any()):
-        return False
-    why = "are constant" if stamps.any() else "are zero"
-    notes.add(f"the header stamps of {what} {why}: the record time is used instead")
-    return True
+class Clock(NamedTuple):
+    """Times of the messages of a topic."""
+
+    recorded: bool  # by record time, not by header stamp
+    delay_s: float  # from a stamp to its record
+    zeros: Callable[[], None]  # called for stamps of zero
+
+    @classmethod
+    def of(cls, times_s: FloatArray, what: str, wanted: str | None, notes: Notes) -> Clock:
+        """Clock of messages, of which `times_s` (2, N) are stamps and records: by default the stamps, unless zero or constant."""
+        stamps_s, known = times_s[0], times_s[:, times_s[0] != 0]
+        if wanted is None and (not known.size or (len(stamps_s) > 1 and np.ptp(stamps_s) == 0)):
+            why = "are constant" if known.size else "are zero"
+            notes.add(f"the header stamps of {what} {why}: the record time is used instead")
+            wanted = "record"
+        delay_s = float(np.median(known[1] - known[0])) if known.size else np.nan
+        zero = f"header stamps of {what} are zero: record times less the usual delay, {delay_s:.3f} s, replace them"
+        return cls(wanted == "record", delay_s, partial(notes.add, zero))
+
+    def times(self, stamps_s: Any, recorded_s: Any) -> Any:
+        """Times, s, of one or several messages."""
+        if self.recorded:
+            return recorded_s
+        zero = np.equal(stamps_s, 0) & np.isfinite(self.delay_s)
+        if zero.any():
+            self.zeros()
+        return np.where(zero, recorded_s - self.delay_s, stamps_s)
 
 
-def _stream(
-    path: Path, names: set[str]
-) -> Generator[tuple[float, Path, Any, bytes | memoryview], None, None]:
+def _stream(path: Path, names: set[str]) -> Generator[tuple[float, Path, Any, Any], None, None]:
     """Yield record time, s, bag, connection of rosbags, and bytes of each message."""
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic in names]
@@ -347,6 +364,5 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _damaged(path: Path, error: Exception) -> ValueError:
     remedy = "if its recording was cut off, mcap recover or rosbag reindex may repair it"
-    return ValueError(
-        f"{path} is not a complete bag: {(str(error) or type(error).__name__).rstrip('.')}; {remedy}"
-    )
+    why = (str(error) or type(error).__name__).rstrip(".")
+    return ValueError(f"{path} is not a complete bag: {why}; {remedy}")

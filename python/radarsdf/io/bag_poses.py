@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from array import array
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from radarsdf.checks import check
 from radarsdf.io.bag_messages import (
     PATH,
     POSE_TYPES,
     TRANSFORM_TYPES,
-    by_record,
+    Clock,
+    FloatArray,
     read_messages,
     topics_of,
     topics_with,
@@ -42,8 +45,6 @@ _DESIRED_POSE = re.compile(
 )
 _CONSTANT = 1e-9  # largest change of a constant transform that is published repeatedly
 
-FloatArray = NDArray[np.float64]
-
 
 @dataclass
 class Track:
@@ -63,13 +64,12 @@ class Track:
     @cached_property
     def constant(self) -> bool:
         """Whether all poses are the same."""
-        return self.static or bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
+        return bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
 
     @cached_property
     def matrix(self) -> FloatArray:
         """T_parent_child (4, 4) of a constant transform."""
-        matrix: NDArray[np.float64] = pose_matrices_of(self.table[-1:, 2:])[0]
-        return matrix
+        return np.asarray(pose_matrices_of(self.table[-1:, 2:])[0])
 
     def trajectory(self, name: str, request: Request) -> Trajectory:
         """Trajectory of the poses. Damaged ones are left out and noted."""
@@ -78,8 +78,24 @@ class Track:
             request.notes.add(
                 f"poses of {name} left out: {damaged} of {count} are not finite, with a unit quaternion"
             )
-        clock = int(by_record(self.table[:, 0], name, request.stamps, request.notes))
-        return trajectory_of(self.table[:, [clock, *range(2, 9)]], name)
+        times_s = self.table[:, :2].T
+        clock = Clock.of(times_s, name, request.stamps, request.notes)
+        return trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)
+
+    def link(self, request: Request) -> Trajectory | FloatArray:
+        """T_parent_child: constant, static from one time to the next, or moving."""
+        name = f"TF from {self.parent} to {self.child}"
+        if self.constant:
+            return self.matrix
+        if not self.static:
+            return self.trajectory(name, request)
+        changed = np.abs(np.diff(self.table[:, 2:], axis=0)).max(axis=1) > _CONSTANT
+        table = self.table[np.r_[True, changed]]
+        by_stamp = request.stamps != "record" and (np.diff(table[:, 0]) > 0).all() and table[1, 0] > 0
+        times_s = np.r_[-np.inf, table[1:, 0 if by_stamp else 1]]
+        listed = ", ".join(f"{time_s:.3f} s" for time_s in times_s[1:4])
+        request.notes.add(f"{name} is static, and changes {len(times_s) - 1} times: at {listed}")
+        return Trajectory(times_s, table[:, 2:5], Rotation.from_quat(table[:, 5:]), held=True)
 
 
 class TransformTree:
@@ -87,6 +103,7 @@ class TransformTree:
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
         self.tracks = dict(tracks)  # keyed by child frame
+        self.moving = {frame for frame, track in tracks.items() if not (track.static or track.constant)}
 
     def chain(self, frame: str) -> list[str]:
         """Return the frame and its ancestors up to the root. Raises a ValueError on a cycle."""
@@ -112,43 +129,49 @@ class TransformTree:
         (top, T_top_base), (other, T_top_sensor) = self.rigid_top(base), self.rigid_top(sensor)
         return np.linalg.inv(T_top_base) @ T_top_sensor if top == other else None
 
+    def mounted_on(self, frame: str) -> str:
+        """Return the highest frame that moves with this one, apart from changes of static transforms."""
+        return next(top for top in self.chain(frame) if top in self.moving or top not in self.tracks)
+
     def attach(self, poses: StampedPoses, base: str, request: Request) -> FindPoses:
         """Assign poses to `base` and to all frames below the highest one rigidly attached to it."""
         top, T_top_base = self.rigid_top(base)
         T_pose_base = np.eye(4) if request.extrinsic is None else request.extrinsic
-        above = (poses, T_pose_base @ np.linalg.inv(T_top_base))
+        return self.finder(top, request, poses, T_pose_base @ np.linalg.inv(T_top_base))
+
+    def finder(self, top: str, request: Request, *above: Any) -> Callable[[str], TransformChain | None]:
+        """Return a function from a frame below `top`, whose poses are the product of `above`, to its poses."""
 
         @cache
         def find(frame: str) -> TransformChain | None:
-            links = self._links(frame, top, request)
-            return None if links is None else TransformChain((*above, *links))
+            try:
+                chain = self.chain(frame)
+                tracks = [self.tracks[child] for child in reversed(chain[: chain.index(top)])]
+                links: list[Any] = [track.link(request) for track in tracks]
+            except ValueError:  # it is not below, or has a single pose
+                return None
+            moving = [i for i, link in enumerate(links) if isinstance(link, Trajectory) and not link.held]
+            for i, below in itertools.pairwise(moving):
+                links[i] = _held_corrections(links[i], links[below], tracks[i], request)
+            return TransformChain((*above, *links)) if above or links else None
 
         return find
 
-    def finder(self, world: str, request: Request) -> Callable[[str], TransformChain | None]:
-        """Return a function from a frame below the world to its poses."""
 
-        @cache
-        def find(frame: str) -> TransformChain | None:
-            links = self._links(frame, world, request)
-            return TransformChain(links) if links else None
-
-        return find
-
-    def _links(
-        self, frame: str, world: str, request: Request
-    ) -> tuple[StampedPoses | FloatArray, ...] | None:
-        """Transforms from the world down to a frame; None if there are none, or one of them has a single pose."""
-        links: list[StampedPoses | FloatArray] = []
-        try:
-            chain = self.chain(frame)
-            for child in reversed(chain[: chain.index(world)]):
-                track = self.tracks[child]
-                name = f"TF from {track.parent} to {child}"
-                links.append(track.matrix if track.constant else track.trajectory(name, request))
-        except ValueError:
-            return None
-        return tuple(links)
+def _held_corrections(slow: Trajectory, below: Trajectory, track: Track, request: Request) -> Trajectory:
+    """Let poses hold, as in tf2, that correct those of the frame below too rarely to be interpolated."""
+    gap_s = float(np.median(np.diff(slow.times_s)))
+    if gap_s <= request.max_gap_s:
+        return slow
+    base = np.stack([np.interp(slow.times_s, below.times_s, axis) for axis in below.positions.T], axis=1)
+    at = slow.rotations.apply(base) + slow.positions
+    uncorrected = slow.rotations[:-1].apply(base[1:]) + slow.positions[:-1]
+    corrected_m, moved_m = (np.linalg.norm(uncorrected - x, axis=1).sum() for x in (at[1:], at[:-1]))
+    if corrected_m > moved_m:  # it moves more than the frame below
+        return slow
+    name = f"TF from {track.parent} to {track.child}"
+    request.notes.add(f"{name} comes every {gap_s:.3g} s: the last one before a scan holds")
+    return replace(slow, held=True)
 
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
@@ -172,28 +195,24 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     names = {n for n in fitting if not _DESIRED_POSE.search(n)} if wanted is None else fitting & {wanted}
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
-    name = wanted if wanted is not None else _choose(tracks, tree, sensor, preferred)
-    if wants_tf or name is None:
+    name = "" if wants_tf else wanted or _choose(tracks, tree, sensor, preferred)
+    if not name:
         try:
             find = _tree_poses(tree, sensor, request)
         except ValueError:
             if wants_tf or not tracks:
                 raise
-            one = len(tracks) == 1
             listed = ", ".join(sorted(tracks))
-            check(
-                one,
-                f"{notes.about} has several topics with poses: choose one with pose_topic, of {listed}",
-            )
+            what = "has several topics with poses: choose one with pose_topic"
+            check(len(tracks) == 1, f"{notes.about} {what}, of {listed}")
             (name,) = tracks
-        else:
-            for other in sorted(fitting):
-                notes.add(f"poses of {other} are ignored; pose_topic selects them")
-            return find
-    check(name in tracks, f"{paths[0]}: {name} holds no poses")
-    trajectory = tracks[name].trajectory(name, request)
     for other in sorted(fitting - {name}):
         notes.add(f"poses of {other} are ignored; pose_topic selects them")
+    if not name:
+        return find
+    request.refuse(f"the poses are those of {name}, and not of TF", "world_frame")
+    check(name in tracks, f"{paths[0]}: {name} holds no poses")
+    trajectory = tracks[name].trajectory(name, request)
     notes.add(f"poses: {len(trajectory.times_s)} of {name}")
     base = sensor if request.extrinsic is not None else _base(tracks[name].child, name, tree, sensor, notes)
     return tree.attach(trajectory, base, request)
@@ -229,20 +248,20 @@ def _tracks_and_tree(
     return moving, TransformTree(edges)
 
 
-def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferred: str | None) -> str | None:
-    """Return the preferred topic, or the only one whose child frame is rigidly attached to that of the scans; else None."""
-    if preferred in tracks:
+def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferred: str | None) -> str:
+    """Return the preferred topic, or the only one whose child frame is rigidly attached to that of the scans; else ``""``."""
+    if preferred is not None and preferred in tracks:
         return preferred
-    known = sensor in tree.tracks
+    known, top = sensor in tree.tracks, tree.mounted_on(sensor)
     children = {name: track.child for name, track in tracks.items() if track.child}
-    leading = [n for n, child in children.items() if not known or tree.fixed(child, sensor) is not None]
-    return leading[0] if len(leading) == 1 else None
+    leading = [n for n, child in children.items() if not known or tree.mounted_on(child) == top]
+    return leading[0] if len(leading) == 1 else ""
 
 
 def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes) -> str:
     """Frame of the poses of a topic; if it names none, the one that moves with the sensor."""
-    base = child or tree.rigid_top(sensor)[0]
-    if tree.fixed(base, sensor) is None or (not child and base == sensor):
+    base = child or tree.mounted_on(sensor)
+    if tree.mounted_on(base) != tree.mounted_on(sensor) or (not child and base == sensor):
         notes.add(
             f"no extrinsic is known between the frame of {name}, {child or '(unnamed)'}, and that of the scans, "
             f"{sensor or '(unnamed)'}: the poses are taken as those of the radar; give extrinsic if they are not"
@@ -256,7 +275,7 @@ def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes)
 def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
     about = request.notes.about
-    moving = {frame for frame, track in tree.tracks.items() if not track.constant}
+    moving = tree.moving
     if not moving:
         what = "TF that moves" if tree.tracks else "Odometry, PoseStamped, Path or TF"
         msg = f"{about} has no poses ({what}): give a file of poses, such as TUM; {FIND_POSES}"

@@ -22,16 +22,16 @@ from radarsdf.io.bag_messages import (
     CLOUD_TYPES,
     IMU,
     PACKETS,
+    Clock,
     Message,
     Topic,
-    by_record,
     is_bag,
     read_messages,
     topics_of,
     topics_with,
 )
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
-from radarsdf.io.poses import UNPOSED, Poses, poses_of
+from radarsdf.io.poses import UNPOSED, NumberedPoses, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
 from radarsdf.scans import Scans
 
@@ -50,18 +50,19 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     """Read scans of one drive from one or several bags; see :func:`radarsdf.io.read`."""
     others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
     check(paths and all(map(is_bag, paths)), f"{others} is not a bag: only bags can be read together")
+    request.refuse(f"{request.notes.about}: messages have names of columns", "columns")
     topics = topics_of(paths)
     scan_topics = _scan_topics(topics, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
     frames = [frame for frame, _ in counted.most_common()]
-    by_recording = {
-        name: by_record(np.array([c.stamp_s for c in clouds]), name, request.stamps, request.notes)
-        for name, clouds in peeked.items()
-    }
+    clocks = {}
+    for name, clouds in peeked.items():
+        times_s = np.array([(cloud.stamp_s, cloud.recorded_s) for cloud in clouds]).T
+        clocks[name] = Clock.of(times_s, name, request.stamps, request.notes)
 
     def raw_scans() -> Iterator[RawScan]:
-        streams = [_raw_scans(paths, topic, by_recording[topic.name], request) for topic in scan_topics]
+        streams = [_raw_scans(paths, topic, clocks[topic.name], request) for topic in scan_topics]
         merged = heapq.merge(*streams, key=lambda raw: raw.time_s or 0.0)
         return streams[0] if len(streams) == 1 else (replace(raw, number=None) for raw in merged)
 
@@ -70,8 +71,9 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
         pose_paths = paths if poses is None else [Path(poses)]
         find = poses_in_bags(pose_paths, request, frames, KNOWN_TOPICS.get(scan_topics[0].name))
     else:
+        request.refuse("poses are given", "pose_topic", "world_frame")
         find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
-    recorded = by_recording[scan_topics[0].name]
+    recorded = clocks[scan_topics[0].name].recorded
     imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
     return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
@@ -85,7 +87,7 @@ def _user_poses(
     request: Request,
 ) -> FindPoses:
     """Poses passed by the user: in the order of the scans, or by time, of the most frequent frame among the first scans."""
-    if isinstance(poses, np.ndarray):
+    if isinstance(poses, (np.ndarray, NumberedPoses)):
         count = topics[0].num_messages if len(topics) == 1 else sum(1 for _ in raw_scans())
         numbered_poses, _ = scan_poses(poses, count, None, request.extrinsic, request)
         return lambda _: numbered_poses
@@ -137,9 +139,9 @@ def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
     return peeked
 
 
-def _raw_scans(paths: list[Path], topic: Topic, recorded: bool, request: Request) -> Iterator[RawScan]:
+def _raw_scans(paths: list[Path], topic: Topic, clock: Clock, request: Request) -> Iterator[RawScan]:
     for message in read_messages(paths, {topic.name}, request.notes):
-        time_s = message.recorded_s if recorded else message.stamp_s
+        time_s = float(clock.times(message.stamp_s, message.recorded_s))
         name = f"{message.bag}: message {message.number} of {topic.name}"
         yield RawScan(partial(dict, message.content), time_s, name, message.frame, topic.name, message.number)
 
@@ -176,11 +178,9 @@ def _read_imu(
     table = table[np.isfinite(table[:, :5]).all(axis=1)]
     if len(table) == 0:
         return None
-    times_s, recorded_s = table[:, 0], table[:, 1]
-    if by_record(times_s, topic, None, request.notes):
-        times_s = recorded_s
-    elif recorded:
-        times_s = times_s + np.median(recorded_s - times_s)
+    times_s = Clock.of(table[:, :2].T, topic, None, request.notes).times(*table[:, :2].T)
+    if recorded:
+        times_s = times_s + np.median(table[:, 1] - times_s)
     order = np.argsort(times_s, kind="stable")
     forces = table[order, 5:]
     has_force = np.isfinite(forces).all() and forces.any()

@@ -19,7 +19,7 @@ from radarsdf.io.fields import Fields, names_of
 from radarsdf.io.files import check_regular_file, reading
 from radarsdf.io.lzf import unpack_lzf
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import read_table
+from radarsdf.io.text import as_numbers, read_table
 from radarsdf.scans import Columns, Notes
 
 TEXT_SUFFIXES = (".csv", ".txt", ".xyz")
@@ -30,6 +30,7 @@ _VLRS_AT, _VLR_BYTES = 100, 54  # offset of the number of records in a LAS heade
 _LAZ_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # layers of a chunk by point format, plus extra bytes
 _VARIABLE = 2**32 - 1  # marks chunks of varying size, in place of the number of points per chunk
 _MAX_HEADER_LINES, _MAX_LINE = 64, 1 << 16  # a PCD header has eleven lines
+_PCD_TYPES = {f"<{kind}{size}" for kind in "iuf" for size in (1, 2, 4, 8)} - {"<f1"}
 _PLY_HEADER_BYTES = 1 << 16
 _KITTI_WIDTH, _INSPECTED_FILES = 4, 20  # columns, and number of .bin files that are inspected
 _MAX_POSITION_M, _DAMAGED = 1e7, 0.02  # limit of coordinates, and share of numbers that may be damaged
@@ -132,6 +133,7 @@ def _variance(numbers: NDArray[np.float32], width: int) -> float:
 def _npy(path: Path, columns: GivenColumns) -> Columns:
     array = array_in(path)
     if array.dtype.names is not None and array.ndim == 1:
+        check(not columns, "it has names of columns: leave out columns (--columns)")
         return {name: array[name] for name in array.dtype.names}
     rows = array.ndim == 2 and array.dtype.kind in "iuf"
     check(rows, f"it holds an array {array.shape} of {array.dtype}, not one row of numbers per point")
@@ -145,9 +147,9 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
     named = [head for head in table.heads if len(head) == width and not any(map(str.isdecimal, head))]
     names = named[-1] if named else names_of(width or 3, columns)
     values = table.values if len(table.values) else np.zeros((0, len(names)))
-    fits = values.shape[1] == len(names) == len(set(names))
-    check(fits, f"its header has {len(names)} names for {width} columns, or a name twice")
-    return dict(zip(names, values.T, strict=True))
+    check(values.shape[1] == len(names), f"its header has {len(names)} names for {values.shape[1]} columns")
+    check(not (named and columns), "it has names of columns: leave out columns (--columns)")
+    return {name: column for name, column in zip(names, values.T, strict=True) if names.count(name) == 1}
 
 
 # PCD: pointclouds.org/documentation/tutorials/pcd_file_format.html
@@ -160,31 +162,24 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
         body = file.read()
     names, points = header["FIELDS"], int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-    fields = zip(header["TYPE"], header["SIZE"], counts, strict=True)
-    dtypes = [np.dtype((f"<{kind.lower()}{size}", (count,))) for kind, size, count in fields]
+    sizes = [int(size) * count for size, count in zip(header["SIZE"], counts, strict=True)]
+    starts, step = np.cumsum([0, *sizes]).tolist(), sum(sizes)
+    kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    # The name _ means padding, and several fields may have it. Others may have any type, size and count.
+    scalars = [i for i, n in enumerate(counts) if n == 1 and kinds[i] in _PCD_TYPES and names[i] != "_"]
     form = header["DATA"][0]
     check(form in ("ascii", "binary", "binary_compressed"), f"its DATA is {form}: save it as binary")
     if form == "binary":
-        record = np.dtype([(f"f{i}", dtype) for i, dtype in enumerate(dtypes)])
-        cloud = np.frombuffer(body, record, points)
-        columns = [cloud[name][:, 0] for name in record.names or ()]
-    elif form == "binary_compressed":  # one field after another
+        table = np.frombuffer(body, np.uint8, points * step).reshape(points, step)
+        return {names[i]: table[:, starts[i] : starts[i + 1]].copy().view(kinds[i])[:, 0] for i in scalars}
+    if form == "binary_compressed":  # one field after another
         packed, unpacked = np.frombuffer(body, "<u4", 2).tolist()
-        ends = np.cumsum([points * dtype.itemsize for dtype in dtypes]).tolist()
-        check(
-            unpacked == ends[-1], f"its {unpacked} unpacked bytes are not {points} points of {ends[-1]} bytes"
-        )
+        wanted = f"{points} points of {step} bytes"
+        check(unpacked == points * step, f"its {unpacked} unpacked bytes are not {wanted}")
         data = unpack_lzf(body[8 : 8 + packed], unpacked)
-        starts = [0, *ends[:-1]]
-        columns = [
-            np.frombuffer(data, dtype, points, start)[:, 0]
-            for dtype, start in zip(dtypes, starts, strict=True)
-        ]
-    else:
-        table = np.array(body.split(), np.float64).reshape(points, sum(counts))
-        columns = [table[:, i] for i in np.cumsum([0, *counts[:-1]])]
-    # The name _ means padding, and several fields may have it.
-    return {name: columns[i] for i, name in enumerate(names) if counts[i] == 1 and name != "_"}
+        return {names[i]: np.frombuffer(data, kinds[i], points, points * starts[i]) for i in scalars}
+    words = np.array(body.split()).reshape(points, sum(counts))
+    return {names[i]: as_numbers(words[:, sum(counts[:i])]) for i in scalars}
 
 
 def read_viewpoint(path: Path) -> NDArray[np.float64]:
@@ -237,10 +232,10 @@ def _ply(path: Path, _: GivenColumns) -> Columns:
         return {axis: np.zeros(0) for axis in "xyz"}
     data = vertex["data"]
     names = data.keys() if isinstance(data, dict) else data.dtype.names
-    columns = {str(name): np.asarray(data[name]).reshape(-1) for name in names}
-    whole = all(len(column) == vertex["length"] for column in columns.values())
+    columns = {str(name): np.asarray(data[name]) for name in names}
+    whole = {name: column.reshape(-1) for name, column in columns.items() if column.size == vertex["length"]}
     check(whole, f"its header claims {vertex['length']} points, but it holds fewer")
-    return columns
+    return whole  # without lists
 
 
 def _las(path: Path, _: GivenColumns) -> Columns:

@@ -98,8 +98,7 @@ def _delft_pose(
     if T_camera_radar is None:
         msg = f"{calibration} lacks Tr_velo_to_cam"
         raise ValueError(msg)
-    T_map_radar: NDArray[np.float64] = T_map_camera @ T_camera_radar
-    return T_map_radar
+    return np.asarray(T_map_camera @ T_camera_radar)
 
 
 # The Oculii Eagle of SNAIL-Radar, snail-radar.github.io. The poses are those of its lidar in UTM zone 50R, the world frame.

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check
-from radarsdf.io.text import SCALES, are_degrees, without_unit
+from radarsdf.io.text import are_degrees
+from radarsdf.io.units import factor_of, known_factor, without_unit
 from radarsdf.scans import Notes, Scan, finite_returns
 
 _XYZ = ("x", "y", "z")
@@ -35,6 +36,11 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "sigma_azimuth": ("sigmaazimuth", "azimuthstd", "aziaccu"),
     "sigma_elevation": ("sigmaelevation", "elevationstd", "eleaccu"),
 }  # fmt: skip
+_DIMENSIONS = {
+    **dict.fromkeys((*_XYZ, "range", "sigma_range"), "length"),
+    **dict.fromkeys(("azimuth", "elevation", "sigma_azimuth", "sigma_elevation"), "angle"),
+    "doppler": "speed",
+}  # intensities may have any unit
 # Names of unnamed columns, by the number of columns.
 _COLUMNS: dict[int, tuple[str, ...]] = {
     3: ("x", "y", "z"),
@@ -47,8 +53,9 @@ _COLUMNS: dict[int, tuple[str, ...]] = {
 
 def names_of(width: int, columns: int | Sequence[str] | None) -> list[str]:
     """Names of `width` columns that have none in their file."""
+    names = range(columns) if isinstance(columns, int) else columns or range(width)
+    check(len(names) == width, f"there are {width} columns, not the {len(names)} that are given")
     if columns is not None and not isinstance(columns, int):
-        check(len(columns) == width, f"there are {width} columns, but {len(columns)} names")
         return list(columns)
     return list(_COLUMNS.get(width, ("x", "y", "z", *(f"column_{i}" for i in range(3, width)))[:width]))
 
@@ -87,12 +94,34 @@ class Fields:
         missing = ", ".join(role for role in wanted if role not in found)
         known = not missing or set(_POLAR) <= set(found)
         check(known, f"the fields {missing} are missing: there are {', '.join(names) or 'none'}")
+        useless = [r for r in _POLAR if (overrides or {}).get(r) is not None and not cls(found).polar]
+        check(not useless, f"fields {useless} have no effect next to x, y and z: set one of these to None")
         return cls(found)
 
     @property
     def polar(self) -> bool:
         """Whether positions are given by range and angles."""
         return not set(_XYZ) <= set(self.names)
+
+    @property
+    def used(self) -> list[str]:
+        """Roles that scans need: the fields of all others may be of any kind."""
+        sigma = SIGMA if set(SIGMA) <= set(self.names) else ()
+        roles = (*(_POLAR if self.polar else _XYZ), "intensity", "doppler", *sigma)
+        return [role for role in roles if role in self.names]
+
+    def factor(self, role: str) -> float:
+        """Return the factor from the unit of a field to m, rad or m/s: that in its name, or else degrees by value."""
+        if role not in _DIMENSIONS:
+            return 1.0
+        name, dimension = self.names[role], _DIMENSIONS[role]
+        bare, unit = plain_name(name)
+        named = name.endswith(("]", ")")) or _squeeze(bare) in _ALIASES[role]
+        if not named and known_factor(unit, dimension) is None:  # v_rad is a radial speed
+            unit = ""
+        if not unit and self.in_degrees and dimension == "angle":
+            unit = "deg"
+        return factor_of(unit, dimension, name)
 
     def with_unit(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
         """Return these fields with the unit of their angles, from their names or else from the values in a cloud."""
@@ -102,17 +131,15 @@ class Fields:
         azimuth, elevation = (np.asarray(columns[name], np.float64) for name in names)
         in_degrees = are_degrees(azimuth, elevation)
         unit = "degrees" if in_degrees else "rad"
-        notes.add(
-            f"{' and '.join(names)} are taken as {unit} by their values: azimuth_deg or azimuth_rad would be explicit"
-        )
+        how = "by their values: azimuth_deg or azimuth_rad would be explicit"
+        notes.add(f"{' and '.join(names)} are taken as {unit} {how}")
         return replace(self, in_degrees=in_degrees)
 
     def note_use(self, names: Iterable[str], notes: Notes) -> None:
         """Note intensities in linear units, and unused fields."""
-        if "intensity" in self.names and plain_name(self.names["intensity"])[1] == "linear":
-            notes.add(
-                f"{self.names['intensity']} is used as intensity unchanged: in dB, 10 log10, it gives a better map"
-            )
+        name = self.names.get("intensity", "")
+        if plain_name(name)[1] == "linear":
+            notes.add(f"{name} is used as intensity unchanged: in dB, 10 log10, it gives a better map")
         if unused := [name for name in names if name and name not in self.names.values()]:
             listed = ", ".join(unused)
             notes.add(f"unused fields: {listed}; fields={{role: name}} or --field selects others")
@@ -125,7 +152,7 @@ class Fields:
         notes: Notes,
     ) -> Scan:
         """Build a scan of the finite returns in the columns, (N,) each."""
-        for name in self.names.values():
+        for name in (self.names[role] for role in self.used):
             check(columns[name].dtype.kind in "biuf", f"the field {name} holds no numbers")
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are dropped
             intensities, doppler_mps = (
@@ -136,12 +163,9 @@ class Fields:
         return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma), notes)
 
     def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
-        """A column converted to m, rad or m/s by the unit in its name, or from degrees."""
-        unit = plain_name(self.names[role])[1]
-        if not unit and self.in_degrees and role.endswith(("azimuth", "elevation")):
-            unit = "deg"
-        values = columns[self.names[role]]
-        return values * np.float64(SCALES[unit]) if unit in SCALES else values
+        """A column converted to m, rad or m/s."""
+        values, factor = columns[self.names[role]], self.factor(role)
+        return values if factor == 1 else values * np.float64(factor)
 
     def points(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
         """(N, 3) sensor frame, m: float64 if the file has it, else float32."""

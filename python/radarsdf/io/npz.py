@@ -145,8 +145,7 @@ def array_in(path: Path) -> NDArray[Any]:
     """Map the array of an ``.npy`` file into memory; a header that claims more than the file holds is refused."""
     check_regular_file(path)
     with reading(path, "a complete .npy file", EOFError):
-        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-        return array
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
 def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, pose_matrices, real_array
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import SCALES, in_seconds, read_numbers, read_table, without_unit
+from radarsdf.io.text import in_seconds, read_numbers, read_table
+from radarsdf.io.units import scaled, without_unit
 from radarsdf.scans import Columns, Notes
 
 MAX_GAP_S = 0.5  # longest gap to interpolate across, by default
@@ -29,6 +30,7 @@ FIND_POSES = "radarsdf poses estimates them from the radar alone"  # ends messag
 
 _MAX_NORM_ERROR = 1e-2  # tolerance for unit quaternions: three digits suffice, other columns are refused
 _ROUNDING_S = 1e-3
+_MAX_NUMBER = 1e9  # limit of numbers of scans; larger integers are times since 1970
 
 _POSITION = "(?:t|p|pos|position|trans|translation|loc|location|pose)"
 _QUATERNION = "(?:q|quat|quaternion|orientation|rot|rotation)"
@@ -46,11 +48,12 @@ _ROLES = (
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """P poses T_world_base of a moving frame `base`."""
+    """P poses T_world_base of a frame `base` that moves, or keeps each pose until the next one."""
 
     times_s: NDArray[np.float64]  # (P,) ascending
     positions: NDArray[np.float64]  # (P, 3) world frame, m
     rotations: Rotation  # P rotations R_world_base
+    held: bool = False  # each pose holds until the next one
 
     def span(self) -> str:
         """First and last time, for messages."""
@@ -74,6 +77,10 @@ class Trajectory:
         A time up to a millisecond beyond the ends, or beyond the edge of a longer gap, gets the pose there: times in files are
         rounded.
         """
+        if self.held:
+            last = int(np.searchsorted(self.times_s, time_s, "right")) - 1
+            row = np.hstack([self.positions[last], self.rotations[last].as_quat()])
+            return None if last < 0 else np.asarray(pose_matrices_of(row[None])[0])
         after = int(np.clip(np.searchsorted(self.times_s, time_s), 1, len(self.times_s) - 1))
         first_s, last_s = self.times_s[after - 1 : after + 1]
         if not first_s <= time_s <= last_s or last_s - first_s > max_gap_s:
@@ -81,8 +88,7 @@ class Trajectory:
             if not abs(time_s - nearest_s) <= _ROUNDING_S:
                 return None
             time_s = nearest_s
-        pose: NDArray[np.float64] = self.poses(np.array([time_s]))[0]
-        return pose
+        return np.asarray(self.poses(np.array([time_s]))[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +112,17 @@ class TransformChain:
         return ", ".join(link.span() for link in self.links if not isinstance(link, np.ndarray))
 
 
+class NumberedPoses(NamedTuple):
+    """P poses T_world_sensor with the numbers of their scans, which may have gaps."""
+
+    numbers: list[int]
+    matrices: NDArray[np.float64]  # (P, 4, 4)
+
+
 StampedPoses: TypeAlias = Trajectory | TransformChain
 
-Poses: TypeAlias = StampedPoses | NDArray[np.float64]
-"""Poses by time, or (F, 4, 4) in the order of the scans."""
+Poses: TypeAlias = StampedPoses | NumberedPoses | NDArray[np.float64]
+"""Poses by time, by number of the scan, or (F, 4, 4) in the order of the scans."""
 
 UNPOSED: StampedPoses = TransformChain(())
 """Passed as `poses`, reads scans without poses, such as for :func:`radarsdf.odometry`: each pose is the identity."""
@@ -123,8 +136,7 @@ def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Mask (P,) of the rows (P, 7) x y z qx qy qz qw that are finite and have a unit quaternion."""
     with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers may overflow
         unit = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= _MAX_NORM_ERROR
-    mask: NDArray[np.bool_] = unit & np.isfinite(table).all(axis=1)
-    return mask
+    return np.asarray(unit & np.isfinite(table).all(axis=1))
 
 
 def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -149,12 +161,10 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    what = "are left out: not finite, no unit quaternion, or a repeated time"
-    left_out = (
-        ""
-        if kept.all()
-        else f"{(~kept).sum()} of {len(table)} poses {what}; the first: pose {np.argmin(kept)}"
+    what = (
+        f"of {len(table)} poses are left out: not finite, no unit quaternion, or a repeated time; the first"
     )
+    left_out = "" if kept.all() else f"{(~kept).sum()} {what}: pose {np.argmin(kept)}"
     if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
         msg = f"{name} holds {len(times_s)} poses at different times; at least two are needed; {left_out}"
         raise ValueError(msg)
@@ -183,6 +193,7 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     - KITTI: lines of twelve numbers, the first three rows of a matrix. If ``calib.txt`` next to it has a ``Tr``,
       T_world_sensor = inv(Tr) P Tr, so that the world is the first scan's sensor frame.
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
+    - Lines of a number of a scan, or a time, and one of these matrices.
 
     Times may be in ms, µs or ns since 1970, or in the unit of their column's name.
     """
@@ -195,44 +206,61 @@ def read_poses(path: Path, notes: Notes) -> Poses:
         check(len(values), "it has no rows of numbers")
     heads = [head for head in reversed(table.heads) if len(head) == width]
     for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
-        columns = _pose_columns(names, values)
+        with reading(path, "a table of poses"):
+            columns = _pose_columns(names, values)
         if columns:
             return _from_columns(columns, path, notes)
-    if width == 12:
-        poses = np.tile(np.eye(4), (len(values), 1, 1))
-        poses[:, :3] = values.reshape(-1, 3, 4)
+    names = heads[0] if heads else [""] * width
+    numbers = {12: 12, 13: 12, 16: 16, 17: 16}.get(width, 0)  # without a number of the scan, or a time
+    with reading(path, "a table of poses"):
+        for at in (3, 7, 11) if numbers else ():
+            values[:, at - numbers] = scaled(values[:, at - numbers], names[at - numbers], "length")
+    if numbers or (width == 4 and len(values) % 4 == 0):
+        rows = values[:, -numbers:].reshape(-1, 3 if numbers == 12 else 4, 4)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, : rows.shape[1]] = rows
         P = rigid_or_nan(poses, str(path), notes)
-        calibration = path.with_name("calib.txt")
-        Tr = read_calibration(calibration) if calibration.is_file() else None
-        found = (
-            "are camera poses, by Tr of calib.txt"
-            if Tr is not None
-            else "are taken as T_world_sensor: no calib.txt"
-        )
-        notes.add(f"{path.name}: KITTI poses {found}")
-        return P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
-    if width == 16 or (width == 4 and len(values) % 4 == 0):
-        return rigid_or_nan(values.reshape(-1, 4, 4), str(path), notes)
+        if numbers == 12:
+            calibration = path.with_name("calib.txt")
+            Tr = read_calibration(calibration) if calibration.is_file() else None
+            how = "are taken as T_world_sensor: no" if Tr is None else "are camera poses, by Tr of"
+            notes.add(f"{path.name}: KITTI poses {how} calib.txt")
+            P = P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
+        return _led_by(values[:, 0], P, path, notes) if width in (13, 17) else P
     msg = f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
     raise ValueError(msg)
 
 
+def _led_by(lead: NDArray[np.float64], P: NDArray[np.float64], path: Path, notes: Notes) -> Poses:
+    """Poses by the first column of a table: numbers of scans if it holds small integers, else times."""
+    known = np.isfinite(lead) & np.isfinite(P).all(axis=(1, 2))
+    lead, P = lead[known], P[known]
+    if (lead == lead.round()).all() and (np.abs(lead) < _MAX_NUMBER).all():
+        notes.add(f"the first column of {path.name} is taken as the number of the scan")
+        return NumberedPoses(lead.astype(int).tolist(), P)
+    quaternions = Rotation.from_matrix(P[:, :3, :3]).as_quat()
+    times_s = in_seconds(lead, path.name, notes)
+    return trajectory_of(np.column_stack([times_s, P[:, :3, 3], quaternions]), str(path), notes)
+
+
 def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
-    """Columns by role, times in s; empty if the names are not those of a pose."""
-    found: Columns = {}
+    """Columns by role, in s and m; empty if the names are not those of a pose."""
+    found: dict[str, tuple[NDArray[np.float64], str]] = {}
     for name, column in zip(names, table.T, strict=True):
-        bare, unit = without_unit(name)
-        words = re.sub(r"[\W_]+", " ", bare).strip()
+        words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
         for pattern, template in _ROLES:
             if match := re.fullmatch(pattern, words):
-                role = template.format(*match.groups())
-                found.setdefault(role, column * SCALES.get(unit, 1.0) if role in _TIMES else column)
+                found.setdefault(template.format(*match.groups()), (column, name))
                 break
+    if not set(_TUM[1:]) <= set(found):
+        return {}
+    columns = {role: scaled(*found[role], "length") for role in "xyz"}
+    columns |= {role: found[role][0] for role in _TUM[4:]}
     if {"sec", "nsec"} <= set(found):
-        found["time"] = found["sec"] + 1e-9 * found["nsec"]
-    elif times := [found[name] for name in (*_TIMES, "sec") if name in found]:
-        found["time"] = times[0]
-    return found if set(_TUM[1:]) <= set(found) else {}
+        columns["time"] = found["sec"][0] + 1e-9 * found["nsec"][0]
+    elif times := [name for name in (*_TIMES, "sec") if name in found]:
+        columns["time"] = scaled(*found[times[0]], "time")
+    return columns
 
 
 def _from_columns(columns: Columns, path: Path, notes: Notes) -> Poses:

@@ -147,7 +147,11 @@ def read(
         max_gap_s=positive(max_gap_s, "max_gap_s"),
         notes=Notes(str(path) if single else "the bags"),
     )
+    if poses is UNPOSED:
+        request.refuse("scans are read without poses", "extrinsic", "pose_topic", "world_frame")
     scans = _read(paths[0], request) if single else read_bags(paths, request)
+    if R_sensor_imu is not None and scans.imu is None:
+        request.refuse(f"{request.notes.about} has no IMU, or several", "R_sensor_imu")
     if ground_truth is None:
         return scans
     if isinstance(ground_truth, (str, PathLike)):
@@ -160,19 +164,19 @@ def _read(path: Path, request: Request) -> Scans:
     """Dispatch on the kind of path: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
     if is_bag(path):
         return read_bags([path], request)
-    if path.is_dir():
-        if (dataset := datasets.find(path)) is not None:
-            return dataset.read(path, request)
-        if bags := bags_in(path):  # NTU4DRadLM and Viking Hill have files next to them
-            if request.extrinsic is None:
-                request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
-            file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
-            if file is not None and request.poses is None and request.pose_topic is None:
-                request.notes.add(f"poses: of {file.name}")
-                request = dataclasses.replace(request, poses=file)
-            return read_bags(bags, request)
-    for name in ("topic", "pose_topic", "imu_topic", "world_frame", "stamps"):
-        check(getattr(request, name) in (None, ()), f"{path} is not a bag: {name} applies only to bags")
+    dataset = datasets.find(path) if path.is_dir() else None
+    bags = bags_in(path) if path.is_dir() and dataset is None else []
+    if bags:  # NTU4DRadLM and Viking Hill have files next to them
+        if request.extrinsic is None:
+            request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
+        file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
+        if file is not None and request.poses is None and request.pose_topic is None:
+            request.notes.add(f"poses: of {file.name}")
+            request = dataclasses.replace(request, poses=file)
+        return read_bags(bags, request)
+    request.refuse(f"{path} is not a bag", "topic", "pose_topic", "imu_topic", "world_frame", "stamps")
+    if dataset is not None:
+        return dataset.read(path, request)
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path, request)
@@ -189,8 +193,9 @@ def _npz(path: Path, request: Request) -> Scans:
     """Read our own file, with its poses or those passed by the user."""
     notes = request.notes
     others = None if request.poses is UNPOSED else request.poses
-    what = "contains its own poses T_world_sensor: extrinsic applies only to poses passed as an argument"
-    check(others is not None or request.extrinsic is None, f"{path} {what}")
+    request.refuse(f"{path} has names of columns", "columns")
+    if others is None:
+        request.refuse(f"{path} contains its own poses T_world_sensor", "extrinsic")
     scans = read_scans(path)
     truth = scans.ground_truth
     if others is None:

@@ -7,9 +7,11 @@ roles. Unusable data are counted in the notes, and never abort the reading. Fold
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check
-from radarsdf.io.clouds import CLOUD_SUFFIXES, check_kitti, read_columns, read_points
+from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, check_kitti, read_columns, read_points
 from radarsdf.io.fields import Fields
 from radarsdf.io.files import reading
+from radarsdf.io.name_times import times_in
 from radarsdf.io.poses import (
     FIND_POSES,
     MAX_GAP_S,
     POSE_FILES,
     NoPoses,
+    NumberedPoses,
     Poses,
+    StampedPoses,
     Trajectory,
     TransformChain,
     poses_of,
     read_transform,
 )
-from radarsdf.io.text import in_seconds, read_numbers, unit_since_1970
+from radarsdf.io.text import in_seconds, read_numbers, read_table
+from radarsdf.io.units import scaled
 from radarsdf.scans import Columns, Notes, Scan, Scans
 
 BASE_T_RADAR = "base_T_radar.txt"
@@ -42,13 +48,11 @@ TIME_FILES = ("times.txt", "timestamps.txt", "timestamp.txt", "timestamp_radar.t
 SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD", "velodyne", "data")
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, "calib.txt", BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
-_SECONDS_AND_NANOSECONDS = re.compile(r"(\d{9,10})[_-](\d{9})$")
-_TIME = re.compile(r"(\d+\.\d+|\d{10,})$")
 
 Truth = Callable[[], NDArray[np.float64] | None]
 """Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
 
-FindPoses = Callable[[str], Poses | None]
+FindPoses = Callable[[str], StampedPoses | NDArray[np.float64] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,12 @@ class Request:
     stamps: str | None = None
     world_frame: str | None = None
     notes: Notes = field(default_factory=Notes)
+
+    def refuse(self, why: str, *names: str) -> None:
+        """Raise a ValueError for arguments that would have no effect."""
+        given = {name: getattr(self, name) for name in names}
+        useless = ", ".join(name for name, value in given.items() if value is not None and np.size(value))
+        check(not useless, f"{why}: {useless} would have no effect; leave it out")
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +145,7 @@ def _scan(
         return None
     if not scan:
         notes.count("scans left out: they hold no returns")
-        return None
-    return scan
+    return scan or None
 
 
 def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields], request: Request) -> Fields:
@@ -156,10 +165,14 @@ def scan_poses(
     times_s: Sequence[float] | None,
     T_base_sensor: NDArray[np.float64] | None,
     request: Request,
-) -> tuple[Poses, Sequence[float] | None]:
+) -> tuple[StampedPoses | NDArray[np.float64], Sequence[float] | None]:
     """Return the poses T_world_sensor of `count` scans, and their times, s, if known."""
     about = request.notes.about
+    if isinstance(poses, NumberedPoses):
+        poses = _by_number(poses, range(count), request.notes)
     if isinstance(poses, np.ndarray):
+        if request.max_gap_s != MAX_GAP_S:
+            request.notes.add("max_gap_s has no effect: the poses have no times")
         what = "give as many, or poses with time stamps for scans with time stamps"
         check(len(poses) == count, f"{about}: there are {count} scans but {len(poses)} poses: {what}")
     elif times_s is None:
@@ -169,16 +182,16 @@ def scan_poses(
         request.notes.add(f"the scans have no time stamps: matched to the {count} poses in their order")
         times_s = poses.times_s.tolist()
         poses = poses.poses(poses.times_s)
-    if T_base_sensor is not None:
-        poses = (
-            poses @ T_base_sensor if isinstance(poses, np.ndarray) else TransformChain((poses, T_base_sensor))
-        )
-    return poses, times_s
+    if T_base_sensor is None:
+        return poses, times_s
+    if isinstance(poses, np.ndarray):
+        return poses @ T_base_sensor, times_s
+    return TransformChain((poses, T_base_sensor)), times_s
 
 
 def read_folder(folder: Path, request: Request) -> Scans:
     """Read the scans of a folder; see :func:`radarsdf.io.read`."""
-    return read_files(cloud_files(folder), folder, request, partial(lidar_map, folder))
+    return read_files(cloud_files(folder, request.notes), folder, request, partial(lidar_map, folder))
 
 
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
@@ -198,35 +211,53 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
         msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
         raise NoPoses(msg)
     known = poses_of(poses, notes)
-    files, times_s, known = _in_order_of_time(files, known, notes)
+    files, times_s, known = _by_time(files, known, notes)
     if T_base_sensor is None:
         T_base_sensor = read_transform(folder / BASE_T_RADAR)
     columns = request.columns
+    if files[0].suffix.lower() not in (".bin", ".npy", *TEXT_SUFFIXES):
+        request.refuse(f"{files[0]} has names of columns", "columns")
     if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
         with reading(notes.about, "points of KITTI"):
             check_kitti(raw)
         columns = 4
-    reads = [partial(read_columns, path, columns) for path in files]
-    names = [str(path) for path in files]
-    matched, known_s = scan_poses(known, len(reads), times_s, T_base_sensor, request)
-    stamps = [None] * len(reads) if known_s is None else known_s
-    raw_scans = [RawScan(*parts) for parts in zip(reads, stamps, names, strict=True)]
+    matched, known_s = scan_poses(known, len(files), times_s, T_base_sensor, request)
+    stamps: Sequence[float | None] = known_s or [None] * len(files)
+    reads = zip(files, stamps, strict=True)
+    raw_scans = [RawScan(partial(read_columns, path, columns), time_s, str(path)) for path, time_s in reads]
     source = posed(lambda: raw_scans, lambda _: matched, request)
     return Scans.of_source(source, notes, truth)
 
 
-def cloud_files(folder: Path) -> list[Path]:
-    """Files of scans in a folder or its subfolder of `SCAN_FOLDERS`, in natural order: those of the most frequent suffix."""
-    for inner in (folder, *(folder / name for name in SCAN_FOLDERS)):
+def cloud_files(folder: Path, notes: Notes) -> list[Path]:
+    """Files of scans in a folder or its subfolder of `SCAN_FOLDERS`, in natural order: the longest series of one suffix.
+
+    Notes and labels next to them are left out: text named as a scan, and single files whose names are unlike the others.
+    """
+    found: list[tuple[Any, ...]] = []
+    for place, inner in enumerate((folder, *(folder / name for name in SCAN_FOLDERS))):
         kinds: dict[str, list[Path]] = {}
         for path in inner.iterdir() if inner.is_dir() else ():
             other = path.name.lower() in _NOT_SCANS or path.stem == _TRUTH_STEM or path.name.startswith(".")
             if path.suffix.lower() in CLOUD_SUFFIXES and not other and path.is_file():
                 kinds.setdefault(path.suffix.lower(), []).append(path)
-        if kinds:
-            most = max(kinds.values(), key=len)
-            return sorted(most, key=natural)
-    return []
+        clouds = {p.stem for suffix in kinds.keys() - set(TEXT_SUFFIXES) for p in kinds[suffix]}
+        for suffix, paths in kinds.items():
+            is_text = suffix in TEXT_SUFFIXES
+            kept = [path for path in paths if not (is_text and path.stem in clouds)]
+            length = max(Counter(map(_words, kept)).values(), default=0)
+            found.append((not is_text or length > 1, -place, length, not is_text, kept))
+    *_, length, _, files = max(found, key=itemgetter(0, 1, 2, 3), default=(0, []))
+    words = Counter(map(_words, files))
+    odd = [path for path in files if 2 * length > len(files) > 2 and words[_words(path)] == 1]
+    if odd:
+        notes.add(f"{len(odd)} files left out: their names are unlike those of scans; the first: {min(odd)}")
+    return sorted(set(files) - set(odd), key=natural)
+
+
+def _words(path: Path) -> str:
+    """Letters of the name of a file: those of scans differ only in their digits."""
+    return re.sub(r"[\d\W_]+", "", path.stem)
 
 
 def natural(path: Path) -> tuple[Any, ...]:
@@ -241,36 +272,47 @@ def lidar_map(folder: Path) -> NDArray[np.float64] | None:
     return next((read_points(path) for path in found if path.is_file()), None)
 
 
-def _in_order_of_time(
-    files: list[Path], poses: Poses, notes: Notes
-) -> tuple[list[Path], Sequence[float] | None, Poses]:
+def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path], list[float] | None, Poses]:
     """Sort scans by time; return files, times, s, or None if there are none, and poses."""
     # Poses without times are matched to the files by index: in the order of the times in their names, or of the lines of a
     # file of times.
-    times = [time for path in files if (time := _time_in(path.stem)) is not None]
+    times = times_in([path.stem for path in files], notes)
     listed = None
-    if len(set(times)) < len(files):
-        places = [
-            folder / name for folder in (files[0].parent, files[0].parent.parent) for name in TIME_FILES
-        ]
+    if times is None:
+        if isinstance(poses, NumberedPoses):
+            # Numbers of scans: the last ones in the names of their files that all differ, or else counted from 0.
+            groups = zip(*(map(int, re.findall(r"\d+", path.stem)[::-1]) for path in files), strict=False)
+            numbers = next((group for group in groups if len(set(group)) == len(files)), range(len(files)))
+            poses = _by_number(poses, numbers, notes)
+        places = [folder / name for folder in files[0].parents[:2] for name in TIME_FILES]
         listed = next((path for path in places if path.is_file()), None)
         if listed is None:
             return files, None, poses
-        table = read_numbers(listed)
-        numbers = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else table[:, -1]
-        check(len(numbers) == len(files), f"{listed} has {len(numbers)} times for {len(files)} scans")
-        times = in_seconds(numbers, listed.name, notes).tolist()
+        times = _listed_times(listed, notes)
+        check(len(times) == len(files), f"{listed} has {len(times)} times for {len(files)} scans")
     order = np.argsort(times, kind="stable")
     if listed is not None and isinstance(poses, np.ndarray) and len(poses) == len(files):
         poses = poses[order]
     return [files[i] for i in order], [times[i] for i in order], poses
 
 
-def _time_in(stem: str) -> float | None:
-    """Time, s, at the end of a name: in s with a point; in ms, µs or ns with at least 12, 15 or 18 digits; else None."""
-    if parts := _SECONDS_AND_NANOSECONDS.search(stem):
-        return int(parts[1]) + 1e-9 * int(parts[2])
-    found = _TIME.search(stem)
-    if found is None:
-        return None
-    return float(found[1]) if "." in found[1] else int(found[1]) * unit_since_1970(int(found[1]))[1]
+def _listed_times(path: Path, notes: Notes) -> list[float]:
+    """Times, s, of a file with one line per scan, in the unit of their column's name, if it has one."""
+    table = read_numbers(path)
+    names = next((head for head in reversed(read_table(path).heads) if len(head) == table.shape[1]), [""])
+    with reading(path, "a list of times"):
+        times = scaled(table[:, -1], names[-1], "time")
+    times = table[:, 1] + 1e-9 * table[:, 2] if table.shape[1] == 3 else times
+    return [float(time_s) for time_s in in_seconds(times, path.name, notes)]
+
+
+def _by_number(poses: NumberedPoses, numbers: Sequence[int], notes: Notes) -> NDArray[np.float64]:
+    """T_world_sensor (F, 4, 4) of the scans with these numbers; NaN for those without a pose, which are counted."""
+    if all(np.ptp(of) + 1 == len(numbers) == len(of) for of in (numbers, poses.numbers)):
+        numbers = sorted(poses.numbers)  # one of them counts from 0, the other one from 1
+    rows = dict(zip(*poses, strict=True))
+    missing = len(set(numbers) - set(rows))
+    check(missing < len(numbers), f"{notes.about}: no scan has a number of the poses, {poses.numbers[:3]}, …")
+    if missing:
+        notes.add(f"{missing} scans left out: there is no pose of their number")
+    return np.array([rows.get(number, np.full((4, 4), np.nan)) for number in numbers])

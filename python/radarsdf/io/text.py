@@ -1,4 +1,4 @@
-"""Tables of numbers in text files, without silent loss of lines, and the units of their columns."""
+"""Tables of numbers in text files, without silent loss of lines; units of times and angles by their values."""
 
 from __future__ import annotations
 
@@ -18,14 +18,6 @@ from radarsdf.scans import Notes
 
 _COMMENT = re.compile("(#|//|%).*")
 
-SCALES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "mrad": 1e-3,
-          **dict.fromkeys(("km/h", "kmh", "kph"), 1 / 3.6),
-          **dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180)}  # fmt: skip
-"""Factors from the units in column names to m, s, m/s or rad."""
-
-_UNIT = re.compile(
-    r"[\s_]+(m|cm|mm|km|s|ms|us|ns|rad|mrad|radians?|deg|degrees?|mps|kmh|kph|dbs?m?|linear)$|[\s_]*[\[(]([^\])]*)[\])]$"
-)
 _SINCE_1970 = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
 _LIMITS = (1e11, 1e14, 1e17)  # bounds of absolute times since 1970 in one of these units and the next
 _SLACK = 1.05  # tolerance for angles that exceed a limit by rounding
@@ -34,9 +26,7 @@ _SLACK = 1.05  # tolerance for angles that exceed a limit by rounding
 class Table(NamedTuple):
     """Table of R rows of numbers in a text file."""
 
-    heads: list[
-        list[str]
-    ]  # words of the lines above the rows, including comments: one of them may name the columns
+    heads: list[list[str]]  # words of the lines and comments above the rows: one may name the columns
     values: NDArray[np.float64]  # (R, W), NaN for words that are not numbers, and for rows of another width
 
 
@@ -97,6 +87,13 @@ def read_text(path: Path) -> str:
     return path.read_bytes().decode("utf-8-sig", errors="replace")
 
 
+def as_numbers(words: NDArray[Any]) -> NDArray[np.float64]:
+    """Convert words (N,) to numbers; NaN for those that are none."""
+    with contextlib.suppress(ValueError):
+        return words.astype(np.float64)
+    return np.array([float(word) if _is_number(word) else np.nan for word in words.tolist()])
+
+
 def _is_number(word: str) -> bool:
     try:
         float(word)
@@ -113,15 +110,6 @@ def _split_words(line: str) -> list[str]:
     if separator is None:
         line = re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
     return [word.strip().strip('"') for word in line.split(separator)]
-
-
-def without_unit(name: str) -> tuple[str, str]:
-    """Split a column name such as ``azimuth_deg``, ``x [m]`` or ``time(ns)`` into the bare name in lower case and the unit."""
-    name = name.strip().lower()
-    found = _UNIT.search(name)
-    if found is None or not found.start():
-        return name, ""
-    return name[: found.start()], found[1] if found[1] is not None else found[2].strip()
 
 
 def unit_since_1970(time: float) -> tuple[str, float]:
