@@ -133,9 +133,9 @@ def test_errors_of_distances_are_estimated_despite_changes():
 def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     normals = [[0.8, 0, 0.6]] if tilted else None
     of_side = side([distance_m], [0.01], normals=normals)
-    odds = np.array([absent], float), np.array([shifted], float)
+    odds = [posterior(np.array([value], float), 0.5) for value in (absent, shifted)]
     for lost, sign in ((GONE, -1), (APPEARED, 1)):
-        found = _classify(of_side, *odds, 0.5, lost)
+        found = _classify(of_side, *odds, lost)
         assert found.kind[0] == (lost if kind == GONE else kind)
         assert_allclose(found.moved_m[0], sign * distance_m if kind == MOVED else np.nan)
         probable = (
@@ -146,7 +146,7 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     unsure = dataclasses.replace(
         of_side, own=evidence([0.0], confidence=0.4), other=evidence([distance_m], normals)
     )
-    assert _classify(unsure, *odds, 0.5, GONE).kind[0] in (SAME, UNSEEN)
+    assert _classify(unsure, *odds, GONE).kind[0] in (SAME, UNSEEN)
 
 
 def test_means_of_a_neighbourhood_are_weighted():

@@ -21,7 +21,15 @@ from radarsdf.changes.changes import (
     Changes,
     areas_of,
 )  # fmt: skip
-from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
+from radarsdf.changes.probability import (
+    Errors,
+    Floats,
+    PlacedMap,
+    Side,
+    odds_of_regions,
+    posterior,
+    share_of_changes,
+)  # fmt: skip
 from radarsdf.changes.reflectance import Differences
 from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
@@ -116,10 +124,14 @@ def compare(
     later = replace(later, T_common_map=alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
     errors = Errors.of(sides)
-    (absent, shifted), (absent_later, shifted_later) = map(errors.log_odds, sides)
-    share = share_of_changes(np.concatenate([absent, absent_later]))
-    gone = _classify(sides[0], absent, shifted, share, GONE)
-    appeared = _classify(sides[1], absent_later, shifted_later, share, APPEARED)
+    odds = [errors.log_odds(side) for side in sides]
+    regions = [odds_of_regions(side, absent) for side, (absent, _) in zip(sides, odds, strict=True)]
+    share = share_of_changes(np.concatenate(regions))
+    # Each place within a region in which something is absent is as probably part of it as not.
+    gone, appeared = (
+        _classify(side, posterior(region, share) * posterior(absent, 0.5), posterior(shifted, share), lost)
+        for side, region, (absent, shifted), lost in zip(sides, regions, odds, (GONE, APPEARED), strict=True)
+    )
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
     report: dict[str, Any] = {
@@ -160,11 +172,11 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
-def _classify(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
-    """Assign kinds, probabilities and displacements by log odds (V,). `lost`: kind of surface missing from the other map."""
+def _classify(side: Side, absent: Floats, shifted: Floats, lost: int) -> ChangedSurface:
+    """Assign kinds and displacements by probabilities (V,). `lost`: kind of surface missing from the other map."""
     own, other = side.own, side.other
-    gone = own.confidence * posterior(absent, share)
-    elsewhere = own.confidence * posterior(shifted, share)
+    gone = own.confidence * absent
+    elsewhere = own.confidence * shifted
     moved = np.where(side.parallel, other.confidence * elsewhere, 0.0)
     seen = np.isfinite(other.distance_m)
     behind = seen & (other.distance_m < 0)

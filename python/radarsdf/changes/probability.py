@@ -20,6 +20,7 @@ from scipy.special import betaln, expit
 from scipy.stats import t as student
 
 from radarsdf.map.map import Map
+from radarsdf.map.threshold import across_triangles
 from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
@@ -40,6 +41,8 @@ _CELLS_PER_SCAN = 2.0
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 _MAX_DISTANCES = 5_000  # evenly spread, for both maps
+# Radii of regions that may have changed as a whole, in blocks of the cells of one ray: up to 2.4 m with leaf cells of 0.2 m.
+_REGIONS = (1.0, 2.0, 4.0)
 
 
 @dataclass(frozen=True)
@@ -212,6 +215,31 @@ class Errors:
         shifted[observed] = elsewhere(-reach_m)
         absent[observed] += elsewhere(0.0)
         return absent, shifted
+
+
+def odds_of_regions(side: Side, absent: Floats) -> Floats:
+    """(V,) log odds that a region around each vertex is absent, of any of several sizes, given those of its vertices (V,)."""
+    # One ray counts in a block of three cells, so a block of surface is one observation, and log odds of rays add up over
+    # blocks. Errors of distances are correlated within a region, so the mean of their log odds counts once.
+    block_m = _CELLS_ALONG_RAY * side.reach_m / _REACH_CELLS
+    free = _free_space_odds(side.own, side.other)
+    _, twice_m2 = across_triangles(side.vertices, side.faces)
+    weights = np.bincount(side.faces.ravel(), np.repeat(twice_m2 / 6, 3), len(free)) / block_m**2
+    axes = np.abs(side.own.normals).argmax(axis=1)
+    facing = 2 * axes + (side.own.normals[np.arange(len(axes)), axes] > 0)
+    # Along a fourth axis, surfaces that face different sides are far apart.
+    places = np.column_stack([np.floor(side.vertices / block_m), 1e6 * facing])
+    blocks, rows = np.unique(places, axis=0, return_inverse=True)
+    columns = (weights, weights * free, weights * (absent - free))
+    sums = np.column_stack([np.bincount(rows.ravel(), column, len(blocks)) for column in columns])
+    tree, odds = cKDTree(blocks), [absent]
+    for radius in _REGIONS:
+        near = tree.sparse_distance_matrix(tree, radius, output_type="coo_matrix")
+        near.data[:] = 1
+        count, of_rays, of_distances = (near @ sums).T
+        odds.append((of_rays + of_distances / np.maximum(count, 1))[rows.ravel()])
+    found: Floats = np.logaddexp.reduce(odds) - np.log(len(odds))
+    return found
 
 
 def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
