@@ -21,15 +21,7 @@ from radarsdf.changes.changes import (
     Changes,
     areas_of,
 )  # fmt: skip
-from radarsdf.changes.probability import (
-    Errors,
-    Floats,
-    PlacedMap,
-    Side,
-    odds_of_regions,
-    posterior,
-    share_of_changes,
-)  # fmt: skip
+from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.changes.reflectance import Differences
 from radarsdf.checks import check_box
 from radarsdf.config.fit_config import FitConfig
@@ -125,13 +117,9 @@ def compare(
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
     errors = Errors.of(sides)
     odds = [errors.log_odds(side) for side in sides]
-    regions = [odds_of_regions(side, absent) for side, (absent, _) in zip(sides, odds, strict=True)]
-    share = share_of_changes(np.concatenate(regions))
-    # Each place within a region in which something is absent is as probably part of it as not.
-    gone, appeared = (
-        _classify(side, posterior(region, share) * posterior(absent, 0.5), posterior(shifted, share), lost)
-        for side, region, (absent, shifted), lost in zip(sides, regions, odds, (GONE, APPEARED), strict=True)
-    )
+    share = share_of_changes(np.concatenate([region for *_, region in odds]))
+    gone = _classify(sides[0], odds[0], share, GONE)
+    appeared = _classify(sides[1], odds[1], share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
     report: dict[str, Any] = {
@@ -172,11 +160,12 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
-def _classify(side: Side, absent: Floats, shifted: Floats, lost: int) -> ChangedSurface:
-    """Assign kinds and displacements by probabilities (V,). `lost`: kind of surface missing from the other map."""
-    own, other = side.own, side.other
-    gone = own.confidence * absent
-    elsewhere = own.confidence * shifted
+def _classify(side: Side, odds: tuple[Floats, Floats, Floats], share: float, lost: int) -> ChangedSurface:
+    """Assign kinds, probabilities, displacements by :meth:`Errors.log_odds`. `lost`: kind of surface missing from the other map."""
+    (absent, shifted, region), own, other = odds, side.own, side.other
+    # Within a region from which something is absent, each place is as probably part of it as not.
+    gone = own.confidence * posterior(region, share) * posterior(absent, 0.5)
+    elsewhere = own.confidence * posterior(shifted, share)
     moved = np.where(side.parallel, other.confidence * elsewhere, 0.0)
     seen = np.isfinite(other.distance_m)
     behind = seen & (other.distance_m < 0)
