@@ -211,8 +211,7 @@ class Errors:
 
     def log_density(self, distance_m: Floats, sigma_m: Floats) -> Floats:
         """(N,) log density of distances (N,) with standard errors (N,), 1/m."""
-        found: Floats = student.logpdf(distance_m, self.freedom, scale=self.scale * sigma_m)
-        return found
+        return np.asarray(student.logpdf(distance_m, self.freedom, scale=self.scale * sigma_m))
 
     def log_odds(self, side: Side) -> tuple[Floats, Floats, Floats]:
         """Log odds (V,), given the evidence, that the surface is absent from the other map rather than unchanged; that it is
@@ -245,8 +244,7 @@ def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
     same = betaln(hit + hits, missed + passes) - betaln(hit, missed)
     changed = betaln(0.5 + hits, 0.5 + passes) - betaln(0.5, 0.5)
     fewer = hits < (hits + passes) * hit / (hit + missed)
-    found: Floats = np.where(fewer, changed - same, np.minimum(changed - same, 0))
-    return found
+    return np.where(fewer, changed - same, np.minimum(changed - same, 0))
 
 
 def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:
@@ -269,5 +267,4 @@ def share_of_changes(log_odds: Floats) -> float:
 
 def posterior(log_odds: Floats, share: float) -> Floats:
     """(N,) posterior probability of a change, for a prior `share` of changed places."""
-    found: Floats = expit(log_odds + np.log(share / (1 - share)))
-    return found
+    return np.asarray(expit(log_odds + np.log(share / (1 - share))))
