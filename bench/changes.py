@@ -4,6 +4,7 @@ The second of two simulated drives has other noise and another path: half a metr
 Area within half a metre of a cube is not a false alarm: precision is the share of the changed area that is near one. Recall is
 the share of a cube's area on its map that is classified as gone, appeared or moved. Cubes and flat patches of the ground that
 change their reflectance return 6 dB more or less in the second drive; recall is the share of the later surface so classified.
+Holes are cubes on raised surfaces whose returns in every second scan are extended by 8 m; recall is the share of area that is gone.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import radarsdf
 from numpy.typing import NDArray
-from radarsdf.changes.changes import UNSEEN, Changes
+from radarsdf.changes.changes import GONE, UNSEEN, Changes
 from radarsdf.poses.posed import pose_sigmas
 from radarsdf.simulate import Box, Scene, Simulation, drifted, materials, simulate
 from scipy.spatial.transform import Rotation
@@ -35,6 +36,7 @@ _PATCH_M = 0.02  # half the thickness of a patch, half of which is above the gro
 _ON_M, _NEAR_M = 0.2, 0.5
 _FOUND = 0.2  # recall of a detected cube
 _TRIES = 20
+_HOLES_M, _HOLES, _EXTENDED_M = (1.0, 2.0, 4.0, 8.0), 2, 8.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,34 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
                 for share in recalls(compared, change):
                     name = f"{change.kind}, {change.size_m:g} m"
                     yield {"part": "cubes", "name": name, "recall": share, "found": float(share > _FOUND)}
+        for size_m, share in holes(first, rng):
+            name = f"hole, {size_m:g} m"
+            yield {"part": "cubes", "name": name, "recall": share, "found": float(share > _FOUND)}
+
+
+def holes(drive: Simulation, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
+    """Yield sizes of holes, m, and the share of area there that is gone in the map of the other half of the scans."""
+    config = radarsdf.FitConfig.quick(returns={"free_space": True})
+    before = radarsdf.fit(drive.points[::2], drive.poses[::2], config=config)
+    poses, terrain = drive.poses[1::2], drive.scene.terrain
+
+    def raised(x: Floats) -> NDArray[np.bool_]:
+        return x[:, 2] - (0.0 if terrain is None else terrain.height(x[:, :2])) > _NEAR_M
+
+    ends = [scan @ T[:3, :3].T + T[:3, 3] for scan, T in zip(drive.points[1::2], poses, strict=True)]
+    x = np.concatenate(ends)
+    x = x[raised(x) & (np.abs(drive.scene.signed_distance(x)) < _ON_M)]
+    for size_m, _ in itertools.product(_HOLES_M, range(_HOLES)):
+        centre, points = x[rng.integers(len(x))], []
+        for scan, end in zip(drive.points[1::2], ends, strict=True):
+            inside = raised(end) & (np.abs(end - centre).max(axis=1) < size_m / 2)
+            points.append(scan * (1 + inside * _EXTENDED_M / np.linalg.norm(scan, axis=1))[:, None])
+        found = radarsdf.compare(before, radarsdf.fit(points, poses, config=config)).before
+        kinds, face_m2 = found.of_faces()
+        middle = found.vertices[found.faces].mean(axis=1)
+        on = raised(middle) & (np.abs(middle - centre).max(axis=1) < size_m / 2 - _ON_M)
+        if on.any():
+            yield size_m, float(face_m2[on & (kinds == GONE)].sum() / face_m2[on].sum())
 
 
 def other_way(poses: Floats, rng: np.random.Generator) -> Floats:

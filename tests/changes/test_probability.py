@@ -86,7 +86,7 @@ def side(distance_m, sigma_m, **other):
 def test_odds_of_distances_are_ratios_of_their_densities():
     errors = Errors(3.0, 1.4)
     distances, sigmas = [0.02, -0.1, 0.3, np.nan, 0.2], [0.02, 0.03, 0.05, 0.1, np.nan]
-    absent, shifted = errors.log_odds(side(distances, sigmas))
+    absent, shifted, _ = errors.log_odds(side(distances, sigmas))
     for i in range(3):
         scaled = student(3.0, scale=1.4 * sigmas[i])
 
@@ -100,6 +100,23 @@ def test_odds_of_distances_are_ratios_of_their_densities():
         assert shifted[i] == pytest.approx(np.log(mean_density(-0.4) / same), rel=1e-6)
     assert absent[3:].tolist() == [0, 0]  # without rays, nothing is known
     assert np.isneginf(shifted[3:]).all()
+
+
+def test_evidence_adds_up_over_a_region():
+    """A few crossings of one place leave a change undecided, but those of 3 x 3 m of wall together show it."""
+    y, z = (axis.ravel() for axis in np.indices((101, 101)) * 0.1 + 0.05)
+    corner = np.arange(101**2).reshape(101, 101)[:-1, :-1].reshape(-1, 1)
+    faces = np.concatenate([corner + [0, 1, 101], corner + [1, 102, 101]]).astype(np.int32)
+    hole = (np.abs(y - 5) < 1.5) & (np.abs(z - 5) < 1.5)
+    own = dataclasses.replace(evidence(0 * y, np.tile([1.0, 0, 0], (len(y), 1))), hits=0 * y + 6)
+    other = dataclasses.replace(own, distance_m=np.where(hole, np.nan, 0), hits=np.where(hole, 0, 6.0))
+    other = dataclasses.replace(other, passes=np.where(hole, 4.0, 0))
+    wall = Side(np.stack([0 * y, y, z], axis=1), faces, own, other, 0 * y + 0.03, 0.4)
+    odds = Errors(3.0, 1.0).log_odds(wall)
+    assert posterior(odds[0], share_of_changes(odds[0])).max() < 0.01
+    gone = _classify(wall, odds, share_of_changes(odds[2]), GONE).kind == GONE
+    assert gone[hole].mean() > 0.9
+    assert not gone[~hole].any()
 
 
 def test_errors_of_distances_are_estimated_despite_changes():
@@ -133,9 +150,9 @@ def test_errors_of_distances_are_estimated_despite_changes():
 def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     normals = [[0.8, 0, 0.6]] if tilted else None
     of_side = side([distance_m], [0.01], normals=normals)
-    odds = np.array([absent], float), np.array([shifted], float)
+    odds = tuple(np.array([value], float) for value in (absent, shifted, np.inf))
     for lost, sign in ((GONE, -1), (APPEARED, 1)):
-        found = _classify(of_side, *odds, 0.5, lost)
+        found = _classify(of_side, odds, 0.5, lost)
         assert found.kind[0] == (lost if kind == GONE else kind)
         assert_allclose(found.moved_m[0], sign * distance_m if kind == MOVED else np.nan)
         probable = (
@@ -146,7 +163,7 @@ def test_kinds_of_changes(distance_m, tilted, absent, shifted, kind):
     unsure = dataclasses.replace(
         of_side, own=evidence([0.0], confidence=0.4), other=evidence([distance_m], normals)
     )
-    assert _classify(unsure, *odds, 0.5, GONE).kind[0] in (SAME, UNSEEN)
+    assert _classify(unsure, odds, 0.5, GONE).kind[0] in (SAME, UNSEEN)
 
 
 def test_means_of_a_neighbourhood_are_weighted():

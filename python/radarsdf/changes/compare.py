@@ -116,10 +116,10 @@ def compare(
     later = replace(later, T_common_map=alignment.T_before_after)
     sides = _side(earlier, later, alignment), _side(later, earlier, alignment)
     errors = Errors.of(sides)
-    (absent, shifted), (absent_later, shifted_later) = map(errors.log_odds, sides)
-    share = share_of_changes(np.concatenate([absent, absent_later]))
-    gone = _classify(sides[0], absent, shifted, share, GONE)
-    appeared = _classify(sides[1], absent_later, shifted_later, share, APPEARED)
+    odds = [errors.log_odds(side) for side in sides]
+    share = share_of_changes(np.concatenate([region for *_, region in odds]))
+    gone = _classify(sides[0], odds[0], share, GONE)
+    appeared = _classify(sides[1], odds[1], share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
     report: dict[str, Any] = {
@@ -160,10 +160,11 @@ def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Sid
     return Side(vertices, own_map.faces, own, other, sigma_m, other_map.reach_m)
 
 
-def _classify(side: Side, absent: Floats, shifted: Floats, share: float, lost: int) -> ChangedSurface:
-    """Assign kinds, probabilities and displacements by log odds (V,). `lost`: kind of surface missing from the other map."""
-    own, other = side.own, side.other
-    gone = own.confidence * posterior(absent, share)
+def _classify(side: Side, odds: tuple[Floats, Floats, Floats], share: float, lost: int) -> ChangedSurface:
+    """Assign kinds, probabilities, displacements by :meth:`Errors.log_odds`. `lost`: kind of surface missing from the other map."""
+    (absent, shifted, region), own, other = odds, side.own, side.other
+    # Within a region from which something is absent, each place is as probably part of it as not.
+    gone = own.confidence * posterior(region, share) * posterior(absent, 0.5)
     elsewhere = own.confidence * posterior(shifted, share)
     moved = np.where(side.parallel, other.confidence * elsewhere, 0.0)
     seen = np.isfinite(other.distance_m)

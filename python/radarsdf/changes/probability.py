@@ -20,6 +20,7 @@ from scipy.special import betaln, expit
 from scipy.stats import t as student
 
 from radarsdf.map.map import Map
+from radarsdf.map.threshold import across_triangles
 from radarsdf.products import turned
 
 Floats = NDArray[np.float64]
@@ -40,6 +41,7 @@ _CELLS_PER_SCAN = 2.0
 _FREEDOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _SCALES = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 _MAX_DISTANCES = 5_000  # evenly spread, for both maps
+_REGIONS = (1.0, 2.0, 4.0)  # radii of regions that may have changed as a whole, in blocks
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,26 @@ class Side:
         mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
         return mask
 
+    def region_odds(self, free: Floats, distances: Floats) -> Floats:
+        """(V,) log odds that a region around each vertex is absent, by log odds (V,) of free space and of distances."""
+        # One ray counts in a block of three cells, and other rays in the next, so their log odds add up over blocks. Errors
+        # of distances are correlated within a region, so the mean of their log odds counts once.
+        block_m = _CELLS_ALONG_RAY * self.reach_m / _REACH_CELLS
+        _, twice_m2 = across_triangles(self.vertices, self.faces)
+        weights = np.bincount(self.faces.ravel(), np.repeat(twice_m2 / 6, 3), len(free)) / block_m**2
+        along = np.abs(np.nan_to_num(self.own.normals)).argmax(axis=1)
+        # Walls along different axes are far apart along a fourth one.
+        places = np.column_stack([np.floor(self.vertices / block_m), 1e6 * along])
+        blocks, rows = np.unique(places, axis=0, return_inverse=True)
+        columns = [np.bincount(rows.ravel(), weights * odds, len(blocks)) for odds in (1, free, distances)]
+        tree, found = cKDTree(blocks), [free + distances]
+        for radius in _REGIONS:
+            near = tree.sparse_distance_matrix(tree, radius, output_type="coo_matrix")
+            near.data[:] = 1
+            area, of_rays, of_distances = (near @ column for column in columns)
+            found.append((of_rays + of_distances / np.maximum(area, 1))[rows.ravel()])
+        return np.asarray(np.logaddexp.reduce(found) - np.log(len(found)))
+
 
 @dataclass(frozen=True)
 class Errors:
@@ -189,12 +211,11 @@ class Errors:
 
     def log_density(self, distance_m: Floats, sigma_m: Floats) -> Floats:
         """(N,) log density of distances (N,) with standard errors (N,), 1/m."""
-        found: Floats = student.logpdf(distance_m, self.freedom, scale=self.scale * sigma_m)
-        return found
+        return np.asarray(student.logpdf(distance_m, self.freedom, scale=self.scale * sigma_m))
 
-    def log_odds(self, side: Side) -> tuple[Floats, Floats]:
-        """Log odds (V,), given the evidence, that the surface is absent from the other map rather than unchanged; and that it is
-        displaced along its normal to either side, -inf where that was not observed."""
+    def log_odds(self, side: Side) -> tuple[Floats, Floats, Floats]:
+        """Log odds (V,), given the evidence, that the surface is absent from the other map rather than unchanged; that it is
+        displaced along its normal to either side, -inf where that was not observed; and that a region around it is absent."""
         observed, reach_m = side.observed, side.reach_m
         distance_m, sigma_m = side.other.distance_m[observed], side.sigma_m[observed]
         same = self.log_density(distance_m, sigma_m)
@@ -207,11 +228,11 @@ class Errors:
             found: Floats = np.log(inside / (reach_m - lower_m)) - same
             return found
 
-        absent = _free_space_odds(side.own, side.other)
-        shifted = np.full(len(absent), -np.inf)
+        free = _free_space_odds(side.own, side.other)
+        distances, shifted = np.zeros(len(free)), np.full(len(free), -np.inf)
         shifted[observed] = elsewhere(-reach_m)
-        absent[observed] += elsewhere(0.0)
-        return absent, shifted
+        distances[observed] = elsewhere(0.0)
+        return free + distances, shifted, side.region_odds(free, distances)
 
 
 def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
@@ -223,8 +244,7 @@ def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
     same = betaln(hit + hits, missed + passes) - betaln(hit, missed)
     changed = betaln(0.5 + hits, 0.5 + passes) - betaln(0.5, 0.5)
     fewer = hits < (hits + passes) * hit / (hit + missed)
-    found: Floats = np.where(fewer, changed - same, np.minimum(changed - same, 0))
-    return found
+    return np.where(fewer, changed - same, np.minimum(changed - same, 0))
 
 
 def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:
@@ -247,5 +267,4 @@ def share_of_changes(log_odds: Floats) -> float:
 
 def posterior(log_odds: Floats, share: float) -> Floats:
     """(N,) posterior probability of a change, for a prior `share` of changed places."""
-    found: Floats = expit(log_odds + np.log(share / (1 - share)))
-    return found
+    return np.asarray(expit(log_odds + np.log(share / (1 - share))))
