@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checking import frames, noise, trajectory
+from radarsdf.checking import frames, noise, piecewise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
@@ -100,9 +100,22 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
         found += _of_poses(recording, numbers, config, effort)
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
-        if not _stops(found):
-            found += noise.check_drift(recording, config)
+        if not _stops(found) and "clock_offset" not in {finding.name for finding in found}:
+            found += _drift(recording, numbers, config, found)
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+def _drift(
+    recording: Scans, numbers: NDArray[np.int64], config: FitConfig, found: list[Finding]
+) -> list[Finding]:
+    """Drift of the poses. If the scans do not show their motion, it may be another fault."""
+    undecided = any(finding.name == "motion_undecided" for finding in found)
+    return [
+        Finding("undecided", "warning", drift.evidence)
+        if undecided and drift.name == "poses_drift"
+        else drift
+        for drift in noise.check_drift(recording, config, numbers)
+    ]
 
 
 def _of_poses(
@@ -111,6 +124,15 @@ def _of_poses(
     found = list(frames.check_still(recording, effort))
     if not found:
         found = list(frames.check_frames(recording, effort))
+        exchanged = piecewise.exchanged_scans(recording, numbers, effort)
+        if exchanged is not None:
+            # Scans in the wrong order may look like a wrong frame, and scans of a wrong frame like exchanged ones.
+            finding, order = exchanged
+            sorted_ = Scans([recording.points[i] for i in order], recording.poses)
+            few = 2 * (order != np.arange(len(order))).sum() <= len(order)
+            trusted = few or all(other.name != "motion_undecided" for other in found)
+            if trusted and not (_stops(found) and _stops(list(frames.check_frames(sorted_, effort)))):
+                found = [finding]
     if not _stops(found):
         found += trajectory.check_lengths(recording)
     if not _stops(found):  # else the scans do not agree at any clock offset
