@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points, some_scans
 from radarsdf.checking.piecewise import changed_mounting
+from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import check_extent, estimate_rays
 from radarsdf.poses.checked_scans import median_range_m
@@ -161,22 +161,7 @@ def check_drift(
         return
     named = np.arange(count) if numbers is None else numbers
     begins = np.linspace(0, max(count - _SCANS, 0), min(_WINDOWS, max(1, count // _SCANS))).astype(np.int64)
-    mounted = changed_mounting(recording)
-    if mounted is not None:
-        scan, vector, poses = mounted
-        part = slice(*(np.clip(scan - _SCANS // 2, 0, max(count - _SCANS, 0)) + [0, _SCANS]))
-        gains = [
-            _refined(recording, given, part, config)[0].report["gain"] for given in (recording.poses, poses)
-        ]
-        if gains[1] < _EXPLAINED * gains[0]:
-            evidence = (
-                f"From scan {named[scan]} on, scans agree better if the sensor is mounted {np.linalg.norm(vector[3:]):.2g} m and "
-                f"{np.degrees(np.linalg.norm(vector[:3])):.2g} degrees otherwise; it explains {1 - gains[1] / gains[0]:.0%} of what "
-                "refined poses gain."
-            )
-            yield Finding("mounting_changed", "warning", evidence)
-            return
-    improved = []
+    improved, others = [], []
     for begin in begins.tolist():
         part = slice(begin, begin + _SCANS)
         refined, lever_m = _refined(recording, recording.poses, part, config)
@@ -188,11 +173,28 @@ def check_drift(
                 step_vectors(poses) * np.repeat([1.0, lever_m], 3)
                 for poses in (refined.poses, recording.poses[part])
             ]
-            other = _other_than_drift(*vectors, named[part])
-            if other is not None:
-                yield other
-                return
+            others.append(_other_than_drift(*vectors, named[part]))
     if improved:
+        mounted = changed_mounting(recording)
+        if mounted is not None:
+            scan, vector, poses = mounted
+            part = slice(*(np.clip(scan - _SCANS // 2, 0, max(count - _SCANS, 0)) + [0, _SCANS]))
+            gains = [
+                _refined(recording, given, part, config)[0].report["gain"]
+                for given in (recording.poses, poses)
+            ]
+            if gains[1] < _EXPLAINED * min(count / _SCANS, 1) * gains[0]:
+                evidence = (
+                    f"From scan {named[scan]} on, scans agree better if the sensor is mounted {np.linalg.norm(vector[3:]):.2g} m and "
+                    f"{np.degrees(np.linalg.norm(vector[:3])):.2g} degrees otherwise; it explains {1 - gains[1] / gains[0]:.0%} of what "
+                    "refined poses gain."
+                )
+                yield Finding("mounting_changed", "warning", evidence)
+                return
+        other = next(filter(None, others), None)
+        if other is not None:
+            yield other
+            return
         significance, _, best = max(improved, key=lambda one: one[:2])
         evidence = (
             f"With refined poses, returns of other scans are {np.expm1(best['gain']):.1%} denser at held-out returns "
