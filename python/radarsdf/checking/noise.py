@@ -39,7 +39,8 @@ _LEAST_SCANS = 4
 _LEAST_MOVED = 0.15
 # Share of the gain of refined poses that is left if a changed mounting explains it. Measured on six kinds: at most 0.56 for
 # changes of 2 degrees or 0.25 m and more; at least 0.76 for drifts and time offsets.
-_EXPLAINED = 0.65
+# In a short window, one step has a large share of a drift too.
+_EXPLAINED = 0.65 / 60  # per scan of a window
 # Ratio of squared differences of steps. Measured: at most 0.9 for time offsets, at least 3 for drifts.
 _SHIFTED = 0.9
 _CONCENTRATED = (
@@ -183,7 +184,7 @@ def check_drift(
                 _refined(recording, given, part, config)[0].report["gain"]
                 for given in (recording.poses, poses)
             ]
-            if gains[1] < _EXPLAINED * min(count / _SCANS, 1) * gains[0]:
+            if gains[1] < _EXPLAINED * min(count, _SCANS) * gains[0]:
                 evidence = (
                     f"From scan {named[scan]} on, scans agree better if the sensor is mounted {np.linalg.norm(vector[3:]):.2g} m and "
                     f"{np.degrees(np.linalg.norm(vector[:3])):.2g} degrees otherwise; it explains {1 - gains[1] / gains[0]:.0%} of what "
