@@ -100,7 +100,7 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
         found += _of_poses(recording, numbers, config, effort)
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
-        if not _stops(found) and "clock_offset" not in {finding.name for finding in found}:
+        if not _stops(found):
             found += _drift(recording, numbers, config, found)
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
@@ -108,14 +108,16 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
 def _drift(
     recording: Scans, numbers: NDArray[np.int64], config: FitConfig, found: list[Finding]
 ) -> list[Finding]:
-    """Drift of the poses. If the scans do not show their motion, it may be another fault."""
-    undecided = any(finding.name == "motion_undecided" for finding in found)
-    return [
-        Finding("undecided", "warning", drift.evidence)
-        if undecided and drift.name == "poses_drift"
-        else drift
-        for drift in noise.check_drift(recording, config, numbers)
-    ]
+    """Drift of the poses, or another fault that refined poses would hide."""
+    drift = list(noise.check_drift(recording, config))
+    if not drift:
+        return []
+    if any(finding.name == "motion_undecided" for finding in found):
+        return [Finding("undecided", "warning", drift[0].evidence)]
+    exchanged = piecewise.check_order(recording, numbers)
+    return (
+        ([] if exchanged is None else [exchanged]) or list(frames.check_clock(recording, far=True)) or drift
+    )
 
 
 def _of_poses(
@@ -124,22 +126,13 @@ def _of_poses(
     found = list(frames.check_still(recording, effort))
     if not found:
         found = list(frames.check_frames(recording, effort))
-        exchanged = piecewise.exchanged_scans(recording, numbers, effort)
-        if exchanged is not None:
-            # Scans in the wrong order may look like a wrong frame, and scans of a wrong frame like exchanged ones.
-            finding, order = exchanged
-            sorted_ = Scans([recording.points[i] for i in order], recording.poses)
-            few = 2 * (order != np.arange(len(order))).sum() <= len(order)
-            trusted = few or all(other.name != "motion_undecided" for other in found)
-            if trusted and not (_stops(found) and _stops(list(frames.check_frames(sorted_, effort)))):
-                found = [finding]
     if not _stops(found):
         found += trajectory.check_lengths(recording)
     if not _stops(found):  # else the scans do not agree at any clock offset
         found += trajectory.check_jumps(recording, numbers, effort)
         found += check_doppler(recording)
         if config is not None and all(finding.severity == "note" for finding in found):
-            found += frames.check_clock(recording, effort)
+            found += frames.check_clock(recording)
         found += noise.check_ground(recording)
     return found
 

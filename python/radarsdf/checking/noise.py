@@ -7,12 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checking.piecewise import changed_mounting
 from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import check_extent, estimate_rays
 from radarsdf.poses.checked_scans import median_range_m
-from radarsdf.poses.refine import RefinedPoses, refine_poses
+from radarsdf.poses.refine import refine_poses
 from radarsdf.poses.rigid import step_vectors
 from radarsdf.returns.noise import SensorNoise, sensor_noise, variances_across
 from radarsdf.returns.planes import Surfels
@@ -37,15 +36,8 @@ _LEAST_SCANS = 4
 # Smallest displacement of returns, as a share of their standard deviation. Measured: true poses of slow sensors with cells
 # of 0.5 m: up to 0.09; a detected drift of 0.01 m and 0.05 degrees per step: 0.27 and more.
 _LEAST_MOVED = 0.15
-# Share of the gain of refined poses that is left if a changed mounting explains it. Measured on six kinds: at most 0.56 for
-# changes of 2 degrees or 0.25 m and more; at least 0.76 for drifts and time offsets.
-# In a short window, one step has a large share of a drift too.
-_EXPLAINED = 0.65 / 60  # per scan of a window
-# Ratio of squared differences of steps. Measured: at most 0.9 for time offsets, at least 3 for drifts.
-_SHIFTED = 0.9
-_CONCENTRATED = (
-    1.25  # margin over the expected share. Measured: at most 0.95 for drifts; 1.1 to 3 for single steps
-)
+# Margin over the share that is expected of four steps. Measured: at most 0.95 for drifts; 1.1 to 3 for single steps.
+_CONCENTRATED = 1.25
 
 
 def check_elevation(recording: Scans) -> Iterator[Finding]:
@@ -150,102 +142,49 @@ def _of_pairs(values: FloatArray, group: NDArray[np.int64], count: int) -> Float
     return np.stack([sums[0] * (sums[0] - 1) / 2, sums[0] * sums[2] - sums[1] ** 2])
 
 
-def check_drift(
-    recording: Scans, config: FitConfig, numbers: NDArray[np.int64] | None = None
-) -> Iterator[Finding]:
-    """Check whether held-out returns agree better with refined poses, and whether the poses drift or differ otherwise.
+def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
+    """Check whether held-out returns agree better with refined poses, in the clearest of some windows of scans.
 
-    Compares the clearest of some windows of scans. `numbers` (F,): of the scans, for messages.
+    If few steps have most of the differences, another fault may be the cause.
     """
     count = len(recording)
     if count < _LEAST_SCANS:
         return
-    named = np.arange(count) if numbers is None else numbers
     begins = np.linspace(0, max(count - _SCANS, 0), min(_WINDOWS, max(1, count // _SCANS))).astype(np.int64)
-    improved, others = [], []
-    for begin in begins.tolist():
-        part = slice(begin, begin + _SCANS)
-        refined, lever_m = _refined(recording, recording.poses, part, config)
-        report, noise = refined.report, SensorNoise(**refined.report["noise"])
-        moved_m = np.hypot(report["moved_m"], lever_m * report["moved_rad"])
-        if refined.improved and moved_m > _LEAST_MOVED * np.hypot(noise.range_m, lever_m * noise.angle_rad):
-            improved.append((report["gain"] / report["gain_error"], begin, report))
-            vectors = [
-                step_vectors(poses) * np.repeat([1.0, lever_m], 3)
-                for poses in (refined.poses, recording.poses[part])
-            ]
-            others.append(_other_than_drift(*vectors, named[part]))
+    improved, shares = [], []
+    for begin in begins:
+        part = recording.select(np.arange(begin, min(begin + _SCANS, count)))
+        # Every n-th return, since returns of a scan are ordered by angle.
+        every = max(1, -(-sum(map(len, part.points)) // _RETURNS))
+        points = [np.asarray(scan[::every], np.float64) for scan in part.points]
+        times_s, doppler_mps = ascending_times_s(part), None
+        if part.doppler_mps is not None and times_s is not None:
+            doppler_mps = [speeds[::every] for speeds in part.doppler_mps]
+        refined = refine_poses(
+            points, part.poses, doppler_mps=doppler_mps, times_s=times_s, config=config, progress=False
+        )
+        if refined.improved:
+            report, range_m = refined.report, median_range_m(points)
+            moved_m = np.hypot(report["moved_m"], range_m * report["moved_rad"])
+            noise = SensorNoise(**report["noise"])
+            if moved_m > _LEAST_MOVED * np.hypot(noise.range_m, range_m * noise.angle_rad):
+                improved.append(report)
+                shares.append(_excess_of_few_steps(part.poses, refined.poses, range_m))
     if improved:
-        mounted = changed_mounting(recording)
-        if mounted is not None:
-            scan, vector, poses = mounted
-            part = slice(*(np.clip(scan - _SCANS // 2, 0, max(count - _SCANS, 0)) + [0, _SCANS]))
-            gains = [
-                _refined(recording, given, part, config)[0].report["gain"]
-                for given in (recording.poses, poses)
-            ]
-            if gains[1] < _EXPLAINED * min(count, _SCANS) * gains[0]:
-                evidence = (
-                    f"From scan {named[scan]} on, scans agree better if the sensor is mounted {np.linalg.norm(vector[3:]):.2g} m and "
-                    f"{np.degrees(np.linalg.norm(vector[:3])):.2g} degrees otherwise; it explains {1 - gains[1] / gains[0]:.0%} of what "
-                    "refined poses gain."
-                )
-                yield Finding("mounting_changed", "warning", evidence)
-                return
-        other = next(filter(None, others), None)
-        if other is not None:
-            yield other
-            return
-        significance, _, best = max(improved, key=lambda one: one[:2])
+        best = max(improved, key=lambda report: float(report["gain"] / report["gain_error"]))
         evidence = (
             f"With refined poses, returns of other scans are {np.expm1(best['gain']):.1%} denser at held-out returns "
-            f"({significance:.0f} standard errors): steps have errors of {best['sigma_m']:.3f} m and "
+            f"({best['gain'] / best['gain_error']:.0f} standard errors): steps have errors of {best['sigma_m']:.3f} m and "
             f"{np.degrees(best['sigma_rad']):.2f} degrees ({len(improved)} of {len(begins)} windows of the recording)."
         )
-        yield Finding("poses_drift", "warning", evidence)
+        if max(shares) > _CONCENTRATED:
+            yield Finding("undecided", "warning", f"Few steps differ from refined ones. {evidence}")
+        else:
+            yield Finding("poses_drift", "warning", evidence)
 
 
-def _other_than_drift(
-    refined_m: FloatArray, given_m: FloatArray, numbers: NDArray[np.int64]
-) -> Finding | None:
-    """Whether refined and given steps (K, 6), m, differ by a time offset or at few scans, unlike a drift."""
-    count = len(given_m)
-    off_m2 = ((refined_m - given_m) ** 2).sum(axis=1)
-    for shift in range(-(count // 2), count // 2 + 1):
-        here, there = (
-            slice(max(-shift, 0), count - max(shift, 0)),
-            slice(max(shift, 0), count + min(shift, 0)),
-        )
-        ratio = np.median(((refined_m[here] - given_m[there]) ** 2).sum(axis=1)) / np.median(off_m2[here])
-        if ratio < _SHIFTED:
-            evidence = (
-                f"The refined step of a scan is closer to that of the poses {abs(shift)} scans "
-                f"{'later' if shift > 0 else 'earlier'}: the median squared difference is {ratio:.2f} times that to its own."
-            )
-            return Finding("clock_offset", "error", evidence)
-    # Of exponentially distributed squares, the four largest of K have a share of about 4 ln(K) / K.
-    share, worst = np.sort(off_m2)[-4:].sum() / off_m2.sum(), int(np.argmax(off_m2))
-    if share > _CONCENTRATED * 4 * np.log(count) / count:
-        evidence = (
-            f"Refined poses differ from the given ones at few steps: four of {count} have {share:.0%} of the squared differences, "
-            f"most after scan {numbers[worst]}. A drift, a changed mounting or exchanged scans cannot be told apart."
-        )
-        return Finding("undecided", "warning", evidence)
-    return None
-
-
-def _refined(
-    recording: Scans, poses: FloatArray, rows: slice, config: FitConfig
-) -> tuple[RefinedPoses, float]:
-    """Refined poses of some scans, and the median range of their returns, m."""
-    part = recording.select(np.arange(len(recording))[rows])
-    # Every n-th return, since returns of a scan are ordered by angle.
-    every = max(1, -(-sum(map(len, part.points)) // _RETURNS))
-    points = [np.asarray(scan[::every], np.float64) for scan in part.points]
-    times_s, doppler_mps = ascending_times_s(part), None
-    if part.doppler_mps is not None and times_s is not None:
-        doppler_mps = [speeds[::every] for speeds in part.doppler_mps]
-    refined = refine_poses(
-        points, poses[rows], doppler_mps=doppler_mps, times_s=times_s, config=config, progress=False
-    )
-    return refined, median_range_m(points)
+def _excess_of_few_steps(given: FloatArray, refined: FloatArray, lever_m: float) -> float:
+    """Share of the four largest squared differences of steps, over that of exponentially distributed ones."""
+    off_m = (step_vectors(refined) - step_vectors(given)) * np.repeat([1.0, lever_m], 3)
+    off_m2 = np.sort((off_m**2).sum(axis=1))
+    return float(off_m2[-4:].sum() / off_m2.sum() * len(off_m2) / (4 * np.log(len(off_m2))))
