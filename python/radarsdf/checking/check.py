@@ -114,9 +114,10 @@ def _drift(
         return []
     if any(finding.name == "motion_undecided" for finding in found):
         return [Finding("undecided", "warning", drift[0].evidence)]
-    exchanged = piecewise.check_order(recording, numbers)
     return (
-        ([] if exchanged is None else [exchanged]) or list(frames.check_clock(recording, far=True)) or drift
+        list(piecewise.check_order(recording, numbers))
+        or list(frames.check_clock(recording, far=True))
+        or drift
     )
 
 

@@ -46,10 +46,8 @@ _NOT_BEHIND = 2.5  # standard errors
 _FIELD_OF_VIEW_STAYS = -1.5
 # Skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it is misleading.
 _UPSIDE_DOWN = -0.5
-_SMALL, _OFFSETS = (
-    np.array([0.5, 1, 2, 4, 8]),
-    128,
-)  # time offsets in steps; number of larger ones to each side
+# Small time offsets, in steps, and the number of larger ones to each side.
+_SMALL, _OFFSETS = np.array([0.5, 1, 2, 4, 8]), 128
 # Gains that leave a large offset undecided, and of its error. Measured: at most 0.008 on drifted poses.
 _FAR_GAINS = 0.008, 0.02
 _UNDECIDED = {
@@ -99,9 +97,8 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
         if equal:
             words = " or ".join(_UNDECIDED[name] for name in sorted(equal))
             evidence = f"The scans agree as well if {words} ({len(pairs)} pairs of scans)."
-            yield Finding(
-                "mirroring_undecided" if equal == {"mirrored"} else "motion_undecided", "note", evidence
-            )
+            unknown = "mirroring" if equal == {"mirrored"} else "motion"
+            yield Finding(f"{unknown}_undecided", "note", evidence)
         return
     guess, gain, significance = best
     evidence = (
@@ -184,10 +181,8 @@ def check_clock(recording: Scans, *, far: bool = False) -> Iterator[Finding]:
             f"different scans are {np.exp(gain):.2f} times closer to each other ({used} pairs of scans, {significance:.0f} "
             "standard errors)."
         )
-        if gain < _FAR_GAINS[1]:
-            yield Finding("undecided", "warning", evidence)
-        else:
-            yield Finding("clock_offset", "error", evidence)
+        unclear = gain < _FAR_GAINS[1]
+        yield Finding("undecided" if unclear else "clock_offset", "warning" if unclear else "error", evidence)
 
 
 def _best(

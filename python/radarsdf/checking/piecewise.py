@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,12 @@ _MIN_GAIN, _MIN_SIGNIFICANCE = 0.05, 8.0
 _CLOSES = 0.5  # share of the difference to the usual score
 
 
-def check_order(recording: Scans, numbers: NDArray[np.int64]) -> Finding | None:
+def check_order(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[Finding]:
     """Find two scans or blocks of scans that changed places. `numbers` (F,): of the scans."""
     rows = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in recording.points])
     count = len(rows)
     if count < 2 * max(LAGS):
-        return None
+        return
     agreement = Agreement([recording.points[i] for i in rows], FULL.returns, FULL.queries)
     pairs = np.concatenate([np.stack([np.arange(count - lag), np.arange(lag, count)], 1) for lag in LAGS[:3]])
     motions = relative(recording.poses[rows], pairs)[None]
@@ -53,10 +54,10 @@ def check_order(recording: Scans, numbers: NDArray[np.int64]) -> Finding | None:
                 best = gain, significance, (a, b, c, d)
     gain, significance, (a, b, c, d) = best
     if not d:
-        return None
+        return
     first, second = (f"{numbers[rows[i]]} to {numbers[rows[j - 1]]}" for i, j in ((a, b), (c, d)))
     evidence = (
         f"If scans {first} and scans {second} change places, returns of neighbouring scans are {np.exp(gain):.2f} times closer to "
         f"each other at the ends of these blocks ({significance:.0f} standard errors)."
     )
-    return Finding("scans_exchanged", "error", evidence)
+    yield Finding("scans_exchanged", "error", evidence)
