@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf.checking import frames, noise, trajectory
+from radarsdf.checking import frames, noise, piecewise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
@@ -105,8 +105,24 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
-            found += noise.check_drift(recording, config)
+            found += _drift(recording, numbers, config, found)
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+def _drift(
+    recording: Scans, numbers: NDArray[np.int64], config: FitConfig, found: list[Finding]
+) -> list[Finding]:
+    """Drift of the poses, or another fault that refined poses would hide."""
+    drift = list(noise.check_drift(recording, config))
+    if not drift:
+        return []
+    if any(finding.name == "motion_undecided" for finding in found):
+        return [Finding("undecided", "warning", drift[0].evidence)]
+    return (
+        list(piecewise.check_order(recording, numbers))
+        or list(frames.check_clock(recording, far=True))
+        or drift
+    )
 
 
 def _of_poses(
@@ -121,7 +137,7 @@ def _of_poses(
         found += trajectory.check_jumps(recording, numbers, effort)
         found += check_doppler(recording)
         if config is not None and all(finding.severity == "note" for finding in found):
-            found += frames.check_clock(recording, effort)
+            found += frames.check_clock(recording)
         found += noise.check_ground(recording)
     return found
 

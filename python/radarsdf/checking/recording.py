@@ -30,6 +30,7 @@ _SAMPLE = 40  # scans from which properties of the sensor are estimated
 _LEFT_OUT = "No action needed: a fit leaves them out."
 _FRAME = "Pass points of the sensor frame in metres, x forward, y left, z up, and T_world_sensor."
 _ANGLES = "Recompute the rotations of the poses from angles in rad or unit quaternions x y z w."
+_UNDECIDED = "Check frames and clock by other means: these scans do not show them."
 _NO_VALUE = "Look up their meaning in the driver. A fit leaves them out of the reflectance."
 FIXES = {
     "returns_not_finite": _LEFT_OUT,
@@ -54,8 +55,12 @@ FIXES = {
     "poses_stand_still": "Pass the position of the sensor for each scan. If it stood still, the map shows the view from there.",
     "poses_disagree": "Use better poses, if there are any; state their errors as returns.pose_sigma_m, if not.",
     "poses_drift": "Refine them: radarsdf poses, radarsdf fit --refine, or radarsdf.refine_poses(points, poses).",
+    "scans_exchanged": "Pass the scans in the order of their poses: sort both by time, and file names by number.",
     "pose_jumps": "Use poses that were smoothed over the whole drive, or leave out the scans at the jumps.",
     "clock_offset": "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
+    "motion_undecided": _UNDECIDED,
+    "mirroring_undecided": _UNDECIDED,
+    "undecided": "Check order, mounting and clock by other means, and refine the poses only if these are right.",
     "times": "Sort scans, poses and times together, and use the record times if the header stamps were never set.",
     "duplicate_scans": "Leave out the copies: they would count as independent measurements.",
     "duplicate_poses": "Interpolate the poses at the times of the scans, unless the sensor stood still.",
