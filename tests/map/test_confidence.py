@@ -128,7 +128,7 @@ def test_places_have_the_evidence_of_their_cells(radar_map):
     contents, evidence = radar_map._contents, radar_map.evidence
     centres = (radar_map.field.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
     found = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
-    columns = *dataclasses.astuple(evidence), contents.usual_information
+    columns = *dataclasses.astuple(evidence), contents.evidence_of_cells[1][:, 3]
     for column, expected in zip(found, columns, strict=True):
         assert expected.max() > 0
         np.testing.assert_allclose(column, expected, rtol=1e-3, atol=1e-3 * expected.max())

@@ -26,6 +26,8 @@ class GridField(Field):
         self.distances_m = nn.Parameter(torch.empty(self.table.num_rows, dtype=torch.float32, device="cpu"))
 
     def sdf(self, points: Tensor) -> Tensor:
+        if not torch.is_grad_enabled():
+            return self._trilinear(points, gradient=False)[:, 0]
         cells = kernels.locate(points, self.table)[:, 0]
         inside = cells >= 0
         corners = self._corners_of_cells.index_select(0, cells.clamp(min=0)).view(-1)
@@ -36,6 +38,13 @@ class GridField(Field):
         values = torch.lerp(values[:, 0], values[:, 1], x[:, None, None])
         values = torch.lerp(values[:, 0], values[:, 1], y[:, None])
         return torch.where(inside, torch.lerp(values[:, 0], values[:, 1], z), 0.0)
+
+    def plane(self, points: Tensor) -> Tensor:
+        return self._trilinear(points, gradient=True)
+
+    def _trilinear(self, points: Tensor, *, gradient: bool) -> Tensor:
+        values, places = kernels.view(self.distances_m), kernels.view(points)
+        return torch.from_numpy(self.table.trilinear(values, places, gradient, kernels.threads()))
 
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
         # The closed form is unbounded; intensities beyond the range of the returns were never measured.
