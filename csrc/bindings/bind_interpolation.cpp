@@ -141,22 +141,21 @@ void bind_interpolation(VertexTableClass& table) {
       "in one (N,).");
   table.def(
       "trilinear",
-      [](const VertexTable& t, const Array<float>& values, const Array<float>& points, bool gradient, int num_threads) {
+      [](const VertexTable& t, const Array<float>& values, const Array<float>& points, int num_threads) {
         const std::int64_t count = check_points(points);
         if (t.encoding() != Encoding::kOctree || t.num_levels() != 1 || check_column(values, "values") != t.num_rows())
           throw std::invalid_argument("values must be one for each row of an octree of one level");
-        const int columns = gradient ? 4 : 1;
-        py::array_t<float> out({static_cast<py::ssize_t>(count), py::ssize_t{columns}});
+        py::array_t<float> out({static_cast<py::ssize_t>(count), py::ssize_t{4}});
         const float *v = values.data(), *p = points.data();
         float* result = out.mutable_data();
         {
           const py::gil_scoped_release release;
-          trilinear(t, v, p, count, result, columns, num_threads);
+          trilinear(t, v, p, count, result, num_threads);
         }
         return out;
       },
-      "values"_a.noconvert(), "points"_a.noconvert(), "gradient"_a = false, "num_threads"_a = 0,
-      "Interpolation (N, 1) of `values` (num_rows,) float32, or (N, 4) with its gradient; 0 outside the cells.");
+      "values"_a.noconvert(), "points"_a.noconvert(), "num_threads"_a = 0,
+      "Interpolation of `values` (num_rows,) float32, and its gradient, (N, 4); 0 outside the cells.");
   bind_kernels<float>(table);
   bind_kernels<double>(table);
 }

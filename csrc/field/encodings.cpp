@@ -98,7 +98,7 @@ void into_cells(const VertexTable& table, float* points, std::int64_t count, flo
 }
 
 void trilinear(const VertexTable& table, const float* values, const float* points, std::int64_t count, float* out,
-               int columns, int num_threads) {
+               int num_threads) {
   const auto inverse = static_cast<float>(1.0 / table.leaf_size_m());
   const auto lerp = [](float a, float b, float x) {
     return x < 0.5F ? std::fma(x, b - a, a) : std::fma(x - 1, b - a, b);
@@ -108,8 +108,8 @@ void trilinear(const VertexTable& table, const float* values, const float* point
   parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const std::int32_t cell = located[static_cast<std::size_t>(i)];
-      float *to = out + columns * i, u[3], at_x[4], at_y[2], along_x[4], along_y[2];
-      std::fill_n(to, columns, 0.0F);
+      float *to = out + 4 * i, u[3], at_x[4], along_x[4], at_y[2], along_y[2];
+      std::fill_n(to, 4, 0.0F);
       if (cell < 0) continue;
       for (int axis = 0; axis < 3; ++axis) {
         const float place = points[3 * i + axis] * inverse;
@@ -126,7 +126,6 @@ void trilinear(const VertexTable& table, const float* values, const float* point
         along_y[z] = at_x[2 * z + 1] - at_x[2 * z];
       }
       to[0] = lerp(at_y[0], at_y[1], u[2]);
-      if (columns < 4) continue;
       const float y[2] = {1 - u[1], u[1]}, z[2] = {1 - u[2], u[2]};
       for (int corner = 0; corner < 4; ++corner)  // PyTorch sums in C order
         to[1] += z[corner & 1] * y[corner >> 1] * along_x[(corner & 1) << 1 | corner >> 1];

@@ -40,10 +40,10 @@ void coordinate_gradient(const VertexTable& table, const T* features, const Poin
 void into_cells(const VertexTable& table, float* points, std::int64_t count, float step_m, bool* inside,
                 int num_threads);
 
-// out (count, columns): trilinear interpolation of values (num_rows,) of an octree of one level, m, followed by its
-// gradient if there are four columns; 0 outside the cells. Rounded like PyTorch's lerp with FMA, and its gradient.
+// out (count, 4): trilinear interpolation of values (num_rows,) of an octree of one level, and its gradient; 0 outside
+// the cells. Rounded like PyTorch's lerp with FMA, and its gradient.
 void trilinear(const VertexTable& table, const float* values, const float* points, std::int64_t count, float* out,
-               int columns, int num_threads);
+               int num_threads);
 
 template <typename T>
 void fourier(const T* points, std::int64_t count, double half_width_m, int first_frequency, int num_frequencies, T* out,

@@ -429,11 +429,10 @@ class VertexTable:
         self,
         values: numpy.typing.NDArray[numpy.float32],
         points: numpy.typing.NDArray[numpy.float32],
-        gradient: bool = False,
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
     ) -> numpy.typing.NDArray[numpy.float32]:
         """
-        Interpolation (N, 1) of `values` (num_rows,) float32, or (N, 4) with its gradient; 0 outside the cells.
+        Interpolation of `values` (num_rows,) float32, and its gradient, (N, 4); 0 outside the cells.
         """
     @property
     def encoding(self) -> Encoding: ...

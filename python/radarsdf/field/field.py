@@ -43,10 +43,6 @@ class Field(nn.Module, ABC):
             (gradient,) = torch.autograd.grad(sdf.sum(), points)
         return torch.cat([sdf.detach()[:, None], gradient], 1)
 
-    def gradient(self, points: Tensor) -> Tensor:
-        """Return the gradients (N, 3) of :meth:`sdf`, pointing to free space."""
-        return self.plane(points)[:, 1:]
-
     @abstractmethod
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
         """Return intensities (N,), scaled to about [0, 1], of returns from points (N, 3), local frame, m.

@@ -27,7 +27,7 @@ class GridField(Field):
 
     def sdf(self, points: Tensor) -> Tensor:
         if not torch.is_grad_enabled():
-            return self._trilinear(points, gradient=False)[:, 0]
+            return self.plane(points)[:, 0].contiguous()
         cells = kernels.locate(points, self.table)[:, 0]
         inside = cells >= 0
         corners = self._corners_of_cells.index_select(0, cells.clamp(min=0)).view(-1)
@@ -40,11 +40,8 @@ class GridField(Field):
         return torch.where(inside, torch.lerp(values[:, 0], values[:, 1], z), 0.0)
 
     def plane(self, points: Tensor) -> Tensor:
-        return self._trilinear(points, gradient=True)
-
-    def _trilinear(self, points: Tensor, *, gradient: bool) -> Tensor:
-        values, places = kernels.view(self.distances_m), kernels.view(points)
-        return torch.from_numpy(self.table.trilinear(values, places, gradient, kernels.threads()))
+        values = kernels.view(self.distances_m)
+        return torch.from_numpy(self.table.trilinear(values, kernels.view(points), kernels.threads()))
 
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
         # The closed form is unbounded; intensities beyond the range of the returns were never measured.

@@ -410,14 +410,9 @@ class Map(ABC):
     def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
         """Return the data for views from a position (3,) within a range, cached for the next view."""
 
-    def plane_at(self, world: Tensor) -> tuple[Tensor, Tensor]:
-        """Return :meth:`Map.sdf` and :meth:`Map.gradient` at positions (N, 3), world, m."""
-        found = self._plane(world, False)
-        return found[:, 0], found[:, 1:]
-
     def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Linearise the surface at positions (N, 3), world, m: signed distances (N,), m, to planes, and unit normals (N, 3)."""
-        sdf, gradient = (values.double().numpy() for values in self.plane_at(torch.from_numpy(x)))
+        sdf, gradient = self.sdf(x, return_gradient=True)
         length = np.linalg.norm(gradient, axis=1)
         # At grazing incidence the field exceeds the distance, and its gradient exceeds 1, by the same factor.
         return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)

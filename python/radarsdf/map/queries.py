@@ -141,7 +141,6 @@ def where_observed(
     return where(known, points, *others, function=partial(function, contents))
 
 
-@torch.inference_mode(mode=False)
 def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Tensor:
     """Evaluate function(*inputs) for the rows in the mask `known` (N,); NaN for the others."""
     if bool(known.all()):

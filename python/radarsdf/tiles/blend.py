@@ -133,11 +133,6 @@ class TileBlend(Map):
                     seen[share.rows] |= inside.numpy() & (owners == tile).all(axis=1)
             yield share.at(points, inside.numpy())
 
-    def _all_shares(self, world: _Floats) -> Iterator[Share]:
-        for share in self._shares(world):
-            points, _ = queries.into_cells(share.contents, share.local)
-            yield share._replace(local=points)
-
     def _average(
         self, world: Tensor, extrapolate: bool, of_tile: Callable[[Share], Tensor], columns: int = 1
     ) -> Tensor:
@@ -146,8 +141,9 @@ class TileBlend(Map):
         found = _averages(self._known_shares(positions, seen), count, of_tile, columns)
         found[~seen] = np.nan
         if extrapolate and not seen.all():
-            unseen = np.where(seen[:, None], np.nan, positions)
-            found[~seen] = _averages(self._all_shares(unseen), count, of_tile, columns)[~seen]
+            rest = self._shares(np.where(seen[:, None], np.nan, positions))
+            moved = (s._replace(local=queries.into_cells(s.contents, s.local)[0]) for s in rest)
+            found[~seen] = _averages(moved, count, of_tile, columns)[~seen]
         return torch.from_numpy(found)
 
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
