@@ -56,7 +56,9 @@ def test_query(benchmark, radar_map, near, name):
 
 
 def test_open3d(benchmark, radar_map, near):
-    o3d = pytest.importorskip("open3d", reason="Open3D is missing: pip install '.[peers]'", exc_type=ImportError)
+    o3d = pytest.importorskip(
+        "open3d", reason="Open3D is missing: pip install '.[peers]'", exc_type=ImportError
+    )
     mesh = radar_map.mesh(0.2, progress=False)
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))

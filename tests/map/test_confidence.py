@@ -2,9 +2,9 @@
 
 import copy
 import dataclasses
-import pickle
 import itertools
 import math
+import pickle
 
 import numpy as np
 import pytest

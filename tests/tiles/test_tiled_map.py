@@ -44,7 +44,9 @@ def test_queries_equal_those_of_one_map(city, whole, points):
 def test_a_query_evaluates_each_position_once_in_a_tile(city, points, monkeypatch, extrapolate):
     x = np.concatenate([points, points[:50] + [0, 0, 3.0], [[np.nan, 0, 0]]])
     evaluated, plane = [], queries.plane
-    monkeypatch.setattr(queries, "plane", lambda contents, at: evaluated.append(len(at)) or plane(contents, at))
+    monkeypatch.setattr(
+        queries, "plane", lambda contents, at: evaluated.append(len(at)) or plane(contents, at)
+    )
     sdf, gradient = city.sdf(x, extrapolate=extrapolate, return_gradient=True)
     shares = sum(len(share.rows) for share in city._shares(x))
     assert 0 < sum(evaluated) <= shares
