@@ -122,6 +122,40 @@ void bind_kernels(py::class_<VertexTable>& cls) {
 }  // namespace
 
 void bind_interpolation(VertexTableClass& table) {
+  using namespace py::literals;
+  table.def(
+      "into_cells",
+      [](const VertexTable& t, Array<float>& points, float step_m, int num_threads) {
+        const std::int64_t count = check_points(points);
+        py::array_t<bool> inside(static_cast<py::ssize_t>(count));
+        float* p = points.mutable_data();
+        bool* result = inside.mutable_data();
+        {
+          const py::gil_scoped_release release;
+          into_cells(t, p, count, step_m, result, num_threads);
+        }
+        return inside;
+      },
+      "points"_a.noconvert(), "step_m"_a, "num_threads"_a = 0,
+      "Moves `points` (N, 3) float32 within `step_m` of a face into an adjacent leaf cell, and returns whether they are "
+      "in one (N,).");
+  table.def(
+      "trilinear",
+      [](const VertexTable& t, const Array<float>& values, const Array<float>& points, int num_threads) {
+        const std::int64_t count = check_points(points);
+        if (t.encoding() != Encoding::kOctree || t.num_levels() != 1 || check_column(values, "values") != t.num_rows())
+          throw std::invalid_argument("values must be one for each row of an octree of one level");
+        py::array_t<float> out({static_cast<py::ssize_t>(count), py::ssize_t{4}});
+        const float *v = values.data(), *p = points.data();
+        float* result = out.mutable_data();
+        {
+          const py::gil_scoped_release release;
+          trilinear(t, v, p, count, result, num_threads);
+        }
+        return out;
+      },
+      "values"_a.noconvert(), "points"_a.noconvert(), "num_threads"_a = 0,
+      "Interpolation of `values` (num_rows,) float32, and its gradient, (N, 4); 0 outside the cells.");
   bind_kernels<float>(table);
   bind_kernels<double>(table);
 }

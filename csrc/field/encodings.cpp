@@ -1,6 +1,8 @@
 #include "field/encodings.hpp"
 
 #include <algorithm>
+#include <cmath>
+#include <vector>
 
 #include "kernels/fourier_kernels.hpp"
 #include "util/instruction_set.hpp"
@@ -69,6 +71,68 @@ void coordinate_gradient(const VertexTable& table, const T* features, const Poin
   const Interpolation<T> in = interpolation(table, batch);
   parallel_blocks(batch.count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
     kernels.coordinate_gradient(in, features, out_grad, stride, points_grad, begin, end);
+  });
+}
+
+void into_cells(const VertexTable& table, float* points, std::int64_t count, float step_m, bool* inside,
+                int num_threads) {
+  const auto leaf_m = static_cast<float>(table.leaf_size_m());
+  const auto near_face = [&](float x) { return std::abs(x / leaf_m - std::nearbyint(x / leaf_m)) * leaf_m <= step_m; };
+  std::vector<std::int32_t> located(static_cast<std::size_t>(count * table.num_levels()));
+  locate(table, points, count, located.data(), num_threads);
+  parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      float* p = points + 3 * i;
+      inside[i] = located[static_cast<std::size_t>(i * table.num_levels())] >= 0;
+      if (inside[i] || !(near_face(p[0]) || near_face(p[1]) || near_face(p[2]))) continue;
+      for (int shift = 0; shift < 8 && !inside[i]; ++shift) {
+        std::int32_t cells[kMaxLevels];
+        float moved[3];
+        for (int axis = 0; axis < 3; ++axis) moved[axis] = p[axis] + (shift << axis & 4 ? step_m : -step_m);
+        table.locate(moved, 1, cells);
+        inside[i] = cells[0] >= 0;
+        if (inside[i]) std::copy_n(moved, 3, p);
+      }
+    }
+  });
+}
+
+void trilinear(const VertexTable& table, const float* values, const float* points, std::int64_t count, float* out,
+               int num_threads) {
+  const auto inverse = static_cast<float>(1.0 / table.leaf_size_m());
+  const auto lerp = [](float a, float b, float x) {
+    return x < 0.5F ? std::fma(x, b - a, a) : std::fma(x - 1, b - a, b);
+  };
+  std::vector<std::int32_t> located(static_cast<std::size_t>(count));
+  locate(table, points, count, located.data(), num_threads);
+  parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) {
+      const std::int32_t cell = located[static_cast<std::size_t>(i)];
+      float *to = out + 4 * i, u[3], at_x[4], along_x[4], at_y[2], along_y[2];
+      std::fill_n(to, 4, 0.0F);
+      if (cell < 0) continue;
+      for (int axis = 0; axis < 3; ++axis) {
+        const float place = points[3 * i + axis] * inverse;
+        u[axis] = place - std::floor(place);
+      }
+      const std::int32_t* rows = table.rows_of(cell);  // the first axis is fastest
+      for (int yz = 0; yz < 4; ++yz) {
+        const float *low = values + rows[yz << 1], *high = values + rows[yz << 1 | 1];
+        at_x[yz] = lerp(*low, *high, u[0]);
+        along_x[yz] = *high - *low;
+      }
+      for (int z = 0; z < 2; ++z) {
+        at_y[z] = lerp(at_x[2 * z], at_x[2 * z + 1], u[1]);
+        along_y[z] = at_x[2 * z + 1] - at_x[2 * z];
+      }
+      to[0] = lerp(at_y[0], at_y[1], u[2]);
+      const float y[2] = {1 - u[1], u[1]}, z[2] = {1 - u[2], u[2]};
+      for (int corner = 0; corner < 4; ++corner)  // PyTorch sums in C order
+        to[1] += z[corner & 1] * y[corner >> 1] * along_x[(corner & 1) << 1 | corner >> 1];
+      to[2] = z[0] * along_y[0] + z[1] * along_y[1];
+      to[3] = at_y[1] - at_y[0];
+      for (int axis = 0; axis < 3; ++axis) to[1 + axis] *= inverse;
+    }
   });
 }
 

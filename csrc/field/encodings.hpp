@@ -35,6 +35,16 @@ template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,
                          std::int64_t stride, T* points_grad, int num_threads);
 
+// Moves points (count, 3) within step_m of a face into an adjacent leaf cell, the first of eight shifts by step_m, unless
+// they are in one; inside (count): whether they are in a leaf cell now.
+void into_cells(const VertexTable& table, float* points, std::int64_t count, float step_m, bool* inside,
+                int num_threads);
+
+// out (count, 4): trilinear interpolation of values (num_rows,) of an octree of one level, and its gradient; 0 outside
+// the cells. Rounded like PyTorch's lerp with FMA, and its gradient.
+void trilinear(const VertexTable& table, const float* values, const float* points, std::int64_t count, float* out,
+               int num_threads);
+
 template <typename T>
 void fourier(const T* points, std::int64_t count, double half_width_m, int first_frequency, int num_frequencies, T* out,
              std::int64_t stride, int num_threads);

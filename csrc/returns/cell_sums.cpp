@@ -10,7 +10,6 @@
 #include "lattice/cell.hpp"
 #include "lattice/morton.hpp"
 #include "util/bits.hpp"
-#include "util/large_array.hpp"
 #include "util/parallel.hpp"
 #include "util/prefetch.hpp"
 
@@ -300,12 +299,6 @@ void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int
 void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float* values, int columns,
                        const float* points, std::int64_t count, float* interpolated, int num_threads) {
   const auto size_m = static_cast<float>(cell_size_m);
-  // Rows of whole vectors, and one of zeros for empty cells.
-  constexpr int kLanes = 4;
-  const std::int64_t width = (columns + kLanes - 1) / kLanes * kLanes;
-  LargeVector<float> padded(static_cast<std::size_t>(width * (cells.size() + 1)));
-  for (std::int64_t row = 0; row < cells.size(); ++row)
-    std::copy_n(values + columns * row, columns, padded.data() + width * row);
   std::atomic<bool> inside{true};
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
     NearbyRows rows(cells);
@@ -331,20 +324,16 @@ void interpolate_cells(const CellBlocks& cells, double cell_size_m, const float*
         for (int axis = 0; axis < 3; ++axis)
           for (std::uint32_t step = 0; step < 2; ++step)
             parts[axis][step] = spread_bits(static_cast<std::uint32_t>(lower[axis]) + step) << axis;
-        for (int corner = 0; corner < 8; ++corner) {
-          const std::int32_t row = rows.row(parts[0][corner >> 2] | parts[1][corner >> 1 & 1] | parts[2][corner & 1]);
-          near[corner] = row >= 0 ? row : cells.size();
-        }
+        for (int corner = 0; corner < 8; ++corner)
+          near[corner] = rows.row(parts[0][corner >> 2] | parts[1][corner >> 1 & 1] | parts[2][corner & 1]);
       }
       const float x[2] = {1 - share[0], share[0]}, y[2] = {1 - share[1], share[1]}, z[2] = {1 - share[2], share[2]};
-      for (int first = 0; first < columns; first += kLanes) {
-        float sums[kLanes] = {};
-        for (int corner = 0; corner < 8; ++corner) {
-          const float weight = x[corner >> 2] * y[corner >> 1 & 1] * z[corner & 1];
-          const float* own = padded.data() + width * near[corner] + first;
-          for (int k = 0; k < kLanes; ++k) sums[k] += weight * own[k];
-        }
-        std::copy_n(sums, std::min(kLanes, columns - first), interpolated + columns * i + first);
+      float* to = interpolated + columns * i;
+      std::fill_n(to, columns, 0.0F);
+      for (int corner = 0; corner < 8; ++corner) {
+        if (near[corner] < 0) continue;
+        const float weight = x[corner >> 2] * y[corner >> 1 & 1] * z[corner & 1];
+        for (int k = 0; k < columns; ++k) to[k] += weight * values[columns * near[corner] + k];
       }
     }
   });

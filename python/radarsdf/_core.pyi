@@ -302,6 +302,15 @@ class VertexTable:
         """
         Like `encode` for located points; with `directions` (N, 3), the directional derivative of the features.
         """
+    def into_cells(
+        self,
+        points: numpy.typing.NDArray[numpy.float32],
+        step_m: typing.SupportsFloat | typing.SupportsIndex,
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.bool]:
+        """
+        Moves `points` (N, 3) float32 within `step_m` of a face into an adjacent leaf cell, and returns whether they are in one (N,).
+        """
     def leaf_cells(self) -> numpy.typing.NDArray[numpy.int32]:
         """
         Lattice coordinates of the occupied leaf cells (C, 3) int32: cell i spans [i, i + 1) * leaf_size_m.
@@ -415,6 +424,15 @@ class VertexTable:
     ) -> tuple[numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.int32]]:
         """
         Vertices (V, 3) float64, m, and faces (F, 3) int32 of the surface in the leaf cells with these rows (S,) int32, by trilinear interpolation at the corners of voxels: `parts` per edge of a leaf cell, with lattice coordinates from `lowest` to `highest`.
+        """
+    def trilinear(
+        self,
+        values: numpy.typing.NDArray[numpy.float32],
+        points: numpy.typing.NDArray[numpy.float32],
+        num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+    ) -> numpy.typing.NDArray[numpy.float32]:
+        """
+        Interpolation of `values` (num_rows,) float32, and its gradient, (N, 4); 0 outside the cells.
         """
     @property
     def encoding(self) -> Encoding: ...

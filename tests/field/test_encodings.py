@@ -94,7 +94,44 @@ def inside(field, count=2000):
 def test_linear_functions_are_reproduced(field):
     x = inside(field)
     np.testing.assert_allclose(field.sdf(torch.from_numpy(x)).detach(), x @ SLOPE + 0.1, atol=1e-6)
-    np.testing.assert_allclose(field.gradient(torch.from_numpy(x)), np.tile(SLOPE, (len(x), 1)), atol=1e-5)
+    np.testing.assert_allclose(
+        field.plane(torch.from_numpy(x))[:, 1:], np.tile(SLOPE, (len(x), 1)), atol=1e-5
+    )
+
+
+def test_the_core_interpolates_like_autograd(field):
+    with torch.no_grad():
+        field.distances_m.normal_(generator=torch.Generator().manual_seed(0))
+    x = torch.from_numpy(np.concatenate([inside(field), [[9, 0, 0]]]).astype(np.float32))
+    points = x.clone().requires_grad_()
+    expected = field.sdf(points)
+    (gradient,) = torch.autograd.grad(expected.sum(), points)
+    expected = torch.cat([expected[:, None], gradient], 1).detach().numpy()
+    found = field.plane(x).numpy()
+    # PyTorch rounds once in a fused multiplication and addition, if the processor has it.
+    fused = torch.backends.cpu.get_cpu_capability() in ("AVX2", "AVX512")
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0 if fused else 1e-5)
+    with torch.no_grad():
+        np.testing.assert_array_equal(field.sdf(x), found[:, 0])
+
+
+def test_points_on_faces_move_into_a_leaf_cell(field):
+    rng = np.random.default_rng(2)
+    cells = field.table.leaf_cells()
+    corners = cells + rng.integers(0, 2, cells.shape) + rng.uniform(-1e-6, 1e-6, cells.shape)
+    x = np.concatenate([corners * LEAF_M, rng.uniform(-2.5, 2.5, (400, 3))]).astype(np.float32)
+    step_m, leaf_m = np.float32(1e-3 * LEAF_M), np.float32(LEAF_M)
+    expected, inside = x.copy(), field.occupied(torch.from_numpy(x)).numpy()
+    on_face = (np.abs(x / leaf_m - np.round(x / leaf_m)) * leaf_m <= step_m).any(axis=1)
+    for shift in np.ndindex(2, 2, 2):
+        moved = x + step_m * (2 * np.array(shift, np.float32) - 1)
+        here = ~inside & on_face & field.occupied(torch.from_numpy(moved)).numpy()
+        expected[here], inside = moved[here], inside | here
+    assert (expected != x).any()
+    for num_threads in (1, 2):
+        found = x.copy()
+        np.testing.assert_array_equal(field.table.into_cells(found, step_m, num_threads), inside)
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_the_gradient_is_the_derivative(field):

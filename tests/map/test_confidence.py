@@ -1,8 +1,10 @@
 """The probability of a mapped surface: from information, hits, visibility counts, and statistics of all returns."""
 
+import copy
 import dataclasses
 import itertools
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -123,12 +125,24 @@ def test_usual_information_is_that_of_most_returns_nearby():
     assert len(usual_information(information[:0], keys[:0])) == 0
 
 
+def test_evidence_is_prepared_once_for_a_map(radar_map, monkeypatch):
+    calls, columns = [], Evidence.columns
+    monkeypatch.setattr(Evidence, "columns", lambda *given: calls.append(0) or columns(*given))
+    x = radar_map.origin + np.random.default_rng(0).uniform(-10, 10, (100, 3))
+    for copied in (pickle.loads(pickle.dumps(radar_map)), copy.deepcopy(radar_map)):
+        calls.clear()
+        for name in ("confidence", "uncertainty", "confidence"):
+            np.testing.assert_array_equal(getattr(copied, name)(x), getattr(radar_map, name)(x))
+            np.testing.assert_array_equal(getattr(copied, name)(x[:3]), getattr(copied, name)(x)[:3])
+        assert len(calls) <= 2  # of the copy, and of the map
+
+
 def test_places_have_the_evidence_of_their_cells(radar_map):
     """In the middle of a cell, its neighbours have no weight."""
     contents, evidence = radar_map._contents, radar_map.evidence
     centres = (radar_map.field.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
     found = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
-    columns = *dataclasses.astuple(evidence), contents.usual_information
+    columns = *dataclasses.astuple(evidence), contents.evidence_of_cells[1][:, 3]
     for column, expected in zip(found, columns, strict=True):
         assert expected.max() > 0
         np.testing.assert_allclose(column, expected, rtol=1e-3, atol=1e-3 * expected.max())

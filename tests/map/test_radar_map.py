@@ -122,6 +122,16 @@ def test_concurrent_queries_equal_sequential_ones(sharp_map):
     assert not failures
 
 
+@pytest.mark.parametrize("extrapolate", [False, True])
+def test_distances_and_gradients_in_one_call(sharp_map, extrapolate):
+    x = np.concatenate([near_surface(9_000), [[np.nan, 0, 0], [1e12, 0, 0]]])
+    for like in (x, x.astype(np.float32), torch.from_numpy(x), x[:0]):
+        sdf, gradient = sharp_map.sdf(like, extrapolate=extrapolate, return_gradient=True)
+        assert type(sdf) is type(like)
+        np.testing.assert_array_equal(sdf, sharp_map.sdf(like, extrapolate=extrapolate))
+        np.testing.assert_array_equal(gradient, sharp_map.gradient(like, extrapolate=extrapolate))
+
+
 def test_gradient_is_the_derivative_of_the_distance(sharp_map):
     x = on_surface(sharp_map, 400)
     local = torch.from_numpy((x - sharp_map.origin).astype(np.float32)).double()

@@ -8,6 +8,7 @@ import pytest
 import radarsdf
 from radarsdf import TiledMap
 from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.map import queries
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.tiles.planning import read_rays
 
@@ -37,6 +38,21 @@ def test_queries_equal_those_of_one_map(city, whole, points):
     assert np.median(difference) < 0.05
     gradients = city.gradient(points), whole.gradient(points)
     assert np.quantile(np.linalg.norm(gradients[0] - gradients[1], axis=1), 0.95) < 0.05
+
+
+@pytest.mark.parametrize("extrapolate", [False, True])
+def test_a_query_evaluates_each_position_once_in_a_tile(city, points, monkeypatch, extrapolate):
+    x = np.concatenate([points, points[:50] + [0, 0, 3.0], [[np.nan, 0, 0]]])
+    evaluated, plane = [], queries.plane
+    monkeypatch.setattr(
+        queries, "plane", lambda contents, at: evaluated.append(len(at)) or plane(contents, at)
+    )
+    sdf, gradient = city.sdf(x, extrapolate=extrapolate, return_gradient=True)
+    shares = sum(len(share.rows) for share in city._shares(x))
+    assert 0 < sum(evaluated) <= shares
+    np.testing.assert_array_equal(sdf, city.sdf(x, extrapolate=extrapolate))
+    assert (np.isfinite(sdf[:-1]) | ~city.observed(x[:-1]) & (not extrapolate)).all()
+    np.testing.assert_array_equal(gradient, city.gradient(x, extrapolate=extrapolate))
 
 
 def test_common_properties_equal_those_of_one_map(folder, city, whole, drive):

@@ -35,11 +35,13 @@ class Field(nn.Module, ABC):
     def sdf(self, points: Tensor) -> Tensor:
         """Return differentiable signed distances (N,), m, positive in free space, at points (N, 3), local frame, m."""
 
-    def gradient(self, points: Tensor) -> Tensor:
-        """Return the gradients (N, 3) of :meth:`sdf`, pointing to free space."""
+    def plane(self, points: Tensor) -> Tensor:
+        """Return :meth:`sdf` and its gradient, pointing to free space, (N, 4), without a graph."""
         with torch.enable_grad():
             points = points.detach().requires_grad_()
-            return torch.autograd.grad(self.sdf(points).sum(), points)[0]
+            sdf = self.sdf(points)
+            (gradient,) = torch.autograd.grad(sdf.sum(), points)
+        return torch.cat([sdf.detach()[:, None], gradient], 1)
 
     @abstractmethod
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:

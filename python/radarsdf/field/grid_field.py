@@ -26,6 +26,8 @@ class GridField(Field):
         self.distances_m = nn.Parameter(torch.empty(self.table.num_rows, dtype=torch.float32, device="cpu"))
 
     def sdf(self, points: Tensor) -> Tensor:
+        if not torch.is_grad_enabled():
+            return self.plane(points)[:, 0].contiguous()
         cells = kernels.locate(points, self.table)[:, 0]
         inside = cells >= 0
         corners = self._corners_of_cells.index_select(0, cells.clamp(min=0)).view(-1)
@@ -36,6 +38,10 @@ class GridField(Field):
         values = torch.lerp(values[:, 0], values[:, 1], x[:, None, None])
         values = torch.lerp(values[:, 0], values[:, 1], y[:, None])
         return torch.where(inside, torch.lerp(values[:, 0], values[:, 1], z), 0.0)
+
+    def plane(self, points: Tensor) -> Tensor:
+        values = kernels.view(self.distances_m)
+        return torch.from_numpy(self.table.trilinear(values, kernels.view(points), kernels.threads()))
 
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
         # The closed form is unbounded; intensities beyond the range of the returns were never measured.

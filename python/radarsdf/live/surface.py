@@ -128,7 +128,9 @@ class GrowingSurface:
         )
         evidence = Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
-        at = queries.interpolated(evidence, rows["keys"], leaf_m, local(scene, vertices + self._origin))
+        points = local(scene, vertices + self._origin)
+        columns = evidence.columns(rows["keys"], resolve_num_threads(0))
+        at = queries.interpolated(CellBlocks(rows["keys"]), columns, leaf_m, points)
         return scene, Surface.from_triangles(scene, vertices, faces, at, len(rows["keys"]))
 
     def _surfels_of(self, rows: Rows) -> Surfels:

@@ -10,9 +10,10 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf._core import CellBlocks
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
-from radarsdf.returns.evidence import Evidence, usual_information
+from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
@@ -58,7 +59,7 @@ class MapContents(WholeMap):
     view_statistics: Callable[[], ViewStatistics] = ViewStatistics.none  # of intensity, or none
 
     @cached_property
-    def usual_information(self) -> NDArray[np.float32]:
-        """(C,) see :func:`radarsdf.returns.evidence.usual_information`."""
+    def evidence_of_cells(self) -> tuple[CellBlocks, NDArray[np.float32]]:
+        """The leaf cells, and (C, 4) see :meth:`radarsdf.returns.evidence.Evidence.columns`. Prepared by the first query."""
         keys = self.field.table.leaf_keys()
-        return usual_information(self.evidence.information, keys, resolve_num_threads(0))
+        return CellBlocks(keys), self.evidence.columns(keys, resolve_num_threads(0))

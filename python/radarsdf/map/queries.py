@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from tqdm import tqdm
 from radarsdf._core import CellBlocks
 from radarsdf.checks import hides_bar
 from radarsdf.map.contents import MapContents, WholeMap
-from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence, usual_information
+from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.returns.free_space import MOST_SCANS
 from radarsdf.returns.response import RANGE_MARGIN
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
@@ -69,8 +68,9 @@ def signed_distance(
     return evaluate(contents.field.sdf, points, description=description, progress=progress)
 
 
-def gradient(contents: MapContents, points: Tensor) -> Tensor:
-    return evaluate(contents.field.gradient, points)
+def plane(contents: MapContents, points: Tensor) -> Tensor:
+    """Evaluate the signed distance and its gradient, (N, 4)."""
+    return evaluate(contents.field.plane, points)
 
 
 @torch.inference_mode(mode=False)
@@ -112,13 +112,13 @@ def evaluate(
     progress: bool | None = False,
 ) -> Tensor:
     """Evaluate function(points) without gradients, in chunks, on the number of threads of PyTorch."""
-    without_gradients = torch.no_grad()(function)
-    chunks = torch.split(points, _CHUNK)
-    if len(chunks) <= 1:
+    if len(points) <= _CHUNK:
         start_vector_library()  # the first queries may be concurrent
-        return without_gradients(points)
+        with torch.no_grad():
+            return function(points)
+    chunks = torch.split(points, _CHUNK)
     with ThreadPool() as pool:
-        results = pool.map(without_gradients, chunks)
+        results = pool.map(torch.no_grad()(function), chunks)
         bar = tqdm(results, description, len(chunks), unit="chunk", disable=hides_bar(progress))
         return torch.cat(list(bar))
 
@@ -134,20 +134,9 @@ def into_cells(contents: MapContents, points: Tensor, size_m: float | None = Non
     """
     leaf_m = contents.config.leaf_size_m
     step_m = INWARD * (leaf_m if size_m is None else size_m)
-    inside = occupied(contents, points)
-    left = torch.nonzero(~inside)[:, 0]
-    place = points[left] / leaf_m
-    left = left[((place - place.round()).abs() * leaf_m <= step_m).any(dim=1)]
-    if len(left) == 0:
-        return points, inside
-    points, inside = points.clone(), inside.clone()
-    for shift in itertools.product((-step_m, step_m), repeat=3):
-        moved = points[left] + torch.tensor(shift, dtype=torch.float32, device="cpu")
-        found = occupied(contents, moved)
-        points[left[found]] = moved[found]
-        inside[left[found]] = True
-        left = left[~found]
-    return points, inside
+    points = points.clone(memory_format=torch.contiguous_format)
+    inside = contents.field.table.into_cells(points.numpy(), step_m, resolve_num_threads(0))
+    return points, torch.from_numpy(inside)
 
 
 def where_observed(
@@ -162,7 +151,6 @@ def where_observed(
     return where(known, points, *others, function=partial(function, contents))
 
 
-@torch.inference_mode(mode=False)
 def where(known: Tensor, *inputs: Tensor, function: Callable[..., Tensor]) -> Tensor:
     """Evaluate function(*inputs) for the rows in the mask `known` (N,); NaN for the others."""
     if bool(known.all()):
@@ -186,26 +174,18 @@ class EvidenceAt(NamedTuple):
 
 
 def evidence(contents: MapContents, points: Tensor) -> EvidenceAt:
-    keys, usual = contents.field.table.leaf_keys(), contents.usual_information
-    return interpolated(contents.evidence, keys, contents.config.leaf_size_m, points, usual)
+    return interpolated(*contents.evidence_of_cells, contents.config.leaf_size_m, points)
 
 
 def interpolated(
-    found: Evidence,
-    leaf_keys: NDArray[np.uint64],
-    leaf_size_m: float,
-    points: Tensor,
-    usual: NDArray[np.float32] | None = None,
+    cells: CellBlocks, columns: NDArray[np.float32], leaf_size_m: float, points: Tensor
 ) -> EvidenceAt:
-    """Interpolate the evidence of leaf cells with ascending keys (C,) at points (N, 3), local frame, m. `usual` (C,), if known."""
-    num_threads = resolve_num_threads(0)
-    usual = usual_information(found.information, leaf_keys, num_threads) if usual is None else usual
-    of_cells = np.stack([found.information, found.hits, found.visibility, usual], 1, dtype=np.float32)
+    """Interpolate the `columns` (C, 4) of the evidence of leaf cells at points (N, 3), local frame, m."""
     # Points beyond the range of keys are clamped to its limit, where there are no cells.
     limit_m = MAX_CELLS_FROM_ORIGIN * leaf_size_m
     near = points.nan_to_num(nan=limit_m).clamp(-limit_m, limit_m).contiguous()
     # Trilinear, because a vertex of a mesh may lie on the face between two cells.
-    at_points = CellBlocks(leaf_keys).interpolate(leaf_size_m, of_cells, near.numpy(), num_threads)
+    at_points = cells.interpolate(leaf_size_m, columns, near.numpy(), resolve_num_threads(0))
     return EvidenceAt(*torch.from_numpy(at_points).unbind(1))
 
 
@@ -241,6 +221,9 @@ class Probabilities(NamedTuple):
 def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:
     """Evaluate the logistic regression on :func:`terms`, times :func:`own_surface`. `reach` is an upper bound of the confidence."""
     # A mesh of 80,000 vertices is one chunk: waking threads for each of forty operations takes longer than one thread.
+    if len(evidence.hits) <= _CHUNK:  # no pool either: it takes longer than a few points
+        start_vector_library()
+        return _probabilities(contents, evidence)
     chunks = list(zip(*(torch.split(column, _VERTICES) for column in evidence), strict=True))
     with ThreadPool() as pool:
         found = pool.map(lambda chunk: _probabilities(contents, EvidenceAt(*chunk)), chunks)
@@ -324,7 +307,7 @@ def free_space_odds(contents: MapContents) -> NDArray[np.float64]:
     centres = torch.from_numpy(((lattice_of(keys) + 0.5) * leaf_m).astype(np.float32))
     distances_m = signed_distance(contents, centres).numpy()
     # At grazing incidence the field exceeds the distance, and with noisy returns falls below it; so does its gradient.
-    edge = leaf_m * np.linalg.norm(gradient(contents, centres).numpy(), axis=1)
+    edge = leaf_m * np.linalg.norm(plane(contents, centres)[:, 1:].numpy(), axis=1)
     weights = confidence(contents, evidence(contents, centres)).numpy().astype(np.float64)
     passed = contents.free_space().at(keys)
 

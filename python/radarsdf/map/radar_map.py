@@ -44,8 +44,8 @@ class RadarMap(Map):
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
         return self._where_observed(queries.signed_distance, world, extrapolate=extrapolate)
 
-    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._where_observed(queries.gradient, world, extrapolate=extrapolate)
+    def _plane(self, world: Tensor, extrapolate: bool) -> Tensor:
+        return self._where_observed(queries.plane, world, extrapolate=extrapolate)
 
     def _observed(self, world: Tensor) -> Tensor:
         return queries.into_cells(self._contents, queries.to_local(self._contents, world))[1]

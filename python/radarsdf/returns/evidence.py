@@ -53,6 +53,11 @@ class Evidence:
         counted = count_visibility(leaf_keys, leaf_size_m, *rays.in_c_order(), rays.scans, num_threads)
         return cls(information, hits, counted)
 
+    def columns(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.float32]:
+        """Return information, hits, visibility and :func:`usual_information` of each leaf cell, (C, 4)."""
+        usual = usual_information(self.information, leaf_keys, num_threads)
+        return np.stack([self.information, self.hits, self.visibility, usual], 1, dtype=np.float32)
+
 
 @dataclass(frozen=True)
 class ReturnsOfCells:

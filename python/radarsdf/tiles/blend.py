@@ -121,44 +121,44 @@ class TileBlend(Map):
                 local = queries.to_local(contents, torch.from_numpy(world[rows]))
                 yield Share(planned.tile, contents, rows, grid.weights(planned.tile, world[rows]), local)
 
-    def _seen(self, world: _Floats) -> NDArray[np.bool_]:
-        """(N,) whether positions (N, 3), world, m, are in observed leaf cells, or on their border."""
+    def _known_shares(self, world: _Floats, seen: NDArray[np.bool_]) -> Iterator[Share]:
+        """Yield the shares of tiles in whose leaf cells, or on their border, positions (N, 3), world, m, are. Set `seen` (N,)."""
         # Tiles disagree, because ghosts depend on surfaces in front of them. The tile that contains a position decides; for
         # an unfinished one, its neighbours do.
-        found = np.zeros(len(world), bool)
         for share in self._shares(world):
-            _, inside = queries.into_cells(share.contents, share.local)
+            points, inside = queries.into_cells(share.contents, share.local)
             owners = self.plan.grid.tiles_of(world[share.rows])
             for tile in neighbours(share.tile):
                 if tile == share.tile or not self.has(tile):
-                    found[share.rows] |= inside.numpy() & (owners == tile).all(axis=1)
-        return found
-
-    def _known_shares(self, world: _Floats, extrapolate: bool) -> Iterator[Share]:
-        """Yield the shares of tiles that observed a position, where any did. `extrapolate`: elsewhere, those of all tiles."""
-        seen = self._seen(world)
-        unseen = ~seen & np.isfinite(world).all(axis=1) & extrapolate
-        for share in self._shares(world):
-            points, inside = queries.into_cells(share.contents, share.local)
-            yield share.at(points, (inside.numpy() & seen[share.rows]) | unseen[share.rows])
+                    seen[share.rows] |= inside.numpy() & (owners == tile).all(axis=1)
+            yield share.at(points, inside.numpy())
 
     def _average(
         self, world: Tensor, extrapolate: bool, of_tile: Callable[[Share], Tensor], columns: int = 1
     ) -> Tensor:
         positions = _contiguous(world)
-        shares = self._known_shares(positions, extrapolate)
-        return torch.from_numpy(_averages(shares, len(positions), of_tile, columns))
+        count, seen = len(positions), np.zeros(len(positions), bool)
+        found = _averages(self._known_shares(positions, seen), count, of_tile, columns)
+        found[~seen] = np.nan
+        if extrapolate and not seen.all():
+            rest = self._shares(np.where(seen[:, None], np.nan, positions))
+            moved = (s._replace(local=queries.into_cells(s.contents, s.local)[0]) for s in rest)
+            found[~seen] = _averages(moved, count, of_tile, columns)[~seen]
+        return torch.from_numpy(found)
 
     def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
         return self._average(world, extrapolate, _distance)[:, 0]
 
-    def _gradient(self, world: Tensor, extrapolate: bool) -> Tensor:
+    def _plane(self, world: Tensor, extrapolate: bool) -> Tensor:
         return self._average(
-            world, extrapolate, lambda share: queries.gradient(share.contents, share.local), columns=3
+            world, extrapolate, lambda share: queries.plane(share.contents, share.local), columns=4
         )
 
     def _observed(self, world: Tensor) -> Tensor:
-        return torch.from_numpy(self._seen(_contiguous(world)))
+        seen = np.zeros(len(world), bool)
+        for _ in self._known_shares(_contiguous(world), seen):
+            pass
+        return torch.from_numpy(seen)
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         def of_tile(share: Share) -> Tensor:
