@@ -107,21 +107,21 @@ def contradiction(
     return dataclasses.replace(max(found, key=lambda one: one[0])[1], windows=len(found))
 
 
-def of_poses(velocities: SensorVelocities, times_s: Floats, poses: Floats) -> Contradiction | None:
-    """Test velocities against given poses (F, 4, 4) at times (F,); windows are of scans."""
-    motion = DopplerMotion.by(velocities, times_s, poses)
-    shown = steps(poses)[:, :3, 3]
-    known = velocities.found[:-1] & velocities.found[1:]
-    variances = motion.shares[:, :3].mean(axis=1) + np.median(_second_differences(shown) ** 2) / 6
+def of_poses(
+    velocities: SensorVelocities, times_s: Floats, poses: Floats
+) -> tuple[Contradiction | None, Clock]:
+    """Test velocities and times (F,) against given poses (F, 4, 4); return the clearest contradiction, and errors of the times."""
+    shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
+    clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
+    motion = DopplerMotion.by(velocities, times_s - clock.errors_s, poses)
+    # Poses have errors, too: where the sensor moves evenly, second differences of steps have six times their variance.
+    jumps = np.diff(shown, 2, axis=0) if len(shown) > 2 else np.zeros((1, 3))
+    variances = motion.shares[:, :3].mean(axis=1) + np.median(jumps**2) / 6
     found = contradiction(shown[known], motion.steps[known, :3, 3], variances[known])
-    if found is None:
-        return None
-    scans = np.append(np.flatnonzero(known), np.flatnonzero(known)[-1] + 1)
-    return dataclasses.replace(found, first=int(scans[found.first]), last=int(scans[found.last]))
-
-
-def _second_differences(steps_m: Floats) -> Floats:
-    return np.diff(steps_m, 2, axis=0) if len(steps_m) > 2 else np.zeros((1, 3))
+    if found is not None:
+        scans = np.append(np.flatnonzero(known), np.flatnonzero(known)[-1] + 1)
+        found = dataclasses.replace(found, first=int(scans[found.first]), last=int(scans[found.last]))
+    return found, clock
 
 
 @dataclass(frozen=True)

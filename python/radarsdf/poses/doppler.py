@@ -32,7 +32,6 @@ ERRORS = 3.0
 # Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
 # elevations with a common error.
 LEAST_MPS = 0.02
-_COMPARED = 8  # steps to sum over, so that errors of single poses are small
 # Prior deviation of the vertical velocity, share of the speed, where Doppler is less precise. Slopes of roads: 0.05.
 _CLIMB = 0.1
 _LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
@@ -200,21 +199,6 @@ class DopplerMotion(KnownMotion):
         turns = rotation_vector(between[:, :3, :3], self.turns)
         between[:, :3, 3] = way(turns, means[:-1], means[1:], self.durations_s[:, None])
         return dataclasses.replace(self, steps=between)
-
-
-def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
-    """Return the share of the squared displacements of poses (F, 4, 4) not explained by velocities; 0 within their errors."""
-    ways = np.einsum("fij,fj->fi", poses[:-1, :3, :3], motion.steps[:, :3, 3])
-    count = min(_COMPARED, len(ways))
-    measured, variance = (
-        np.diff(np.pad(np.cumsum(rows, axis=0), ((1, 0), (0, 0)))[::count], axis=0)
-        for rows in (ways, motion.shares[:, :3])
-    )
-    given = np.diff(poses[::count, :3, 3], axis=0)
-    squares = float(((measured - given) ** 2).sum())
-    if squares <= ERRORS**2 * float(variance.sum()):
-        return 0.0
-    return squares / max(float((given**2).sum()), float((measured**2).sum()))
 
 
 class _Pair:
