@@ -1,4 +1,4 @@
-"""Deferral of Ctrl-C during critical work."""
+"""Deferral of Ctrl-C during critical work, and changes that it cannot divide."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
+from typing import Any
 
 
 @contextmanager
@@ -31,3 +33,11 @@ def deferred_interrupts() -> Iterator[Callable[[], bool]]:
     finally:
         if in_main_thread and signal.getsignal(signal.SIGINT) is remember:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def at_once(*calls: partial[Any]) -> list[Any]:
+    """Call compiled functions in turn, and return their results. No asynchronous exception comes between them.
+
+    Python raises those, of signals and of other threads, between bytecodes only, and `map` executes none.
+    """
+    return list(map(partial.__call__, calls))

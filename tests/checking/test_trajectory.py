@@ -147,6 +147,19 @@ def test_returns_excluded_from_a_fit_are_noted(good):
 
 
 @pytest.mark.usefixtures("right_frames")
+@pytest.mark.parametrize("far_m", [300.0, 65_535.0])
+def test_a_range_that_stands_for_no_return_is_named(good, far_m):
+    points, poses = good
+    assert "range_sentinel" not in names(check_cheaply(points, poses))
+    broken = [scan.astype(np.float32) for scan in points]
+    for scan in broken:
+        scan[::90] *= far_m / np.linalg.norm(scan[::90], axis=1, keepdims=True)
+    found = check_cheaply(broken, poses)
+    assert "range_sentinel" in names(found)
+    assert any(finding.name == "far_returns" for finding in found) == (far_m > 1000)
+
+
+@pytest.mark.usefixtures("right_frames")
 def test_utm_coordinates_in_float32_are_named_with_their_resolution(good):
     points, poses = good
     poses = poses.copy()

@@ -2,12 +2,13 @@
 
 import os
 import stat
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 import trimesh
-from radarsdf.io.files import check_outputs, write_whole
+from radarsdf.io.files import check_outputs, whole_file, write_whole
 from radarsdf.io.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="links, pipes and permissions of POSIX")
@@ -23,6 +24,19 @@ def test_a_link_is_followed_and_permissions_are_kept(tmp_path):
     assert link.is_symlink()
     assert file.read_bytes() == b"new"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
+
+
+@posix
+def test_the_next_write_removes_files_of_killed_ones(tmp_path):
+    target = tmp_path / "map [1].npz"
+    killed = "import os, sys, radarsdf.io.files as f\nwith f.whole_file(sys.argv[1]): os.kill(os.getpid(), 9)"
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", killed, str(target)], check=False)
+    assert len(list(tmp_path.iterdir())) == 1  # the second one removed the file of the first
+    with whole_file(target) as slow:
+        write_whole(target, b"fast")
+        slow.write(b"slow")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"slow"]
 
 
 @posix

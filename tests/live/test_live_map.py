@@ -92,7 +92,7 @@ def test_a_change_updates_bridges_outside_its_region():
     round_one = world[np.linalg.norm(world - world[3], axis=1) < 1.5]
     live.integrate((round_one - poses[0][:3, 3]) @ poses[0][:3, :3], poses[0])
     grown = mesh_bits(live.mesh())
-    live._state.forget_surface()
+    live._state._surface = None
     assert grown == mesh_bits(live.mesh())
 
 
@@ -107,7 +107,7 @@ def test_only_the_changed_part_of_a_long_drive_is_recomputed():
     redone = surface.update(*changes)
     assert 0 < len(redone) < 0.4 * len(regions_of(surface.distances.gather()["keys"]))
     grown = mesh_bits(live.mesh())
-    live._state.forget_surface()
+    live._state._surface = None
     assert grown == mesh_bits(live.mesh())
 
 
@@ -157,11 +157,11 @@ def test_sizes_are_not_read_during_integration(monkeypatch):
     reader = threading.Thread(target=lambda: found.append(repr(live)))
     apply = live._state._apply
 
-    def slowly(come, gone):
+    def slowly(*change):
         reader.start()
         reader.join(0.2)
         during.extend(found)
-        return apply(come, gone)
+        return apply(*change)
 
     monkeypatch.setattr(live._state, "_apply", slowly)
     live.integrate(SCENE.points[3], SCENE.poses[3], SCENE.intensities[3])
@@ -249,7 +249,7 @@ def test_a_full_disk_leaves_the_map_unchanged(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("radarsdf.live.store.write_arrays", full)
+        patched.setattr("radarsdf.live.store._write", full)
         for _ in range(3):
             with pytest.raises(OSError, match="No space"):
                 live.integrate(SCENE.points[6], SCENE.poses[6], SCENE.intensities[6])
@@ -287,7 +287,7 @@ def test_distant_regions_are_dropped():
     assert 0 < len(gone) < len(keys)
     mesh = live.mesh()
     assert np.linalg.norm(mesh.vertices - [20.0, 0.0, 1.0], axis=1).max() < 9.0 + 1.6 * np.sqrt(3)
-    live._state.forget_surface()
+    live._state._surface = None
     assert mesh_bits(mesh) == mesh_bits(live.mesh())
     assert live.sealed_scans == 8  # all were taken farther away
     with pytest.raises(ValueError, match="sealed"):

@@ -54,7 +54,7 @@ def test_a_drive_that_starts_fast_is_as_accurate_as_odometry():
     motion = radarsdf.simulate.measured_motion(scans, seed=seed)
     live = LiveMap(SETTINGS)
     moved = [follow(live, scans, motion, [i], sign=-1).moved for i in range(12)]
-    assert live._follower._steps[-1].sign == -1
+    assert live._state.track.steps[-1].sign == -1
     assert moved[3] == (1, 2)
     assert moved[7] == (1, 2, 3, 4, 5, 6)
     batch = radarsdf.odometry(
@@ -126,10 +126,10 @@ def test_a_stationary_sensor_leaves_the_doppler_sign_undetermined(drive):
     for i in range(6):
         noisy = scans.points[0] + rng.normal(0, 0.02, scans.points[0].shape)
         live.integrate(noisy, doppler_mps=rng.normal(0, 0.05, len(noisy)), time_s=motion.times_s[i])
-        assert live._follower._steps[-1].sign == 0
+        assert live._state.track.steps[-1].sign == 0
     for i in range(1, 14):
         live.integrate(scans.points[i], doppler_mps=-motion.doppler_mps[i], time_s=motion.times_s[i] + 0.5)
-    assert live._follower._steps[-1].sign == -1
+    assert live._state.track.steps[-1].sign == -1
 
 
 def test_the_next_scan_is_placed_relative_to_moved_scans(drive, tmp_path):

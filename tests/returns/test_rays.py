@@ -1,7 +1,9 @@
 """Preparation: from sensor frames to rays of one local frame."""
 
 import numpy as np
-from radarsdf.returns.rays import prepare
+import pytest
+from radarsdf import LiveMap
+from radarsdf.returns.rays import check_scans, prepare
 
 from ..conftest import pose
 
@@ -73,3 +75,21 @@ def test_accumulated_scans_are_seen_from_the_middle_one():
     np.testing.assert_allclose(back, sensors, atol=5e-5)
     np.testing.assert_array_equal(rays.points, single.points)
     np.testing.assert_array_equal(rays.origin, single.origin)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.8])
+@pytest.mark.parametrize("far_m", [6553.5, 65_535.0, 1e6])
+def test_returns_that_no_radar_measures_are_left_out_and_counted(share, far_m):
+    rng = np.random.default_rng(0)
+    scan = rng.normal(size=(2000, 3)) * [20, 20, 2]
+    scan[0] = 300.0  # far, but possible
+    kept, _, left_out = check_scans([scan])
+    assert left_out.notes == []
+    assert kept[0] is scan
+    far = rng.random(len(scan)) < share
+    scan[far] *= far_m / np.linalg.norm(scan[far], axis=1, keepdims=True)
+    kept, _, left_out = check_scans([scan.astype(np.float32)])
+    assert (left_out.far, left_out.rows) == (far.sum(), 0)
+    assert ((kept[0] == 0).all(axis=1) == far).all()
+    done = LiveMap().integrate(scan, np.eye(4))
+    assert done.far == far.sum()

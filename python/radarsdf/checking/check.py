@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +13,12 @@ from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
 from radarsdf.checks import MISSING_POSES, are_rigid, instance
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.returns.rays import measured
+from radarsdf.returns.rays import measured, too_far
 from radarsdf.scans import Scans, filled
+
+_EQUAL = 1e-6  # relative difference of equal ranges, from float32
+# A largest range is too frequent if more than 8 returns, and 5 times as many as at each of the next 10 ranges, have it.
+_NEXT, _LEAST_EQUAL, _ABOVE_NEXT = 10, 8, 5
 
 
 def check(
@@ -124,8 +128,12 @@ def _of_poses(
 
 def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
     """Findings about unusable rows, scans and poses, the recording without them, and the numbers (F,) of its scans."""
-    found, numbers = [], np.arange(len(recording))
-    left_out = [~measured(scan) for scan in recording.points]
+    found: list[Finding] = []
+    numbers = np.arange(len(recording))
+    returns = [measured(scan) for scan in recording.points]
+    far = [too_far(*each) for each in zip(recording.points, returns, strict=True)]
+    found += _far(recording, returns, sum(int(mask.sum()) for mask in far))
+    left_out = [~mask for mask in returns]
     total, unmeasured = sum(map(len, left_out)), sum(int(mask.sum()) for mask in left_out)
     infinite = sum(int((~np.isfinite(scan)).any(axis=1).sum()) for scan in recording.points)
     if infinite:
@@ -135,7 +143,8 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
         count = f"{unmeasured - infinite} of {total} returns"
         evidence = f"{count} are no measurements: 0 0 0, or consecutive copies of one point."
         found.append(Finding("padding", "note", evidence))
-    if unmeasured:
+    left_out = [mask | apart for mask, apart in zip(left_out, far, strict=True)]
+    if any(mask.any() for mask in left_out):
         recording = _without(recording, left_out)
     empty = np.array([mask.all() for mask in left_out])
     if empty.any():
@@ -148,6 +157,22 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
         numbers = np.flatnonzero(~empty & are_rigid(recording.poses))
         recording = recording.select(numbers)
     return found, recording, numbers
+
+
+def _far(recording: Scans, returns: list[NDArray[np.bool_]], num_far: int) -> Iterator[Finding]:
+    """Report returns that a fit leaves out as too far away, and a farthest range that is much too frequent."""
+    lengths = [
+        np.linalg.norm(scan[mask], axis=1) for scan, mask in zip(recording.points, returns, strict=True)
+    ]
+    ranges = np.concatenate(lengths)
+    most = ranges.max(initial=0.0)
+    counts = np.unique((np.log(ranges / most) / _EQUAL).round(), return_counts=True)[1]
+    if num_far:
+        evidence = f"{num_far} of {len(ranges)} returns are beyond 100 times the median range of their scan."
+        yield Finding("far_returns", "note", evidence)
+    if len(counts) > _NEXT and counts[-1] > _LEAST_EQUAL + _ABOVE_NEXT * counts[-1 - _NEXT : -1].max():
+        evidence = f"{counts[-1]} of {len(ranges)} returns are at exactly the largest range, {most:g} m."
+        yield Finding("range_sentinel", "warning", evidence)
 
 
 def _without(recording: Scans, left_out: list[NDArray[np.bool_]]) -> Scans:

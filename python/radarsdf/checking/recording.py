@@ -37,6 +37,8 @@ FIXES = {
     "empty_scans": f"Pass the returns. {_LEFT_OUT}",
     "intensity_not_finite": "Fit without intensities, if there are hardly any. A fit leaves them out of the reflectance.",
     "no_elevation": "Read the map from above only: its heights are those of the sensor, not of the scene.",
+    "far_returns": "A fit leaves them out.",
+    "range_sentinel": "Leave them out, if they mark directions without a return: a fit keeps those near other returns.",
     "positions_rounded": "Keep poses in float64, or subtract an origin before they become float32.",
     "poses_not_rigid": f"A fit leaves out their scans. {_ANGLES}",
     "poses_transposed": "Transpose each pose: poses.transpose(0, 2, 1).",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import socket
 import stat
@@ -61,8 +62,8 @@ def check_outputs(
         taken[target] = path
         _mode_to_keep(Path(target), path)
         descriptor, temporary = _open_temporary(Path(target))
+        temporary.unlink(missing_ok=True)
         os.close(descriptor)
-        temporary.unlink()
 
 
 def write_whole(path: str | PathLike[str], data: bytes) -> None:
@@ -76,19 +77,23 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
     """Open a file for writing that replaces the one at `path` only once it is on the disk.
 
     If the block raises, the old file is unchanged. Links are followed, and the old file's permissions are kept. A killed
-    process may leave a hidden file named `.NAME.` and 16 hexadecimal digits in the same folder.
+    process may leave a hidden file named `.NAME.` and 16 hexadecimal digits in the same folder, which the next call removes.
     """
     target = Path(os.path.realpath(path_of(path, "path")))
     mode = _mode_to_keep(target, path)
+    _remove_abandoned(target)
     descriptor, temporary = _open_temporary(target)
     try:
         with os.fdopen(descriptor, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        if mode is not None:
-            temporary.chmod(mode)
-        temporary.replace(target)
+            if mode is not None:
+                temporary.chmod(mode)
+            if sys.platform != "win32":  # while it is locked
+                temporary.replace(target)
+        if sys.platform == "win32":
+            temporary.replace(target)
     except BaseException as error:
         with suppress(OSError):  # its folder or the disk may be gone, as the first error says
             temporary.unlink()
@@ -109,19 +114,36 @@ def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
     return stat.S_IMODE(mode)
 
 
+def _remove_abandoned(target: Path) -> None:
+    """Remove temporary files for `target` of killed processes, which no longer lock them."""
+    ours = re.compile(rf"\.{re.escape(target.name[:_MAX_STEM])}\.[0-9a-f]{{16}}")
+    with suppress(OSError):  # a leftover file is harmless
+        for path in target.parent.iterdir():
+            if ours.fullmatch(path.name):
+                with suppress(OSError), path.open("rb+") as file:
+                    _lock(file.fileno())
+                    path.unlink()
+
+
 def _open_temporary(target: Path) -> tuple[int, Path]:
-    """Create a file in the folder of `target`: a rename is atomic only within a file system."""
+    """Create and lock a file in the folder of `target`: a rename is atomic only within a file system."""
     if len(os.fsencode(target.name)) > _MAX_NAME_BYTES:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
     temporary = target.with_name(f".{target.name[:_MAX_STEM]}.{secrets.token_hex(8)}")
     # Not tempfile: its files are readable by the owner only, and the rename would keep that.
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
-        return os.open(temporary, flags, 0o666), temporary
+        descriptor = os.open(temporary, flags, 0o666)
     except OSError as error:
         missing = isinstance(error, FileNotFoundError) and not target.parent.is_dir()
         why = f"there is no folder {target.parent}" if missing else error.strerror
         raise OSError(error.errno, why, str(target)) from error
+    with suppress(OSError):  # some file systems have no locks: nothing is removed there
+        _lock(descriptor)
+    if temporary.exists():
+        return descriptor, temporary
+    os.close(descriptor)  # another process took it for abandoned before it was locked
+    return _open_temporary(target)
 
 
 def take_lock(path: Path, use: str) -> int:

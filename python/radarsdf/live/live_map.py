@@ -56,6 +56,8 @@ class Integrated:
     """Number of moving returns, which are left out."""
     moved: tuple[ScanId, ...] = ()
     """Earlier scans with re-estimated poses, since the motion was not observable before; see :meth:`LiveMap.pose`."""
+    far: int = 0
+    """Number of returns at more than 100 times the median range, such as sentinels, which are left out."""
 
 
 class LiveMap:
@@ -89,7 +91,9 @@ class LiveMap:
     to one that never saw the scan, in any order. Estimated noise of the sensor, intensities, the result of :meth:`finish`, and
     files depend on the order of scans.
 
-    All methods are thread-safe, and changes are atomic: after any error, the map is as before. Poses are T_world_sensor, m.
+    All methods are thread-safe, and changes are atomic: after any error, the map is as before; after Ctrl-C or another
+    asynchronous exception, a change is either complete or absent. A map belongs to the process that created it: in one forked
+    from it, methods that change the map or may use its folder raise a RuntimeError. Poses are T_world_sensor, m.
     Methods that change the map return the ascending keys (B,), uint64, of the blocks of 8 × 8 × 8 leaf cells with changed or
     removed returns.
 
@@ -123,9 +127,12 @@ class LiveMap:
         most = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
         place = None if folder is None else path_of(folder, "folder")
         if place is not None:
-            weakref.finalize(self, os.close, locked_folder(place))
+            unlock = weakref.finalize(self, os.close, locked_folder(place))
+            if hasattr(os, "register_at_fork"):  # a child process would hold the lock, too
+                os.register_at_fork(after_in_child=unlock)
         self._state = GrowingState(config, corner, most, place)
         self._follower = Follower(config)
+        self._pid = os.getpid()
         self._lock = threading.RLock()  # guards the state
         self._reading = threading.Lock()  # guards its surface; acquired first
 
@@ -165,6 +172,13 @@ class LiveMap:
         """Memory of the map, bytes."""
         with self._lock:  # tables must not grow meanwhile
             return self._state.num_bytes
+
+    def _owned(self, *, changes: bool = True) -> threading.RLock:
+        """Return the lock, for changes or use of the folder. Raise a RuntimeError in another process than the map's."""
+        if os.getpid() != self._pid and (changes or self._state.log.folder is not None):
+            msg = f"the map belongs to process {self._pid}, not to {os.getpid()}, which was forked from it: use it there, or load a saved one"
+            raise RuntimeError(msg)
+        return self._lock
 
     def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
         """Return the pose of a scan, (4, 4) float64.
@@ -223,14 +237,14 @@ class LiveMap:
         Lost
             If a scan without a pose cannot be registered with the last ones; a ValueError.
         """
-        scan = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
+        scan, far = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
         if given is None and scan.time_s is None:
             msg = "a scan needs a pose, or a time"
             raise ValueError(msg)
         state = self._state
-        with self._lock:
+        with self._owned():
             scan_id = state.next_id if scan_id is None else scan_id
             if scan_id in state.log:
                 msg = f"the map has a scan {scan_id!r} already: remove or move it"
@@ -239,25 +253,25 @@ class LiveMap:
             if state.with_intensities not in (None, with_intensities):
                 msg = "either all scans have intensities, or none has"
                 raise ValueError(msg)
-            steps = [] if given is not None else self._follower.seek(state.log, scan_id, scan)
+            steps = [] if given is not None else self._follower.seek(state.track, state.log, scan_id, scan)
             come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
             if given is not None:
                 come[scan_id] = scan.at(given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
-            origin = None
-            if state.origin is None:
+            origin = state.origin
+            if origin is None:
                 lattice = self.config.lattice
                 origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
-            blocks = state.exchange(come, again, origin)
-            state.with_intensities = with_intensities
-            if isinstance(scan_id, int):
-                state.next_id = max(state.next_id, scan_id + 1)
-            if given is None:
-                self._follower.keep(steps)
-            else:
-                self._follower.place(scan_id, scan)
+            blocks = state.exchange(
+                come,
+                again,
+                origin=origin,
+                with_intensities=with_intensities,
+                next_id=max(state.next_id, scan_id + 1) if isinstance(scan_id, int) else state.next_id,
+                track=self._follower.track(steps) if steps else state.track.placed(scan_id, scan),
+            )
         moving = 0 if scan.is_static is None else int((~scan.is_static).sum())
-        return Integrated(scan_id, scan.pose.copy(), blocks, moving, again)
+        return Integrated(scan_id, scan.pose.copy(), blocks, moving, again, far)
 
     def remove(self, scan_id: ScanId) -> Keys:
         """Remove a scan. The map is then bit-identical to one that never saw it.
@@ -269,7 +283,7 @@ class LiveMap:
         ValueError
             If it was sealed by `max_bytes` or :meth:`clear_outside`.
         """
-        with self._lock:
+        with self._owned():
             return self._state.exchange({}, [scan_id])
 
     def move(self, scan_id: ScanId, pose: ArrayLike) -> Keys:
@@ -290,7 +304,7 @@ class LiveMap:
             As for :meth:`remove`, or if a pose is invalid.
         """
         instance(poses, Mapping, "poses")  # type: ignore[type-abstract]
-        with self._lock:
+        with self._owned():
             moved = {}
             for scan_id, given in poses.items():
                 pose, scan = (
@@ -320,7 +334,7 @@ class LiveMap:
             If an argument is out of range, or a region cannot be written to the folder.
         """
         middle, radius = positions([np.asarray(centre)], "centre")[0], not_negative(radius_m, "radius_m")
-        with self._lock:
+        with self._owned():
             return self._state.clear_outside(middle, radius)
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -331,7 +345,7 @@ class LiveMap:
         ValueError, OSError
             If a scan id is neither an integer nor a string, or the file cannot be written.
         """
-        with self._lock, self._state.whole():
+        with self._owned(changes=False), self._state.whole():
             self._state.save(path)
 
     @classmethod
@@ -357,7 +371,7 @@ class LiveMap:
         live = cls(config, origin=described.origin, max_bytes=described.max_bytes, folder=folder)
         live._state.restore(described, scans, sums)
         for scan_id, scan in zip(described.ids, scans, strict=True):
-            live._follower.place(scan_id, scan)
+            live._state.track = live._state.track.placed(scan_id, scan)
         return live
 
     def mesh(self, **limits: Any) -> trimesh.Trimesh:
@@ -380,14 +394,11 @@ class LiveMap:
         """
         wanted = Limits.of(self.config.leaf_size_m, **limits)
         with self._reading:
-            with self._lock:
+            with self._owned(changes=False):
                 growing, changes, visibility = self._state.changes()
-            try:
-                growing.update(*changes)
-                scene, surface = growing.surface(visibility)
-            except BaseException:  # such as Ctrl-C: a partial update would be inconsistent
-                self._state.forget_surface()
-                raise
+            growing.update(*changes)
+            growing.complete = True
+            scene, surface = growing.surface(visibility)
         return surface.mesh(scene.origin, wanted, surface.cells_searched)
 
     def map(self) -> RadarMap:
@@ -398,7 +409,7 @@ class LiveMap:
         ValueError, OSError
             If there is no such scan, or files in the folder cannot be read.
         """
-        with self._lock, self._state.whole():
+        with self._owned(changes=False), self._state.whole():
             read = self._state.fit_input()
         return fit_rays(read, self._state.quick, progress=False)
 
@@ -415,7 +426,7 @@ class LiveMap:
         ValueError
             If scans were sealed, or there are none.
         """
-        with self._lock:
+        with self._owned(changes=False):
             if sealed := self.sealed_scans:
                 msg = f"{sealed} scans were sealed by max_bytes or clear_outside, and cannot be fitted: give the map a folder to keep scans in"
                 raise ValueError(msg)
@@ -439,9 +450,9 @@ def _checked_scan(
     doppler_mps: ArrayLike | None,
     time_s: float | None,
     config: ReturnsConfig,
-) -> LoggedScan:
-    """Check a scan, without a pose yet. Raise a ValueError if it is invalid."""
-    scans, values, _ = check_scans([points], None if intensities is None else [intensities])
+) -> tuple[LoggedScan, int]:
+    """Check a scan, without a pose yet, and count returns too far away. Raise a ValueError if it is invalid."""
+    scans, values, left_out = check_scans([points], None if intensities is None else [intensities])
     scan = scans[0].copy()
     speeds, static = None, None
     if doppler_mps is not None:
@@ -456,4 +467,4 @@ def _checked_scan(
             msg = f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
             raise ValueError(msg)
     values_of_scan = None if values is None else values[0].copy()
-    return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s)
+    return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s), left_out.far

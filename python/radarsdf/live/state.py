@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ from numpy.typing import NDArray
 from radarsdf._core import QUANTA, GrowingSums, SumsChange
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
-from radarsdf.live.regions import REGION_BITS, REGION_CELLS, Keys, region_places, regions_of
+from radarsdf.interrupts import at_once
+from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, Keys, region_places, regions_of
 from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
 from radarsdf.live.surface import GrowingSurface
+from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
 from radarsdf.returns.intensities import IntensityScale, Plausible
 from radarsdf.returns.noise import SensorNoise, sensor_noise
@@ -26,12 +29,17 @@ from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import ScanSums, lattice_of
 from radarsdf.threads import resolve_num_threads
 
+_Scans = dict[ScanId, LoggedScan]
 _UNKNOWN = SensorNoise(0.1, 0.01, 0.01)  # placeholder until it is estimated from scans
 _NOISE_RETURNS = 100_000  # sample for the noise, enough to include the required returns on flat surfels
 
 
 class GrowingState:
-    """Sums over scans, the scans, and the surface derived from them. Not thread-safe."""
+    """Sums over scans, the scans, and the surface derived from them. Not thread-safe.
+
+    Each change is prepared in new objects and made by one :func:`at_once`, so that an asynchronous exception, such as Ctrl-C,
+    leaves it complete or absent.
+    """
 
     def __init__(
         self,
@@ -52,7 +60,9 @@ class GrowingState:
         self.origin = origin
         self.max_bytes = max_bytes
         self.log = ScanLog(folder)
+        self.track = Track()
         self._store = RegionStore(folder)
+        self._away = NO_KEYS  # ascending keys of the regions on disk
         self._num_threads = resolve_num_threads(config.num_threads)
         self.sums = GrowingSums()
         self.noise = _UNKNOWN
@@ -68,50 +78,49 @@ class GrowingState:
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
-    def exchange(
-        self,
-        come: dict[ScanId, LoggedScan],
-        gone: Iterable[ScanId],
-        origin: NDArray[np.float64] | None = None,
-    ) -> Keys:
-        """Remove and insert scans, possibly of the same ids, atomically. Return the keys of the changed blocks."""
+    def exchange(self, come: _Scans, gone: Iterable[ScanId], **new: Any) -> Keys:
+        """Remove and insert scans, possibly of the same ids, atomically. Return the keys of the changed blocks.
+
+        `new`: attributes to set with them.
+        """
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
-        before, self.origin = self.origin, self.origin if origin is None else origin
+        new = {"origin": self.origin, "log": self.log.exchanged(come, left)} | new
+        before = {name: getattr(self, name) for name in new}
+        blocks = self._apply(come, left, new)
         try:
-            blocks = self._apply(come, left)
-            try:
-                if come:
-                    self._bound()
-            except BaseException:  # such as a full disk
-                self._apply(left, come)
-                raise
-        except BaseException:
-            self.origin = before
+            if come:
+                self._bound()
+        except BaseException:  # such as a full disk
+            self._apply(left, come, before)
             raise
+        before["log"].unlink(left)
         return blocks
 
-    def _apply(self, come: dict[ScanId, LoggedScan], gone: dict[ScanId, LoggedScan]) -> Keys:
-        """Change the sums and the log atomically. Return the keys of the changed blocks."""
+    def _apply(self, come: _Scans, gone: _Scans, new: dict[str, Any]) -> Keys:
+        """Change the sums and set attributes atomically. Return the keys of the changed blocks."""
         change = SumsChange(self.config.leaf_size_m, self.config.leaf_size_m / QUANTA)
         for scans, sign in ((gone, -1), (come, 1)):
             for scan in scans.values():
-                rays = _rays_of([scan], self.config, self.origin)
+                rays = _rays_of([scan], self.config, self.origin if new["origin"] is None else new["origin"])
                 change.collect(rays.points, rays.directions, rays.ranges_m, sign)
         self._bring_back(regions_of(change.block_keys() << BLOCK_BITS))
-        blocks, _ = self.sums.apply(change)
-        self._changed.update(blocks.tolist())
-        for scan_id in gone.keys() - come.keys():
-            self.log.drop(scan_id)
-        for scan_id, scan in come.items():
-            self.log.put(scan_id, scan)
-        return blocks
+        return self._commit(partial(self.sums.apply, change), None, **new)
+
+    def _commit(self, change: partial[Any], blocks: Keys | None, **new: Any) -> Keys:
+        """Change the sums and set attributes at once. Return the changed blocks: `blocks`, or those that `change` returns."""
+        surface, self._surface = self._surface, None  # an interruption after the change discards it
+        result, _ = at_once(change, partial(vars(self).update, new))
+        changed: Keys = result[0] if blocks is None else blocks
+        self._changed.update(changed.tolist())
+        self._surface = surface
+        return changed
 
     def _bound(self) -> None:
         """Seal scans, or write them to the folder, to stay within the memory limit."""
         if self.max_bytes is not None and self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans for its estimate may be sealed
                 self._settle_noise()
-            self.log.shrink(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
+            self.log = self.log.shrunk(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
     def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
         """See :meth:`LiveMap.clear_outside`."""
@@ -125,15 +134,13 @@ class GrowingState:
             return self._put_away(regions[np.square(nearest - centre).sum(axis=1) > radius_m**2])
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
         gone: Keys = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
-        self.sums.erase(gone)
-        self.log.seal_beyond(centre, radius_m)
-        self._changed.update(gone.tolist())
-        return gone
+        log = self.log.sealed_beyond(centre, radius_m)
+        return self._commit(partial(self.sums.erase, gone), gone, log=log)
 
     @contextmanager
     def whole(self) -> Iterator[None]:
         """Restore all regions from disk within the context, and write the same ones again afterwards."""
-        away = self._store.regions
+        away = self._away
         self._bring_back(away)
         try:
             yield
@@ -141,30 +148,32 @@ class GrowingState:
             self._put_away(away)
 
     def _bring_back(self, regions: Keys) -> None:
-        self._changed.update(self._store.bring_back(self.sums, regions).tolist())
+        regions = np.intersect1d(regions, self._away)
+        if len(regions):
+            blocks, columns = self._store.read(regions)
+            away = np.setdiff1d(self._away, regions)
+            self._commit(partial(self.sums.insert, *columns), blocks, _away=away)
+            self._store.unlink(regions)
 
     def _put_away(self, regions: Keys) -> Keys:
-        blocks = self._store.put_away(self.sums, regions)
-        self._changed.update(blocks.tolist())
-        return blocks
+        blocks, written = self._store.write(self.sums, regions)
+        away = np.union1d(self._away, written)
+        return self._commit(partial(self.sums.erase, blocks), blocks, _away=away)
 
     def changes(self) -> tuple[GrowingSurface, tuple[Any, ...], VisibilityCounts]:
         """Return the last surface, the arguments of its update, and the visibility counts."""
         self._settle_noise()  # first: may raise, since scans may be read from disk
-        if self._surface is None:
+        if self._surface is None or not self._surface.complete:
             surface = GrowingSurface(self.quick, np.zeros(3) if self.origin is None else self.origin)
             self._surface = None if self.origin is None else surface
             blocks = self.sums.block_keys()
         else:
             surface = self._surface
             blocks = np.array(sorted(self._changed), np.uint64)
-        self._changed.clear()
         sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(blocks)))
+        surface.complete = False
+        self._changed.clear()
         return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
-
-    def forget_surface(self) -> None:
-        """Discard the surface, to recompute it from all sums."""
-        self._surface = None
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
@@ -240,8 +249,8 @@ class GrowingState:
         if asked:
             surfels = Surfels.of_sums(sums, self._num_threads)
             rays = _rays_of(asked, self.config, self.origin)
-            self.noise = sensor_noise(surfels, rays, self.config.returns, self._num_threads)
-            self._noise_of = scans
+            noise = sensor_noise(surfels, rays, self.config.returns, self._num_threads)
+            vars(self).update(noise=noise, _noise_of=scans)
 
 
 def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:

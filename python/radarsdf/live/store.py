@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -18,7 +19,7 @@ from radarsdf._core import GrowingSums
 from radarsdf.checks import MAX_POSITION_M, check_pose, check_values_of_scan, positions
 from radarsdf.io.files import take_lock
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
-from radarsdf.live.regions import NO_KEYS, REGION_BITS, Keys
+from radarsdf.live.regions import REGION_BITS, Keys
 from radarsdf.returns.evidence import BLOCK_BITS
 
 ScanId = Hashable
@@ -116,14 +117,14 @@ def _scan_of(
 
 
 class ScanLog:
-    """Scans by id, in order of insertion.
+    """Scans by id, in order of insertion. Changes return a new log, and leave the files of this one.
 
     To limit memory, the oldest are written to `folder`. Without a folder they are sealed: they stay in the map, but can no
     longer be removed.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        self._folder = folder
+        self.folder = folder
         self._scans: dict[ScanId, LoggedScan | _OnDisk] = {}
         self.sealed: set[ScanId] = set()
         self._written = 0
@@ -161,47 +162,62 @@ class ScanLog:
 
     def put(self, scan_id: ScanId, scan: LoggedScan | _OnDisk) -> None:
         """Add a scan, or replace it in place."""
-        self._free(scan_id)
+        before = self._scans.get(scan_id)
         self._scans[scan_id] = scan
-        self.num_bytes += scan.num_bytes
+        self.num_bytes += scan.num_bytes - (0 if before is None else before.num_bytes)
 
-    def drop(self, scan_id: ScanId) -> None:
-        """Remove a scan."""
-        self._free(scan_id)
-        del self._scans[scan_id]
+    def exchanged(
+        self,
+        come: Mapping[ScanId, LoggedScan | _OnDisk],
+        gone: Iterable[ScanId],
+        sealed: Sequence[ScanId] = (),
+    ) -> ScanLog:
+        """Return a log without the scans `gone`, and with those of `come`. Ids in both keep their place."""
+        log = copy(self)
+        log._scans = self._scans.copy()
+        if sealed:
+            log.sealed = self.sealed.union(sealed)
+        for scan_id in set(gone).union(sealed) - come.keys():
+            log.num_bytes -= log._scans.pop(scan_id).num_bytes
+        for scan_id, scan in come.items():
+            log._written += isinstance(scan, _OnDisk)
+            log.put(scan_id, scan)
+        return log
 
-    def _free(self, scan_id: ScanId) -> None:
-        there = self._scans.get(scan_id)
-        self.num_bytes -= 0 if there is None else there.num_bytes
-        if isinstance(there, _OnDisk):
-            with suppress(OSError):  # a leftover file is harmless
-                there.path.unlink()
+    def unlink(self, scan_ids: Iterable[ScanId]) -> None:
+        """Delete the files of scans, which another log has replaced."""
+        for scan_id in scan_ids:
+            if isinstance(there := self._scans[scan_id], _OnDisk):
+                with suppress(OSError):  # a leftover file is harmless
+                    there.path.unlink()
 
-    def shrink(self, max_bytes: int) -> None:
-        """Write or seal the oldest scans in memory until they fit into `max_bytes`."""
+    def shrunk(self, max_bytes: int) -> ScanLog:
+        """Return a log with the oldest scans in memory written or sealed until they fit into `max_bytes`."""
+        come: dict[ScanId, _OnDisk] = {}
+        sealed, excess = [], self.num_bytes - max_bytes
         in_memory = [(scan_id, scan) for scan_id, scan in self._scans.items() if isinstance(scan, LoggedScan)]
         for scan_id, scan in in_memory:
-            if self.num_bytes <= max_bytes:
+            if excess <= 0:
                 break
-            if self._folder is None:
-                self._seal(scan_id)
+            excess -= scan.num_bytes
+            if self.folder is None:
+                sealed.append(scan_id)
                 continue
-            path = self._folder / f"scan-{self._written:09d}.npz"
-            write_arrays(path, scan.arrays)
-            self._written += 1
-            self.put(scan_id, _OnDisk(scan.pose, path, scan.time_s))
+            path = self.folder / f"scan-{self._written + len(come):09d}.npz"
+            _write(path, scan.arrays)
+            come[scan_id] = on_disk = _OnDisk(scan.pose, path, scan.time_s)
+            excess += on_disk.num_bytes
+        return self.exchanged(come, (), sealed)
 
-    def seal_beyond(self, centre: NDArray[np.float64], radius_m: float) -> None:
-        """Seal the scans with returns outside a ball around `centre` (3,), world, m. No scan is on disk."""
+    def sealed_beyond(self, centre: NDArray[np.float64], radius_m: float) -> ScanLog:
+        """Return a log with those scans sealed that have returns outside a ball around `centre` (3,), world, m."""
+        sealed = []
         for scan_id in self.ids:
             scan = self.get(scan_id)
             reach_m = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1).max())
             if np.linalg.norm(scan.pose[:3, 3] - centre) + reach_m > radius_m:
-                self._seal(scan_id)
-
-    def _seal(self, scan_id: ScanId) -> None:
-        self.drop(scan_id)
-        self.sealed.add(scan_id)
+                sealed.append(scan_id)
+        return self.exchanged({}, (), sealed)
 
 
 class RegionStore:
@@ -209,46 +225,42 @@ class RegionStore:
 
     def __init__(self, folder: Path | None) -> None:
         self.folder = folder
-        self._away: set[int] = set()
-
-    @property
-    def regions(self) -> Keys:
-        """Ascending keys (R,) of the regions on disk."""
-        return np.array(sorted(self._away), np.uint64)
 
     def _path(self, region: int) -> Path:
         assert self.folder is not None
         return self.folder / f"region-{region:016x}.npz"
 
-    def put_away(self, sums: GrowingSums, regions: Keys) -> Keys:
-        """Move all blocks of `regions` from `sums` to disk, after all are written. Return the ascending keys of the blocks."""
+    def write(self, sums: GrowingSums, regions: Keys) -> tuple[Keys, Keys]:
+        """Write those of `regions` that are in `sums`. Return the ascending keys of their blocks, and theirs."""
         blocks = sums.block_keys()
         region_of_block = (blocks << BLOCK_BITS) >> REGION_BITS
         written = np.intersect1d(regions, region_of_block)
         for region in written.tolist():
             own = blocks[region_of_block == region]
             columns = (*sums.sums_of(own), *sums.visibility_of(own))
-            write_arrays(self._path(region), dict(zip(_CELL_COLUMNS, columns, strict=True)))
-        self._away.update(written.tolist())
-        gone: Keys = blocks[np.isin(region_of_block, written)]
-        sums.erase(gone)
-        return gone
+            _write(self._path(region), dict(zip(_CELL_COLUMNS, columns, strict=True)))
+        return blocks[np.isin(region_of_block, written)], written
 
-    def bring_back(self, sums: GrowingSums, regions: Keys) -> Keys:
-        """Move the `regions` on disk into `sums`, atomically. Return the ascending keys of their blocks."""
-        regions = np.intersect1d(regions, self.regions)
-        if len(regions) == 0:
-            return NO_KEYS
+    def read(self, regions: Keys) -> tuple[Keys, list[NDArray[Any]]]:
+        """Return the ascending keys of the blocks of `regions` on disk, and the columns of their sums."""
         paths = [self._path(region) for region in regions.tolist()]
         read = [_sums_of(path, arrays_of(path, _CELL_COLUMNS)) for path in paths]
         columns = [np.concatenate(parts) for parts in zip(*read, strict=True)]
-        sums.insert(*columns)
-        self._away.difference_update(regions.tolist())
-        for path in paths:
-            with suppress(OSError):  # a leftover file is harmless
-                path.unlink()
         keys, _, _, visibility_keys, _ = columns
-        return np.union1d(visibility_keys, keys >> BLOCK_BITS)
+        return np.union1d(visibility_keys, keys >> BLOCK_BITS), columns
+
+    def unlink(self, regions: Keys) -> None:
+        """Delete the files of regions that are in memory again."""
+        for region in regions.tolist():
+            with suppress(OSError):  # a leftover file is harmless
+                self._path(region).unlink()
+
+
+def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a file in the locked folder. It is used only once it is complete, so that it needs no temporary one."""
+    save: Callable[..., None] = np.savez
+    with path.open("wb") as file:
+        save(file, **arrays)
 
 
 def _sums_of(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], ...]:

@@ -59,6 +59,7 @@ class GrowingSurface:
     def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
         self._config = config  # quick settings
         self._origin = origin  # (3,) origin of the local frame, world, m
+        self.complete = False  # set by the caller after :meth:`update`, so that a partial one is not used
         self._noise: SensorNoise | None = None
         vector, number = np.full((1, 3), np.nan, np.float32), np.zeros(1, np.float32)
         # Leaf cells with returns: mean rays and normals.

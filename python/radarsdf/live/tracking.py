@@ -75,21 +75,32 @@ class Step:
         return float(v @ np.linalg.solve(_covariance(self.velocity), v)) > _MOVES**2
 
 
+@dataclass(frozen=True)
+class Track:
+    """Scans from which tracking continues."""
+
+    steps: tuple[Step, ...] = ()
+    given: tuple[tuple[ScanId, LoggedScan], ...] = ()  # later ones with given poses
+
+    def placed(self, scan_id: ScanId, logged: LoggedScan) -> Track:
+        """Return the track with a scan at a given pose. It is processed before the next one without."""
+        if logged.time_s is None:
+            return self
+        return dataclasses.replace(self, given=(*self.given, (scan_id, logged))[-WINDOW:])
+
+
 @dataclass
 class Follower:
-    """Tracker of the sensor. The map owns the poses, which are read before each scan. A rejected scan has no effect."""
+    """Tracker of the sensor. A cache: the map owns the track and the poses, which are read before each scan."""
 
     config: FitConfig
+    _complete: bool = False  # False while the attributes below change, or if that was interrupted
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
     _rates: deque[tuple[MotionRate, MotionRate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
-    _given: deque[tuple[ScanId, LoggedScan]] = field(default_factory=lambda: deque(maxlen=WINDOW))
 
-    def __post_init__(self) -> None:
-        self._begin([])
-
-    def seek(self, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
+    def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
-        self._synchronise(log)
+        self._synchronise(track, log)
         new = Step(scan_id, logged, self._velocity(logged), begun(np.eye(4)), given=False)
         if not self._steps:
             if len(log):
@@ -118,30 +129,33 @@ class Follower:
             raise Lost(msg)
         return found
 
-    def keep(self, found: list[Step]) -> None:
-        """Continue from the scans returned by :meth:`seek`, which are now in the map."""
-        if len(found) == 1:
-            self._add(found[0])
+    def track(self, found: list[Step]) -> Track:
+        """Return the track that continues with the scans returned by :meth:`seek`."""
+        again = {step.scan_id for step in found}
+        return Track((*(step for step in self._steps if step.scan_id not in again), *found)[-_STEPS:])
+
+    def _synchronise(self, track: Track, log: ScanLog) -> None:
+        """Read the poses of the map: scans may have been added, moved or removed."""
+        steps = [now for step in track.steps if (now := _now(step, log)) is not None]
+        new = next((more for more in (0, 1) if self._complete and self._continued_by(steps, more)), None)
+        self._complete = False
+        if new is None:
+            self._begin(steps)
         else:
-            again = {step.scan_id for step in found}
-            self._begin([*(step for step in self._steps if step.scan_id not in again), *found])
-
-    def place(self, scan_id: ScanId, logged: LoggedScan) -> None:
-        """Queue a scan with a given pose. It is processed before the next one without."""
-        if logged.time_s is not None:
-            self._given.append((scan_id, logged))
-
-    def _synchronise(self, log: ScanLog) -> None:
-        """Read the poses of the map: scans may have been moved or removed."""
-        steps = {step.scan_id: now for step in self._steps if (now := _now(step, log)) is not None}
-        if len(steps) < len(self._steps) or not all(map(operator.is_, steps.values(), self._steps)):
-            self._begin(list(steps.values()))
-        for scan_id, logged in self._given:
+            for step in steps[len(steps) - new :]:
+                self._add(step)
+        for scan_id, logged in track.given:
             found = Tracked(logged.pose, _GIVEN, 1.0, 0, np.zeros(3))
             now = _now(Step(scan_id, logged, self._velocity(logged), found), log)
             if now is not None and not (self._steps and now.time_s <= self._steps[-1].time_s):
                 self._add(now)
-        self._given.clear()
+        self._complete = True
+
+    def _continued_by(self, steps: list[Step], new: int) -> bool:
+        """Whether steps are the present ones, without the oldest if there are too many, and `new` ones."""
+        before = [*self._steps][max(0, len(self._steps) + new - _STEPS) :]
+        poses = ([step.found.pose for step in each] for each in (before, steps[: len(steps) - new]))
+        return len(before) + new == len(steps) and all(map(operator.is_, *poses))
 
     def _begin(self, steps: Sequence[Step]) -> None:
         """Reset to the state after only these scans."""

@@ -28,6 +28,11 @@ from radarsdf.returns.intensities import Plausible
 _LOG = logging.getLogger("radarsdf.returns")
 _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repeat some
 
+# At equal received power the radar cross section grows with the fourth power of the range: a return at 100 times the median
+# range needs 80 dB more than the median one. Birds have about -30 dBsm, ships and buildings at most about 50 dBsm.
+_MOST_RATIO = 100.0
+_SAME_SQUARE = 1e-6  # relative difference of squares of ranges that are equal but for float32
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -105,12 +110,30 @@ def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
     return returns
 
 
+def too_far(scan: NDArray[Any], returns: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask (N,) of those `returns` (N,) of a scan (N, 3) that no radar measures with the others, such as 65,535 m.
+
+    Their range is more than 100 times the median of the others. Equal ranges count once in it: a sentinel has one.
+    """
+    squares = np.square(scan, dtype=np.float64) @ np.ones(3)
+    ordered = squares[returns]
+    if len(ordered) and ordered.max() > _MOST_RATIO**2 * ordered.min():
+        ordered.sort()
+        ordered = ordered[np.diff(ordered, prepend=0.0) > _SAME_SQUARE * ordered]
+        while ordered[-1] > (most := _MOST_RATIO**2 * ordered[len(ordered) // 2]):
+            ordered = ordered[ordered <= most]
+        far: NDArray[np.bool_] = returns & (squares > ordered[-1] * (1 + _SAME_SQUARE))
+        return far
+    return np.zeros(len(scan), np.bool_)
+
+
 @dataclass
 class LeftOut:
     """Rows and scans that cannot be used."""
 
     given: int = 0  # number of rows
     rows: int = 0  # number of rows that are not returns: see :func:`measured`
+    far: int = 0  # number of returns without others nearly as far: see :func:`too_far`
     empty: list[int] = dataclasses.field(default_factory=list)  # scans without returns
     poses: list[int] = dataclasses.field(default_factory=list)  # scans whose pose is not a rigid transform
 
@@ -119,6 +142,9 @@ class LeftOut:
         parts = []
         if self.rows:
             parts.append(f"{self.rows} of {self.given} returns (not finite, at the sensor, or padding)")
+        if self.far:
+            ratio = f"{_MOST_RATIO:g} times the median range of their scan"
+            parts.append(f"{self.far} of {self.given} returns (beyond {ratio})")
         kinds = ((self.empty, "without returns"), (self.poses, "whose pose is not a rigid transform"))
         parts += [
             f"{len(scans)} scans {what} (the first is scan {scans[0]})" for scans, what in kinds if scans
@@ -131,16 +157,19 @@ def check_scans(
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None, LeftOut]:
     """Convert scans (N_i, 3) and intensities (N_i,) to arrays. Raise the ValueError of :func:`prepare` if they are invalid.
 
-    Rows that are not returns become 0 0 0 and non-finite intensities NaN, so that the arrays keep their length.
+    Rows that are not returns, or too far, become 0 0 0 and non-finite intensities NaN, so that the arrays keep their length.
     """
     scans, left_out = [], LeftOut()
     for i, given in enumerate(one_for_each_scan(points, "points")):
         scan = real_array(given, f"scan {i}")
         check_scan_shape(scan, i)
         returns = measured(scan)
+        far = too_far(scan, returns)
+        returns &= ~far
         num_rows = len(scan) - int(np.count_nonzero(returns))
         left_out.given += len(scan)
-        left_out.rows += num_rows
+        left_out.far += int(np.count_nonzero(far))
+        left_out.rows += num_rows - int(np.count_nonzero(far))
         if num_rows == len(scan):
             left_out.empty.append(i)
         scans.append(np.where(returns[:, None], scan, 0.0) if num_rows else scan)
@@ -197,7 +226,7 @@ def prepare(
     different scans share their cells. `whole` False: the scans are a part of a set, which need not have returns within the
     ranges, and intensity outliers are not replaced by NaN.
 
-    Rows that are not returns (not finite, 0 0 0, padding) and scans with a pose that is not rigid are dropped, with a warning
+    Rows that are not returns (not finite, 0 0 0, padding), returns at 100 times the median range of their scan and scans with a pose that is not rigid are dropped, with a warning
     of the logger ``radarsdf.returns``. Raises a ValueError if lengths or shapes do not match, half of the poses or more are
     not rigid, intensities are all equal or too far apart for float32, or no return is within the ranges.
     """
