@@ -196,3 +196,15 @@ def test_ghosts_of_an_incremental_map_equal_those_of_a_new_one():
         fresh.integrate(scans.points[i], scans.poses[i], scan_id=i)
     assert mesh_bits(live.mesh()) == mesh_bits(fresh.mesh())
     assert len(live._state._surface._ghosts) > 50
+
+
+def test_flipped_bits_of_a_state_are_detected(tmp_path):
+    path, rng = tmp_path / "flipped.npz", np.random.default_rng(0)
+    map_of(range(2)).save(path)
+    whole = path.read_bytes()
+    for first in [0, len(whole) - 1000] * 20:  # the directory of the archive is at its end
+        content = bytearray(whole)
+        content[rng.integers(first, len(whole))] ^= 1 << rng.integers(8)
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"flipped\.npz"):
+            LiveMap.load(path)

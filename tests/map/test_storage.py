@@ -88,7 +88,7 @@ def test_a_loaded_map_is_bit_identical(scene, tmp_path, encoding, with_intensity
 def test_the_file_is_plain_safetensors_with_units(saved):
     _, path, tensors, metadata = saved
     assert metadata["format"] == "radarsdf.map"
-    assert metadata["format_version"] == "13"
+    assert metadata["format_version"] == "14"
     assert "positive in free space" in metadata["units"]
     assert {"origin", "leaf_keys", "field.cells.features"} <= set(tensors)
     with path.open("rb") as file:
@@ -257,3 +257,13 @@ def test_maps_that_load_would_reject_are_not_saved(scene, tmp_path):
     with pytest.raises(ValueError, match="distances_m"):
         radar_map.save(path)
     assert path.read_bytes() == before
+
+
+def test_flipped_bits_are_detected(saved, tmp_path):
+    whole, rng, path = saved[1].read_bytes(), np.random.default_rng(0), tmp_path / "flipped.safetensors"
+    for last in [4000, len(whole)] * 20:
+        content = bytearray(whole)
+        content[rng.integers(last)] ^= 1 << rng.integers(8)
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"flipped\.safetensors"):
+            radarsdf.load(path)

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.evaluation import KNNIntensity, holdout
+from radarsdf.fitting import average
 from radarsdf.returns import intensities as plausible
-from radarsdf.returns import reflectance
+from radarsdf.returns import reflectance, sensor
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
 from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.response import LEVEL, NO_SURFACE, STEEP, Response, kinds_of
+from radarsdf.returns.sampling import hashes
 
 LEAF_M = 0.2
 
@@ -213,9 +215,30 @@ def test_limits_of_parts_equal_those_of_the_whole(monkeypatch, most):
     intensities = decibels(np.random.default_rng(0)).astype(np.float32)
     intensities[12_345] = 1e9  # a sample may miss it
     parts = Intensities()
-    for part in np.split(intensities, [10, 10, 3000, 9001]):
-        parts.add(part)
+    keys = hashes(np.arange(len(intensities), dtype=np.uint32))
+    for rows in np.split(np.arange(len(intensities))[::-1], [10, 10, 3000, 9001]):
+        parts.add(intensities[rows], keys[rows])
     found = parts.plausible()
-    assert found == Plausible.of(intensities)
+    assert found == Plausible.of(intensities, keys)
     assert np.flatnonzero(~found.holds(intensities)).tolist() == [12_345]
     assert (parts.low, parts.high) == (45, 1e9)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_intensities_do_not_depend_on_the_order_of_scans(monkeypatch, many):
+    if many:
+        for module, name, value in (
+            (average, "_ENOUGH_RETURNS", 3000), (average, "_ENOUGH_PER_PLANE", 0), (plausible, "_MOST", 1000),
+            (reflectance, "_MOST_RETURNS", 1000), (sensor, "_MAX_RETURNS", 1000),
+        ):  # fmt: skip
+            monkeypatch.setattr(module, name, value)
+    scans = radarsdf.simulate.wall(frames=12, seed=2)
+    given = scans.points, scans.poses, scans.intensities
+    quick = radarsdf.FitConfig.quick()
+    one, other = (
+        radarsdf.fit(*(column[::step] for column in given), config=quick, progress=False) for step in (1, -1)
+    )
+    x, viewpoint = one.mesh(progress=False).vertices, scans.poses[3, :3, 3]
+    np.testing.assert_array_equal(one.intensity(x, viewpoint), other.intensity(x, viewpoint))
+    assert one.sensor.range_m == other.sensor.range_m
+    assert one.sensor.thresholds == other.sensor.thresholds

@@ -83,3 +83,20 @@ def test_damaged_parts_of_a_mesh_are_rejected(copy):
         np.savez(path, **damaged)
         with pytest.raises(ValueError, match=f"{path.name} is not a complete"):
             radarsdf.load(copy).mesh(0.2, progress=False)
+
+
+def test_a_map_in_the_place_of_another_is_missing(copy):
+    first, second = Plan.load(copy).tiles[:2]
+    shutil.copyfile(map_path(copy, second), map_path(copy, first))
+    assert list(radarsdf.load(copy).missing) == [first.name]
+
+
+def test_flipped_bits_of_a_plan_are_detected(copy):
+    path, rng = copy / "plan.json", np.random.default_rng(0)
+    whole = path.read_bytes()
+    for _ in range(40):
+        content = bytearray(whole)
+        content[rng.integers(len(whole))] ^= 1 << rng.integers(8)
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"plan\.json"):
+            radarsdf.load(copy)

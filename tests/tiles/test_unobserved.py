@@ -32,6 +32,11 @@ def returns(drive):
     return np.concatenate([scan.world_points for scan in drive])[::50].astype(np.float64)
 
 
+@pytest.fixture(scope="module")
+def sensors(drive):
+    return np.concatenate([np.tile(scan.T_world_sensor[:3, 3], (len(scan), 1)) for scan in drive])[::50]
+
+
 def answers(any_map, x, sensor=SENSOR, **options):
     like = (lambda a: torch.from_numpy(a).to(x.dtype)) if isinstance(x, torch.Tensor) else x.dtype.type
     return {
@@ -61,18 +66,29 @@ def test_unobserved_places_are_nan(any_map, kind, dtype):
             assert np.isnan(values).all(), name
 
 
-def test_exactly_observed_places_have_values(any_map, returns):
-    x = (returns[:, None] + np.random.default_rng(0).normal(0, 1.0, (4, 3))).reshape(-1, 3)
-    found = answers(any_map, x)
+def test_exactly_observed_places_have_values(any_map, returns, sensors):
+    moved = np.random.default_rng(0).normal(0, 1.0, (4, 3))
+    found = answers(any_map, *((places[:, None] + moved).reshape(-1, 3) for places in (returns, sensors)))
     assert 0.1 < found["observed"].mean() < 0.9
     for name in ("sdf", "gradient", "intensity"):
-        known = np.isfinite(found[name]).reshape(len(x), -1).all(axis=1)
+        known = np.isfinite(found[name]).reshape(len(found["observed"]), -1).all(axis=1)
         np.testing.assert_array_equal(known, found["observed"])
 
 
-def test_extrapolation_has_values_everywhere_near_tiles(any_map, returns):
-    x = np.concatenate([returns, returns + [0.0, 0.0, 30.0]])
-    found, known = answers(any_map, x, extrapolate=True), answers(any_map, x)
+@pytest.mark.parametrize("above_m", [[0, 0, 30.0], [0, 0, 1e4]])
+def test_unmeasured_views_have_no_intensity(any_map, returns, above_m):
+    if any_map.config.networks.reflectance == "network" and above_m[2] < 100:
+        pytest.skip("the elevations of returns are known to the closed form alone")
+    x = returns[any_map.observed(returns)]
+    assert np.isnan(any_map.intensity(x, x + above_m)).all()
+    assert np.isfinite(any_map.intensity(x, x + above_m, extrapolate=True)).all()
+    mesh = any_map.mesh(0.2, viewpoint=returns.mean(axis=0) + above_m, progress=False)
+    assert np.isnan(mesh.vertex_attributes["intensity"]).all()
+
+
+def test_extrapolation_has_values_everywhere_near_tiles(any_map, returns, sensors):
+    x, sensors = np.concatenate([returns, returns + [0.0, 0.0, 30.0]]), np.tile(sensors, (2, 1))
+    found, known = answers(any_map, x, sensors, extrapolate=True), answers(any_map, x, sensors)
     for name in ("sdf", "gradient", "intensity"):
         assert np.isfinite(found[name]).all()
         rows = known["observed"]

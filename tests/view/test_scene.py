@@ -100,11 +100,11 @@ def test_quantities_are_those_of_the_map_on_their_scales(page, sharp_map):
     x, sensor = surface.vertices, (3.0, 1.0, 1.5)
     found = quantities_of(sharp_map, surface, ALL.sensor)
     values = {
-        "intensity": sharp_map.intensity(x, np.array(ALL.sensor), extrapolate=True),
+        "intensity": sharp_map.intensity(x, np.array(ALL.sensor)),
         "uncertainty": sharp_map.uncertainty(x), "confidence": sharp_map.confidence(x), "height": x[:, 2],
     }  # fmt: skip
     assert list(found) == list(values)
-    moved = sharp_map.intensity(x, np.array(sensor), extrapolate=True)
+    moved = sharp_map.intensity(x, np.array(sensor))
     for name, of_all in values.items():
         quantity, shown = found[name], moved if name == "intensity" else of_all
         np.testing.assert_allclose(quantity.values(rows, sensor), shown[rows], rtol=1e-4)

@@ -211,23 +211,23 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     known = rays.with_intensity
     if known.any() and not known.all():  # a tile without any counts as the middle of the range
         rays = rays.select(known)
-    rays = _sample(rays, surfels, num_threads)
+    rays = _in_order(rays, surfels, num_threads)
     assert rays.intensities is not None
 
     def network(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
         sensors = torch.from_numpy(points - directions * ranges_m[:, None])
-        return scale.to_unit(queries.intensity(contents, torch.from_numpy(points), sensors).numpy())
+        places = torch.from_numpy(points)
+        return scale.to_unit(queries.intensity(contents, places, sensors, extrapolate=True).numpy())
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
     ask = network if contents.config.trains_intensity else None
     return Reflectance.of(rays, unit, surfels, contents.config.leaf_size_m, ask, num_threads)
 
 
-def _sample(rays: Rays, surfels: Surfels, num_threads: int) -> Rays:
-    """Select every n-th ray in Morton order of the returns: evenly among places, and among the scans of each."""
+def _in_order(rays: Rays, surfels: Surfels, num_threads: int) -> Rays:
+    """Sort rays by place, independent of the order of scans. Of very many, select every n-th: evenly among places."""
     enough = max(_ENOUGH_RETURNS, _ENOUGH_PER_PLANE * int(surfels.is_flat().sum()))
     every = -(-len(rays) // enough)
-    if every <= 1:
-        return rays
-    keys = cell_keys(np.ascontiguousarray(rays.points), surfels.cell_size_m, num_threads)
-    return rays.select(stable_order(keys)[::every])
+    # The lower half of the Morton keys, which repeats after 400 m or more, and pseudo-random numbers within each cell.
+    keys = cell_keys(np.ascontiguousarray(rays.points), surfels.cell_size_m, num_threads) << np.uint64(33)
+    return rays.select(stable_order(keys | rays.hashes() >> np.uint64(31))[::every])

@@ -118,7 +118,9 @@ def _las(file: BinaryIO, rows: NDArray[Any], *, compressed: bool) -> None:
     header.add_extra_dims([laspy.ExtraBytesParams(as_names.get(n, n), rows.dtype[n]) for n in extra])
     header.offsets = np.round([rows[axis].mean() for axis in "xyz"])
     header.scales = np.full(3, _LAS_SCALE_M)
+    header.global_encoding.wkt = True  # required for formats 6 and above
     points = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
+    points["return_number"] = points["number_of_returns"] = np.ones(len(rows), np.uint8)  # of each pulse
     for name in rows.dtype.names or ():
         points[as_names.get(name, name)] = rows[name]
     with laspy.open(file, mode="w", header=header, closefd=False, do_compress=compressed) as writer:

@@ -84,7 +84,7 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
     _remove_abandoned(target)
     descriptor, temporary = _open_temporary(target)
     try:
-        with os.fdopen(descriptor, "wb") as file:
+        with os.fdopen(descriptor, "w+b") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -131,7 +131,7 @@ def _open_temporary(target: Path) -> tuple[int, Path]:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(target))
     temporary = target.with_name(f".{target.name[:_MAX_STEM]}.{secrets.token_hex(8)}")
     # Not tempfile: its files are readable by the owner only, and the rename would keep that.
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
         descriptor = os.open(temporary, flags, 0o666)
     except OSError as error:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
+_COLOR = "_COLOR"  # trimesh writes COLOR_0 with 8 bits, too few for linear colours
 _SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 
@@ -72,8 +73,8 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
         import trimesh  # noqa: PLC0415 - takes long
 
         scene: Any = trimesh.Scene()
-        scene.add_geometry(mesh, transform=_T_GLTF_WORLD)
-        exported: Any = scene.export(file_type="glb")
+        scene.add_geometry(_for_gltf(mesh), transform=_T_GLTF_WORLD)
+        exported: Any = scene.export(file_type="glb", tree_postprocessor=_name_colors)
     else:
         exported = mesh.export(file_type=suffix[1:])
     write_whole(path, exported.encode() if isinstance(exported, str) else exported)
@@ -142,6 +143,35 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
         name, points = next(iter(arrays.items()))
         return positions(points, f"{path}: {name}")
     return read_points(file)
+
+
+def _for_gltf(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Copy with linear colours and a matt material, without numbers that JSON cannot hold."""
+    import trimesh  # noqa: PLC0415 - takes long
+
+    of_trimesh: Any = trimesh.visual  # incompletely typed
+    material = of_trimesh.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
+    attributes = {n: v for n, v in mesh.vertex_attributes.items() if np.isfinite(v).all()}
+    visual: Any = mesh.visual
+    if visual.kind == "vertex":
+        srgb = np.asarray(visual.vertex_colors)[:, :3] / 255
+        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        attributes[_COLOR] = linear.astype(np.float32)
+    return trimesh.Trimesh(
+        mesh.vertices,
+        mesh.faces,
+        process=False,
+        vertex_attributes=attributes,
+        metadata={n: v for n, v in mesh.metadata.items() if not isinstance(v, float) or np.isfinite(v)},
+        visual=of_trimesh.TextureVisuals(material=material),
+    )
+
+
+def _name_colors(tree: Any) -> None:
+    for mesh in tree["meshes"]:
+        attributes = mesh["primitives"][0]["attributes"]
+        if _COLOR in attributes:
+            attributes["COLOR_0"] = attributes.pop(_COLOR)
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
 from pathlib import Path
@@ -181,3 +182,19 @@ def write_arrays(
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
     with whole_file(path) as file:
         save(file, **arrays)
+        # The zip format has a CRC of each array, but none of its own headers: it is the comment of the archive.
+        file.flush()
+        comment = _comment(np.memmap(file, np.uint8, "r")[:-2])
+        file.seek(-2, 2)  # the length of the comment
+        file.write(comment)
+
+
+def check_archive(path: str | PathLike[str]) -> None:
+    """Raise a ValueError if a file of :func:`write_arrays` differs from what was written."""
+    content = np.memmap(path, np.uint8, "r")
+    size = len(_comment(content[:0]))
+    check(content[-size:].tobytes() == _comment(content[:-size]), "its checksum is wrong")
+
+
+def _comment(content: NDArray[np.uint8]) -> bytes:
+    return b"\x08\0%08x" % zlib.crc32(content.data)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
@@ -11,10 +13,28 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from radarsdf.checks import check
+
+_CHECKSUMS = "crc32"  # key of the metadata: CRC-32 of each tensor by name, and of the other metadata as ""
+
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """Encode tensors as a safetensors file."""
-    return save({name: tensor.contiguous() for name, tensor in tensors.items()}, dict(metadata))
+    """Encode tensors as a safetensors file with checksums."""
+    tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    checksums = {"": _metadata_checksum(metadata)} | {
+        name: _checksum(t.numpy()) for name, t in tensors.items()
+    }
+    return save(tensors, {**metadata, _CHECKSUMS: json.dumps(checksums)})
+
+
+def _metadata_checksum(metadata: Mapping[str, str]) -> int:
+    return zlib.crc32(json.dumps(metadata, sort_keys=True).encode())
+
+
+def _checksum(array: Any) -> int:
+    """CRC-32 of an array, its type and its shape."""
+    seed = zlib.crc32(f"{array.dtype} {tuple(array.shape)}".encode())
+    return zlib.crc32(array.reshape(-1).view("u1"), seed)
 
 
 class TensorFile:
@@ -24,10 +44,23 @@ class TensorFile:
         self._file = file
         self.names: list[str] = list(file.keys())
         self.metadata: dict[str, str] = file.metadata() or {}
+        self._checksums = self.metadata.pop(_CHECKSUMS, "{}")
+
+    def check_metadata(self) -> None:
+        """Raise a ValueError if the metadata or the names of the arrays differ from those written."""
+        found = json.loads(self._checksums)
+        whole = isinstance(found, dict) and set(found) == {"", *self.names}
+        check(
+            whole and found[""] == _metadata_checksum(self.metadata), "the checksum of its metadata is wrong"
+        )
 
     def array(self, name: str) -> Any:
-        """Return an array as a view of the file."""
-        return self._file.get_tensor(name)
+        """Return an array as a view of the file. Raise a ValueError if its checksum is wrong."""
+        self.check_metadata()
+        array = self._file.get_tensor(name)
+        found = _checksum(array.numpy() if isinstance(array, Tensor) else array)
+        check(found == json.loads(self._checksums)[name], f"the checksum of {name} is wrong")
+        return array
 
 
 @contextmanager

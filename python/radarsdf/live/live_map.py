@@ -88,8 +88,8 @@ class LiveMap:
     Notes
     -----
     A scan adds integers that depend on the scan, its pose and the settings alone. So after a removal, the map is bit-identical
-    to one that never saw the scan, in any order. Estimated noise of the sensor, intensities, the result of :meth:`finish`, and
-    files depend on the order of scans.
+    to one that never saw the scan, in any order. Estimated noise of the sensor, the result of :meth:`finish`, and files depend
+    on the order of scans. Intensities depend on the origin.
 
     All methods are thread-safe, and changes are atomic: after any error, the map is as before; after Ctrl-C or another
     asynchronous exception, a change is either complete or absent. A map belongs to the process that created it: in one forked

@@ -22,7 +22,7 @@ from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, Scan
 from radarsdf.live.surface import GrowingSurface
 from radarsdf.live.tracking import Track
 from radarsdf.returns.evidence import BLOCK_BITS, VisibilityCounts
-from radarsdf.returns.intensities import IntensityScale, Plausible
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
@@ -222,10 +222,7 @@ class GrowingState:
         scans, sums, visibility, origin = self.scans(), self._all_sums(), self._visibility(), self.origin
 
         def read() -> FitInput:
-            rays = _rays_of(scans, self.config, origin)
-            if rays.intensities is not None:
-                known = Plausible.of(rays.intensities).kept(rays.intensities)
-                rays = dataclasses.replace(rays, intensities=known)
+            rays = _rays_of(scans, self.config, origin).without_outliers()
             poses = np.stack([scan.pose for scan in scans])
             moving = sum(int((~scan.is_static).sum()) for scan in scans if scan.is_static is not None)
             scale = IntensityScale.of(rays.intensities)

@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from radarsdf._core import GrowingSums
 from radarsdf.checks import MAX_POSITION_M, check_pose, check_values_of_scan, positions
-from radarsdf.io.files import take_lock
-from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
+from radarsdf.io.files import check_regular_file, take_lock
+from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.regions import REGION_BITS, Keys
 from radarsdf.returns.evidence import BLOCK_BITS
 
@@ -285,7 +285,7 @@ class Described(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-    format: Literal[3] = 3
+    format: Literal[4] = 4
     config: dict[str, Any]
     origin: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
     noise: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=3, max_length=3)]
@@ -317,7 +317,9 @@ def load_state(
     path: str | PathLike[str],
 ) -> tuple[Described, list[LoggedScan], tuple[NDArray[Any], ...]]:
     """Read a state written by :func:`save_state`. Raise a ValueError if the file is invalid or damaged."""
+    check_regular_file(path)
     try:
+        check_archive(path)
         described = Described.model_validate_json(arrays_of(path, ["described"])["described"].tobytes())
         ids = [*described.ids, *described.sealed]
         if len(set(ids)) < len(ids) or (ids and described.origin is None):

@@ -141,7 +141,8 @@ class Map(ABC):
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
         """Predict the intensity of the return that a sensor would measure at each position.
 
-        Ranges are clipped to those of the fit.
+        Only views like those of the returns of the fit are predicted: from a range within a factor of 1.7, at an elevation
+        within about 4° of a return's.
 
         Parameters
         ----------
@@ -150,12 +151,14 @@ class Map(ABC):
         sensor_positions : (N, 3) or (3,) array_like or Tensor
             World, m.
         extrapolate : bool
-            As for :meth:`sdf`.
+            Whether to predict also where nothing was observed and for views unlike those of all returns, there with ranges
+            clipped to those of the fit. Such values are meaningless.
 
         Returns
         -------
         (N,) ndarray or Tensor
-            Intensity, sensor units. NaN where `x` was not :meth:`observed`, or a position is not finite.
+            Intensity, sensor units. NaN where `x` was not :meth:`observed`, from ranges and elevations unlike those of all
+            returns, or a position is not finite.
 
         Raises
         ------
@@ -208,7 +211,8 @@ class Map(ABC):
             World frame, m. Triangles and vertex normals face free space. Empty if there is no surface.
 
             - ``vertex_attributes``: `confidence` and `uncertainty_m`, (V,) float32. With a viewpoint also `intensity`,
-              sensor units, and vertex colours for it, from dark (low) to bright (high).
+              sensor units, and vertex colours for it, from dark (low) to bright (high); NaN and grey where :meth:`intensity`
+              is NaN, as from far away or above.
             - ``metadata``: `leaf_cells` of the map, and `leaf_cells_searched`, those that may contain surface;
               the applied `min_confidence`; `expected_precision`, the share of the mesh that is expected to be true;
               `coverage_of_observed`, the expected share of the surface with returns that the mesh covers;
@@ -243,7 +247,7 @@ class Map(ABC):
             raise ValueError(msg)
         mesh = self._surface_mesh(voxel_size, **wanted)
         vertices = np.array(mesh.vertices, np.float64)
-        return with_intensities(mesh, self.intensity(vertices, sensor_position, extrapolate=True), scale)
+        return with_intensities(mesh, self.intensity(vertices, sensor_position), scale)
 
     def render(
         self,

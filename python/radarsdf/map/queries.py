@@ -20,6 +20,7 @@ from radarsdf.checks import hides_bar
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.returns.evidence import CELLS_OF_SURFACE, Evidence, usual_information
 from radarsdf.returns.free_space import MOST_SCANS
+from radarsdf.returns.response import RANGE_MARGIN
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 from radarsdf.threads import ThreadPool, resolve_num_threads, start_vector_library
 
@@ -73,8 +74,11 @@ def gradient(contents: MapContents, points: Tensor) -> Tensor:
 
 
 @torch.inference_mode(mode=False)
-def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
-    """Predict intensities (N,), sensor units, of returns from points to sensors (N, 3), local frame, m."""
+def intensity(contents: MapContents, points: Tensor, sensors: Tensor, *, extrapolate: bool = False) -> Tensor:
+    """Predict intensities (N,), sensor units, of returns from points to sensors (N, 3), local frame, m.
+
+    NaN for ranges and elevations unlike those of all returns, unless `extrapolate`.
+    """
     scale, field = contents.intensity_scale, contents.field
     assert scale is not None
 
@@ -83,8 +87,14 @@ def intensity(contents: MapContents, points: Tensor, sensors: Tensor) -> Tensor:
         ranges_m = rays.norm(dim=1)
         directions = rays / ranges_m.clamp_min(_MIN_RANGE_M)[:, None]
         # Clip to the ranges of the fit: the regression would extrapolate.
-        ranges_m = ranges_m.clamp(*contents.sensor.range_m)
-        return scale.to_sensor(field.intensity(positions, directions, ranges_m))
+        nearest_m, farthest_m = contents.sensor.range_m
+        found = scale.to_sensor(field.intensity(positions, directions, ranges_m.clamp(nearest_m, farthest_m)))
+        if extrapolate:
+            return found
+        measured = (ranges_m >= nearest_m / RANGE_MARGIN) & (ranges_m <= farthest_m * RANGE_MARGIN)
+        if field.reflectance is not None:
+            measured &= torch.from_numpy(field.reflectance.measured(directions.numpy(), ranges_m.numpy()))
+        return found.where(measured, torch.nan)
 
     return evaluate(of_chunk, torch.cat([points, sensors], 1))
 

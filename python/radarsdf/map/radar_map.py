@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +51,8 @@ class RadarMap(Map):
         return queries.into_cells(self._contents, queries.to_local(self._contents, world))[1]
 
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        return self._where_observed(queries.intensity, world, sensors, extrapolate=extrapolate)
+        predicted = partial(queries.intensity, extrapolate=extrapolate)
+        return self._where_observed(predicted, world, sensors, extrapolate=extrapolate)
 
     @property
     def _contents_of_any(self) -> MapContents:

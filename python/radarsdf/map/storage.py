@@ -31,7 +31,7 @@ from radarsdf.returns.view_statistics import ViewStatistics
 from radarsdf.settings import by_name, first_wrong
 
 FORMAT = "radarsdf.map"
-FORMAT_VERSION = 13
+FORMAT_VERSION = 14
 _UNITS = "positions and distances in m, world frame; signed distance positive in free space; intensities as measured"
 # Types of the columns of `Evidence`.
 _EVIDENCE = {"information": torch.float32, "hits": torch.uint32, "visibility": torch.uint32}
@@ -87,6 +87,7 @@ def load_contents(path: str | PathLike[str]) -> MapContents:
             elif version != str(FORMAT_VERSION):
                 foreign = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}: fit it again"
             else:
+                file.check_metadata()
                 # Copy: the tensors are views of the file, which may be changed or removed.
                 tensors = {name: file.array(name).clone() for name in file.names}
                 return contents_of(tensors, json.loads(metadata["description"]))

@@ -51,7 +51,7 @@ class View:
     points: NDArray[np.float32]
     """(N, 3) returns, sensor frame, m."""
     intensities: NDArray[np.float32] | None
-    """(N,) sensor units. None if the map has no intensities."""
+    """(N,) sensor units, NaN where :meth:`Map.intensity` is. None if the map has no intensities."""
     azimuth_rad: _Floats
     """(A,) azimuths of the beams, ascending, rad."""
     elevation_rad: _Floats
@@ -169,7 +169,7 @@ def view_from(
     intensities = None
     if surface.intensity is not None:
         intensities = surface.intensity(surface.centres[chosen], position)
-        detected = intensities >= sensor.threshold(np.linalg.norm(points, axis=1))
+        detected = ~(intensities < sensor.threshold(np.linalg.norm(points, axis=1)))
         points, intensities = points[detected], intensities[detected]
     if flag(noise, "noise"):
         seed = seed if isinstance(seed, np.random.Generator) else whole_number(seed, "seed", 0)

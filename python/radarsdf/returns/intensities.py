@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from radarsdf.checks import real_array
+from radarsdf.returns.sampling import Keys, hashes, sample
 
 # An intensity is an outlier if it lies beyond a gap and significantly outside the extrapolated tail of the inliers.
 _GAP = 3.0  # ratio of distances from the median across a gap. Tails have gaps, too
@@ -19,7 +20,6 @@ _RARE = 0.03  # largest share of outliers. A larger group is another kind of ret
 _FEW = 3  # ... unless it has at most this many distinct values: sentinels
 _FEWEST = 128  # fewest returns that determine the usual range
 _MOST = 1 << 15  # size of the sample that determines it
-_THINNED = 7  # factor by which a larger sample is thinned. Few sensors have a period of seven returns
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Plausible:
     high: float
 
     @classmethod
-    def of(cls, intensities: NDArray[Any]) -> Plausible:
+    def of(cls, intensities: NDArray[Any], keys: Keys | None = None) -> Plausible:
         known = Intensities()
-        known.add(intensities)
+        known.add(intensities, hashes(np.arange(len(intensities), dtype=np.uint32)) if keys is None else keys)
         return known.plausible()
 
     def holds(self, intensities: NDArray[Any]) -> NDArray[np.bool_]:
@@ -44,30 +44,32 @@ class Plausible:
 
 
 class Intensities:
-    """Streaming sample of intensities, with the lowest and the highest."""
+    """Streaming sample of intensities, with the lowest and the highest, independent of their order."""
 
     def __init__(self) -> None:
         self._some: NDArray[Any] = np.zeros(0, np.float32)
-        self._every, self._count = 1, 0
+        self._keys: Keys = np.zeros(0, np.uint64)
+        self._count = 0
         self.low, self.high = math.inf, -math.inf
 
-    def add(self, intensities: NDArray[Any]) -> None:
-        """Add intensities (N,), sensor units; NaN where missing."""
+    def add(self, intensities: NDArray[Any], keys: Keys) -> None:
+        """Add intensities (N,), sensor units, NaN where missing, with keys (N,) by :func:`hashes`."""
         none = np.isnan(intensities)
-        known = intensities[~none] if none.any() else intensities
+        known, keys = (intensities[~none], keys[~none]) if none.any() else (intensities, keys)
         if len(known) == 0:
             return
-        self._some = np.concatenate([self._some, known[-self._count % self._every :: self._every]])
         self._count += len(known)
-        while len(self._some) > _MOST:
-            self._some, self._every = self._some[::_THINNED], _THINNED * self._every
+        rows = sample(keys, _MOST)
+        some, keys = (np.concatenate(pair) for pair in ((self._some, known[rows]), (self._keys, keys[rows])))
+        rows = sample(keys, _MOST)
+        self._some, self._keys = some[rows], keys[rows]
         self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
 
     def plausible(self) -> Plausible:
         if len(self._some) < _FEWEST:
             return Plausible(-math.inf, math.inf)
         values = self._some
-        if self._every > 1:
+        if self._count > len(values):
             values = np.append(values, np.array([self.low, self.high], values.dtype))
         median = np.partition(values, len(values) // 2)[len(values) // 2]
         limit = _farthest(np.sort(np.abs(values - median)), self._count)

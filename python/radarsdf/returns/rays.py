@@ -24,6 +24,7 @@ from radarsdf.checks import (
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
+from radarsdf.returns.sampling import Keys, hashes
 
 _LOG = logging.getLogger("radarsdf.returns")
 _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repeat some
@@ -61,6 +62,18 @@ class Rays:
         if self.intensities is None:
             return np.zeros(len(self), np.bool_)
         return ~np.isnan(self.intensities)
+
+    def hashes(self) -> Keys:
+        """Return keys (N,) for samples that do not depend on the order of scans, nor on the origin."""
+        values = () if self.intensities is None else (self.intensities,)
+        return hashes(*self.directions.T, self.ranges_m, *values)
+
+    def without_outliers(self) -> Rays:
+        """Replace intensity outliers by NaN."""
+        if self.intensities is None:
+            return self
+        kept = Plausible.of(self.intensities, self.hashes()).kept(self.intensities)
+        return dataclasses.replace(self, intensities=kept)
 
     def select(self, part: slice | NDArray[np.bool_] | NDArray[np.integer[Any]]) -> Rays:
         """Select rays by a slice, a mask (N,) or row indices (M,), in this order."""
@@ -255,13 +268,7 @@ def prepare(
     for note in left_out.notes if whole else ():
         _LOG.warning(note)
     intensity = None if values is None else np.concatenate(values)[kept]
-    if intensity is not None and whole:
-        intensity = Plausible.of(intensity).kept(intensity)
-        if np.isnan(intensity).all():
-            msg = "no intensity is finite: omit intensities if the sensor does not measure them"
-            raise ValueError(msg)
-        check_range(float(np.nanmin(intensity)), float(np.nanmax(intensity)))
-    return Rays(
+    rays = Rays(
         origin=local_origin,
         points=points_m,
         directions=directions,
@@ -271,6 +278,13 @@ def prepare(
         up_of_scan=T_world_sensor[:, :3, 2].copy(),
         num_given=left_out.given,
     )
+    rays = rays.without_outliers() if whole else rays
+    if rays.intensities is not None and whole:
+        if not rays.with_intensity.any():
+            msg = "no intensity is finite: omit intensities if the sensor does not measure them"
+            raise ValueError(msg)
+        check_range(float(np.nanmin(rays.intensities)), float(np.nanmax(rays.intensities)))
+    return rays
 
 
 def check_range(low: float, high: float) -> None:

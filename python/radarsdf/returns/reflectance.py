@@ -134,6 +134,10 @@ class Reflectance:
             share,
         )
 
+    def measured(self, directions: Float32, ranges_m: Float32) -> NDArray[np.bool_]:
+        """See :meth:`~radarsdf.returns.response.Response.measured`."""
+        return self._response.measured(directions, ranges_m)
+
     def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
         """Predict values (N,) at points (N, 3), local frame, m, along directions (N, 3), unit vectors, from ranges (N,), m."""
         size_m = LEAVES_PER_SURFEL * self.leaf_size_m

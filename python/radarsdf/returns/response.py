@@ -37,6 +37,11 @@ _LOG_RANGES = (np.log10(0.5), np.log10(200.0))  # of the table, m
 # Standard deviations in log10(range) and sine of elevation.
 _KERNELS = ((0.22, 0.083), (0.11, 0.042), (0.055, 0.021))
 _TABLE_SHRINKAGE = 1.0  # 0.5 to 2 differ by up to 2 %
+RANGE_MARGIN = 10 ** _KERNELS[0][0]
+"""Factor of the range over which residuals are averaged: views farther from all returns are unmeasured."""
+# Added to a residual, far smaller, whose range and elevation are unmeasured. The precision left is 1e-5.
+_UNMEASURED = -64.0
+_HALF = -32.0  # after the halving for a network
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ class Response:
     """Intensity as a function of range, elevation, incidence and the kind of surface."""
 
     coefficients: NDArray[np.float64]  # (3, 14) of the regression for each kind of surface
-    table: Float32  # (48, 96) residuals of the first of them by range and elevation
+    table: Float32  # (48, 96) residuals of the first of them by range and elevation, plus `_UNMEASURED` far from returns
 
     @classmethod
     @np.errstate(under="ignore")  # lobes and kernels underflow far from their centre
@@ -64,6 +69,7 @@ class Response:
         coefficients[:, :_BASE] = _regression(rays, y)
         left = y - product(rays, coefficients[NO_SURFACE, :_BASE, None])[:, 0]
         table = _smooth_means(_bins(rays[:, 1], rays[:, 3]), left)
+        table[~_near(_bins(_log_range(ranges_m), directions[:, 2]))] += _UNMEASURED
         for kind in (LEVEL, STEEP):
             own = chosen == kind
             if np.count_nonzero(own) >= _FEWEST:
@@ -86,13 +92,21 @@ class Response:
                 columns = _of_ray(directions[own], ranges_m[own])
                 values = _weighted_sum(self.coefficients[kind, :_BASE], columns.T)
                 if kind == NO_SURFACE:
-                    values += self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
+                    residuals = self.table.ravel()[_bins(columns[:, 1], columns[:, 3])]
+                    values += residuals - _HALF * np.rint(residuals / _HALF)
                 else:
                     # Nearest tabulated angle: interpolation would dominate the time.
                     nearest = incidence_rad[own] * np.float32((len(_ANGLES_RAD) - 1) / _ANGLES_RAD[-1])
                     values += tables[kind][np.nan_to_num(nearest + np.float32(0.5)).astype(np.int32)]
                 found[own] = values
         return found
+
+    def measured(self, directions: Float32, ranges_m: Float32) -> NDArray[np.bool_]:
+        """Return a mask (N,) of the directions (N, 3) and ranges (N,), m, near which there were returns."""
+        near: NDArray[np.bool_] = (self.table > _HALF / 2).ravel()[
+            _bins(_log_range(ranges_m), directions[:, 2])
+        ]
+        return near
 
 
 def kinds_of(normals: Float32, plane: NDArray[np.int32]) -> NDArray[np.int8]:
@@ -122,9 +136,13 @@ def _of_incidence(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _of_ray(directions: Float32, ranges_m: Float32) -> Float32:
     """Return columns (N, 5): 1, the logarithm of the range and its square, the sine of the elevation and its square."""
-    log_range = np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
-    up = directions[:, 2]
+    log_range, up = _log_range(ranges_m), directions[:, 2]
     return np.stack([np.ones_like(up), log_range, log_range**2, up, up**2], axis=1)
+
+
+def _log_range(ranges_m: Float32) -> Float32:
+    log_range: Float32 = np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
+    return log_range
 
 
 def _bins(log_range: NDArray[np.floating], up: NDArray[np.floating]) -> NDArray[np.int32]:
@@ -156,17 +174,30 @@ def _regression(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDA
 def _smooth_means(bins: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return smoothed bin means of `values` (N,): bins with few returns shrink to the mean of a wider kernel."""
     weights, means = np.ones(len(values)), np.zeros(TABLE_SHAPE)
-    steps = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
     for _ in range(2):
         error = np.abs(values - means.ravel()[bins])
         weights = 1 / np.hypot(1, error / max(2 * float(np.median(error)), 1e-9)) if means.any() else weights
         tables = [np.bincount(bins, w, means.size).reshape(TABLE_SHAPE) for w in (weights * values, weights)]
         means = np.zeros(TABLE_SHAPE)
         for widths in _KERNELS:
-            by_range, by_elevation = map(_kernel, TABLE_SHAPE, np.divide(widths, steps).tolist())
+            by_range, by_elevation = _kernels(widths)
             smooth_sums, smooth_masses = (product(product(by_range, t), by_elevation) for t in tables)
             means = (smooth_sums + _TABLE_SHRINKAGE * means) / (smooth_masses + _TABLE_SHRINKAGE)
     return means
+
+
+def _near(bins: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Return a mask of the table: entries within a standard deviation of the widest kernels from a return."""
+    returns = np.bincount(bins, minlength=TABLE_SHAPE[0] * TABLE_SHAPE[1]).reshape(TABLE_SHAPE)
+    by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
+    near: NDArray[np.bool_] = product(product(by_range, returns), by_elevation) > 0
+    return near
+
+
+def _kernels(widths: tuple[float, float]) -> list[NDArray[np.float64]]:
+    """Return the kernels by range and elevation."""
+    steps = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
+    return [_kernel(*of_axis) for of_axis in zip(TABLE_SHAPE, np.divide(widths, steps).tolist(), strict=True)]
 
 
 def _kernel(size: int, deviation_bins: float) -> NDArray[np.float64]:

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import number, usable_poses
-from radarsdf.returns.intensities import Plausible
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays, prepare
+from radarsdf.returns.sampling import sample
 
 # Quantile of azimuth, elevation and range at either end, beyond which returns count as outliers.
 _STRAY = 0.002
-_MAX_RETURNS = 20_000  # sample size: angles within 0.2° and ranges within 1 % of those of all returns
+_MAX_RETURNS = 10_000  # sample size: angles within 0.2° and ranges within 1 % of those of all returns
 _RANGE_BINS = 8
 _WEAKEST = 0.01  # quantile of the intensities in a range bin that is the threshold there
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))  # of a normal distribution, standard deviations
@@ -154,16 +154,15 @@ class Sensor:
         if len(rays) == 0:
             msg = "no return lies within the ranges: a sensor cannot be estimated from its scans"
             raise ValueError(msg)
-        if rays.intensities is not None:
-            kept = Plausible.of(rays.intensities).kept(rays.intensities)
-            rays = dataclasses.replace(rays, intensities=kept)
-        return cls.of_rays(rays, poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise)
+        return cls.of_rays(
+            rays.without_outliers(), poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise
+        )
 
     @classmethod
     def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
         """Estimate from `rays` of scans with poses (F, 4, 4) T_world_sensor, m."""
         T_world_sensor, _ = usable_poses(poses, len(rays.up_of_scan))
-        rows = np.arange(0, len(rays), -(-len(rays) // _MAX_RETURNS))
+        rows = sample(rays.hashes(), _MAX_RETURNS)
         scans = rays.scans[rows]
         # By coordinate: a matrix for each return takes three times as long.
         from_sensor = rays.points[rows].T - (T_world_sensor[:, :3, 3] - rays.origin)[scans].T
@@ -205,7 +204,7 @@ def _thresholds(
     ranges_m: NDArray[np.float64], intensities: NDArray[np.float64]
 ) -> tuple[tuple[float, float], ...]:
     """Return the median range and the robust weakest intensity of range bins with equal counts."""
-    order = np.argsort(ranges_m)
+    order = np.lexsort((intensities, ranges_m))  # equal ranges in an order of their own
     bins = [part for part in np.array_split(order, _RANGE_BINS) if len(part)]
     of_bins = ((np.median(ranges_m[part]), np.quantile(intensities[part], _WEAKEST)) for part in bins)
     return tuple(sorted({float(range_m): float(weakest) for range_m, weakest in of_bins}.items()))

@@ -163,7 +163,7 @@ class TileBlend(Map):
     def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
         def of_tile(share: Share) -> Tensor:
             there = queries.to_local(share.contents, sensors[torch.from_numpy(share.rows)])
-            predicted = partial(queries.intensity, share.contents)
+            predicted = partial(queries.intensity, share.contents, extrapolate=extrapolate)
             return queries.where(there.isfinite().all(dim=1), share.local, there, function=predicted)
 
         return self._average(world, extrapolate, of_tile)[:, 0]
@@ -204,8 +204,9 @@ def _averages(
     sums, totals = np.zeros((count, columns)), np.zeros(count)
     for share in shares:
         values = of_tile(share).numpy().astype(np.float64).reshape(-1, columns)
-        sums[share.rows] += share.weights[:, None] * values
-        totals[share.rows] += share.weights
+        known = ~np.isnan(values[:, 0])  # a tile may lack a view that its neighbour has
+        sums[share.rows[known]] += share.weights[known, None] * values[known]
+        totals[share.rows[known]] += share.weights[known]
     with np.errstate(invalid="ignore", divide="ignore"):
         found: _Floats = sums / totals[:, None]
     return found

@@ -185,7 +185,7 @@ def fit_tile(folder: str, name: str) -> None:
         )
 
     radar_map = fit_rays(read, plan.config, progress=False)
-    radar_map.report["plan"] = plan.digest
+    radar_map.report["plan"] = plan.digest_of(tile)
     radar_map.save(map_path(root, tile))
 
 

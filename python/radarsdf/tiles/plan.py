@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from safetensors import SafetensorError
 
-from radarsdf.checks import MAX_POSITION_M
+from radarsdf.checks import MAX_POSITION_M, check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors
@@ -27,7 +28,7 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.settings import by_name, settings
 
-FORMAT = {"format": "radarsdf.tiles", "format_version": 2}
+FORMAT = {"format": "radarsdf.tiles", "format_version": 3}
 PLAN, TILES = "plan.json", "tiles"
 
 Tile = tuple[int, int]
@@ -184,6 +185,10 @@ class Plan:
         """Hash of the whole plan, by which results of another plan are recognised."""
         return hashlib.blake2b(self._to_json(), digest_size=16).hexdigest()
 
+    def digest_of(self, tile: TilePlan) -> str:
+        """Identifier of the map of a tile: that of the plan, and the name, since a file may lie in the place of another."""
+        return f"{self.digest} {tile.name}"
+
     def _to_json(self) -> bytes:
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         own |= {"config": self.config.to_dict(), "sensor": self.sensor.to_dict()}
@@ -192,7 +197,11 @@ class Plan:
 
     def save(self, folder: Path) -> None:
         """Write the plan atomically."""
-        write_whole(folder / PLAN, self._to_json())
+        write_whole(folder / PLAN, self._file_bytes())
+
+    def _file_bytes(self) -> bytes:
+        content = self._to_json()
+        return content[:-2] + f',\n "crc32": {zlib.crc32(content)}\n}}'.encode()
 
     @classmethod
     def load(cls, folder: Path) -> Plan:
@@ -203,16 +212,20 @@ class Plan:
             raise ValueError(msg)
         check_regular_file(path)
         try:
-            described = by_name(json.loads(path.read_bytes()), "the plan")
+            content = path.read_bytes()
+            described = by_name(json.loads(content), "the plan")
             if {name: described.pop(name, None) for name in FORMAT} != FORMAT:
                 msg = f"it is not a plan of {FORMAT}"
                 raise ValueError(msg)
-            return cls(
+            described.pop("crc32")
+            plan = cls(
                 config=FitConfig.from_dict(described.pop("config")),
                 sensor=Sensor.from_dict(described.pop("sensor")),
                 tiles=tuple(TilePlan(**planned) for planned in described.pop("tiles")),
                 **described,
             )
+            check(plan._file_bytes() == content, "its checksum is wrong")
+            return plan
         except Exception as error:  # damaged files raise exceptions of many kinds
             msg = f"{path} is not a complete plan: {error}"
             raise ValueError(msg) from error
@@ -245,7 +258,7 @@ def failure_of(folder: Path, tile: TilePlan) -> str:
 def is_done(folder: Path, plan: Plan, tile: TilePlan) -> bool:
     """Whether the map of a tile exists and belongs to this plan. Only the header of its file is read."""
     try:
-        return bool(report_of(folder, tile)["plan"] == plan.digest)
+        return bool(report_of(folder, tile)["plan"] == plan.digest_of(tile))
     except (OSError, KeyError, ValueError):
         return False
 
@@ -255,6 +268,7 @@ def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
     path = map_path(folder, tile)
     try:
         with open_tensors(path, "np") as file:
+            file.check_metadata()
             return checked_report(json.loads(file.metadata["description"])["report"])
     except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         msg = f"{path} is not a complete radarsdf map: {error}"

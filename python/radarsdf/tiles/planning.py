@@ -7,7 +7,9 @@ import hashlib
 import logging
 import math
 import shutil
+import zlib
 from collections.abc import Iterable, Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +109,7 @@ class _Planner:
         self._origins: dict[Tile, NDArray[np.int64]] = {}  # (3,) origins of the tiles' maps, leaf cells
         self._counts: dict[Tile, NDArray[np.int64]] = {}  # numbers of returns in each tile, and of rays
         self._axes: list[NDArray[np.float64]] = []  # (F, 6) sensor positions and z axes, world
-        self._samples: list[Scan] = []  # every n-th scan
-        self._every = 1
+        self._samples: list[tuple[int, Scan]] = []  # scans with the smallest hashes
         self._intensities = Intensities()
         self._with_intensities: bool | None = None
 
@@ -120,10 +121,8 @@ class _Planner:
                 msg = f"either all scans have intensities, or none has: scan {number} is not like those before it"
                 raise ValueError(msg)
             self._with_intensities = has
-            if number % self._every == 0:
-                self._samples.append(scan)
-                if len(self._samples) > _SENSOR_SCANS:
-                    self._samples, self._every = self._samples[::2], 2 * self._every
+            self._samples.append((zlib.crc32(np.asarray(scan.points).tobytes()), scan))
+            self._samples = sorted(self._samples, key=itemgetter(0))[:_SENSOR_SCANS]
         rays = self._rays(scans, first)
         poses = np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans])
         together = self._config.returns.accumulate_scans
@@ -132,7 +131,7 @@ class _Planner:
         if len(rays) == 0:
             return
         if rays.intensities is not None:
-            self._intensities.add(rays.intensities)
+            self._intensities.add(rays.intensities, rays.hashes())
         points, sensors = rays.in_world()
         owner = self._grid.tiles_of(points)
         pairs = zip(*self._grid.crossed(points, sensors), strict=True)
@@ -240,8 +239,8 @@ class _Planner:
     def _sensor(self, noise: SensorNoise) -> Sensor:
         limits = self._config.returns
         return Sensor.of(
-            [scan.points for scan in self._samples],
-            [scan.intensities for scan in self._samples if scan.intensities is not None] or None,
+            [scan.points for _, scan in self._samples],
+            [scan.intensities for _, scan in self._samples if scan.intensities is not None] or None,
             noise=noise,
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m,

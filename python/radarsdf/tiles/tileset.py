@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import trimesh
@@ -52,7 +53,7 @@ def write_tileset(
             {
                 "boundingVolume": _box(local),
                 "geometricError": 0.0,
-                "content": {"uri": f"{folder.name}/{name}"},
+                "content": {"uri": quote(f"{folder.name}/{name}")},
                 "transform": T_world_tile.T.ravel().tolist(),  # column-major
             }
         )

@@ -64,7 +64,7 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     vertices, found = surface.vertices, {}
 
     def intensity(rows: _Rows, sensor: Position) -> NDArray[Any]:
-        values: NDArray[Any] = radar_map.intensity(vertices[rows], np.array(sensor), extrapolate=True)
+        values: NDArray[Any] = radar_map.intensity(vertices[rows], np.array(sensor))
         return values
 
     if radar_map.has_intensity:
