@@ -43,6 +43,8 @@ _JUDGED, _PARTED = (
 )  # last scans whose Doppler is compared with the returns, and that suggest it by agreeing less
 _PULLED = 0.1  # relative difference of the motion by returns and by Doppler that suggests it
 _LEAST_GAIN, _LEAST_STEP_M = 1e-5, 0.1  # of a step whose difference is known
+# A leap of the velocity: more than three times the acceleration of gravity, and than this multiple of the earlier changes.
+_FASTEST_MPS2, _LEAP, _FEWEST_CHANGES = 30.0, 4.0, 4
 _MOVES = 5.0  # standard deviations of a significant velocity
 _OBSERVED_STEPS = 10  # steps over which returns alone must observe the motion of the sensor
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # approximate covariance of a step between given poses
@@ -139,10 +141,25 @@ class Follower:
             if logged.doppler_mps is not None and not by_doppler:
                 msg += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
             raise Lost(msg)
+        if (leap_mps := self._leap_mps(new)) is not None:
+            msg = f"{NOT_USED}: its velocity changes by {leap_mps:.1f} m/s, far more than before: give the pose of the scan"
+            raise Lost(msg)
         if (contradicted := self._contradicted(found[-1])) is not None:
             msg = f"{contradicted} Give the poses of this scan and the next ones, or leave their Doppler out"
             raise Lost(msg)
         return found
+
+    def _leap_mps(self, new: Step) -> float | None:
+        """Return the change of the velocity by Doppler, m/s, if it exceeds those before: its sign or scale may have changed."""
+        known = [(one.time_s, one.velocity.velocity_mps) for one in [*self._steps, new] if one.velocity]
+        if new.velocity is None or len(known) < _FEWEST_CHANGES + 2:
+            return None
+        times_s, velocities = (np.array(columns) for columns in zip(*known, strict=True))
+        changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / np.sqrt(np.diff(times_s))
+        usual = float(np.sqrt((changes[:-1] ** 2).mean()))
+        leap_mps = float(np.linalg.norm(velocities[-1] - velocities[-2]))
+        fast = leap_mps > _FASTEST_MPS2 * (times_s[-1] - times_s[-2])
+        return leap_mps if fast and changes[-1] > _LEAP * usual else None
 
     def _contradicted(self, new: Step) -> str | None:
         """Return why the returns exclude the Doppler of the last scans, if they do."""

@@ -40,7 +40,7 @@ _LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
 _IN_COMMON = 0.003
 OFFSET_ERRORS = 6.0
 """Standard errors of a significant offset of all radial speeds: noise of directions is common to the scans."""
-_FEWEST_OFFSETS = 4  # scans
+_FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
 
 
@@ -145,7 +145,7 @@ def radial_offset_mps(
         fitted = inverse @ columns.T @ speeds[used]
         spread = float(((speeds[used] - columns @ fitted) ** 2).sum()) / (used.sum() - 4)
         offsets.append(float(fitted[3]))
-        variances.append(float(spread * inverse[3, 3]))
+        variances.append(max(spread, _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
     if len(offsets) < _FEWEST_OFFSETS:
         return 0.0, np.inf
     weights = 1 / np.array(variances)
