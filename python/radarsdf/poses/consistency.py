@@ -31,6 +31,7 @@ FEWEST_STEPS = 6
 SAME_SPEED = 0.03
 """Relative difference of speeds that axes and scale of a radar and given poses may have, ten times that of two motorway radars."""
 _PAIRS = 48  # maximum number of pairs of scans to compare
+_DELAYED = 24  # steps to compare with delayed ones
 _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
 # Prior deviations of velocities, share of the speed: along them, so that returns of most scenes converge from half or twice the true
 # ones, and across.
@@ -48,6 +49,8 @@ _MOST_LATE = 10  # scans
 _SAME_RESIDUALS = 1.25  # ratio of squared residuals up to which a delay does not matter
 _EVEN = 1e-3  # unevenness of times that does not matter, share of an interval
 _LEAST_STEP_M = 0.1  # minimum motion in a step that reveals its duration
+_MOSTLY = 0.8  # share of steps without motion by Doppler from which on returns must confirm it
+_LEAST_SEEN = 0.5  # share of a step's prior variance that the returns remove, if their difference counts
 _STILL_MPS = 0.1  # slower Doppler, in which compensation for ego motion leaves only noise, tells no direction
 
 
@@ -213,10 +216,21 @@ class Consistency:
         pairs = pairs[:: -(-len(pairs) // _PAIRS)]
         gains = np.array([_gains(scans[i], scans[i + 1], motion.steps[i]) for i in pairs])
         runs = np.r_[0, np.cumsum(durations_s > 2 * np.median(durations_s))]
-        delay = _delay(velocities, runs, rows, motion, tracked, followed)
+        # The fastest steps: of slow ones, errors of the returns seem delays.
+        ways_m, count = np.linalg.norm(motion.steps[:, :3, 3], axis=1) * usable, min(_DELAYED, len(usable))
+        begin = int(np.argmax(np.convolve(ways_m, np.ones(count), "valid")))
+        fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
+        delay = _delay(velocities, runs, rows, motion, tracked, fastest) if every <= _MOST_LATE else 0
         slow = np.linalg.norm(compared.mean_mps, axis=1)[pairs] < _STILL_MPS
         own, shown = motion.steps[pairs, :3, 3], steps(poses)[pairs, :3, 3]
         along = np.einsum("ki,ki->k", shown - own, own) / np.maximum((own**2).sum(axis=1), 1e-12)
+        # Of a step that the returns hardly observe, the difference is that of the prior.
+        prior = np.stack([free.step_covariance(i, times_s[i + 1] - times_s[i]) for i in pairs])
+        axes, of_steps = poses[pairs, :3, :3], np.stack([tracked[i + 1].covariance[:3, :3] for i in pairs])
+        before = np.einsum("ki,kij,kj->k", own, prior, own)
+        left = np.einsum("ki,kji,kjl,klm,km->k", own, axes, of_steps, axes, own)
+        seen = 1 - left / np.maximum(before, 1e-30)
+        along = np.where(seen > _LEAST_SEEN, along / np.maximum(seen, _LEAST_SEEN), np.nan)
         clock = (
             Clock.of(times_s, steps(poses)[:, :3, 3], motion.steps[:, :3, 3], followed)
             if every == 1
@@ -227,6 +241,8 @@ class Consistency:
             first, last = pairs[window.first], pairs[min(window.last, len(pairs) - 1)] + 1
             window = dataclasses.replace(window, first=int(rows[first]), last=int(rows[last]))
         limits = _scale(gains[~slow, : len(_SCALES)]) if (~slow).sum() >= FEWEST_STEPS else ()
+        if limits and np.isfinite(along).sum() >= FEWEST_STEPS and window is None:
+            limits = (limits[0], min(limits[1], 1.0), max(limits[2], 1.0))  # the windows decide
         return cls(*limits, delay=delay, contradicted=window, clock=clock, undecided=undecided)
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
@@ -266,7 +282,11 @@ def _judged(gains: Floats, along: Floats, slow: NDArray[np.bool_]) -> tuple[Cont
     for rows in tried:
         moving, still = gains[rows][~slow[rows], :count], gains[rows][slow[rows], count:]
         level = BY_CHANCE / len(tried)
-        if len(still) >= FEWEST_STEPS:
+        # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
+        if (
+            len(still) >= max(FEWEST_STEPS, _MOSTLY * len(gains[rows]))
+            and 2 * len(gains[rows]) >= len(gains) - 1
+        ):
             # Without motion by Doppler, which compensation for ego motion leaves, too, returns must agree less after any shift.
             t = _t_values(still).min() / student.ppf(1 - level / still.shape[1], len(still) - 1)
             found.append((float(2 - t), Contradiction(rows.start, rows.stop, np.inf)))
@@ -278,7 +298,17 @@ def _judged(gains: Floats, along: Floats, slow: NDArray[np.bool_]) -> tuple[Cont
         )
         means = moving.mean(axis=0)
         best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
-        if best != here:
+        shares = along[rows][~slow[rows]]
+        known = np.isfinite(shares)
+        tracked = known.sum() >= FEWEST_STEPS
+        share, error = (
+            (shares[known].mean(), shares[known].std(ddof=1) / np.sqrt(known.sum()))
+            if tracked
+            else (0.0, np.inf)
+        )
+        # Of a radar that is too narrow, gains increase up to the end of the scales.
+        same = abs(share) + needed * error < _SAME_SCALE - 1
+        if best != here and 0 < best < count - 1 and not same:
             loss = float(_t_values(moving[:, [best]] - moving[:, [here]])[0])
             found.append(
                 (
@@ -286,11 +316,8 @@ def _judged(gains: Floats, along: Floats, slow: NDArray[np.bool_]) -> tuple[Cont
                     Contradiction(rows.start, rows.stop, float(_SCALES[best])),
                 )
             )
-        shares = along[rows][~slow[rows]]
-        known = np.isfinite(shares)
-        if known.sum() < FEWEST_STEPS:
+        if not tracked:
             continue
-        share, error = shares[known].mean(), shares[known].std(ddof=1) / np.sqrt(known.sum())
         excess = (abs(share) - _SAME_TRACKED) / max(needed * error, 1e-9)
         if excess > 1:
             # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
@@ -325,6 +352,11 @@ def _scale(gains: Floats, needed: float | None = None) -> tuple[float, float, fl
     if needed is None:
         needed = float(student.ppf(1 - BY_CHANCE / len(_SCALES), len(gains) - 1))
     possible = _SCALES[losses.mean(axis=0) <= needed * errors]
+    if best in (
+        0,
+        len(_SCALES) - 1,
+    ):  # no maximum: of a radar that is too narrow, gains increase with the scale
+        possible = _SCALES
     return float(_SCALES[best]), float(possible[0]), float(possible[-1])
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.poses.motion import KnownMotion, spans_of, way
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector, step_vectors, steps
-from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
+from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, folding_interval_mps, sensor_velocities
 
 _SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
 _FEW_SAMPLED = 100  # returns of a scan, where many pairs are compared
@@ -130,6 +130,8 @@ def radial_offset_mps(
     Returns in different directions distinguish it from a velocity.
     """
     offsets, variances = [], []
+    if folding_interval_mps(doppler_mps) is not None:
+        return 0.0, np.inf  # aliased speeds hide it
     for scan, speeds, static, found in zip(
         scans, doppler_mps, velocities.static, velocities.found, strict=True
     ):
