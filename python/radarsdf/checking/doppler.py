@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_scans
+from radarsdf.poses.consistency import contradiction, of_poses
+from radarsdf.poses.doppler import (
+    LEAST_MPS,
+    OFFSET_ERRORS,
+    NoVelocityError,
+    SensorVelocities,
+    radial_offset_mps,
+)
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
 from radarsdf.scans import Scans
 
@@ -18,6 +27,7 @@ _MIN_SCANS = 4
 _MIN_SIGNIFICANCE = 4.0
 _MIN_YAW_RAD = np.radians(3)
 _MANY_MOVE = 0.4
+_BLOCK = 40  # successive scans to compare
 
 
 def check_doppler(recording: Scans) -> Iterator[Finding]:
@@ -77,9 +87,15 @@ def _compared_with_poses(
     used = (scans > 0) & (scans < len(recording) - 1)
     used &= (np.linalg.norm(by_poses, axis=1) > 0) & (np.linalg.norm(by_doppler, axis=1) > _STILL_MPS)
     if used.sum() < _MIN_SCANS:
+        if times is not None:
+            yield from _compared_speeds(recording, scans, by_poses, by_doppler)
         return
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (by_doppler[used], by_poses[used]))
     cosine = float(np.median(np.einsum("na,na->n", a, b)))
+    sign = -1.0 if cosine < -0.8 else 1.0
+    if times is not None:
+        yield from _compared_speeds(recording, scans, by_poses, sign * by_doppler)
+        yield from _compared_in_block(recording, times, sign)
     if cosine < -0.8:
         # Sign conventions differ, and moving returns are found with either: so this is not a fault of the data.
         evidence = f"By its Doppler the sensor moves backwards where its poses move forwards (median cosine {cosine:.2f})."
@@ -95,6 +111,45 @@ def _compared_with_poses(
             f"{len(yaws)} scans."
         )
         yield Finding("sensor_turned", "warning", evidence)
+
+
+def _compared_speeds(
+    recording: Scans, scans: NDArray[np.int64], by_poses: FloatArray, by_doppler: FloatArray
+) -> Iterator[Finding]:
+    """Compare velocities (K, 3) of scans (K,), sensor frame, m/s, by window."""
+    used = (scans > 0) & (scans < len(recording) - 1)
+    jumps = np.diff(by_poses[used], 2, axis=0)
+    # Where the sensor moves evenly, second differences have six times the variance of a velocity.
+    variance = LEAST_MPS**2 + (float(np.median(jumps**2)) / 6 if len(jumps) else 0.0)
+    found = contradiction(by_poses[used], by_doppler[used], np.full(int(used.sum()), variance))
+    if found is not None:
+        rows = scans[used]
+        found = replace(found, first=int(rows[found.first]), last=int(rows[min(found.last, len(rows) - 1)]))
+        yield Finding(
+            "doppler_contradicts_poses",
+            "warning",
+            f"{found.words('the poses')[:1].upper()}{found.words('the poses')[1:]}.",
+        )
+
+
+def _compared_in_block(recording: Scans, times_s: FloatArray, sign: float) -> Iterator[Finding]:
+    """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone."""
+    assert recording.doppler_mps is not None
+    begin = max(0, (len(recording) - _BLOCK) // 2)
+    rows = slice(begin, begin + _BLOCK)
+    points = [np.asarray(scan, np.float64) for scan in recording.points[rows]]
+    speeds = [sign * np.asarray(values, np.float64) for values in recording.doppler_mps[rows]]
+    try:
+        velocities = SensorVelocities.of(points, speeds, times_s[rows])
+    except NoVelocityError:
+        return
+    offset_mps, error_mps = radial_offset_mps(points, speeds, velocities)
+    if abs(offset_mps) > max(OFFSET_ERRORS * error_mps, LEAST_MPS):
+        evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
+        yield Finding("doppler_offset", "warning", evidence)
+    contradicted, clock = of_poses(velocities, times_s[rows], recording.poses[rows])
+    if contradicted is None and clock.note:
+        yield Finding("times_uneven", "warning", clock.note[0])
 
 
 def velocity_of_poses(T_world_sensor: FloatArray, times_s: FloatArray) -> FloatArray:

@@ -14,8 +14,10 @@ import numpy as np
 
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog
+from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import (
     CLEAR,
+    ERRORS,
     LEAST_MPS,
     NOT_USED,
     YAW_STEP_RAD,
@@ -24,7 +26,7 @@ from radarsdf.poses.doppler import (
     sign_significance,
     upright,
 )
-from radarsdf.poses.motion import MotionRate
+from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.rigid import Floats, rotation_vector
 from radarsdf.poses.tracking import LEAST_OBSERVED, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
@@ -35,6 +37,14 @@ _START = 8  # scans of the initialisation, re-estimated jointly after 2, 4 and 8
 _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 # Least share of the returns that agree while the sign of the Doppler is open: a wrong one places scans metres off.
 _LEAST_AGREEING = 0.1
+_JUDGED, _PARTED = (
+    24,
+    3,
+)  # last scans whose Doppler is compared with the returns, and that suggest it by agreeing less
+_PULLED = 0.1  # relative difference of the motion by returns and by Doppler that suggests it
+_LEAST_GAIN, _LEAST_STEP_M = 1e-5, 0.1  # of a step whose difference is known
+# A leap of the velocity: more than three times the acceleration of gravity, and than this multiple of the earlier changes.
+_FASTEST_MPS2, _LEAP, _FEWEST_CHANGES = 30.0, 4.0, 4
 _MOVES = 5.0  # standard deviations of a significant velocity
 _OBSERVED_STEPS = 10  # steps over which returns alone must observe the motion of the sensor
 _GIVEN = np.diag([0.01**2] * 3 + [0.001**2] * 3)  # approximate covariance of a step between given poses
@@ -53,6 +63,8 @@ class Step:
     velocity: SensorVelocity | None  # from its Doppler, if that yields one
     found: Tracked
     given: bool = True  # whether the pose was given, and is not re-estimated
+    # Relative difference of the motion that the returns show from that by Doppler. NaN if unknown.
+    pull: float = np.nan
     sign: int = 0  # sign of the Doppler as known then: -1 if positive for approaching objects, 0 if unknown
 
     @property
@@ -94,6 +106,8 @@ class Follower:
     """Tracker of the sensor. A cache: the map owns the track and the poses, which are read before each scan."""
 
     config: FitConfig
+    _judged_s: float = -np.inf  # time of the scan whose Doppler was last compared with the returns
+    _patience: int = _START // 2  # scans until the next comparison
     _complete: bool = False  # False while the attributes below change, or if that was interrupted
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
     _rates: deque[tuple[MotionRate, MotionRate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
@@ -127,7 +141,56 @@ class Follower:
             if logged.doppler_mps is not None and not by_doppler:
                 msg += f". {NOT_USED}: scans agree on no velocity, or its sign is not known yet"
             raise Lost(msg)
+        if (leap_mps := self._leap_mps(new)) is not None:
+            msg = f"{NOT_USED}: its velocity changes by {leap_mps:.1f} m/s, far more than before: give the pose of the scan"
+            raise Lost(msg)
+        if (contradicted := self._contradicted(found[-1])) is not None:
+            msg = f"{contradicted} Give the poses of this scan and the next ones, or leave their Doppler out"
+            raise Lost(msg)
         return found
+
+    def _leap_mps(self, new: Step) -> float | None:
+        """Return the change of the velocity by Doppler, m/s, if it exceeds those before: its sign or scale may have changed."""
+        known = [(one.time_s, one.velocity.velocity_mps) for one in [*self._steps, new] if one.velocity]
+        if new.velocity is None or len(known) < _FEWEST_CHANGES + 2:
+            return None
+        times_s, velocities = (np.array(columns) for columns in zip(*known, strict=True))
+        changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / np.sqrt(np.diff(times_s))
+        usual = float(np.sqrt((changes[:-1] ** 2).mean()))
+        leap_mps = float(np.linalg.norm(velocities[-1] - velocities[-2]))
+        fast = leap_mps > _FASTEST_MPS2 * (times_s[-1] - times_s[-2])
+        return leap_mps if fast and changes[-1] > _LEAP * usual else None
+
+    def _contradicted(self, new: Step) -> str | None:
+        """Return why the returns exclude the Doppler of the last scans, if they do."""
+        steps = [*self._steps, new]
+        without = [i for i, step in enumerate(steps) if step.velocity is None or step.given]
+        steps = steps[max(without, default=-1) + 1 :][-_JUDGED:]
+        count, since = len(steps), sum(step.time_s > self._judged_s for step in steps)
+        if count < _START or since < self._patience:
+            return None
+        pulls = np.array([step.pull for step in steps if np.isfinite(step.pull)])[-_START:]
+        agreeing = np.array([step.found.agreeing for step in steps])
+        pulled = len(pulls) == _START and abs(pulls.mean()) > _PULLED + ERRORS * pulls.std() / np.sqrt(_START)
+        parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
+        due = count in (_START, 2 * _START)
+        if not (due or pulled or parted):
+            return None
+        # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
+        self._judged_s, self._patience = new.time_s, self._patience * (1 if due else 2)
+        times_s = np.array([step.time_s for step in steps])
+        points, speeds = zip(*((one.logged.points, one.logged.doppler_mps) for one in steps), strict=True)
+        try:
+            velocities = SensorVelocities.of(points, speeds, times_s).scaled(new.sign or 1.0)
+        except NoVelocityError:
+            return None
+        drive = Drive([step.scan for step in steps], times_s, velocities, None)
+        tested = Consistency.of_returns(drive, self.config, self.config.num_threads)
+        trusted, notes = tested.applied(velocities)
+        if trusted is None:
+            self._judged_s = -np.inf  # the next scans are judged, too
+            return notes[-1]
+        return None
 
     def track(self, found: list[Step]) -> Track:
         """Return the track that continues with the scans returned by :meth:`seek`."""
@@ -200,8 +263,12 @@ class Follower:
             usual.moves.learnt(moves, durations_s),
         )
         turn, move = self._rates[-1] if self._rates else (None, None)
-        found = self._tracker.seek(drive.scans[-1], drive.expected(len(steps) - 1, turn, move))
-        return dataclasses.replace(new, found=found, sign=sign)
+        expected = drive.expected(len(steps) - 1, turn, move)
+        found = self._tracker.seek(drive.scans[-1], expected)
+        pull = (
+            np.nan if drive.velocities is None or found.segment else _pull(steps[-2].found, found, expected)
+        )
+        return dataclasses.replace(new, found=found, pull=pull, sign=sign)
 
     def _velocities(self, steps: list[Step], sign: int) -> SensorVelocities | None:
         """Return the velocities of scans. None if one of the last two has none."""
@@ -269,6 +336,18 @@ class Follower:
             turns = drive.turns.learnt(rates, durations_s)
             drive = dataclasses.replace(drive, velocities=_signed(velocities, likelier), turns=turns)
         return sign, followed(drive, self.config, self.config.num_threads)[1]
+
+
+def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:
+    """Return the relative difference, along the predicted step, of the motion by returns alone."""
+    R, way_m = before.pose[:3, :3], expected.pose(found.turn)[:3, 3]
+    length_m = float(np.linalg.norm(way_m))
+    along = way_m / max(length_m, 1e-9)
+    prior = along @ expected.covariance(found.turn)[:3, :3] @ along
+    left = along @ R.T @ found.covariance[:3, :3] @ R @ along
+    moved_m = along @ (R.T @ (found.pose[:3, 3] - before.pose[:3, 3]) - way_m)
+    gain = 1 - left / max(prior, 1e-12)  # the returns move the predicted step by this share of its error
+    return float(moved_m / (gain * length_m)) if gain > _LEAST_GAIN and length_m > _LEAST_STEP_M else np.nan
 
 
 def _covariance(velocity: SensorVelocity) -> Floats:

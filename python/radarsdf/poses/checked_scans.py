@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.checks import MAX_TIME_S, real_array
-from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities
+from radarsdf.poses.doppler import (
+    LEAST_MPS,
+    NOT_USED,
+    OFFSET_ERRORS,
+    NoVelocityError,
+    SensorVelocities,
+    radial_offset_mps,
+)
 from radarsdf.poses.rigid import Floats
 from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
@@ -51,7 +58,12 @@ class CheckedScans:
         if times is not None:
             times_s = _checked_times(times, len(scans))
             begin_s = float(times_s[0])
-            times_s = times_s - begin_s
+            times_s, repeated = spread_times(times_s - begin_s)
+            if repeated:
+                notes = [
+                    *notes,
+                    f"{repeated} scans repeat the time of the one before: they are spread evenly.",
+                ]
         if doppler_mps is None or times_s is None:
             return cls(scans, times_s, begin_s, None, 0, notes)
         speeds, filler = without_filler(scans, checked_doppler(scans, doppler_mps))
@@ -64,6 +76,10 @@ class CheckedScans:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
+        offset_mps, error_mps = radial_offset_mps(scans, speeds, velocities)
+        if abs(offset_mps) > max(OFFSET_ERRORS * error_mps, LEAST_MPS):
+            offset = f"{offset_mps:.2f} m/s are added to that of all returns"
+            return cls(scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {offset}."])
         moving = sum(int((~static).sum()) for static in velocities.static)
         standing = [scan[static] for scan, static in zip(scans, velocities.static, strict=True)]
         return cls(standing, times_s, begin_s, velocities, moving, notes)
@@ -82,6 +98,17 @@ class CheckedScans:
                 f"while returns are {range_m:.1f} m away: give times in s, Doppler in m/s"
             )
             raise ValueError(msg)
+
+
+def spread_times(times_s: Floats) -> tuple[Floats, int]:
+    """Spread repeated times (F,) evenly up to the next later one; return them with the number of repeats."""
+    first = np.r_[True, np.diff(times_s) > 0]
+    if first.all() or first.sum() < 2:
+        return times_s, 0
+    knots = np.flatnonzero(first)
+    ends = times_s[knots[-1]] + np.median(np.diff(times_s[knots])) * np.array([1.0])
+    at = np.append(knots, max(knots[-1] + 1, len(times_s)))
+    return np.interp(np.arange(len(times_s)), at, np.append(times_s[knots], ends)), int((~first).sum())
 
 
 def median_range_m(scans: Sequence[Floats]) -> float:

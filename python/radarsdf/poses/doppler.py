@@ -14,9 +14,10 @@ from scipy.spatial import cKDTree
 
 from radarsdf.poses.motion import KnownMotion, spans_of, way
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector, step_vectors, steps
-from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, sensor_velocities
+from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, folding_interval_mps, sensor_velocities
 
 _SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
+_FEW_SAMPLED = 100  # returns of a scan, where many pairs are compared
 _FIRST_PAIRS = 12
 _FEW_PAIRS = 8  # pairs from which on their spread determines the standard error, else that of single returns
 YAW_STEP_RAD = 0.07
@@ -31,13 +32,15 @@ ERRORS = 3.0
 # Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
 # elevations with a common error.
 LEAST_MPS = 0.02
-_COMPARED = 8  # steps to sum over, so that errors of single poses are small
 # Prior deviation of the vertical velocity, share of the speed, where Doppler is less precise. Slopes of roads: 0.05.
 _CLIMB = 0.1
 _LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
 # Systematic error of all velocities of a drive in any direction, share of the speed: by the axes and the scale of the radar.
 # Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
 _IN_COMMON = 0.003
+OFFSET_ERRORS = 6.0
+"""Standard errors of a significant offset of all radial speeds: noise of directions is common to the scans."""
+_FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
 
 
@@ -56,6 +59,7 @@ class SensorVelocities:
     found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Else it is interpolated
     # Standard deviation of the systematic error of all velocities in any direction, share of the speed.
     common_sigma: float = _IN_COMMON
+    clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
 
     @classmethod
@@ -90,9 +94,10 @@ class SensorVelocities:
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
         return cls(mean, covariance, change, static, found, climb_assumed=weak)
 
-    def select(self, rows: slice) -> SensorVelocities:
+    def select(self, rows: slice | NDArray[np.int64]) -> SensorVelocities:
         """Select scans."""
-        mean_mps, covariance, static = self.mean_mps[rows], self.covariance[rows], self.static[rows]
+        mean_mps, covariance = self.mean_mps[rows], self.covariance[rows]
+        static = [self.static[i] for i in np.arange(len(self.static))[rows]]
         return dataclasses.replace(
             self, mean_mps=mean_mps, covariance=covariance, static=static, found=self.found[rows]
         )
@@ -112,7 +117,43 @@ class SensorVelocities:
         """Return the covariance (3, 3) of the step from scan `i`, m²: of both velocities, and a Brownian bridge between them."""
         ends = (self.covariance[i] + self.covariance[i + 1]) * duration_s**2 / 4
         between: Floats = ends + np.diag(self.change) * duration_s**3 / 12
+        if self.clock_sigma_s:
+            between = between + 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
         return between
+
+
+def radial_offset_mps(
+    scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], velocities: SensorVelocities
+) -> tuple[float, float]:
+    """Return a constant in the Doppler of all static returns, m/s, and its standard error; infinite if it is not observable.
+
+    Returns in different directions distinguish it from a velocity.
+    """
+    offsets, variances = [], []
+    if folding_interval_mps(doppler_mps) is not None:
+        return 0.0, np.inf  # aliased speeds hide it
+    for scan, speeds, static, found in zip(
+        scans, doppler_mps, velocities.static, velocities.found, strict=True
+    ):
+        used = static & np.isfinite(speeds) & scan.any(axis=1)
+        if not found or used.sum() <= 2 * MIN_DOPPLER_RETURNS:
+            continue
+        away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
+        columns = np.column_stack([-away, np.ones(len(away))])
+        normal = columns.T @ columns
+        if np.linalg.cond(normal) > 1e6:
+            continue
+        inverse = np.linalg.inv(normal)
+        fitted = inverse @ columns.T @ speeds[used]
+        spread = float(((speeds[used] - columns @ fitted) ** 2).sum()) / (used.sum() - 4)
+        offsets.append(float(fitted[3]))
+        variances.append(max(spread, _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
+    if len(offsets) < _FEWEST_OFFSETS:
+        return 0.0, np.inf
+    weights = 1 / np.array(variances)
+    mean = float((weights * offsets).sum() / weights.sum())
+    squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
+    return mean, float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:
@@ -162,27 +203,12 @@ class DopplerMotion(KnownMotion):
         return dataclasses.replace(self, steps=between)
 
 
-def unexplained_motion(motion: DopplerMotion, poses: Floats) -> float:
-    """Return the share of the squared displacements of poses (F, 4, 4) not explained by velocities; 0 within their errors."""
-    ways = np.einsum("fij,fj->fi", poses[:-1, :3, :3], motion.steps[:, :3, 3])
-    count = min(_COMPARED, len(ways))
-    measured, variance = (
-        np.diff(np.pad(np.cumsum(rows, axis=0), ((1, 0), (0, 0)))[::count], axis=0)
-        for rows in (ways, motion.shares[:, :3])
-    )
-    given = np.diff(poses[::count, :3, 3], axis=0)
-    squares = float(((measured - given) ** 2).sum())
-    if squares <= ERRORS**2 * float(variance.sum()):
-        return 0.0
-    return squares / max(float((given**2).sum()), float((measured**2).sum()))
-
-
 class _Pair:
     """Two scans, whose returns are compared with the nearest one of the other."""
 
-    def __init__(self, first: Floats, second: Floats) -> None:
+    def __init__(self, first: Floats, second: Floats, sampled: int = _SAMPLED) -> None:
         self._trees = cKDTree(first), cKDTree(second)
-        self._sampled = [scan[:: max(1, len(scan) // _SAMPLED)] for scan in (first, second)]
+        self._sampled = [scan[:: max(1, len(scan) // sampled)] for scan in (first, second)]
 
     def log_distances(self, turn: Floats, shifts_m: Floats) -> Floats:
         """Return log distances (K, M) to the nearest returns, if the second scan is turned by (3, 3) and shifted by (K, 3)."""
@@ -194,12 +220,22 @@ class _Pair:
         return found
 
 
-def scale_gains(first: Floats, second: Floats, moved_m: Floats, scales: Floats) -> Floats:
-    """Return how much nearer returns of scans in common axes are after `scales` (K,) times `moved_m` (3,) than after the reverse."""
+def log_distance_gains(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
+    """Return how much nearer (K,) returns of scans in common axes are after shifts (K, 3) than after the reverse ones."""
     # What scans have in common wherever they were taken, such as density, clutter, or walls along the motion, cancels.
-    shifts_m = np.multiply.outer(np.concatenate([scales, -scales]), moved_m)
-    ahead, back = np.split(_Pair(first, second).log_distances(np.eye(3), shifts_m).mean(axis=1), 2)
+    both_m = np.concatenate([shifts_m, -shifts_m])
+    ahead, back = np.split(
+        _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), both_m).mean(axis=1), 2
+    )
     found: Floats = back - ahead
+    return found
+
+
+def shift_losses(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
+    """Return how much nearer (K,) returns of scans in common axes are than after shifts (K, 3)."""
+    both_m = np.concatenate([np.zeros((1, 3)), shifts_m])
+    distances = _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), both_m).mean(axis=1)
+    found: Floats = distances[1:] - distances[0]
     return found
 
 

@@ -15,8 +15,8 @@ from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
-from radarsdf.poses.doppler_tests import DopplerTests
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
@@ -138,10 +138,16 @@ def odometry(
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
         drive = Drive(scans, times_s, velocities, None)
         if velocities is not None:
-            velocities, tested = DopplerTests.of(drive, config, pool.num_threads).applied(velocities)
+            consistency = Consistency.of_returns(drive, config, pool.num_threads)
+            velocities, tested = consistency.applied(velocities)
             notes += tested
+            if velocities is not None and (clock := consistency.clock) is not None:
+                times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
+                velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
-        drive = dataclasses.replace(drive, velocities=velocities, gyroscope=inertial.gyroscope)
+        drive = dataclasses.replace(
+            drive, times_s=times_s, velocities=velocities, gyroscope=inertial.gyroscope
+        )
         try:
             drive, tracked = followed(drive, config, pool.num_threads, progress)
         except UnusableGyroscopeError as why:

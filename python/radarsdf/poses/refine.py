@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.doppler import NOT_USED, DopplerMotion, unexplained_motion
+from radarsdf.poses.consistency import of_poses
+from radarsdf.poses.doppler import NOT_USED, DopplerMotion
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
@@ -30,7 +32,6 @@ from radarsdf.threads import ThreadPool
 # Minimum initial standard deviations of a step, m and rad. They do not determine the result: measured, 0.1 m and 0.5 degrees
 # converge to the same deviations, to 3 %, as 0.03 m and 0.2 degrees.
 _FIRST_SIGMAS = 0.1, 0.01
-_CONTRADICTED = 0.5  # unexplained share of the squared motion at which Doppler and poses are inconsistent
 # Within short windows of scans, the drift is small compared with a cell. The window doubles from stage to stage.
 _FIRST_WINDOW = 8
 _OF_WINDOWS = (4, 2)  # cell edges for windows, relative to a map's surfels
@@ -148,13 +149,15 @@ def refine_poses(
     if velocities is not None and times_s is not None:
         if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
             velocities = velocities.scaled(-1.0)
-        motion = DopplerMotion.by(velocities, times_s, given)
-        if (unexplained := unexplained_motion(motion, given)) < _CONTRADICTED:
-            motions.append(motion)
+        contradicted, clock = of_poses(velocities, times_s, given)
+        notes += clock.note
+        if contradicted is None:
+            velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
+            motions.append(DopplerMotion.by(velocities, times_s - clock.errors_s, given))
         else:
             notes.append(
-                f"{NOT_USED}: it contradicts {unexplained:.0%} of the motion of the given poses. If it is right, "
-                "leave the poses out: radarsdf.odometry"
+                f"{NOT_USED}: {contradicted.words('the given poses')}. If it is right, leave the poses out: "
+                "radarsdf.odometry"
             )
     cell_m = LEAVES_PER_SURFEL * config.leaf_size_m
     with ThreadPool(config.num_threads) as pool:
