@@ -196,14 +196,15 @@ def main() -> None:
         scans = KINDS.get(kind, getattr(radarsdf.simulate, kind, None))(seed=seed, frames=FRAMES)
         motion = measured_motion(scans, seed=seed)
         for fault, use in itertools.product(wanted.faults, wanted.uses):
-            told = Told(
-                scans, list(motion.doppler_mps), motion.times_s.copy(), np.random.default_rng(seed)
-            )
+            told = Told(scans, list(motion.doppler_mps), motion.times_s.copy(), np.random.default_rng(seed))
             FAULTS[fault](told)
             begin = time.process_time()
             result = USES[use](told)
             counts[use, fault, result.split()[0]] += 1
-            print(f"{kind:9} {seed:3} {fault:16} {use:8} {time.process_time() - begin:5.1f} s  {result}", flush=True)
+            print(
+                f"{kind:9} {seed:3} {fault:16} {use:8} {time.process_time() - begin:5.1f} s  {result}",
+                flush=True,
+            )
     for use, fault in itertools.product(wanted.uses, wanted.faults):
         print(use, fault, {name: n for (u, f, name), n in sorted(counts.items()) if (u, f) == (use, fault)})
 

@@ -137,7 +137,8 @@ void bind_interpolation(VertexTableClass& table) {
         return inside;
       },
       "points"_a.noconvert(), "step_m"_a, "num_threads"_a = 0,
-      "Moves `points` (N, 3) float32 within `step_m` of a face into an adjacent leaf cell, and returns whether they are "
+      "Moves `points` (N, 3) float32 within `step_m` of a face into an adjacent leaf cell, and returns whether they "
+      "are "
       "in one (N,).");
   table.def(
       "trilinear",

@@ -35,8 +35,8 @@ template <typename T>
 void coordinate_gradient(const VertexTable& table, const T* features, const PointBatch<T>& batch, const T* out_grad,
                          std::int64_t stride, T* points_grad, int num_threads);
 
-// Moves points (count, 3) within step_m of a face into an adjacent leaf cell, the first of eight shifts by step_m, unless
-// they are in one; inside (count): whether they are in a leaf cell now.
+// Moves points (count, 3) within step_m of a face into an adjacent leaf cell, the first of eight shifts by step_m,
+// unless they are in one; inside (count): whether they are in a leaf cell now.
 void into_cells(const VertexTable& table, float* points, std::int64_t count, float step_m, bool* inside,
                 int num_threads);
 
