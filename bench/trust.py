@@ -18,6 +18,7 @@ import numpy as np
 import radarsdf
 from numpy.typing import NDArray
 from radarsdf.poses.rigid import aligned
+from radarsdf.returns.moving import sensor_velocity
 from radarsdf.simulate import Simulation, drifted, measured_motion
 
 from bench.kinds import KINDS
@@ -58,7 +59,7 @@ def _late(told: Told) -> None:
     for i, values in enumerate(told.doppler_mps):
         x = told.scans.points[i] / np.linalg.norm(told.scans.points[i], axis=1, keepdims=True)
         own, other = (
-            radarsdf.returns.moving.sensor_velocity(told.scans.points[k], told.doppler_mps[k]).velocity_mps
+            sensor_velocity(told.scans.points[k], told.doppler_mps[k]).velocity_mps
             for k in (i, max(i - 3, 0))
         )
         resampled.append((values + x @ (own - other)).astype(np.float32))
@@ -193,7 +194,8 @@ def main() -> None:
     wanted = parser.parse_args()
     counts: Counter[tuple[str, str, str]] = Counter()
     for kind, seed in itertools.product(wanted.kinds, wanted.seeds):
-        scans = KINDS.get(kind, getattr(radarsdf.simulate, kind, None))(seed=seed, frames=FRAMES)
+        make = KINDS[kind] if kind in KINDS else getattr(radarsdf.simulate, kind)
+        scans = make(seed=seed, frames=FRAMES)
         motion = measured_motion(scans, seed=seed)
         for fault, use in itertools.product(wanted.faults, wanted.uses):
             told = Told(scans, list(motion.doppler_mps), motion.times_s.copy(), np.random.default_rng(seed))

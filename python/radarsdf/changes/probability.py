@@ -244,7 +244,8 @@ def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
     same = betaln(hit + hits, missed + passes) - betaln(hit, missed)
     changed = betaln(0.5 + hits, 0.5 + passes) - betaln(0.5, 0.5)
     fewer = hits < (hits + passes) * hit / (hit + missed)
-    return np.where(fewer, changed - same, np.minimum(changed - same, 0))
+    odds: Floats = np.where(fewer, changed - same, np.minimum(changed - same, 0))
+    return odds
 
 
 def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:

@@ -152,7 +152,7 @@ class Follower:
     def _leap_mps(self, new: Step) -> float | None:
         """Return the change of the velocity by Doppler, m/s, if it exceeds those before: its sign or scale may have changed."""
         known = [(one.time_s, one.velocity.velocity_mps) for one in [*self._steps, new] if one.velocity]
-        if new.velocity is None or len(known) < _FEWEST_CHANGES + 2:
+        if new.velocity is None or len(known) < _FEWEST_CHANGES + 2 or not self._steps[-1].moves:
             return None
         times_s, velocities = (np.array(columns) for columns in zip(*known, strict=True))
         changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / np.sqrt(np.diff(times_s))
@@ -346,7 +346,9 @@ def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:
     prior = along @ expected.covariance(found.turn)[:3, :3] @ along
     left = along @ R.T @ found.covariance[:3, :3] @ R @ along
     moved_m = along @ (R.T @ (found.pose[:3, 3] - before.pose[:3, 3]) - way_m)
-    gain = 1 - left / max(prior, 1e-12)  # the returns move the predicted step by this share of its error
+    gain = 1 - float(left) / max(
+        float(prior), 1e-12
+    )  # the returns move the predicted step by this share of its error
     return float(moved_m / (gain * length_m)) if gain > _LEAST_GAIN and length_m > _LEAST_STEP_M else np.nan
 
 

@@ -225,7 +225,7 @@ class Consistency:
         own, shown = motion.steps[pairs, :3, 3], steps(poses)[pairs, :3, 3]
         along = np.einsum("ki,ki->k", shown - own, own) / np.maximum((own**2).sum(axis=1), 1e-12)
         # Of a step that the returns hardly observe, the difference is that of the prior.
-        prior = np.stack([free.step_covariance(i, times_s[i + 1] - times_s[i]) for i in pairs])
+        prior = np.stack([free.step_covariance(i, times_s[i + 1] - times_s[i]) for i in pairs.tolist()])
         axes, of_steps = poses[pairs, :3, :3], np.stack([tracked[i + 1].covariance[:3, :3] for i in pairs])
         before = np.einsum("ki,kij,kj->k", own, prior, own)
         left = np.einsum("ki,kji,kjl,klm,km->k", own, axes, of_steps, axes, own)
@@ -240,10 +240,12 @@ class Consistency:
         if window is not None:
             first, last = pairs[window.first], pairs[min(window.last, len(pairs) - 1)] + 1
             window = dataclasses.replace(window, first=int(rows[first]), last=int(rows[last]))
-        limits = _scale(gains[~slow, : len(_SCALES)]) if (~slow).sum() >= FEWEST_STEPS else ()
-        if limits and np.isfinite(along).sum() >= FEWEST_STEPS and window is None:
-            limits = (limits[0], min(limits[1], 1.0), max(limits[2], 1.0))  # the windows decide
-        return cls(*limits, delay=delay, contradicted=window, clock=clock, undecided=undecided)
+        scale, least, most = 1.0, float(_SCALES[0]), float(_SCALES[-1])
+        if (~slow).sum() >= FEWEST_STEPS:
+            scale, least, most = _scale(gains[~slow, : len(_SCALES)])
+        if np.isfinite(along).sum() >= FEWEST_STEPS and window is None:
+            least, most = min(least, 1.0), max(most, 1.0)  # the windows decide
+        return cls(scale, least, most, delay, window, clock, undecided)
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if returns contradict them; and notes."""
