@@ -187,7 +187,8 @@ class Follower:
         drive = Drive([step.scan for step in steps], times_s, velocities, None)
         tested = Consistency.of_returns(drive, self.config, self.config.num_threads)
         trusted, notes = tested.applied(velocities)
-        if trusted is None:
+        undecided = tested.contradicted is not None and np.isnan(tested.contradicted.ratio)
+        if trusted is None and not undecided:
             self._judged_s = -np.inf  # the next scans are judged, too
             return notes[-1]
         return None

@@ -37,6 +37,7 @@ _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the retu
 # ones, and across.
 _FREE_SCALE, _FREE_ACROSS = 0.15, 0.04
 _SCALES = np.geomspace(0.4, 2.5, 17)
+_BACK, _AHEAD = [0, 1, 2, 6, 7, 8], [5, 4, 3, 11, 10, 9]  # opposite shifts
 _SAME = len(_SCALES) // 2
 _SAME_TRACKED = 0.05  # relative difference of tracked steps and right Doppler: simulated scenes up to 0.02
 _SHIFTS_M = np.concatenate(
@@ -60,7 +61,8 @@ class Contradiction:
 
     first: int  # scan
     last: int
-    ratio: float  # of the speeds by the other source to those by Doppler
+    # Of the speeds by the other source to those by Doppler: infinite where Doppler shows no motion, NaN where this is undecided.
+    ratio: float
     windows: int = 1  # that contradict
 
     def words(self, source: str) -> str:
@@ -290,8 +292,13 @@ def _judged(gains: Floats, along: Floats, slow: NDArray[np.bool_]) -> tuple[Cont
             and 2 * len(gains[rows]) >= len(gains) - 1
         ):
             # Without motion by Doppler, which compensation for ego motion leaves, too, returns must agree less after any shift.
-            t = _t_values(still).min() / student.ppf(1 - level / still.shape[1], len(still) - 1)
-            found.append((float(2 - t), Contradiction(rows.start, rows.stop, np.inf)))
+            level /= still.shape[1]
+            needed = student.ppf(1 - level, len(still) - 1)
+            confirmed = float(_t_values(still).min() / needed)
+            back, ahead = still[:, _BACK], still[:, _AHEAD]
+            moved = float(np.abs(_t_values(back - ahead)).max() / needed)
+            ratio = np.inf if moved > 1 else np.nan
+            found.append((max(2 - confirmed, moved), Contradiction(rows.start, rows.stop, ratio)))
         if len(moving) < FEWEST_STEPS:
             continue
         needed = float(student.ppf(1 - level, len(moving) - 1))
