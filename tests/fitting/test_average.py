@@ -69,11 +69,11 @@ def test_of_many_returns_a_sample_is_even_among_scans_and_places(monkeypatch):
     scans = radarsdf.simulate.wall(frames=12, seed=2)
     rays = prepare(scans.points, scans.poses)
     surfels = Surfels.of(rays, 0.2)
-    assert average._sample(rays, surfels, 1) is rays
+    assert len(average._in_order(rays, surfels, 1)) == len(rays)
     monkeypatch.setattr(average, "_ENOUGH_RETURNS", 1)
     planes = np.count_nonzero(surfels.is_flat())
     monkeypatch.setattr(average, "_ENOUGH_PER_PLANE", len(rays) // (3 * planes))
-    sample = average._sample(rays, surfels, 1)
+    sample = average._in_order(rays, surfels, 1)
     assert len(rays) / 5 < len(sample) < len(rays) / 2
     share = len(sample) / len(rays)
     for groups in (lambda r: r.scans, lambda r: (r.points[:, 1] // 4).astype(int) + 100):

@@ -90,14 +90,10 @@ def test_a_distant_outlier_opens_no_cells_along_its_ray(distance_m):
     scene = ground_and_wall(scans=2, returns_per_scan=600)
     points = [scene.points[0], np.concatenate([scene.points[1], [[distance_m, 0.0, 0.0]]])]
     config = QUICK.override(training={"sdf_iterations": 10})
-    if distance_m > 2e5:  # beyond the lattice
-        with pytest.raises(ValueError, match=r"1 of 1201 returns .* within a million cells .*max_range_m"):
-            radarsdf.fit(points, scene.poses, config=config, progress=False)
-    else:
-        with_it = radarsdf.fit(points, scene.poses, config=config, progress=False)
-        without = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
-        assert 0 <= with_it.report["leaf_cells"] - without.report["leaf_cells"] < 12
-        assert np.isfinite(with_it.sdf(points[1] @ scene.poses[1, :3, :3].T + scene.poses[1, :3, 3])).all()
+    with_it = radarsdf.fit(points, scene.poses, config=config, progress=False)
+    without = radarsdf.fit(scene.points, scene.poses, config=config, progress=False)
+    assert with_it.report["leaf_cells"] == without.report["leaf_cells"]
+    assert with_it.report["returns_used"] == without.report["returns_used"]
     dropped = radarsdf.fit(
         points, scene.poses, config=config.override(returns={"max_range_m": 1000.0}), progress=False
     )

@@ -115,7 +115,9 @@ def test_distances_are_continuous_across_tiles(city, points, offset_m):
     assert len(border) > 20
     assert np.abs(city.sdf(border + step) - city.sdf(border - step)).max() < 1e-3
     before, after = (city.intensity(border + sign * step, [0, 0, 1]) for sign in (-1, 1))
-    assert np.median(np.abs(after - before)) < 0.01
+    seen = np.isfinite(before) & np.isfinite(after)  # within the measured elevations
+    assert seen.sum() > 10
+    assert np.median(np.abs(after - before)[seen]) < 0.01
 
 
 def test_limited_memory_changes_no_bit(folder, city, points):

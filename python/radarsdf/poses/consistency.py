@@ -270,7 +270,7 @@ class Consistency:
 
 def _gains(first: Floats, second: Floats, step: Floats) -> Floats:
     """Return how much nearer returns of two scans are after scales of a step (4, 4) than after the reverse, and than after shifts."""
-    turned = second @ step[:3, :3].T
+    turned = np.einsum("ni,ji->nj", second, step[:3, :3])
     gains = log_distance_gains(first, turned, np.multiply.outer(_SCALES, step[:3, 3]))
     return np.concatenate([gains, shift_losses(first, turned, _SHIFTS_M)])
 

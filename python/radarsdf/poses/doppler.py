@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf.poses.motion import KnownMotion, spans_of, way
 from radarsdf.poses.rigid import Floats, rotation, rotation_vector, step_vectors, steps
+from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, folding_interval_mps, sensor_velocities
 
 _SAMPLED, _PAIRS = 200, 40  # returns of a scan, and pairs of neighbouring scans, that determine the sign
@@ -140,12 +141,12 @@ def radial_offset_mps(
             continue
         away = scan[used] / np.linalg.norm(scan[used], axis=1)[:, None]
         columns = np.column_stack([-away, np.ones(len(away))])
-        normal = columns.T @ columns
+        normal = normal_matrix(columns, columns)
         if np.linalg.cond(normal) > 1e6:
             continue
         inverse = np.linalg.inv(normal)
-        fitted = inverse @ columns.T @ speeds[used]
-        spread = float(((speeds[used] - columns @ fitted) ** 2).sum()) / (used.sum() - 4)
+        fitted = np.einsum("ij,nj,n->i", inverse, columns, speeds[used])
+        spread = float(((speeds[used] - np.einsum("ni,i->n", columns, fitted)) ** 2).sum()) / (used.sum() - 4)
         offsets.append(float(fitted[3]))
         variances.append(max(spread, _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
     if len(offsets) < _FEWEST_OFFSETS:

@@ -128,7 +128,8 @@ def too_far(scan: NDArray[Any], returns: NDArray[np.bool_]) -> NDArray[np.bool_]
 
     Their range is more than 100 times the median of the others. Equal ranges count once in it: a sentinel has one.
     """
-    squares = np.square(scan, dtype=np.float64) @ np.ones(3)
+    bounded = np.clip(np.asarray(scan, np.float64), -1e150, 1e150)  # against overflow
+    squares = np.einsum("ni,ni->n", bounded, bounded)
     ordered = squares[returns]
     if len(ordered) and ordered.max() > _MOST_RATIO**2 * ordered.min():
         ordered.sort()

@@ -1,0 +1,113 @@
+"""Doppler and times that contradict the motion by returns or poses."""
+
+import numpy as np
+import pytest
+import radarsdf
+from radarsdf.live.tracking import Lost
+from radarsdf.poses.consistency import Clock, contradiction
+from radarsdf.simulate import measured_motion
+
+HALF = np.arange(20) >= 10
+FACTORS = {
+    "sign from half": np.where(HALF, -1, 1),
+    "zero from half": np.where(HALF, 0, 1),
+    "1.3 from half": np.where(HALF, 1.3, 1),
+    "1.15": np.full(20, 1.15),
+}
+
+
+@pytest.fixture(scope="module")
+def street():
+    return radarsdf.simulate.hugin(seed=5, frames=20)
+
+
+@pytest.fixture(scope="module")
+def motion(street):
+    return measured_motion(street, seed=5)
+
+
+def odometry(street, speeds, times_s):
+    found = radarsdf.odometry(street.points, doppler_mps=speeds, times_s=times_s, progress=False)
+    middle = len(street.poses) // 2
+    off = (np.linalg.inv(poses[middle]) @ poses for poses in (found.poses, street.poses))
+    errors_m = np.linalg.norm(np.subtract(*(poses[:, :3, 3] for poses in off)), axis=1)
+    sigmas_m = np.sqrt(np.trace(found.covariance[:, :3, :3], axis1=1, axis2=2))
+    return found, float((errors_m / np.maximum(sigmas_m, 1e-3)).max())
+
+
+def names(street, speeds, times_s):
+    found = radarsdf.check(street.points, street.poses, doppler_mps=speeds, times_s=times_s)
+    return {one.name for one in found if one.severity != "note"}
+
+
+@pytest.mark.parametrize("fault", FACTORS)
+def test_wrong_speeds_are_excluded_and_named(street, motion, fault):
+    speeds = [factor * values for factor, values in zip(FACTORS[fault], motion.doppler_mps, strict=True)]
+    found, worst = odometry(street, speeds, motion.times_s)
+    assert not found.report["doppler"]
+    assert worst < 4
+    assert "doppler_contradicts_poses" in names(street, speeds, motion.times_s)
+    refined = radarsdf.refine_poses(street.points, street.poses, doppler_mps=speeds, times_s=motion.times_s)
+    assert len(refined.report["notes"]) == 1
+
+
+def test_an_offset_of_all_speeds_is_found(street, motion):
+    speeds = [values + np.float32(0.5) for values in motion.doppler_mps]
+    assert not odometry(street, speeds, motion.times_s)[0].report["doppler"]
+    assert "doppler_offset" in names(street, speeds, motion.times_s)
+
+
+def test_good_doppler_is_used_without_a_mark(street, motion):
+    found, worst = odometry(street, motion.doppler_mps, motion.times_s)
+    assert found.report["doppler"]
+    assert found.report["notes"] == []
+    assert worst < 4
+    assert names(street, motion.doppler_mps, motion.times_s) == set()
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 0.012])
+def test_wrong_times_are_evened_and_noted(street, motion, jitter_s):
+    times_s = motion.times_s + jitter_s * np.random.default_rng(5).standard_normal(20)
+    if jitter_s == 0:
+        times_s[10] = times_s[9]
+    found, worst = odometry(street, motion.doppler_mps, times_s)
+    assert worst < 4
+    assert found.report["notes"]
+    assert names(street, motion.doppler_mps, times_s) & {"times", "times_uneven"}
+
+
+def test_true_uneven_times_are_kept():
+    rng = np.random.default_rng(1)
+    times_s = np.arange(20) * 0.1 + 0.02 * rng.standard_normal(20)
+    moved_m = 20 * np.diff(times_s)[:, None] * [1.0, 0, 0]
+    shown_m = moved_m + 0.01 * rng.standard_normal((19, 3))
+    assert not Clock.of(times_s, shown_m, moved_m, np.ones(19, bool)).errors_s.any()
+    even_m = np.full((19, 1), 2.0) * [1.0, 0, 0] + 0.01 * rng.standard_normal((19, 3))
+    evened_s = times_s - Clock.of(times_s, even_m, moved_m, np.ones(19, bool)).errors_s
+    assert np.diff(evened_s).std() < 0.2 * np.diff(times_s).std()
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.0, -1.0, 1.2])
+def test_ratios_of_speeds_are_tested_by_window(ratio):
+    rng = np.random.default_rng(2)
+    shown_m = [2.0, 0, 0] + 0.02 * rng.standard_normal((30, 3))
+    doppler_m = shown_m * np.where(np.arange(30) < 15, 1, ratio)[:, None] + 0.01 * rng.standard_normal(
+        (30, 3)
+    )
+    found = contradiction(shown_m, doppler_m, np.full(30, 5e-4))
+    assert (found is None) == (ratio == 1)
+    assert ratio == 1 or found.last > 15
+
+
+@pytest.mark.parametrize("fault", ["sign from half", "zero from half"])
+def test_a_live_map_is_lost_where_its_doppler_turns_wrong(street, motion, fault):
+    live = radarsdf.LiveMap()
+
+    def drive():
+        for i, factor in enumerate(FACTORS[fault]):
+            speeds = factor * motion.doppler_mps[i]
+            live.integrate(street.points[i], doppler_mps=speeds, time_s=motion.times_s[i])
+
+    with pytest.raises(Lost):
+        drive()
+    assert 10 <= len(live) < 14
