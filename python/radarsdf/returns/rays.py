@@ -31,6 +31,10 @@ _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repea
 
 # At equal received power the radar cross section grows with the fourth power of the range: a return at 100 times the median
 # range needs 80 dB more than the median one. Birds have about -30 dBsm, ships and buildings at most about 50 dBsm.
+_HASHED_PER_M, _LAST_BITS = (
+    64.0,
+    np.uint64(0xFFFFFF),
+)  # resolution of hashes, and bits that may depend on the origin
 _MOST_RATIO = 100.0
 _SAME_SQUARE = 1e-6  # relative difference of squares of ranges that are equal but for float32
 
@@ -66,7 +70,11 @@ class Rays:
     def hashes(self) -> Keys:
         """Return keys (N,) for samples that do not depend on the order of scans, nor on the origin."""
         values = () if self.intensities is None else (self.intensities,)
-        return hashes(*self.directions.T, self.ranges_m, *values)
+        measured = np.column_stack([self.directions, self.ranges_m])
+        # Of a tile, directions and ranges differ in their last bits, which only decide among returns that are equal otherwise.
+        coarse = np.floor(_HASHED_PER_M * measured).astype(np.int32)
+        first, second = hashes(*coarse.T, *values), hashes(*measured.T, *values)
+        return (first & ~_LAST_BITS) | (second & _LAST_BITS)
 
     def without_outliers(self) -> Rays:
         """Replace intensity outliers by NaN."""
