@@ -94,7 +94,7 @@ def test_ratios_of_speeds_are_tested_by_window(ratio):
     doppler_m = shown_m * np.where(np.arange(30) < 15, 1, ratio)[:, None] + 0.01 * rng.standard_normal(
         (30, 3)
     )
-    found = contradiction(shown_m, doppler_m, np.full(30, 5e-4))
+    found = contradiction(shown_m, doppler_m, np.full(30, 1e-4), np.arange(31))
     assert (found is None) == (ratio == 1)
     assert ratio == 1 or found.last > 15
 

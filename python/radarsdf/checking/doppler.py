@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, 
 from radarsdf.poses.consistency import contradiction, of_poses
 from radarsdf.poses.doppler import (
     LEAST_MPS,
-    OFFSET_ERRORS,
     NoVelocityError,
     SensorVelocities,
     radial_offset_mps,
@@ -118,18 +116,12 @@ def _compared_speeds(
 ) -> Iterator[Finding]:
     """Compare velocities (K, 3) of scans (K,), sensor frame, m/s, by window."""
     used = (scans > 0) & (scans < len(recording) - 1)
-    jumps = np.diff(by_poses[used], 2, axis=0)
-    # Where the sensor moves evenly, second differences have six times the variance of a velocity.
-    variance = LEAST_MPS**2 + (float(np.median(jumps**2)) / 6 if len(jumps) else 0.0)
-    found = contradiction(by_poses[used], by_doppler[used], np.full(int(used.sum()), variance))
+    variances = np.full(int(used.sum()), LEAST_MPS**2)
+    scans = np.append(scans[used], scans[used][-1:])
+    found = contradiction(by_poses[used], by_doppler[used], variances, scans)
     if found is not None:
-        rows = scans[used]
-        found = replace(found, first=int(rows[found.first]), last=int(rows[min(found.last, len(rows) - 1)]))
-        yield Finding(
-            "doppler_contradicts_poses",
-            "warning",
-            f"{found.words('the poses')[:1].upper()}{found.words('the poses')[1:]}.",
-        )
+        words = found.words("the poses")
+        yield Finding("doppler_contradicts_poses", "warning", f"{words[0].upper()}{words[1:]}.")
 
 
 def _compared_in_block(recording: Scans, times_s: FloatArray, sign: float) -> Iterator[Finding]:
@@ -143,8 +135,7 @@ def _compared_in_block(recording: Scans, times_s: FloatArray, sign: float) -> It
         velocities = SensorVelocities.of(points, speeds, times_s[rows])
     except NoVelocityError:
         return
-    offset_mps, error_mps = radial_offset_mps(points, speeds, velocities)
-    if abs(offset_mps) > max(OFFSET_ERRORS * error_mps, LEAST_MPS):
+    if offset_mps := radial_offset_mps(points, speeds, velocities):
         evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
         yield Finding("doppler_offset", "warning", evidence)
     contradicted, clock = of_poses(velocities, times_s[rows], recording.poses[rows])

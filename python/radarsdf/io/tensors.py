@@ -44,22 +44,26 @@ class TensorFile:
         self._file = file
         self.names: list[str] = list(file.keys())
         self.metadata: dict[str, str] = file.metadata() or {}
-        self._checksums = self.metadata.pop(_CHECKSUMS, "{}")
+        self._stated = self.metadata.pop(_CHECKSUMS, "{}")
+        self._checksums: dict[str, int] | None = None  # by name of the array, once the metadata are checked
 
     def check_metadata(self) -> None:
         """Raise a ValueError if the metadata or the names of the arrays differ from those written."""
-        found = json.loads(self._checksums)
+        found = json.loads(self._stated)
         whole = isinstance(found, dict) and set(found) == {"", *self.names}
-        check(
-            whole and found[""] == _metadata_checksum(self.metadata), "the checksum of its metadata is wrong"
-        )
+        whole = whole and found[""] == _metadata_checksum(self.metadata)
+        check(whole, "the checksum of its metadata is wrong")
+        self._checksums = found
 
     def array(self, name: str) -> Any:
         """Return an array as a view of the file. Raise a ValueError if its checksum is wrong."""
-        self.check_metadata()
+        if self._checksums is None:
+            self.check_metadata()
+        assert self._checksums is not None
+        expected = self._checksums[name]
         array = self._file.get_tensor(name)
         found = _checksum(array.numpy() if isinstance(array, Tensor) else array)
-        check(found == json.loads(self._checksums)[name], f"the checksum of {name} is wrong")
+        check(found == expected, f"the checksum of {name} is wrong")
         return array
 
 

@@ -37,10 +37,8 @@ _START = 8  # scans of the initialisation, re-estimated jointly after 2, 4 and 8
 _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 # Least share of the returns that agree while the sign of the Doppler is open: a wrong one places scans metres off.
 _LEAST_AGREEING = 0.1
-_JUDGED, _PARTED = (
-    24,
-    3,
-)  # last scans whose Doppler is compared with the returns, and that suggest it by agreeing less
+_JUDGED = 24  # last scans whose Doppler is compared with the returns
+_PARTED = 3  # last scans that suggest this by agreeing less than those before
 _PULLED = 0.1  # relative difference of the motion by returns and by Doppler that suggests it
 _LEAST_GAIN, _LEAST_STEP_M = 1e-5, 0.1  # of a step whose difference is known
 # A leap of the velocity: more than three times the acceleration of gravity, and than this multiple of the earlier changes.
@@ -347,9 +345,8 @@ def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:
     prior = along @ expected.covariance(found.turn)[:3, :3] @ along
     left = along @ R.T @ found.covariance[:3, :3] @ R @ along
     moved_m = along @ (R.T @ (found.pose[:3, 3] - before.pose[:3, 3]) - way_m)
-    gain = 1 - float(left) / max(
-        float(prior), 1e-12
-    )  # the returns move the predicted step by this share of its error
+    # The returns move the predicted step by this share of its error.
+    gain = 1 - float(left) / max(float(prior), 1e-12)
     return float(moved_m / (gain * length_m)) if gain > _LEAST_GAIN and length_m > _LEAST_STEP_M else np.nan
 
 

@@ -10,9 +10,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import MAX_TIME_S, real_array
 from radarsdf.poses.doppler import (
-    LEAST_MPS,
     NOT_USED,
-    OFFSET_ERRORS,
     NoVelocityError,
     SensorVelocities,
     radial_offset_mps,
@@ -76,8 +74,7 @@ class CheckedScans:
             count = f"{velocities.climb_assumed} of {len(scans)} scans"
             climb = f"Assumed: the sensor climbs by about a tenth of its speed; the Doppler of {count} hardly measures its climb."
             notes = [*notes, climb]
-        offset_mps, error_mps = radial_offset_mps(scans, speeds, velocities)
-        if abs(offset_mps) > max(OFFSET_ERRORS * error_mps, LEAST_MPS):
+        if offset_mps := radial_offset_mps(scans, speeds, velocities):
             offset = f"{offset_mps:.2f} m/s are added to that of all returns"
             return cls(scans, times_s, begin_s, None, 0, [*notes, f"{NOT_USED}: {offset}."])
         moving = sum(int((~static).sum()) for static in velocities.static)
@@ -106,9 +103,9 @@ def spread_times(times_s: Floats) -> tuple[Floats, int]:
     if first.all() or first.sum() < 2:
         return times_s, 0
     knots = np.flatnonzero(first)
-    ends = times_s[knots[-1]] + np.median(np.diff(times_s[knots])) * np.array([1.0])
-    at = np.append(knots, max(knots[-1] + 1, len(times_s)))
-    return np.interp(np.arange(len(times_s)), at, np.append(times_s[knots], ends)), int((~first).sum())
+    end_s = times_s[knots[-1]] + np.median(np.diff(times_s[knots]))
+    at, known_s = np.append(knots, len(times_s)), np.append(times_s[knots], end_s)
+    return np.interp(np.arange(len(times_s)), at, known_s), int((~first).sum())
 
 
 def median_range_m(scans: Sequence[Floats]) -> float:

@@ -39,8 +39,7 @@ _LEAST_STEP_M = 1e-4  # minimum deviation of a step, against division by zero
 # Systematic error of all velocities of a drive in any direction, share of the speed: by the axes and the scale of the radar.
 # Two radars on a motorway: 0.003 along it, 0.002 and 0.006 across.
 _IN_COMMON = 0.003
-OFFSET_ERRORS = 6.0
-"""Standard errors of a significant offset of all radial speeds: noise of directions is common to the scans."""
+_OFFSET_ERRORS = 6.0  # standard errors of a significant offset: noise of directions is common to the scans
 _FEWEST_OFFSETS, _LEAST_OFFSET_MPS = 4, 1e-3  # scans, and deviation of a return, against division by zero
 NOT_USED = "The Doppler is not used"  # prefix of notes on it
 
@@ -125,14 +124,14 @@ class SensorVelocities:
 
 def radial_offset_mps(
     scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], velocities: SensorVelocities
-) -> tuple[float, float]:
-    """Return a constant in the Doppler of all static returns, m/s, and its standard error; infinite if it is not observable.
+) -> float:
+    """Return a significant constant in the Doppler of all static returns, m/s, or 0.
 
     Returns in different directions distinguish it from a velocity.
     """
     offsets, variances = [], []
     if folding_interval_mps(doppler_mps) is not None:
-        return 0.0, np.inf  # aliased speeds hide it
+        return 0.0  # aliased speeds hide it
     for scan, speeds, static, found in zip(
         scans, doppler_mps, velocities.static, velocities.found, strict=True
     ):
@@ -150,11 +149,12 @@ def radial_offset_mps(
         offsets.append(float(fitted[3]))
         variances.append(max(spread, _LEAST_OFFSET_MPS**2) * float(inverse[3, 3]))
     if len(offsets) < _FEWEST_OFFSETS:
-        return 0.0, np.inf
+        return 0.0
     weights = 1 / np.array(variances)
     mean = float((weights * offsets).sum() / weights.sum())
     squares = (weights**2 * (np.array(offsets) - mean) ** 2).sum() / weights.sum() ** 2
-    return mean, float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
+    error = float(np.sqrt(squares * len(offsets) / (len(offsets) - 1)))
+    return mean if abs(mean) > max(_OFFSET_ERRORS * error, LEAST_MPS) else 0.0
 
 
 def upright(mean_mps: Floats, covariance: Floats) -> tuple[Floats, Floats, int]:

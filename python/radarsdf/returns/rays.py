@@ -27,14 +27,11 @@ from radarsdf.returns.intensities import Plausible
 from radarsdf.returns.sampling import Keys, hashes
 
 _LOG = logging.getLogger("radarsdf.returns")
+_HASHED_PER_M, _LAST_BITS = 64.0, np.uint64(0xFFFFFF)  # resolution of hashes, and bits beyond it
 _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repeat some
 
 # At equal received power the radar cross section grows with the fourth power of the range: a return at 100 times the median
 # range needs 80 dB more than the median one. Birds have about -30 dBsm, ships and buildings at most about 50 dBsm.
-_HASHED_PER_M, _LAST_BITS = (
-    64.0,
-    np.uint64(0xFFFFFF),
-)  # resolution of hashes, and bits that may depend on the origin
 _MOST_RATIO = 100.0
 _SAME_SQUARE = 1e-6  # relative difference of squares of ranges that are equal but for float32
 
