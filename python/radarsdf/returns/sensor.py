@@ -19,7 +19,7 @@ from radarsdf.returns.sampling import sample
 
 # Quantile of azimuth, elevation and range at either end, beyond which returns count as outliers.
 _STRAY = 0.002
-_MAX_RETURNS = 10_000  # sample size: angles within 0.2° and ranges within 1 % of those of all returns
+_MAX_RETURNS = 20_000  # sample size: angles within 0.2° and ranges within 1 % of those of all returns
 _RANGE_BINS = 8
 _WEAKEST = 0.01  # quantile of the intensities in a range bin that is the threshold there
 _FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))  # of a normal distribution, standard deviations
