@@ -14,7 +14,7 @@ function(radarsdf_compiler_options target)
   if(RADARSDF_SANITIZE)
     # Undefined behaviour ends the program, or a test would pass over it; debug information names the line.
     target_compile_options(${target} PRIVATE -fsanitize=${RADARSDF_SANITIZE} -fno-sanitize-recover=all
-                                             -fno-omit-frame-pointer -g)
+                                             -fno-omit-frame-pointer -g1)
     target_link_options(${target} PUBLIC -fsanitize=${RADARSDF_SANITIZE})
   endif()
 endfunction()
