@@ -23,8 +23,8 @@ from radarsdf.poses.posed import pose_sigmas
 from radarsdf.simulate import Box, Scene, Simulation, drifted, materials, simulate
 from scipy.spatial.transform import Rotation
 
-from bench.kinds import KINDS
 from bench.runner import Column, Experiment, Row, main
+from scenes.kinds import KINDS
 
 Floats = NDArray[np.float64]
 

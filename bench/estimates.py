@@ -14,7 +14,7 @@ from radarsdf import Estimate, FitConfig
 from bench.growth.street import street
 from bench.measure import in_new_process, measured, memory_bytes, timed
 from bench.runner import Column, Experiment, Row, main
-from bench.settings import PRESETS, Changes, merged, words_of
+from scenes.settings import PRESETS, Changes, merged, words_of
 
 MEMORY_CASES: list[tuple[int, bool, Changes]] = [
     (10_000, True, {}),

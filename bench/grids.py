@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from radarsdf.grids.grid import Grid
 from radarsdf.simulate import SCENES, Simulation
 
-from bench.kinds import KINDS
 from bench.measure import timed
 from bench.runner import Experiment, Row, main
+from scenes.kinds import KINDS
 
 Floats = NDArray[np.float64]
 

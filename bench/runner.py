@@ -25,7 +25,8 @@ from radarsdf.evaluation.intensity import INTENSITY_PROTOCOL
 from radarsdf.evaluation.surface import PROTOCOL
 
 from bench.measure import ROOT
-from bench.settings import parsed
+from scenes.scene import Scene, load_scene
+from scenes.settings import parsed
 
 Row = dict[str, Any]
 """Numbers and words of one result. `why_not` is the reason of a missing result."""
@@ -150,6 +151,13 @@ def _add_options(parser: argparse.ArgumentParser, experiment: Experiment) -> Non
     for name in experiment.options:
         parser.add_argument(f"--{name}", **OPTIONS[name])
     parser.set_defaults(**experiment.defaults)
+
+
+def chosen_scenes(options: argparse.Namespace) -> Iterator[Scene]:
+    """Yield the scenes of a command line; four scans of each in a quick run."""
+    for spec in options.cases:
+        frames = getattr(options, "frames", None) or (4 if options.quick else None)
+        yield load_scene(spec, frames=frames, seed=options.seed, box=getattr(options, "box", None))
 
 
 def run(experiment: Experiment, options: argparse.Namespace, stem: Path, made: dict[str, Any]) -> None:

@@ -21,7 +21,7 @@ from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from bench.growth.street import street, street_scans
 from bench.measure import in_new_process, timed
 from bench.runner import Experiment, Row, main
-from bench.scenes import load_scene
+from scenes.scene import load_scene
 
 # Edges of the tiles: small, for many borders; the default on the long street.
 _TILE_M = {"hugin": 32.0, "oculii": 51.2, "street": None}

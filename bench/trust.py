@@ -21,7 +21,7 @@ from radarsdf.poses.rigid import aligned
 from radarsdf.returns.moving import sensor_velocity
 from radarsdf.simulate import Simulation, drifted, measured_motion
 
-from bench.kinds import KINDS
+from scenes.kinds import KINDS
 
 Floats = NDArray[np.float64]
 FRAMES, SIGMAS, SHARE = 20, 4.0, 0.05

@@ -15,7 +15,7 @@ from radarsdf.simulate.radar import generator, unit_vectors
 from radarsdf.simulate.simulation import Lidar
 from scipy.spatial import cKDTree
 
-from bench.scenes import Scene
+from scenes.scene import Scene
 
 FloatArray = NDArray[np.float64]
 

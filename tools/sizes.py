@@ -34,7 +34,7 @@ def sizes() -> dict[str, int]:
     found["package"] = lines(PACKAGE)
     found["core"] = lines(ROOT / "csrc")
     found["tests"] = lines(ROOT / "tests")
-    found["bench"] = lines(ROOT / "bench")
+    found["bench"] = lines(ROOT / "bench") + lines(ROOT / "scenes")
     documents = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").rglob("*.md")]
     found["documents, words"] = sum(len(file.read_text(encoding="utf-8").split()) for file in documents)
     return found

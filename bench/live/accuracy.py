@@ -16,7 +16,7 @@ from radarsdf.poses.rigid import aligned
 from bench.measure import timed
 from bench.paper.poses import walked
 from bench.runner import Row
-from bench.scenes import Scene, load_scene
+from scenes.scene import Scene, load_scene
 
 _FINE_M = 0.1  # voxels of a fit; those of a live map are its leaf cells
 _HELD_OUT_EVERY = 5

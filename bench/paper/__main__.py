@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from radarsdf.simulate import SCENES
 
-from bench.kinds import KINDS
 from bench.paper import calibration, poses, reflectance, surface
 from bench.peers.interface import PEERS
 from bench.runner import Column, Experiment, main
+from scenes.kinds import KINDS
 
 _SCENES = ("hugin", "oculii", "wall")
 _ALL = ("seed", "frames", "box")

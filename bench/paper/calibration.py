@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 
 from bench.paper.surface import measured, sampled, samples_of
 from bench.peers.interface import PEERS
-from bench.runner import Column, Row
-from bench.scenes import Scene, chosen_scenes
+from bench.runner import Column, Row, chosen_scenes
 from bench.sensor import deviation
-from bench.settings import words_of
 from bench.truth import truth_of
+from scenes.scene import Scene
+from scenes.settings import words_of
 
 Floats = NDArray[np.float64]
 

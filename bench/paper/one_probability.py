@@ -26,10 +26,10 @@ from radarsdf.simulate import SCENES
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from bench.kinds import KINDS
 from bench.runner import markdown
-from bench.scenes import VOXEL_M, Scene, load_scene
 from bench.truth import truth_of
+from scenes.kinds import KINDS
+from scenes.scene import VOXEL_M, Scene, load_scene
 
 FloatArray = NDArray[np.float64]
 

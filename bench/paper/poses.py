@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from bench.measure import timed
 from bench.paper.reflectance import errors_of
 from bench.paper.surface import samples_of
-from bench.runner import Column, Row
-from bench.scenes import Scene, chosen_scenes
+from bench.runner import Column, Row, chosen_scenes
+from scenes.scene import Scene
 
 Poses = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from radarsdf.map.view import View
 from radarsdf.render.figures import save_view_picture
 from scipy.spatial import cKDTree
 
-from bench.runner import Column, Row
-from bench.scenes import Scene, chosen_scenes
-from bench.settings import Changes, merged
+from bench.runner import Column, Row, chosen_scenes
+from scenes.scene import Scene
+from scenes.settings import Changes, merged
 
 Floats = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ from radarsdf.render.picture import save_picture
 from scipy.spatial import cKDTree
 
 from bench.peers.interface import PEERS, Peer, Reconstruction, reconstruct
-from bench.runner import Column, Row, figure, groups
-from bench.scenes import QUICK, Scene, chosen_scenes
-from bench.settings import Changes, merged, words_of
+from bench.runner import Column, Row, chosen_scenes, figure, groups
 from bench.truth import NEAR_M, score_without_holes
+from scenes.scene import QUICK, Scene
+from scenes.settings import Changes, merged, words_of
 
 Floats = NDArray[np.float64]
 

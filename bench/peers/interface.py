@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 
 from bench.measure import ROOT, failure
-from bench.settings import Changes, merged
+from scenes.settings import Changes, merged
 
 PYTHON = [sys.executable]
 """Command that runs a peer, unless it needs another Python."""

@@ -10,7 +10,7 @@ import radarsdf.fitting.fit  # else the first fit and the first mesh would impor
 import radarsdf.map.mesh
 
 from bench.measure import timed
-from bench.settings import PRESETS
+from scenes.settings import PRESETS
 
 from .child import Made, ScanArrays
 

@@ -6,8 +6,8 @@ import trimesh
 
 from bench.paper.calibration import compared
 from bench.paper.surface import sampled
-from bench.scenes import load_scene
 from bench.truth import along_normals
+from scenes.scene import load_scene
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from bench import runner
 from bench.paper.__main__ import EXPERIMENTS
 from bench.peers.interface import Reconstruction
 from bench.runner import Column, Experiment
-from bench.scenes import load_scene
-from bench.settings import parsed, words_of
+from scenes.scene import load_scene
+from scenes.settings import parsed, words_of
 
 
 @pytest.fixture
@@ -165,7 +165,7 @@ def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
     few = {
         "training": {"sdf_iterations": 3, "intensity_iterations": 3, "batch_size": 512}
     }  # enough to differ
-    monkeypatch.setattr("bench.scenes.QUICK", few)
+    monkeypatch.setattr("scenes.scene.QUICK", few)
     neighbours, *ours = run(tmp_path, "intensity", "wall", "--base", "default", "--repetitions", "2")[1][
         "rows"
     ]

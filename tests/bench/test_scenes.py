@@ -13,9 +13,9 @@ from radarsdf.simulate import Scene as World
 from radarsdf.simulate.radar import unit_vectors
 from scipy.spatial import cKDTree
 
-from bench.kinds import KINDS
-from bench.scenes import load_scene
 from bench.truth import along_normals, filled_truth, score_without_holes, to_planes, truth_of
+from scenes.kinds import KINDS
+from scenes.scene import load_scene
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from radarsdf.io.poses import Trajectory
 from radarsdf.simulate import SCENES
 from scipy.spatial.transform import Rotation
 
-from bench.kinds import KINDS
+from scenes.kinds import KINDS
 
 FloatArray = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 import radarsdf
 from radarsdf import Diverged, FitConfig, RadarMap
 
-from bench.settings import Changes, merged
+from scenes.settings import Changes, merged
 
 CASES: dict[str, Changes] = {
     "default": {},

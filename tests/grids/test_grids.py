@@ -7,7 +7,7 @@ from radarsdf.cli import main
 from radarsdf.grids.grid import Grid, Wheels
 from radarsdf.grids.occupancy import _crossed, _touched
 
-from bench.kinds import KINDS
+from scenes.kinds import KINDS
 
 BOX = [[5.0, -5.03, -1.57], [22.0, 4.97, 4.43]]
 

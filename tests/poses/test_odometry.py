@@ -8,7 +8,7 @@ from radarsdf.io import Imu
 from radarsdf.poses.rigid import aligned, between, turned_by
 from radarsdf.simulate import drifted, measured_motion
 
-from bench.kinds import KINDS
+from scenes.kinds import KINDS
 
 from ..conftest import recorded_file
 from .drift import first, position_error_m

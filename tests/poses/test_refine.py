@@ -18,7 +18,7 @@ from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import Surfels
 from radarsdf.simulate import drifted
 
-from bench.kinds import KINDS
+from scenes.kinds import KINDS
 
 from .drift import position_error_m
 

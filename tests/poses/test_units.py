@@ -14,7 +14,7 @@ from radarsdf.poses.rigid import aligned
 from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
 
-from bench.kinds import KINDS
+from scenes.kinds import KINDS
 
 from .drift import first, position_error_m
 

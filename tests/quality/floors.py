@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from radarsdf import FitConfig
 from radarsdf.evaluation import intensity_metrics, surface_metrics
 
-from bench.scenes import VOXEL_M, Scene, load_scene
+from scenes.scene import VOXEL_M, Scene, load_scene
 
 from ..conftest import recorded_scans
 

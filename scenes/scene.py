@@ -1,10 +1,8 @@
-"""Scenes of the experiments: simulated ones, and recorded ones from files and folders."""
+"""Scenes of experiments and tests of quality: simulated ones, and recorded ones from files and folders."""
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,8 @@ from radarsdf.scans import Scans
 from radarsdf.simulate import SCENES, Simulation
 from scipy.spatial import cKDTree
 
-from bench.kinds import KINDS
-from bench.settings import PRESETS, Changes, merged
+from scenes.kinds import KINDS
+from scenes.settings import PRESETS, Changes, merged
 
 SEEN_BY_RADAR_M = 1.0
 """Radius of ground truth around the radar's returns: a lidar sees in all directions, and farther points are ignored."""
@@ -38,7 +36,6 @@ _MAX_RANGE_FILE_M = 60.0
 _HOLDOUT_EVERY = 10
 _HOLDOUT_EVERY_SHORT = 5
 _SHORT_FRAMES = 50  # below this, every tenth scan would be too few for a test
-_QUICK_FRAMES = 4
 
 QUICK: Changes = {"training": {"sdf_iterations": 60, "intensity_iterations": 60}}
 """Settings of a quick run. After 20 iterations, some scenes have no surface yet."""
@@ -163,13 +160,6 @@ class Scene:
         )
 
 
-def chosen_scenes(options: argparse.Namespace) -> Iterator[Scene]:
-    """Yield the scenes of a command line; four scans of each in a quick run."""
-    for spec in options.cases:
-        frames = getattr(options, "frames", None) or (_QUICK_FRAMES if options.quick else None)
-        yield load_scene(spec, frames=frames, seed=options.seed, box=getattr(options, "box", None))
-
-
 def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: ArrayLike | None = None) -> Scene:
     """Load a scene.
 
@@ -178,7 +168,7 @@ def load_scene(spec: str, *, frames: int | None = None, seed: int = 0, box: Arra
     spec : str
         One of
 
-        - the name of a simulated scene in `radarsdf.simulate.SCENES` or `bench.kinds.KINDS`;
+        - the name of a simulated scene in `radarsdf.simulate.SCENES` or `scenes.kinds.KINDS`;
         - an ``.npz`` file for :func:`radarsdf.io.npz.read_scans`. Only lidar points within 1 m of a return that is
           2.5 to 60 m from its sensor are ground truth, unless an array ``box`` (2, 3) says where it is complete;
         - a folder of scans with poses for :func:`radarsdf.io.read`, such as a recording of Viking Hill. All its lidar

@@ -1,0 +1,1 @@
+"""Scenes of tests and benchmarks, and changes of settings by name."""
