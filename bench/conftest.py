@@ -85,11 +85,17 @@ class Surface:
 
 
 @pytest.fixture(scope="session")
-def surface():
+def smoke(request):
+    """Whether nothing is measured: small sizes suffice to check that the benchmarks run."""
+    return request.config.getoption("benchmark_disable")
+
+
+@pytest.fixture(scope="session")
+def surface(smoke):
     cells = CellSet(LEAF_M)
-    cells.insert(surface_points(1_500_000))
+    cells.insert(surface_points(50_000 if smoke else 1_500_000))
     keys = cells.sorted_keys()
-    assert 1.5e5 < len(keys) < 2.5e5
+    assert smoke or 1.5e5 < len(keys) < 2.5e5
     table = VertexTable(keys, LEAF_M, NUM_LEVELS)
     generator = torch.Generator().manual_seed(0)
     return Surface(table, torch.randn(table.num_rows, FEATURE_DIM, generator=generator))
@@ -109,9 +115,11 @@ class Batch:
 
 
 @pytest.fixture(scope="session", params=[8192, 262144])
-def batch(request, surface):
+def batch(request, surface, smoke):
     """Points in the cells of the surface, in the order of a training batch (Morton)."""
-    points = surface_points(1_500_000)[: request.param]
+    points = (
+        surface_points(50_000)[: request.param // 16] if smoke else surface_points(1_500_000)[: request.param]
+    )
     points = np.ascontiguousarray(points[np.argsort(cell_keys(points, LEAF_M), kind="stable")])
     rows, weights = surface.rows_and_weights(points)
     features = surface.features.numpy().astype(np.float64)

@@ -16,29 +16,32 @@ from radarsdf import FitConfig
 from radarsdf.map.marching_cubes import extract_cells, marching_cubes, sparse_lattice
 
 
-def sphere_256():
-    axis = np.linspace(-1, 1, 256, dtype=np.float32)
+def sphere(size):
+    axis = np.linspace(-1, 1, size, dtype=np.float32)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)
     return np.sqrt(x * x + y * y + z * z) - np.float32(0.8)
 
 
-def gyroid_192():
-    axis = np.linspace(-4 * np.pi, 4 * np.pi, 192, dtype=np.float32)
+def gyroid(size):
+    axis = np.linspace(-4 * np.pi, 4 * np.pi, size, dtype=np.float32)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)
     return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
 
 
-# Volume, number of triangles, which rounding can change slightly, and their area in cells.
+# Function, and number of triangles by size of the volume, which rounding can change slightly. The smaller is for smoke tests.
 FIELDS = {
-    "sphere256": (sphere_256, 392_252, 4 * np.pi * (0.8 * 255 / 2) ** 2),
-    "gyroid192": (gyroid_192, 1_415_084, None),
+    "sphere256": (sphere, {256: 392_252, 96: 54_572}),
+    "gyroid192": (gyroid, {192: 1_415_084, 96: 350_372}),
 }
 
 
 @pytest.fixture(scope="module", params=FIELDS)
-def field(request):
-    make, num_faces, area = FIELDS[request.param]
-    return np.ascontiguousarray(make(), dtype=np.float32), num_faces, area
+def field(request, smoke):
+    """Volume, number of triangles, and their area in cells if it is known."""
+    make, num_faces = FIELDS[request.param]
+    size = min(num_faces) if smoke else max(num_faces)
+    area = 4 * np.pi * (0.8 * (size - 1) / 2) ** 2 if make is sphere else None
+    return np.ascontiguousarray(make(size), dtype=np.float32), num_faces[size], area
 
 
 def check_mesh(vertices, faces, field, rel=1e-4):
@@ -120,32 +123,33 @@ def test_pymcubes(benchmark, field):
 
 
 @pytest.fixture(scope="module")
-def shell():
-    """Cells of random points within 2 cells of a sphere, repeated and in random order."""
+def shell(smoke):
+    """Radius of a sphere, cells of random points within 2 cells of it, repeated and in random order, and their number."""
     rng = np.random.default_rng(0)
-    points = rng.normal(size=(6_000_000, 3))
-    points *= (200 + rng.uniform(-2, 2, size=(len(points), 1))) / np.linalg.norm(
-        points, axis=1, keepdims=True
-    )
-    return np.floor(points).astype(np.int32)
+    radius, count, num_cells = (40, 400_000, 92_185) if smoke else (200, 6_000_000, 2_116_492)
+    points = rng.normal(size=(count, 3))
+    points *= (radius + rng.uniform(-2, 2, size=(count, 1))) / np.linalg.norm(points, axis=1, keepdims=True)
+    return radius, np.floor(points).astype(np.int32), num_cells
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_sparse_lattice(benchmark, shell, threads):
     benchmark.group = "lattice of a shell"
-    cells, corners, cell_corners = benchmark(sparse_lattice, shell, num_threads=threads)
-    assert len(cells) == 2_116_492
+    _, given, num_cells = shell
+    cells, corners, cell_corners = benchmark(sparse_lattice, given, num_threads=threads)
+    assert len(cells) == num_cells
     assert np.array_equal(corners[cell_corners[:, 7]], cells + 1)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_sparse_extraction(benchmark, shell, threads):
     benchmark.group = "extraction from a shell"
-    _, corners, cells = sparse_lattice(shell)
-    values = (np.linalg.norm(corners, axis=1) - 200.0).astype(np.float32)
+    radius, given, _ = shell
+    _, corners, cells = sparse_lattice(given)
+    values = (np.linalg.norm(corners, axis=1) - radius).astype(np.float32)
     vertices, faces = benchmark(extract_cells, corners, values, cells, num_threads=threads)
-    assert np.abs(np.linalg.norm(vertices, axis=1) - 200).max() < 0.01
-    assert len(faces) == 1_431_246
+    assert np.abs(np.linalg.norm(vertices, axis=1) - radius).max() < 0.01
+    assert len(faces) == {40: 59_857, 200: 1_431_246}[radius]
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +178,11 @@ class MapLattice:
 
 
 @pytest.fixture(scope="module")
-def map_lattice():
-    scans = radarsdf.simulate.hugin(frames=20)
-    config = FitConfig(num_threads=1, returns={"max_range_m": 30.0}, training={"sdf_iterations": 100})
+def map_lattice(smoke):
+    frames, max_range_m, iterations = (4, 12.0, 30) if smoke else (20, 30.0, 100)
+    scans = radarsdf.simulate.hugin(frames=frames)
+    returns, training = {"max_range_m": max_range_m}, {"sdf_iterations": iterations}
+    config = FitConfig(num_threads=1, returns=returns, training=training)
     radar_map = radarsdf.fit(scans.points, scans.poses, config=config, progress=False)
     part = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(8, 3)
     cells = (2 * radar_map.field.table.leaf_cells()[:, None] + part).reshape(-1, 3).astype(np.int32)

@@ -9,6 +9,7 @@ from radarsdf import FitConfig
 
 COUNTS = (1, 1_000, 100_000)
 CONFIGS = {"quick": FitConfig.quick(num_threads=1), "trained": FitConfig(num_threads=1)}
+FEW = {"sdf_iterations": 30, "intensity_iterations": 30}
 SENSOR = np.zeros(3)
 QUERIES = {
     "sdf": lambda radar_map, x: radar_map.sdf(x),
@@ -21,16 +22,15 @@ QUERIES = {
 
 
 @pytest.fixture(scope="module")
-def drive(request):
-    """The drive of `hugin`, shortened if nothing is measured."""
-    return radarsdf.simulate.hugin(frames=4 if request.config.getoption("benchmark_disable") else None)
+def drive(smoke):
+    """The drive of `hugin`."""
+    return radarsdf.simulate.hugin(frames=4 if smoke else None)
 
 
 @pytest.fixture(scope="module", params=CONFIGS)
-def radar_map(request, drive):
-    return radarsdf.fit(
-        drive.points, drive.poses, drive.intensities, config=CONFIGS[request.param], progress=False
-    )
+def radar_map(request, drive, smoke):
+    config = CONFIGS[request.param].override(training=FEW if smoke and request.param == "trained" else {})
+    return radarsdf.fit(drive.points, drive.poses, drive.intensities, config=config, progress=False)
 
 
 @pytest.fixture(params=COUNTS)
@@ -68,7 +68,8 @@ def test_open3d(benchmark, radar_map, near):
 
 
 @pytest.mark.parametrize("voxel_m", [0.1, 0.05])
-def test_mesh(benchmark, radar_map, voxel_m):
+def test_mesh(benchmark, radar_map, voxel_m, smoke):
+    voxel_m = 4 * voxel_m if smoke else voxel_m
     mesh = benchmark.pedantic(radar_map.mesh, (voxel_m,), {"progress": False}, rounds=5, warmup_rounds=1)
     benchmark.extra_info["vertices"] = len(mesh.vertices)
     assert len(mesh.faces) > 0

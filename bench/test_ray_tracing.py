@@ -13,24 +13,28 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.map.view import ViewedMap
 
-RAYS = (600, 2000)  # elevations, azimuths
+
+@pytest.fixture(scope="module")
+def rays(smoke):
+    """Numbers of elevations and of azimuths."""
+    return (60, 200) if smoke else (600, 2000)
 
 
 @pytest.fixture(scope="module")
-def scene():
-    scans = radarsdf.simulate.hugin(frames=60)
+def scene(smoke):
+    scans = radarsdf.simulate.hugin(frames=12 if smoke else 60)
     radar_map = radarsdf.fit(scans.points, scans.poses, config=FitConfig.quick(), progress=False)
-    return radar_map, scans.poses[30]
+    return radar_map, scans.poses[len(scans.poses) // 2]
 
 
 @pytest.mark.parametrize("order", ["in order", "shuffled"])
 @pytest.mark.parametrize("threads", [1, 2])
-def test_first_hits(benchmark, scene, threads, order):
-    benchmark.group = f"{RAYS[0] * RAYS[1]:,} rays through a map, {order}"
+def test_first_hits(benchmark, scene, rays, threads, order):
+    benchmark.group = f"{rays[0] * rays[1]:,} rays through a map, {order}"
     radar_map, pose = scene
     surface = ViewedMap.of(radar_map._contents)
     low, high = np.transpose([radar_map.sensor.elevation_rad, radar_map.sensor.azimuth_rad])
-    axes = [np.linspace(*limits) for limits in zip(low, high, RAYS, strict=True)]
+    axes = [np.linspace(*limits) for limits in zip(low, high, rays, strict=True)]
     elevation, azimuth = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
     directions = (radar_map.sensor.directions(azimuth, elevation) @ pose[:3, :3].T).astype(np.float32)
     if order == "shuffled":

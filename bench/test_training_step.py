@@ -1,7 +1,7 @@
 """Time of a training step on one of two threads: the whole step, and its matrix products alone.
 
 There is a group per stage of the schedule: geometry alone, geometry and intensity together, and intensity with
-frozen geometry. All cases of a group run `STEPS` steps per round, so that times can be compared.
+frozen geometry. All cases of a group run as many steps per round, so that times can be compared.
 """
 
 from __future__ import annotations
@@ -21,10 +21,15 @@ from radarsdf.threads import ThreadPool
 
 from .conftest import surface_points
 
-STEPS = 100  # after this many steps, a training checks its parameters and keeps a copy
 STAGES = ("geometry", "joint", "intensity")
 CONFIG = FitConfig(num_threads=1, returns={"drop_ghosts": False})
 SHARE = 2  # a fit splits its batches among two threads
+
+
+@pytest.fixture(scope="module")
+def steps(smoke):
+    """After 100 steps, a training checks its parameters and keeps a copy."""
+    return 10 if smoke else 100
 
 
 @pytest.fixture(scope="module")
@@ -50,21 +55,21 @@ def batch_size(stage):
     return (training.intensity_batch_size if stage == "intensity" else training.batch_size) // SHARE
 
 
-def group(stage):
-    return f"training step, {stage}, {batch_size(stage)} samples, {STEPS} steps a round"
+def group(stage, steps):
+    return f"training step, {stage}, {batch_size(stage)} samples, {steps} steps a round"
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_whole(benchmark, stage, rays, leaf_keys):
-    """`STEPS` steps of `Training` on one thread. The stage with frozen geometry follows one step of geometry."""
+def test_whole(benchmark, stage, steps, rays, leaf_keys):
+    """Steps of `Training` on one thread. The stage with frozen geometry follows one step of geometry."""
     field = new_field(stage, leaf_keys)
     scale = IntensityScale.of(rays.intensities) if stage != "geometry" else None
     config = CONFIG.override(
         training={
             "batch_size": CONFIG.training.batch_size // SHARE,
             "intensity_batch_size": CONFIG.training.intensity_batch_size // SHARE,
-            "sdf_iterations": 1 if stage == "intensity" else STEPS,
-            "intensity_iterations": {"geometry": 1, "joint": 1, "intensity": STEPS + 1}[stage],
+            "sdf_iterations": 1 if stage == "intensity" else steps,
+            "intensity_iterations": {"geometry": 1, "joint": 1, "intensity": steps + 1}[stage],
         }
     )
     count, vertices = len(rays), field.cells.table.num_rows
@@ -81,7 +86,7 @@ def test_whole(benchmark, stage, rays, leaf_keys):
         training.run(progress=False)
         losses.append(training.losses["intensity" if stage == "intensity" else "sdf"])
 
-    benchmark.group = group(stage)
+    benchmark.group = group(stage, steps)
     with ThreadPool(1) as pool:
         benchmark.pedantic(run, setup=setup, rounds=10, warmup_rounds=1)
         while len(losses) < 5:  # with --benchmark-disable there is one round
@@ -117,13 +122,13 @@ def linear(network):
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_matrix_products(benchmark, stage, leaf_keys):
+def test_matrix_products(benchmark, stage, steps, leaf_keys):
     """Matrix products of the networks, forward and backward: no encoding, loss, bias, ReLU or optimiser."""
     operands = products(stage, new_field(stage, leaf_keys))
-    benchmark.group = group(stage)
+    benchmark.group = group(stage, steps)
 
     def run():
-        for _ in range(STEPS):
+        for _ in range(steps):
             result = [torch.mm(a, b) for a, b in operands]
         return result
 
