@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from radarsdf.checking import frames
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.render import picture
 
-from .poses.drift import first
+from .poses.drift import first, thinned
 
 _SCANS = {
     "hugin": (12, 2),
@@ -41,14 +42,12 @@ def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:
         set_attribute(radarsdf.simulate, name, _begun(getattr(radarsdf.simulate, name), scans, every))
 
 
+@functools.cache
 def _begun(drive, scans, every):
-    @functools.wraps(drive)
-    def begun(*given, **named):
-        found = first(drive, scans, *given, **named)
-        thinned = {
-            name: [values[::every] for values in getattr(found, name)]
-            for name in ("points", "intensities", "noiseless_intensities", "origin_kind")
-        }
-        return dataclasses.replace(found, **thinned)
+    """The drive's first scans, thinned, and simulated once for all pages of a process."""
 
-    return begun
+    @functools.cache
+    def begun(*given, **named):
+        return thinned(first(drive, scans, *given, **named), every)
+
+    return functools.wraps(drive)(lambda *given, **named: copy.deepcopy(begun(*given, **named)))

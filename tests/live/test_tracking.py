@@ -11,7 +11,7 @@ from radarsdf.poses.rigid import aligned
 from radarsdf.poses.tracking import begun
 from radarsdf.returns.moving import SensorVelocity
 
-from ..poses.drift import first
+from ..poses.drift import first, thinned
 
 SETTINGS = FitConfig(num_threads=1)
 
@@ -104,7 +104,7 @@ def test_untrackable_scans_are_rejected_without_side_effects(drive):
 
 
 def test_unobservable_motion_along_a_wall_is_rejected():
-    scans = radarsdf.simulate.wall(seed=91, frames=24)
+    scans = thinned(radarsdf.simulate.wall(seed=91, frames=24), 2)
     live = LiveMap(SETTINGS)
 
     def follow(speeds=None):

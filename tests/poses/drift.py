@@ -55,6 +55,13 @@ def first(drive, count, *given, **named):
     return dataclasses.replace(simulation, **of_scans)
 
 
+def thinned(simulation, every):
+    """Every n-th return of a simulation, where a test needs fewer."""
+    names = ("points", "intensities", "noiseless_intensities", "origin_kind")
+    parts = {name: [values[::every] for values in getattr(simulation, name)] for name in names}
+    return dataclasses.replace(simulation, **parts)
+
+
 @functools.cache
 def drifting_drive():
     """48 scans with Doppler, times and drifting poses; and the true poses."""
