@@ -8,6 +8,7 @@ from radarsdf.checking.frames import CHEAP, FULL, check_clock, check_frames, che
 from radarsdf.checking.recording import checked_input
 
 from tests.conftest import recorded_file, recorded_scans
+from tests.poses.drift import thinned
 
 from .breakages import Data, slow
 
@@ -24,7 +25,8 @@ def worse_than_notes(findings):
 
 @pytest.fixture(scope="module", params=["astyx", "oculii"])
 def good(request):
-    scans = getattr(radarsdf.simulate, request.param)(frames={"astyx": 12, "oculii": 48}[request.param])
+    frames, every = {"astyx": (12, 1), "oculii": (48, 2)}[request.param]
+    scans = thinned(getattr(radarsdf.simulate, request.param)(frames=frames), every)
     return Data(scans.points, scans.poses, scans.intensities)
 
 

@@ -17,14 +17,14 @@ from bench.estimates import peak_of_a_fit
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 SHORT = FitConfig(training={"sdf_iterations": 6, "intensity_iterations": 6, "batch_size": 512})
-NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 10, "intensity_iterations": 12}}
+NORMALS = {"networks": {"normals": True}, "training": {"sdf_iterations": 4, "intensity_iterations": 5}}
 
 
 @LINUX
 @pytest.mark.parametrize(
     ("count", "with_intensities", "changes"),
     [
-        (100_000, True, {}),
+        (50_000, True, {}),
         (12_000, True, FitConfig.quick().to_dict()),
         (12_000, True, NORMALS | {"num_threads": 4}),
     ],
