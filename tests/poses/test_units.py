@@ -16,12 +16,12 @@ from radarsdf.simulate import measured_motion
 
 from scenes.kinds import KINDS
 
-from .drift import first, position_error_m
+from .drift import first, position_error_m, thinned
 
 
 @pytest.fixture(scope="module")
 def drive():
-    return first(radarsdf.simulate.hugin, 16, seed=61, frames=30)
+    return thinned(first(radarsdf.simulate.hugin, 16, seed=61, frames=30), 2)
 
 
 @pytest.fixture(scope="module")
