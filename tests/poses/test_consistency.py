@@ -7,6 +7,8 @@ from radarsdf.live.tracking import Lost
 from radarsdf.poses.consistency import Clock, contradiction
 from radarsdf.simulate import measured_motion
 
+from .drift import thinned
+
 HALF = np.arange(20) >= 10
 FACTORS = {
     "sign from half": np.where(HALF, -1, 1),
@@ -18,7 +20,7 @@ FACTORS = {
 
 @pytest.fixture(scope="module")
 def street():
-    return radarsdf.simulate.hugin(seed=5, frames=20)
+    return thinned(radarsdf.simulate.hugin(seed=5, frames=20), 2)
 
 
 @pytest.fixture(scope="module")
