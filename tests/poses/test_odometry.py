@@ -11,7 +11,7 @@ from radarsdf.simulate import drifted, measured_motion
 from scenes.kinds import KINDS
 
 from ..conftest import recorded_file
-from .drift import first, position_error_m
+from .drift import first, position_error_m, thinned
 
 BIAS_RAD_S = (0.01, -0.02, 0.03)
 
@@ -19,7 +19,7 @@ BIAS_RAD_S = (0.01, -0.02, 0.03)
 @pytest.fixture(scope="module")
 def drive():
     """A third of a lap."""
-    return first(radarsdf.simulate.oculii, 40, seed=62, frames=120)
+    return thinned(first(radarsdf.simulate.oculii, 40, seed=62, frames=120), 2)
 
 
 @pytest.fixture(scope="module")
@@ -317,7 +317,7 @@ def test_poses_of_radars_on_a_motorway_are_estimated(name):
 @pytest.mark.parametrize("rate_rad_s", [0.0, 0.15])
 def test_errors_of_a_narrow_radar_are_in_its_covariance(rate_rad_s):
     """Its returns do not observe rotations, so that bends have the prior's errors: 0.15 rad/s are two deviations."""
-    points, doppler_mps, times_s, true = road(1, rate_rad_s)
+    points, doppler_mps, times_s, true = road(1, rate_rad_s, scans=24)
     found = radarsdf.odometry(points, doppler_mps=doppler_mps, times_s=times_s)
     assert found.report["segments"] == 1
     assert np.abs(deviations(found, true)).max() < 4
