@@ -70,7 +70,7 @@ _NOT_MEASURED = -1.0  # a variance of sensor_msgs/Imu that marks a missing measu
 
 
 class Topic(NamedTuple):
-    """A topic and its number of messages in all bags."""
+    """A topic, with its messages in all bags."""
 
     name: str
     message_type: str
@@ -138,17 +138,13 @@ def _point_cloud2(message: Any) -> Columns:
 
 
 def _point_cloud(message: Any) -> Columns:
-    columns = {axis: _column(message.points, axis) for axis in "xyz"}
-    for channel in message.channels:
-        if len(channel.values) == len(message.points):
-            columns.setdefault(channel.name, channel.values)
-    return columns
+    channels = {c.name: c.values for c in message.channels[::-1] if len(c.values) == len(message.points)}
+    return channels | {axis: _column(message.points, axis) for axis in "xyz"}
 
 
 def _radar_scan(message: Any) -> Columns:
-    names = {"range": "range", "azimuth": "azimuth_rad", "elevation": "elevation_rad",
-             "doppler_velocity": "doppler_velocity", "amplitude": "amplitude"}  # fmt: skip
-    return {name: _column(message.returns, attribute) for attribute, name in names.items()}
+    names = ("range", "azimuth_rad", "elevation_rad", "doppler_velocity", "amplitude")
+    return {name: _column(message.returns, name.removesuffix("_rad")) for name in names}
 
 
 def _column(rows: list[Any], attribute: str) -> NDArray[np.float32]:
@@ -186,27 +182,15 @@ def _ars548(returns: Columns, invalid: NDArray[np.bool_]) -> Columns:
     return columns
 
 
-def _pose(message: Any, position: Any, rotation: Any) -> Pose:
+def _pose(message: Any) -> Pose:
+    """Pose of a stamped message with a pose, with or without a covariance, or with a transform."""
+    if hasattr(message, "transform"):
+        position, rotation = message.transform.translation, message.transform.rotation
+    else:
+        pose = getattr(message.pose, "pose", message.pose)
+        position, rotation = pose.position, pose.orientation
     values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
     return Pose(*_stamp(message), getattr(message, "child_frame_id", "").lstrip("/"), values)
-
-
-def _pose_stamped(message: Any) -> list[Pose]:
-    """Pose of a stamped message, with or without a covariance."""
-    pose = getattr(message.pose, "pose", message.pose)
-    return [_pose(message, pose.position, pose.orientation)]
-
-
-def _transform(message: Any) -> list[Pose]:
-    return [_pose(message, message.transform.translation, message.transform.rotation)]
-
-
-def _path(message: Any) -> list[Pose]:
-    return [pose for stamped in message.poses for pose in _pose_stamped(stamped)]
-
-
-def _transforms(message: Any) -> list[Pose]:
-    return [pose for stamped in message.transforms for pose in _transform(stamped)]
 
 
 def _imu(message: Any) -> list[tuple[float, ...] | None]:
@@ -229,22 +213,24 @@ _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _ars548_packets,
 }
-_POSES: dict[str, Callable[[Any], list[Pose]]] = {
-    "nav_msgs/msg/Odometry": _pose_stamped,
-    "geometry_msgs/msg/PoseStamped": _pose_stamped,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
-    "geometry_msgs/msg/TransformStamped": _transform,
-    PATH: _path,
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_GEOMETRY = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+_POSES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/{name}" for name in _GEOMETRY))
+CLOUD_TYPES, POSE_TYPES = tuple(_CLOUDS), (*_POSES, PATH)
+_READERS: dict[str, Callable[[Any], Any]] = {
+    **_CLOUDS,
+    **dict.fromkeys(_POSES, lambda message: [_pose(message)]),
+    PATH: lambda message: [_pose(stamped) for stamped in message.poses],
+    **dict.fromkeys(TRANSFORM_TYPES, lambda message: [_pose(stamped) for stamped in message.transforms]),
+    IMU: _imu,
 }
-_TRANSFORMS = dict.fromkeys(("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), _transforms)
-_READERS: dict[str, Callable[[Any], Any]] = {**_CLOUDS, **_POSES, **_TRANSFORMS, IMU: _imu}
-CLOUD_TYPES, POSE_TYPES, TRANSFORM_TYPES = tuple(_CLOUDS), tuple(_POSES), tuple(_TRANSFORMS)
 
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a bag by its suffix, or a folder with the metadata of a ROS 2 bag whose files were not renamed."""
-    if path.suffix.lower() in BAG_SUFFIXES or not (path / _METADATA).is_file():
-        return path.suffix.lower() in BAG_SUFFIXES
+    named = path.suffix.lower() in BAG_SUFFIXES
+    if named or not (path / _METADATA).is_file():
+        return named
     listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
     files = [file.name for file in path.iterdir() if file.suffix.lower() in BAG_SUFFIXES]
     return not files or any(name in listed for name in files)
@@ -261,11 +247,11 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
     for path in paths:
         with _opened(path) as reader:
             for connection in reader.connections:
-                name = connection.topic
-                named = isinstance(name, str) and isinstance(connection.msgtype, str)
+                name, kind = connection.topic, connection.msgtype
+                named = isinstance(name, str) and isinstance(kind, str)
                 check(named, f"{path} is not a complete bag: a topic has no name or no type")
                 count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
-                topics[name] = Topic(name, connection.msgtype, count)
+                topics[name] = Topic(name, kind, count)
     return topics
 
 

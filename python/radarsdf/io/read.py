@@ -16,8 +16,8 @@ from radarsdf.imu import checked_rotation
 from radarsdf.io import datasets
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
-from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
-from radarsdf.io.fields import SIGMA
+from radarsdf.io.clouds import READERS, read_points
+from radarsdf.io.fields import columns_of
 from radarsdf.io.npz import read_scans
 from radarsdf.io.poses import (
     MAX_GAP_S,
@@ -29,8 +29,19 @@ from radarsdf.io.poses import (
     read_transform,
     rigid_or_nan,
 )
-from radarsdf.io.recordings import BASE_T_RADAR, RawScan, Request, posed, read_files, read_folder, scan_poses
-from radarsdf.scans import Columns, Notes, Scan, Scans
+from radarsdf.io.recordings import (
+    BASE_T_RADAR,
+    OF_BAGS,
+    OF_POSES,
+    RawScan,
+    Request,
+    cloud_files,
+    lidar_map,
+    posed,
+    read_files,
+    scan_poses,
+)
+from radarsdf.scans import Notes, Scans
 
 
 def read(
@@ -148,7 +159,7 @@ def read(
         notes=Notes(str(path) if single else "the bags"),
     )
     if poses is UNPOSED:
-        request.refuse("scans are read without poses", "extrinsic", "pose_topic", "world_frame")
+        request.refuse("scans are read without poses", *OF_POSES)
     scans = _read(paths[0], request) if single else read_bags(paths, request)
     if R_sensor_imu is not None and scans.imu is None:
         request.refuse(f"{request.notes.about} has no IMU, or several", "R_sensor_imu")
@@ -174,47 +185,35 @@ def _read(path: Path, request: Request) -> Scans:
             request.notes.add(f"poses: of {file.name}")
             request = dataclasses.replace(request, poses=file)
         return read_bags(bags, request)
-    request.refuse(f"{path} is not a bag", "topic", "pose_topic", "imu_topic", "world_frame", "stamps")
+    request.refuse(f"{path} is not a bag", *OF_BAGS)
     if dataset is not None:
         return dataset.read(path, request)
-    suffix = path.suffix.lower()
     if path.is_dir():
-        return read_folder(path, request)
-    if suffix == ".npz":
-        return _npz(path, request)
-    if suffix in CLOUD_SUFFIXES:
-        return read_files([path], path.parent, request)
-    kinds = ", ".join((".npz", *BAG_SUFFIXES, *CLOUD_SUFFIXES))
-    msg = f"{path} is of no kind that can be read: {kinds}, or a folder of them"
-    raise ValueError(msg)
+        return read_files(cloud_files(path, request.notes), path, request, partial(lidar_map, path))
+    suffix = path.suffix.lower()
+    kinds = ", ".join((".npz", *BAG_SUFFIXES, *READERS))
+    known = suffix == ".npz" or suffix in READERS
+    check(known, f"{path} is of no kind that can be read: {kinds}, or a folder of them")
+    return _npz(path, request) if suffix == ".npz" else read_files([path], path.parent, request)
 
 
 def _npz(path: Path, request: Request) -> Scans:
     """Read our own file, with its poses or those passed by the user."""
     notes = request.notes
-    others = None if request.poses is UNPOSED else request.poses
     request.refuse(f"{path} has names of columns", "columns")
-    if others is None:
-        request.refuse(f"{path} contains its own poses T_world_sensor", "extrinsic")
     scans = read_scans(path)
-    truth = scans.ground_truth
-    if others is None:
+    if own := request.poses is None or request.poses is UNPOSED:
+        request.refuse(f"{path} contains its own poses T_world_sensor", "extrinsic")
         poses: Poses = rigid_or_nan(scans.poses, str(path), notes)
     else:
-        poses = poses_of(others, notes)
+        poses = poses_of(request.poses, notes)
         notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
-        truth = None
     times_s = None if scans.times_s is None else scans.times_s.tolist()
     matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
-    raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
-    imu = scans.imu
+    raw = [
+        RawScan(partial(columns_of, s, s.points), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)
+    ]
+    truth, imu = scans.ground_truth if own else None, scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
     return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu)
-
-
-def _columns(scan: Scan) -> Columns:
-    columns: dict[str, Any] = dict(zip("xyz", scan.points.T, strict=True))
-    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
-    columns |= dict(zip(SIGMA, () if scan.sigma is None else scan.sigma.T, strict=False))
-    return {name: values for name, values in columns.items() if values is not None}
