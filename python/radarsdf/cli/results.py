@@ -36,13 +36,19 @@ class Results:
             cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             self.add("  ".join(cells).rstrip())
 
-    def add_threshold(self, threshold: Threshold) -> None:
-        """Add the confidence threshold of a mesh and its expected effect."""
+    def add_mesh(self, path: Path, vertices: int, triangles: int, threshold: Threshold) -> None:
+        """Add a written mesh, its confidence threshold and the expected effect of that."""
+        line = f"{vertices} vertices and {triangles} triangles"
+        self.add_file(line, path, vertices=vertices, triangles=triangles)
         self.add(str(threshold), **threshold.metadata)
 
     def add_file(self, what: str, path: Path, **values: Any) -> None:
         """Add a line on a written file."""
         self.add(f"{what} written to {path}", out=path, **values)
+
+    def add_picture(self, path: Path) -> None:
+        """Add a line on a written picture."""
+        self.add(f"picture written to {path}", picture=path)
 
     def end(self) -> None:
         """Print the JSON object, if there is one. Non-finite numbers become null."""

@@ -8,6 +8,7 @@ import multiprocessing
 from argparse import Namespace
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 
 from radarsdf.cli.app import refuse_if, warn
@@ -45,14 +46,10 @@ def plan(given: Namespace, results: Results) -> None:
         if len(first) > 1:
             some = scans_in_memory(first)
             warn_or_refuse(some, some.intensities)
-    used = scans
-    if given.geometry_only:
-        used = Scans.of_source(
-            lambda: (dataclasses.replace(scan, intensities=None) for scan in scans),
-            Notes(str(given.scans)),
-        )
+    without = partial(dataclasses.replace, intensities=None)
+    used = Scans.of_source(lambda: map(without, scans), Notes(str(given.scans)))
     planned = plan_tiles(
-        used,
+        used if given.geometry_only else scans,
         given.out,
         tile_size=given.tile_size,
         halo=given.halo,
@@ -113,10 +110,8 @@ def mesh(given: Namespace, results: Results) -> None:
     out, limits = given.out or given.folder / "mesh.ply", mesh_limits(given)
     check_outputs([out])
     city = TiledMap(given.folder)
-    vertices, triangles = city.export(out, given.voxel, **limits, progress=results.progress)
-    line = f"{vertices} vertices and {triangles} triangles"
-    results.add_file(line, out, vertices=vertices, triangles=triangles)
-    results.add_threshold(city.threshold(given.voxel, **limits))
+    counts = city.export(out, given.voxel, **limits, progress=results.progress)
+    results.add_mesh(out, *counts, city.threshold(given.voxel, **limits))
 
 
 def status(given: Namespace, results: Results) -> int:

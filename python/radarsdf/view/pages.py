@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
+from radarsdf.checks import check
 from radarsdf.view.framing import framing_pose
 from radarsdf.view.glb import glb, lightness_of, shaded
 from radarsdf.view.quantities import key, paragraph, table
@@ -74,9 +75,7 @@ class ChangesView(Page):
     ) -> None:
         super().__init__(host, port)
         mesh: Any = thinned(changes.mesh(), _MAX_VERTICES, edge_m)[0]
-        if len(mesh.faces) == 0:
-            msg = "the map has no surface here"
-            raise ValueError(msg)
+        check(len(mesh.faces), "the map has no surface here")
         vertices = np.asarray(mesh.vertices, np.float64)
         local = vertices - vertices.mean(axis=0)  # the page computes in float32
         colors = shaded(colors_of(mesh.vertex_attributes["kind"]), lightness_of(mesh.vertex_normals))

@@ -244,15 +244,6 @@ class Viewer(Page):
             rows["intensity"] = f"{self._map.intensity(x, sensor)[0]:.1f} from {range_m:.1f} m"
         self._answer.content = table(rows)
 
-    @property
-    def notes(self) -> list[str]:
-        """Sentences on reduced details of the page."""
-        shown, spacing_m = len(self.surface.vertices), self.surface.spacing_m
-        thinned = (
-            f"the mesh is thinned to {shown} vertices, {spacing_m:.2g} m apart: --max-vertices allows more"
-        )
-        return [thinned] if spacing_m > self._voxel_size else []
-
 
 def _aspect(camera: Any) -> float:
     """Aspect ratio of a page's frame, clipped to what a screen can have."""
