@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
-from radarsdf.scans import Scan, Scans
+from radarsdf.scans import Scans
 from radarsdf.view.glb import glb, shaded
 from radarsdf.view.quantities import Position, Quantity, Scale
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
@@ -230,8 +230,11 @@ class ScanClouds:
         self._shown = index
         scan = self._scans[index]
         world, view = scan.world_points, self._map.render(scan.T_world_sensor)
+        colors: Any = np.full((len(scan), 3), MEASURED_COLOR, np.uint8)
+        if scan.intensities is not None and self._scale is not None:
+            colors = self._scale(np.asarray(scan.intensities, np.float64))
         with self._server.atomic():
-            self._draw("measured", world, self._colors_of(scan))
+            self._draw("measured", world, colors)
             self._draw("predicted", view.world_points, np.full((len(view), 3), PREDICTED_COLOR, np.uint8))
         text = f"scan {index}: {len(scan)} returns measured, {len(view)} predicted"
         if scan.intensities is not None and self._map.has_intensity:
@@ -240,12 +243,6 @@ class ScanClouds:
             errors = errors[np.isfinite(errors)]
             text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
         self._text.content = text
-
-    def _colors_of(self, scan: Scan) -> NDArray[np.uint8]:
-        """(N, 3) sRGB of measured returns."""
-        if scan.intensities is None or self._scale is None:
-            return np.full((len(scan), 3), MEASURED_COLOR, np.uint8)
-        return self._scale(np.asarray(scan.intensities, np.float64))
 
     def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
         local = (world - self._map.origin).astype(np.float32)

@@ -50,8 +50,7 @@ def free_port(host: str, port: int | None) -> int:
         try:
             family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
             with socket.create_server((host, candidate), family=family) as listening:
-                found: int = listening.getsockname()[1]
-                return found
+                return int(listening.getsockname()[1])
         except OSError as error:  # raised also for an unknown host name
             reason = error.strerror or str(error)
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):

@@ -53,7 +53,7 @@ class Viewer(Page):
         **limits: Any,
     ) -> None:
         super().__init__(host, port)
-        self._map, self._voxel_size = radar_map, voxel_size
+        self._map = radar_map
         self.surface = ShownSurface.of(
             radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
