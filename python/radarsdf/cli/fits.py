@@ -84,16 +84,16 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
     """Add the numbers of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
     names = ("scans", "returns", "returns_used", "moving", "ghosts", "intensity_outliers", "leaf_cells")
-    used, moving, ghosts = report["returns_used"], report["moving"], report["ghosts"]
+    scans, returns, used, moving, ghosts, outliers, _ = (report[name] for name in names)
     left_out = {
         "move according to their Doppler": moving,
         "are ghosts": ghosts,
-        "are invalid or out of range": report["returns"] - used - moving - ghosts,
+        "are invalid or out of range": returns - used - moving - ghosts,
     }
-    line = f"{used} of {report['returns']} returns in {report['scans']} scans form the surface"
+    line = f"{used} of {returns} returns in {scans} scans form the surface"
     line += "".join(f", {count} {why}" for why, count in left_out.items() if count)
     results.add(line, **{name: report[name] for name in names})
-    if outliers := report["intensity_outliers"]:
+    if outliers:
         results.add(f"{outliers} intensities are outliers, left out of the reflectance")
     noise, losses = report["noise"], report["losses"]
     seconds = sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s")

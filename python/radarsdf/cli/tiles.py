@@ -9,7 +9,6 @@ from argparse import Namespace
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from pathlib import Path
 
 from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.inputs import mesh_limits, read_scans
@@ -56,26 +55,21 @@ def plan(given: Namespace, results: Results) -> None:
         config=config,
         threads=1 if given.processes or given.cluster else None,
     )
-    _add_plan(results, planned, given.out)
-
-
-def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
-    returns, rays, seconds = (
-        sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays", "seconds")
-    )
-    most = max(tile.memory_bytes for tile in plan.tiles)
+    totals = {
+        name: sum(getattr(tile, name) for tile in planned.tiles) for name in ("returns", "rays", "seconds")
+    }
+    most = max(tile.memory_bytes for tile in planned.tiles)
     results.add(
-        f"{len(plan.tiles)} tiles of {plan.tile_m:g} m with a halo of {plan.halo_m:g} m, {returns} returns in "
-        f"{plan.scans} scans; about {seconds:.0f} s in all, and {most / 1e9:.2f} GB for the largest",
-        tiles=len(plan.tiles),
-        tile_m=plan.tile_m,
-        halo_m=plan.halo_m,
-        returns=returns,
-        rays=rays,
-        scans=plan.scans,
-        seconds=seconds,
+        f"{len(planned.tiles)} tiles of {planned.tile_m:g} m with a halo of {planned.halo_m:g} m, "
+        f"{totals['returns']} returns in {planned.scans} scans; about {totals['seconds']:.0f} s in all, and "
+        f"{most / 1e9:.2f} GB for the largest",
+        tiles=len(planned.tiles),
+        tile_m=planned.tile_m,
+        halo_m=planned.halo_m,
+        scans=planned.scans,
         memory_bytes=most,
-        plan=folder / "plan.json",
+        plan=given.out / "plan.json",
+        **totals,
     )
 
 

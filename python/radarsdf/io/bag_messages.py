@@ -330,7 +330,6 @@ def _stream(path: Path, names: set[str]) -> Generator[tuple[float, Path, Any, An
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a bag with rosbags."""
     check_regular_file(path if path.is_file() or not (path / _METADATA).is_file() else path / _METADATA)
     require("rosbags", what=f"{path}: bags are read by")
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra

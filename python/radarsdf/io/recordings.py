@@ -199,7 +199,7 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
     if poses is None:
-        poses = _first_file((folder, *files[0].parents[:2]), POSE_FILES)
+        poses = first_file((folder, *files[0].parents[:2]), POSE_FILES)
         if poses is None:
             what = files[0] if len(files) == 1 else folder
             msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
@@ -251,7 +251,8 @@ def cloud_files(folder: Path, notes: Notes) -> list[Path]:
     return sorted(set(files) - set(odd), key=natural)
 
 
-def _first_file(folders: Iterable[Path], names: Sequence[str]) -> Path | None:
+def first_file(folders: Iterable[Path], names: Sequence[str]) -> Path | None:
+    """Return the first of these files that exists, folder by folder."""
     return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
 
 
@@ -268,7 +269,7 @@ def natural(path: Path) -> tuple[Any, ...]:
 
 def lidar_map(folder: Path) -> NDArray[np.float64] | None:
     """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``; None if there is neither."""
-    path = _first_file([folder], (f"{_TRUTH_STEM}.pcd", f"{_TRUTH_STEM}.ply"))
+    path = first_file([folder], (f"{_TRUTH_STEM}.pcd", f"{_TRUTH_STEM}.ply"))
     return None if path is None else read_points(path)
 
 
@@ -284,7 +285,7 @@ def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path],
             groups = zip(*(map(int, re.findall(r"\d+", path.stem)[::-1]) for path in files), strict=False)
             numbers = next((group for group in groups if len(set(group)) == len(files)), range(len(files)))
             poses = _by_number(poses, numbers, notes)
-        listed = _first_file(files[0].parents[:2], TIME_FILES)
+        listed = first_file(files[0].parents[:2], TIME_FILES)
         if listed is None:
             return files, None, poses
         times = _listed_times(listed, notes)

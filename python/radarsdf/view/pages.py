@@ -38,8 +38,8 @@ def centre_of(region: Region) -> str:
 class GrowingView(Page):
     """Serves the current surface and trajectory."""
 
-    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
-        super().__init__(host, port)
+    def __init__(self, **address: Any) -> None:
+        super().__init__(**address)
         self._start()
         self._origin: NDArray[np.float64] | None = None
 
@@ -64,16 +64,8 @@ class GrowingView(Page):
 class ChangesView(Page):
     """Serves the coloured surface of :meth:`Changes.mesh`, whose vertices are `edge_m` apart, and lists its regions."""
 
-    def __init__(
-        self,
-        changes: Changes,
-        regions: Sequence[Region],
-        edge_m: float,
-        *,
-        host: str = "127.0.0.1",
-        port: int | None = None,
-    ) -> None:
-        super().__init__(host, port)
+    def __init__(self, changes: Changes, regions: Sequence[Region], edge_m: float, **address: Any) -> None:
+        super().__init__(**address)
         mesh: Any = thinned(changes.mesh(), _MAX_VERTICES, edge_m)[0]
         check(len(mesh.faces), "the map has no surface here")
         vertices = np.asarray(mesh.vertices, np.float64)

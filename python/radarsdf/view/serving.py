@@ -119,7 +119,7 @@ def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: fl
 class Page:
     """A page served until it is stopped. Raises an OSError for a taken port before any work."""
 
-    def __init__(self, host: str, port: int | None) -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int | None = None) -> None:
         require_viser()
         self.host = host
         self.port = free_port(host, port)

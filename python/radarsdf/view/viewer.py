@@ -203,10 +203,8 @@ class Viewer(Page):
 
         async def on_update(event: Any) -> None:
             sensor = self._map.origin + np.asarray(event.target.position, np.float64)
-            ended = event.phase == "end"
-            self._painter.change(
-                sensor=tuple(sensor.tolist()), coarse=not ended, settle_s=0.0 if ended else HELD_S
-            )
+            moving = event.phase != "end"
+            self._painter.change(sensor=tuple(sensor.tolist()), coarse=moving, settle_s=HELD_S * moving)
 
         self._gizmo.on_update(on_update)
 
