@@ -113,7 +113,7 @@ def demo(given: Namespace, results: Results) -> None:
     refuse_if(frames is not None and frames < 2, f"--frames must be at least 2, not {frames}")
     if view is None:  # only if somebody can see it and stop it with Ctrl-C
         in_terminal = sys.stdout is not None and sys.stdout.isatty() and not results.json
-        view = in_terminal and serving.has_display() and serving.has_viser()
+        view = in_terminal and serving.has_display() and find_spec("viser") is not None
     elif view:
         serving.require_viser()
     drive = radarsdf.simulate.SCENES[given.scene](frames=frames)

@@ -19,22 +19,16 @@ class Parser(argparse.ArgumentParser):
         super().__init__(f"radarsdf {command}", usage or None, text, allow_abbrev=False)
         # Before Python 3.14, argparse takes -1e-5 for an option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
-        for name in OF_COMMANDS[command].split():
-            if name in GROUPS:
-                group = self.add_argument_group(name)
-                for member in GROUPS[name].split():
-                    _add(self if not member.startswith("-") else group, command, member)
-            else:
-                _add(self, command, name)
+        for group in OF_COMMANDS[command].split():
+            options = self.add_argument_group(group) if group in GROUPS else self
+            for name in GROUPS.get(group, group).split():
+                kind, text = OPTIONS.get(f"{command} {name}") or OPTIONS[name]
+                names = ("-o", "--out") if name == "-o" else (name,)
+                (options if name.startswith("-") else self).add_argument(*names, help=text, **kind)
 
     def error(self, message: str) -> NoReturn:
         msg = f"{message}; {self.prog} --help lists the options"
         raise UsageError(msg)
-
-
-def _add(group: Any, command: str, name: str) -> None:
-    kind, text = OPTIONS.get(f"{command} {name}") or OPTIONS[name]
-    group.add_argument(*(("-o", "--out") if name == "-o" else (name,)), help=text, **kind)
 
 
 class _Corners(argparse.Action):

@@ -27,6 +27,11 @@ FloatArray = NDArray[np.float64]
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
+_ARS548_DEFINITION = (
+    "float32 azimuth; float32 azimuth_std; {} invalid; float32 elevation; float32 elevation_std; float32 range; "
+    "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
+    "uint8 multi_target; uint16 object; uint8 ambiguity"
+)
 _DEFINITIONS = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
     "tf/msg/tfMessage": "geometry_msgs/TransformStamped[] transforms",
@@ -36,20 +41,12 @@ _DEFINITIONS = {
     "radar_msgs/msg/RadarScan": "std_msgs/Header header; radar_msgs/RadarReturn[] returns",
     "nebula_msgs/msg/NebulaPacket": "builtin_interfaces/Time stamp; uint8[] data",
     "nebula_msgs/msg/NebulaPackets": "std_msgs/Header header; nebula_msgs/NebulaPacket[] packets",
-    "continental_msgs/msg/ContinentalArs548Detection": (
-        "float32 azimuth; float32 azimuth_std; bool[8] invalid; float32 elevation; float32 elevation_std; float32 range; "
-        "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
-        "uint8 multi_target; uint16 object; uint8 ambiguity"
-    ),
+    "continental_msgs/msg/ContinentalArs548Detection": _ARS548_DEFINITION.format("bool[8]"),
     "continental_msgs/msg/ContinentalArs548DetectionList": (
         "std_msgs/Header header; uint8 sync_status; geometry_msgs/Point origin; float32[8] origin_and_alignment; "
         "uint8 alignment_status; continental_msgs/ContinentalArs548Detection[] detections"
     ),
-    "ars548_messages/msg/Detection": (
-        "float32 azimuth; float32 azimuth_std; uint8 invalid; float32 elevation; float32 elevation_std; float32 range; "
-        "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
-        "uint8 multi_target; uint16 object; uint8 ambiguity; uint16 sort_index"
-    ),
+    "ars548_messages/msg/Detection": _ARS548_DEFINITION.format("uint8") + "; uint16 sort_index",
     "ars548_messages/msg/DetectionList": (
         "std_msgs/Header header; uint64 crc; uint32[5] counters; uint8 sync_status; uint32 event; uint8 qualifier; "
         "uint16 origin_invalid; float32[12] origin; uint8 invalid; ars548_messages/Detection[800] detections; "

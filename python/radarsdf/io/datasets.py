@@ -95,7 +95,9 @@ def _delft_pose(
         T_map_camera = check_pose(np.array(T_map_camera, np.float64).reshape(4, 4), "mapToCamera")
     calibration = radar / "calib" / f"{frame}.txt"
     T_camera_radar = read_calibration(calibration) if extrinsic is None else extrinsic
-    check(T_camera_radar is not None, f"{calibration} lacks Tr_velo_to_cam")
+    if T_camera_radar is None:
+        msg = f"{calibration} lacks Tr_velo_to_cam"
+        raise ValueError(msg)
     return np.asarray(T_map_camera @ T_camera_radar)
 
 

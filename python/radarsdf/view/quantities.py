@@ -77,8 +77,12 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     }
     for name, (label, values) in of_vertices.items():
         scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
-        found[name] = Quantity(label, lambda rows, _, of=values: of[rows], scale)
+        found[name] = Quantity(label, _lookup(values), scale)
     return found
+
+
+def _lookup(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
+    return lambda rows, _: values[rows]
 
 
 def legend(quantity: Quantity) -> str:

@@ -26,9 +26,8 @@ from radarsdf.view.surface import ShownSurface, spread_evenly
 
 HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
 SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
-PATH_COLOR = (40, 44, 52)
-MEASURED_COLOR = (0, 72, 140)  # colour without intensities
-PREDICTED_COLOR = (0, 158, 115)  # not on the intensity scale, so that predictions stand out from the surface
+# Measured returns without intensities; predictions are not on the intensity scale, and stand out from the surface.
+SCAN_COLORS = {"measured": (0, 72, 140), "predicted": (0, 158, 115), "trajectory": (40, 44, 52)}
 
 # On two cores, intensities of 30,000 points take about 0.025 s, of 400,000 about 0.4 s.
 _DRAG_POINTS = 30_000
@@ -214,7 +213,9 @@ class ScanClouds:
         self._server, self._map, self._scans = server, radar_map, list(scans)
         self._scale, self._text = scale, text
         self._shown: int | None = None
-        path = add_path(server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, PATH_COLOR)
+        path = add_path(
+            server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, SCAN_COLORS["trajectory"]
+        )
         self.nodes: dict[str, Any] = {"trajectory": path}
         self.show(0)
 
@@ -230,12 +231,13 @@ class ScanClouds:
         self._shown = index
         scan = self._scans[index]
         world, view = scan.world_points, self._map.render(scan.T_world_sensor)
-        colors: Any = np.full((len(scan), 3), MEASURED_COLOR, np.uint8)
+        colors: Any = np.full((len(scan), 3), SCAN_COLORS["measured"], np.uint8)
         if scan.intensities is not None and self._scale is not None:
             colors = self._scale(np.asarray(scan.intensities, np.float64))
+        predicted = np.full((len(view), 3), SCAN_COLORS["predicted"], np.uint8)
         with self._server.atomic():
             self._draw("measured", world, colors)
-            self._draw("predicted", view.world_points, np.full((len(view), 3), PREDICTED_COLOR, np.uint8))
+            self._draw("predicted", view.world_points, predicted)
         text = f"scan {index}: {len(scan)} returns measured, {len(view)} predicted"
         if scan.intensities is not None and self._map.has_intensity:
             found = self._map.intensity(world, scan.T_world_sensor[:3, 3], extrapolate=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import gc
-import importlib.util
 import io
 import ipaddress
 import os
@@ -31,11 +30,6 @@ WAIT_STEP_S = 0.2  # step of waits in the main thread: on Windows, Ctrl-C does n
 def require_viser() -> None:
     """Raise an ImportError with the install command if viser is missing."""
     require("viser", what="the viewer needs")
-
-
-def has_viser() -> bool:
-    """Whether viser is installed."""
-    return importlib.util.find_spec("viser") is not None
 
 
 def free_port(host: str, port: int | None) -> int:

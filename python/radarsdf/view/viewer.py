@@ -12,17 +12,7 @@ from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.framing import FOV_RAD, CameraPose, framing_pose
 from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
-from radarsdf.view.scene import (
-    HELD_S,
-    MEASURED_COLOR,
-    PATH_COLOR,
-    PREDICTED_COLOR,
-    SLID_S,
-    Canvas,
-    Painter,
-    ScanClouds,
-    State,
-)
+from radarsdf.view.scene import HELD_S, SCAN_COLORS, SLID_S, Canvas, Painter, ScanClouds, State
 from radarsdf.view.serving import Page, set_initial_camera
 from radarsdf.view.surface import ShownSurface, first_hit
 
@@ -136,7 +126,7 @@ class Viewer(Page):
         """Add the returns of scans, and controls to choose a scan and its elements."""
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
-        colors = {"measured": scale or MEASURED_COLOR, "predicted": PREDICTED_COLOR, "trajectory": PATH_COLOR}
+        colors: dict[str, Any] = {**SCAN_COLORS, "measured": scale or SCAN_COLORS["measured"]}
         with tab, gui.add_folder("scans"):
             gui.add_html(key(colors))
             slider = gui.add_slider("scan", 0, max(len(scans) - 1, 1), 1, 0, disabled=len(scans) == 1)
