@@ -152,7 +152,7 @@ class Fields:
         time_s: float | None,
         notes: Notes,
     ) -> Scan:
-        """Build a scan of the finite returns in the columns, (N,) each; float64 positions if the file has x, y, z as such."""
+        """Build a scan of the finite returns in the columns, (N,) each. Positions are float64 if x, y or z need it, else float32."""
         values: dict[str, NDArray[Any]] = {}  # m, rad, m/s
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are dropped
             for role in self.used:

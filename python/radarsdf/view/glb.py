@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from radarsdf.io.glb import MATT, SRGB_TO_LINEAR, encode_glb
 
-_UNLIT = MATT | {
-    "extensions": {"KHR_materials_unlit": {}}
-}  # colours as they are, like those of point clouds and legends
+# Colours as they are, like those of point clouds and legends.
+_UNLIT = MATT | {"extensions": {"KHR_materials_unlit": {}}}
 _TO_LIGHT = np.array([-0.35, -0.5, 0.79])
 _SHADE = 0.87  # lightness of faces averted from the light; higher keeps colours close to those of the legend
 
