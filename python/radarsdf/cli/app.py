@@ -1,4 +1,4 @@
-"""Run one command and print its error: the only module that prints errors."""
+"""Run one command and print its error."""
 
 from __future__ import annotations
 
@@ -7,30 +7,16 @@ import os
 import sys
 from argparse import Namespace
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from radarsdf.cli.commands import COMMANDS, TILE_STEPS, steps
-from radarsdf.cli.options import Parser, UsageError
+from radarsdf.cli.options import Parser, UsageError, refuse_if
+from radarsdf.cli.results import Results, warn
 
-if TYPE_CHECKING:
-    from radarsdf.cli.results import Results
-
-_Function: TypeAlias = "Callable[[Namespace, Results], int | None]"
+_Function: TypeAlias = Callable[[Namespace, Results], int | None]
 
 # Errors with a message for the user. Every other error is a bug and keeps its traceback.
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
-
-
-def refuse_if(wrong: object, message: str) -> None:
-    """Raise a :class:`UsageError` with this message if `wrong`."""
-    if wrong:
-        raise UsageError(message)
-
-
-def warn(text: str) -> None:
-    """Print a line on standard error, if there is one."""
-    if sys.stderr is not None:
-        print(text, file=sys.stderr)
 
 
 def run(words: list[str]) -> int:
@@ -74,8 +60,6 @@ def _run(words: list[str]) -> int:
         command, (arguments, text) = f"tiles {step}", TILE_STEPS[step]
     usage = " ".join(filter(None, ("radarsdf", command, arguments, "[OPTIONS]...")))
     given = Parser(command, usage, text).parse_args(words)
-
-    from radarsdf.cli.results import Results
 
     results = Results(**{key: vars(given).get(key, False) for key in ("quiet", "json")})
     status = _function_of(command)(given, results)

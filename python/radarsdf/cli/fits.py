@@ -10,10 +10,9 @@ from importlib.util import find_spec
 
 import radarsdf
 from radarsdf import Interrupted, RadarMap
-from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split
 from radarsdf.cli.maps import evaluate, mesh
-from radarsdf.cli.options import LIMITS, Parser
+from radarsdf.cli.options import LIMITS, Parser, refuse_if
 from radarsdf.cli.pages import add_report
 from radarsdf.cli.pages import view as show_map
 from radarsdf.cli.results import Results

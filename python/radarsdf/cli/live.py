@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check
-from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import check_address, inputs_of, scans_or_unposed
+from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from radarsdf import evaluation
 from radarsdf.checks import check
-from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import is_map, load_map, mesh_limits, scans_if, split
+from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.io.bag_messages import is_bag

@@ -12,6 +12,12 @@ class UsageError(Exception):
     """The command line is wrong: exit status 2."""
 
 
+def refuse_if(wrong: object, message: str) -> None:
+    """Raise a :class:`UsageError` with this message if `wrong`."""
+    if wrong:
+        raise UsageError(message)
+
+
 class Parser(argparse.ArgumentParser):
     """Parser of the arguments of a command, or of a step such as ``tiles fit``."""
 

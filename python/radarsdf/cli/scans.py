@@ -13,9 +13,9 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.check import check_cheaply
 from radarsdf.checks import check as check_that
-from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.inputs import inputs_of, read_scans, scans_if, scans_or_unposed
-from radarsdf.cli.results import Results
+from radarsdf.cli.options import refuse_if
+from radarsdf.cli.results import Results, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
 from radarsdf.io.cloud_writing import check_cloud_path, write_cloud

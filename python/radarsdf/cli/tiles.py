@@ -10,9 +10,9 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
-from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.inputs import mesh_limits, read_scans
-from radarsdf.cli.results import Results
+from radarsdf.cli.options import refuse_if
+from radarsdf.cli.results import Results, warn
 from radarsdf.cli.scans import warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
