@@ -106,6 +106,13 @@ def test_glb_stands_upright_in_programs_that_read_gltf(tmp_path):
     np.testing.assert_allclose(read_mesh(tmp_path / "tower.glb").extents, [1, 2, 30])
 
 
+def test_a_mesh_without_triangles_is_refused_as_glb(tmp_path):
+    empty = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int), process=False)
+    with pytest.raises(ValueError, match="no triangle"):
+        write_mesh(tmp_path / "empty.glb", empty)
+    assert not list(tmp_path.iterdir())
+
+
 def test_ply_keeps_attributes_colours_and_faces(tmp_path):
     mesh = sphere()
     mesh.visual = trimesh.visual.ColorVisuals(

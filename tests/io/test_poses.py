@@ -126,6 +126,17 @@ def test_units_of_matrices(tmp_path):
     names = "r11 r12 r13 t1[mm] r21 r22 r23 t2[mm] r31 r32 r33 t3[mm]"
     (tmp_path / "a.txt").write_text(f"# {names}\n1 0 0 1000 0 1 0 2000 0 0 1 3000\n")
     assert_allclose(read_poses(tmp_path / "a.txt", Notes())[0, :3, 3], [1, 2, 3])
+    (tmp_path / "a.txt").write_text(
+        f"# t[min] {names}\n0.01 1 0 0 0 0 1 0 0 0 0 1 0\n0.02 1 0 0 0 0 1 0 0 0 0 1 0\n"
+    )
+    assert_allclose(read_poses(tmp_path / "a.txt", Notes()).times_s, [0.6, 1.2])
+    (tmp_path / "a.txt").write_text(
+        "# t[min] east[mm] north[mm] up[mm] a b c d\n1 2000 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n"
+    )
+    found = read_poses(
+        tmp_path / "a.txt", Notes()
+    )  # names without a role: the columns of TUM, in these units
+    assert (found.times_s.tolist(), found.positions[0].tolist()) == ([60, 120], [2, 0, 0])
 
 
 def test_one_bad_pose_is_left_out_and_named(tmp_path):

@@ -80,7 +80,7 @@ def test_changes_have_their_colours_and_a_legend(server, monkeypatch):
         shown, fixed = colors[rows].astype(float), np.array(COLORS[kind], float)
         assert np.abs(shown / shown.max(axis=1, keepdims=True) - fixed / fixed.max()).max() < 0.1
     legend, alignment, table = server.texts
-    assert all("rgb({},{},{})".format(*COLORS[kind]) in legend and NAMES[kind] in legend for kind in NAMES)
+    assert all("rgb({} {} {})".format(*COLORS[kind]) in legend and NAMES[kind] in legend for kind in NAMES)
     assert "As &lt;given&gt;." in alignment
     for region in changes.regions():
         x, y, z = region.box.mean(axis=0)

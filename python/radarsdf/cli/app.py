@@ -1,29 +1,22 @@
-"""Run one command and print its error: the only module that prints errors."""
+"""Run one command and print its error."""
 
 from __future__ import annotations
 
 import io
 import os
 import sys
-from importlib import import_module
+from argparse import Namespace
+from collections.abc import Callable
+from typing import TypeAlias
 
 from radarsdf.cli.commands import COMMANDS, TILE_STEPS, steps
-from radarsdf.cli.options import Parser, UsageError
+from radarsdf.cli.options import Parser, UsageError, refuse_if
+from radarsdf.cli.results import Results, warn
+
+_Function: TypeAlias = Callable[[Namespace, Results], int | None]
 
 # Errors with a message for the user. Every other error is a bug and keeps its traceback.
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
-
-
-def refuse_if(wrong: object, message: str) -> None:
-    """Raise a :class:`UsageError` with this message if `wrong`."""
-    if wrong:
-        raise UsageError(message)
-
-
-def warn(text: str) -> None:
-    """Print a line on standard error, if there is one."""
-    if sys.stderr is not None:
-        print(text, file=sys.stderr)
 
 
 def run(words: list[str]) -> int:
@@ -51,31 +44,59 @@ def run(words: list[str]) -> int:
 
 def _run(words: list[str]) -> int:
     commands = {name: found for of_heading in COMMANDS.values() for name, found in of_heading.items()}
-    name, *words = words
-    if name == "--version":
+    command, *words = words
+    if command == "--version":
         import radarsdf
 
         print("radarsdf", radarsdf.__version__)
         return 0
-    refuse_if(name not in commands, f"unknown command {name!r:.50}; radarsdf --help lists all")
-    command = name
-    if name == "tiles":
+    refuse_if(command not in commands, f"unknown command {command!r:.50}; radarsdf --help lists all")
+    arguments, text = commands[command]
+    if command == "tiles":
         if not words or words[0] in ("-h", "--help"):
             print(steps())
             return 0
-        name = words.pop(0) if words[0] in TILE_STEPS else "run"
-        command, commands = f"tiles {name}", TILE_STEPS
-    module, arguments, text = commands[name]
+        step = words.pop(0) if words[0] in TILE_STEPS else "run"
+        command, (arguments, text) = f"tiles {step}", TILE_STEPS[step]
     usage = " ".join(filter(None, ("radarsdf", command, arguments, "[OPTIONS]...")))
     given = Parser(command, usage, text).parse_args(words)
 
-    from radarsdf.cli.results import Results
-
     results = Results(**{key: vars(given).get(key, False) for key in ("quiet", "json")})
-    function = {"eval": "evaluate"}.get(name, name)
-    status = getattr(import_module(f"radarsdf.cli.{module}"), function)(given, results)
+    status = _function_of(command)(given, results)
     results.end()
     return int(status or 0)
+
+
+def _function_of(command: str) -> _Function:
+    """Import the function of a command, which takes long for all but one."""
+    if command == "config":
+        from radarsdf.cli.settings import config
+
+        return config
+    from radarsdf.cli import fits, info, live, maps, pages, scans, tiles, uses
+
+    functions: dict[str, _Function] = {
+        "demo": fits.demo,
+        "check": scans.check,
+        "fit": fits.fit,
+        "mesh": maps.mesh,
+        "poses": scans.poses,
+        "live": live.live,
+        "view": pages.view,
+        "report": pages.report,
+        "eval": maps.evaluate,
+        "render": maps.render,
+        "compare": uses.compare,
+        "grid": uses.grid,
+        "convert": scans.convert,
+        "info": info.info,
+        "tiles run": tiles.run,
+        "tiles plan": tiles.plan,
+        "tiles fit": tiles.fit,
+        "tiles mesh": tiles.mesh,
+        "tiles status": tiles.status,
+    }
+    return functions[command]
 
 
 def message_of(error: Exception) -> str:

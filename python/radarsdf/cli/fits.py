@@ -10,10 +10,9 @@ from importlib.util import find_spec
 
 import radarsdf
 from radarsdf import Interrupted, RadarMap
-from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import MAP_SUFFIX, inputs_of, split
 from radarsdf.cli.maps import evaluate, mesh
-from radarsdf.cli.options import LIMITS, Parser
+from radarsdf.cli.options import LIMITS, Parser, refuse_if
 from radarsdf.cli.pages import add_report
 from radarsdf.cli.pages import view as show_map
 from radarsdf.cli.results import Results
@@ -84,16 +83,16 @@ def _add_fit(results: Results, radar_map: RadarMap) -> None:
     """Add the numbers of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
     names = ("scans", "returns", "returns_used", "moving", "ghosts", "intensity_outliers", "leaf_cells")
-    used, moving, ghosts = report["returns_used"], report["moving"], report["ghosts"]
+    scans, returns, used, moving, ghosts, outliers, _ = (report[name] for name in names)
     left_out = {
         "move according to their Doppler": moving,
         "are ghosts": ghosts,
-        "are invalid or out of range": report["returns"] - used - moving - ghosts,
+        "are invalid or out of range": returns - used - moving - ghosts,
     }
-    line = f"{used} of {report['returns']} returns in {report['scans']} scans form the surface"
+    line = f"{used} of {returns} returns in {scans} scans form the surface"
     line += "".join(f", {count} {why}" for why, count in left_out.items() if count)
     results.add(line, **{name: report[name] for name in names})
-    if outliers := report["intensity_outliers"]:
+    if outliers:
         results.add(f"{outliers} intensities are outliers, left out of the reflectance")
     noise, losses = report["noise"], report["losses"]
     seconds = sum(value for name, value in report.items() if name.endswith("_s") and name != "skipped_s")
@@ -113,7 +112,7 @@ def demo(given: Namespace, results: Results) -> None:
     refuse_if(frames is not None and frames < 2, f"--frames must be at least 2, not {frames}")
     if view is None:  # only if somebody can see it and stop it with Ctrl-C
         in_terminal = sys.stdout is not None and sys.stdout.isatty() and not results.json
-        view = in_terminal and serving.has_display() and serving.has_viser()
+        view = in_terminal and serving.has_display() and find_spec("viser") is not None
     elif view:
         serving.require_viser()
     drive = radarsdf.simulate.SCENES[given.scene](frames=frames)

@@ -6,8 +6,8 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from radarsdf.cli.app import refuse_if, warn
-from radarsdf.cli.options import GROUPS, LIMITS
+from radarsdf.cli.options import GROUPS, LIMITS, refuse_if
+from radarsdf.cli.results import warn
 from radarsdf.evaluation import holdout
 from radarsdf.io.poses import MAX_GAP_S, UNPOSED, NoPoses, StampedPoses
 from radarsdf.io.read import read

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.cli.app import refuse_if
+from radarsdf.checks import check
 from radarsdf.cli.inputs import check_address, inputs_of, scans_or_unposed
+from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
@@ -94,9 +95,8 @@ def live(given: Namespace, results: Results) -> None:
     if given.view:
         check_address(given)
     scans, unposed = scans_or_unposed(given, find=given.find)
-    if unposed and scans.times_s is None:
-        msg = f"{given.scans}: scans without poses need times, one per scan"
-        raise ValueError(msg)
+    timed = scans.times_s is not None or not unposed
+    check(timed, f"{given.scans}: scans without poses need times, one per scan")
     if trajectory is not None:
         check_pose_times(trajectory, scans.times_s)
     growing = LiveMap(load_config(given))
@@ -143,9 +143,7 @@ class _PeriodicView:
 
 
 def _add_rates(results: Results, done: Replay, scans: int) -> None:
-    if not done.rows:
-        msg = "no scan was integrated into the map"
-        raise ValueError(msg)
+    check(done.rows, "no scan was integrated into the map")
     in_map, dropped, lost = len(done.rows), len(done.dropped), len(done.lost)
     line = f"{in_map} of {scans} scans in the map, {dropped} dropped, {lost} lost"
     results.add(line, scans=in_map, dropped=dropped, lost=lost)

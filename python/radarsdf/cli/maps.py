@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf import evaluation
-from radarsdf.cli.app import refuse_if
+from radarsdf.checks import check
 from radarsdf.cli.inputs import is_map, load_map, mesh_limits, scans_if, split
+from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.io.bag_messages import is_bag
@@ -46,38 +47,30 @@ def mesh(given: Namespace, results: Results) -> None:
         **mesh_limits(given),
         progress=results.progress,
     )
-    vertices, triangles = len(found.vertices), len(found.faces)
-    if triangles == 0:
-        msg = f"{given.map} has no surface here: nothing written"
-        raise ValueError(msg)
-    line = f"{vertices} vertices and {triangles} triangles"
+    check(len(found.faces), f"{given.map} has no surface here: nothing written")
     write_mesh(out, found)
-    results.add_file(line, out, vertices=vertices, triangles=triangles)
-    results.add_threshold(Threshold.of_mesh(found.metadata))
+    results.add_mesh(out, len(found.vertices), len(found.faces), Threshold.of_mesh(found.metadata))
     if drawing is not None:
         picture.save_picture(drawing, found, scalar=found.vertex_attributes.get("intensity"))
-        results.add(f"picture written to {drawing}", picture=drawing)
+        results.add_picture(drawing)
 
 
 def evaluate(given: Namespace, results: Results) -> None:
     """Print the errors of the surface, the intensities, or both."""
-    what, truth, holdout = given.what, given.scans, given.holdout
-    radar_map = load_map(what) if is_map(what) else None
+    mesh_file, truth, holdout = given.what, given.scans, given.holdout
+    radar_map = load_map(mesh_file) if is_map(mesh_file) else None
     if radar_map is None:
-        check_regular_file(what)
+        check_regular_file(mesh_file)
     scans = scans_if(given.poses is not None or _holds_scans(truth), given)
     lacking = holdout is not None and (radar_map is None or scans is None)
-    refuse_if(lacking, f"--holdout {holdout} needs a map and scans, not {what} and {truth}")
+    refuse_if(lacking, f"--holdout {holdout} needs a map and scans, not {mesh_file} and {truth}")
     ground_truth = scans.ground_truth if scans is not None else read_ground_truth(truth)
-    if ground_truth is None and holdout is None:
-        msg = (
-            f"{truth} has no lidar points: lidar_points or ground_truth in an .npz file, lidar.pcd or lidar.ply in a folder; "
-            "--holdout N evaluates intensities"
-        )
-        raise ValueError(msg)
+    places = "lidar_points or ground_truth in an .npz file, lidar.pcd or lidar.ply in a folder"
+    what = f"{truth} has no lidar points: {places}; --holdout N evaluates intensities"
+    check(ground_truth is not None or holdout is not None, what)
     if ground_truth is not None:
         if radar_map is None:
-            found = read_mesh(what)
+            found = read_mesh(mesh_file)
         else:
             found = radar_map.mesh(given.voxel, **mesh_limits(given), progress=results.progress)
         metrics = evaluation.surface_metrics(found, ground_truth, box=given.box, samples=given.samples)
@@ -135,9 +128,7 @@ def render(given: Namespace, results: Results) -> None:
     if suffix == ".png":
         views = list(views)  # a picture shows the whole view; other formats need only the returns
     scans = scans_of_views(view for view in views if len(view))
-    if not len(scans):
-        msg = f"{given.map} has no surface visible from there: nothing written"
-        raise ValueError(msg)
+    check(len(scans), f"{given.map} has no surface visible from there: nothing written")
     if suffix == ".npz":
         write_scans(out, scans)
     elif suffix == ".ply":

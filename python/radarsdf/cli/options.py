@@ -12,6 +12,12 @@ class UsageError(Exception):
     """The command line is wrong: exit status 2."""
 
 
+def refuse_if(wrong: object, message: str) -> None:
+    """Raise a :class:`UsageError` with this message if `wrong`."""
+    if wrong:
+        raise UsageError(message)
+
+
 class Parser(argparse.ArgumentParser):
     """Parser of the arguments of a command, or of a step such as ``tiles fit``."""
 
@@ -19,22 +25,16 @@ class Parser(argparse.ArgumentParser):
         super().__init__(f"radarsdf {command}", usage or None, text, allow_abbrev=False)
         # Before Python 3.14, argparse takes -1e-5 for an option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
-        for name in OF_COMMANDS[command].split():
-            if name in GROUPS:
-                group = self.add_argument_group(name)
-                for member in GROUPS[name].split():
-                    _add(self if not member.startswith("-") else group, command, member)
-            else:
-                _add(self, command, name)
+        for group in OF_COMMANDS[command].split():
+            options = self.add_argument_group(group) if group in GROUPS else self
+            for name in GROUPS.get(group, group).split():
+                kind, text = OPTIONS.get(f"{command} {name}") or OPTIONS[name]
+                names = ("-o", "--out") if name == "-o" else (name,)
+                (options if name.startswith("-") else self).add_argument(*names, help=text, **kind)
 
     def error(self, message: str) -> NoReturn:
         msg = f"{message}; {self.prog} --help lists the options"
         raise UsageError(msg)
-
-
-def _add(group: Any, command: str, name: str) -> None:
-    kind, text = OPTIONS.get(f"{command} {name}") or OPTIONS[name]
-    group.add_argument(*(("-o", "--out") if name == "-o" else (name,)), help=text, **kind)
 
 
 class _Corners(argparse.Action):

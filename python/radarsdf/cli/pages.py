@@ -7,8 +7,8 @@ from argparse import Namespace
 from pathlib import Path
 
 from radarsdf import check
-from radarsdf.cli.app import refuse_if
 from radarsdf.cli.inputs import check_address, inputs_of, load_map, mesh_limits, scans_if, split
+from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.io.files import check_outputs
 from radarsdf.report.page import require_extras

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,13 +37,19 @@ class Results:
             cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             self.add("  ".join(cells).rstrip())
 
-    def add_threshold(self, threshold: Threshold) -> None:
-        """Add the confidence threshold of a mesh and its expected effect."""
+    def add_mesh(self, path: Path, vertices: int, triangles: int, threshold: Threshold) -> None:
+        """Add a written mesh, its confidence threshold and the expected effect of that."""
+        line = f"{vertices} vertices and {triangles} triangles"
+        self.add_file(line, path, vertices=vertices, triangles=triangles)
         self.add(str(threshold), **threshold.metadata)
 
     def add_file(self, what: str, path: Path, **values: Any) -> None:
         """Add a line on a written file."""
         self.add(f"{what} written to {path}", out=path, **values)
+
+    def add_picture(self, path: Path) -> None:
+        """Add a line on a written picture."""
+        self.add(f"picture written to {path}", picture=path)
 
     def end(self) -> None:
         """Print the JSON object, if there is one. Non-finite numbers become null."""
@@ -62,6 +69,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error, if there is one."""
+    if sys.stderr is not None:
+        print(text, file=sys.stderr)
 
 
 def until_stopped(page: Page) -> None:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.checking.check import check_cheaply
-from radarsdf.cli.app import refuse_if, warn
+from radarsdf.checks import check as check_that
 from radarsdf.cli.inputs import inputs_of, read_scans, scans_if, scans_or_unposed
-from radarsdf.cli.results import Results
+from radarsdf.cli.options import refuse_if
+from radarsdf.cli.results import Results, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
 from radarsdf.io.cloud_writing import check_cloud_path, write_cloud
@@ -40,9 +41,8 @@ def check(given: Namespace, results: Results) -> int:
 def warn_or_refuse(scans: Scans, intensities: list[NDArray[Any]] | None) -> None:
     """Print warnings of the cheap checks before a fit. Raises a ValueError if a map of the scans would be nonsense."""
     for finding in check_cheaply(scans.points, scans.poses, intensities):
-        if finding.severity == "error":
-            msg = f"{finding.name}: {finding.evidence} {finding.fix} --no-check fits the scans as they are"
-            raise ValueError(msg)
+        what = f"{finding.name}: {finding.evidence} {finding.fix} --no-check fits the scans as they are"
+        check_that(finding.severity != "error", what)
         if finding.severity == "warning":
             warn(str(finding))
 
@@ -64,17 +64,16 @@ def poses(given: Namespace, results: Results) -> None:
     )
     if as_scans:
         write_scans(out, scans)
-    elif posed.segments > 1 and out.suffix.lower() != ".tum":
-        msg = f"there are {posed.segments} segments, but {out} cannot tell which scans have poses: write .tum or .npz"
-        raise ValueError(msg)
     else:
+        what = f"there are {posed.segments} segments, but {out} cannot tell which scans have poses: write .tum or .npz"
+        check_that(posed.segments <= 1 or out.suffix.lower() == ".tum", what)
         write_poses(out, scans.poses, scans.times_s)
     results.add_file(f"{len(scans.poses)} poses", out)
     if picture is not None:
         given_poses = {} if posed.given is None else {"given": posed.given}
         drawn = given_poses | {"refined" if given_poses else "found": scans.poses}
         save_trajectory_picture(picture, scans.points, drawn)
-        results.add(f"picture written to {picture}", picture=picture)
+        results.add_picture(picture)
 
 
 def posed_scans(
@@ -97,8 +96,13 @@ def posed_scans(
         found = radarsdf.odometry(scans, config=config)
         results.add(found.report["verdict"], poses=found.report)
         posed, scans = PosedScans.found(found), scans.with_poses(found.poses, other_world=True)
-        add_segments(results, posed)
-        return (scans.select(range(len(scans))[posed.rows]) if posed.segments > 1 else scans), posed
+        for note in posed.notes:
+            warn(f"note: {note}")
+        if posed.segments > 1:
+            rows = posed.rows
+            results.add(f"the scans {rows.start} to {rows.stop - 1} are used, the longest segment")
+            scans = scans.select(range(len(scans))[rows])
+        return scans, posed
     if not refine:
         return scans, PosedScans(scans.poses, slice(0, len(scans.poses)), scans.poses)
     refined = radarsdf.refine_poses(scans, config=config)
@@ -111,14 +115,6 @@ def posed_scans(
             f"{report['sigma_m']:.3f} m and {sigma_deg:.2f} degrees"
         )
     return scans.with_poses(refined.poses), PosedScans.refined(refined, scans.poses)
-
-
-def add_segments(results: Results, posed: PosedScans) -> None:
-    """Report which segment of a trajectory is used, and what its estimate ignored."""
-    for note in posed.notes:
-        warn(f"note: {note}")
-    if posed.segments > 1:
-        results.add(f"the scans {posed.rows.start} to {posed.rows.stop - 1} are used, the longest segment")
 
 
 def convert(given: Namespace, results: Results) -> None:
@@ -135,9 +131,9 @@ def convert(given: Namespace, results: Results) -> None:
     suffix = out.suffix.lower()
     if suffix != ".npz":
         check_cloud_path(out)
-    if suffix in CLOUD_SUFFIXES and folder.is_dir() and folder in out.resolve().parents:
-        msg = f"{out} lies in the folder of the scans, where it would be read as one of them: write it elsewhere"
-        raise ValueError(msg)
+    among = suffix in CLOUD_SUFFIXES and folder.is_dir() and folder in out.resolve().parents
+    what = "lies in the folder of the scans, where it would be read as one of them: write it elsewhere"
+    check_that(not among, f"{out} {what}")
     scans = read_scans(given)
     if suffix == ".npz":
         write_scans(out, scans)

@@ -6,7 +6,7 @@ import ast
 from argparse import Namespace
 from typing import Any
 
-from radarsdf.cli.app import refuse_if
+from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.toml import read_toml, to_toml

@@ -8,11 +8,11 @@ import multiprocessing
 from argparse import Namespace
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
+from functools import partial
 
-from radarsdf.cli.app import refuse_if, warn
 from radarsdf.cli.inputs import mesh_limits, read_scans
-from radarsdf.cli.results import Results
+from radarsdf.cli.options import refuse_if
+from radarsdf.cli.results import Results, warn
 from radarsdf.cli.scans import warn_or_refuse
 from radarsdf.cli.settings import load_config
 from radarsdf.io.files import check_outputs
@@ -45,40 +45,31 @@ def plan(given: Namespace, results: Results) -> None:
         if len(first) > 1:
             some = scans_in_memory(first)
             warn_or_refuse(some, some.intensities)
-    used = scans
-    if given.geometry_only:
-        used = Scans.of_source(
-            lambda: (dataclasses.replace(scan, intensities=None) for scan in scans),
-            Notes(str(given.scans)),
-        )
+    without = partial(dataclasses.replace, intensities=None)
+    used = Scans.of_source(lambda: map(without, scans), Notes(str(given.scans)))
     planned = plan_tiles(
-        used,
+        used if given.geometry_only else scans,
         given.out,
         tile_size=given.tile_size,
         halo=given.halo,
         config=config,
         threads=1 if given.processes or given.cluster else None,
     )
-    _add_plan(results, planned, given.out)
-
-
-def _add_plan(results: Results, plan: Plan, folder: Path) -> None:
-    returns, rays, seconds = (
-        sum(getattr(tile, name) for tile in plan.tiles) for name in ("returns", "rays", "seconds")
-    )
-    most = max(tile.memory_bytes for tile in plan.tiles)
+    totals = {
+        name: sum(getattr(tile, name) for tile in planned.tiles) for name in ("returns", "rays", "seconds")
+    }
+    most = max(tile.memory_bytes for tile in planned.tiles)
     results.add(
-        f"{len(plan.tiles)} tiles of {plan.tile_m:g} m with a halo of {plan.halo_m:g} m, {returns} returns in "
-        f"{plan.scans} scans; about {seconds:.0f} s in all, and {most / 1e9:.2f} GB for the largest",
-        tiles=len(plan.tiles),
-        tile_m=plan.tile_m,
-        halo_m=plan.halo_m,
-        returns=returns,
-        rays=rays,
-        scans=plan.scans,
-        seconds=seconds,
+        f"{len(planned.tiles)} tiles of {planned.tile_m:g} m with a halo of {planned.halo_m:g} m, "
+        f"{totals['returns']} returns in {planned.scans} scans; about {totals['seconds']:.0f} s in all, and "
+        f"{most / 1e9:.2f} GB for the largest",
+        tiles=len(planned.tiles),
+        tile_m=planned.tile_m,
+        halo_m=planned.halo_m,
+        scans=planned.scans,
         memory_bytes=most,
-        plan=folder / "plan.json",
+        plan=given.out / "plan.json",
+        **totals,
     )
 
 
@@ -113,10 +104,8 @@ def mesh(given: Namespace, results: Results) -> None:
     out, limits = given.out or given.folder / "mesh.ply", mesh_limits(given)
     check_outputs([out])
     city = TiledMap(given.folder)
-    vertices, triangles = city.export(out, given.voxel, **limits, progress=results.progress)
-    line = f"{vertices} vertices and {triangles} triangles"
-    results.add_file(line, out, vertices=vertices, triangles=triangles)
-    results.add_threshold(city.threshold(given.voxel, **limits))
+    counts = city.export(out, given.voxel, **limits, progress=results.progress)
+    results.add_mesh(out, *counts, city.threshold(given.voxel, **limits))
 
 
 def status(given: Namespace, results: Results) -> int:

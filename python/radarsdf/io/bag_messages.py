@@ -27,6 +27,11 @@ FloatArray = NDArray[np.float64]
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
+_ARS548_DEFINITION = (
+    "float32 azimuth; float32 azimuth_std; {} invalid; float32 elevation; float32 elevation_std; float32 range; "
+    "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
+    "uint8 multi_target; uint16 object; uint8 ambiguity"
+)
 _DEFINITIONS = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
     "tf/msg/tfMessage": "geometry_msgs/TransformStamped[] transforms",
@@ -36,20 +41,12 @@ _DEFINITIONS = {
     "radar_msgs/msg/RadarScan": "std_msgs/Header header; radar_msgs/RadarReturn[] returns",
     "nebula_msgs/msg/NebulaPacket": "builtin_interfaces/Time stamp; uint8[] data",
     "nebula_msgs/msg/NebulaPackets": "std_msgs/Header header; nebula_msgs/NebulaPacket[] packets",
-    "continental_msgs/msg/ContinentalArs548Detection": (
-        "float32 azimuth; float32 azimuth_std; bool[8] invalid; float32 elevation; float32 elevation_std; float32 range; "
-        "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
-        "uint8 multi_target; uint16 object; uint8 ambiguity"
-    ),
+    "continental_msgs/msg/ContinentalArs548Detection": _ARS548_DEFINITION.format("bool[8]"),
     "continental_msgs/msg/ContinentalArs548DetectionList": (
         "std_msgs/Header header; uint8 sync_status; geometry_msgs/Point origin; float32[8] origin_and_alignment; "
         "uint8 alignment_status; continental_msgs/ContinentalArs548Detection[] detections"
     ),
-    "ars548_messages/msg/Detection": (
-        "float32 azimuth; float32 azimuth_std; uint8 invalid; float32 elevation; float32 elevation_std; float32 range; "
-        "float32 range_std; float32 range_rate; float32 range_rate_std; int8 rcs; uint16 id; uint8 existence; uint8 class_; "
-        "uint8 multi_target; uint16 object; uint8 ambiguity; uint16 sort_index"
-    ),
+    "ars548_messages/msg/Detection": _ARS548_DEFINITION.format("uint8") + "; uint16 sort_index",
     "ars548_messages/msg/DetectionList": (
         "std_msgs/Header header; uint64 crc; uint32[5] counters; uint8 sync_status; uint32 event; uint8 qualifier; "
         "uint16 origin_invalid; float32[12] origin; uint8 invalid; ars548_messages/Detection[800] detections; "
@@ -70,7 +67,7 @@ _NOT_MEASURED = -1.0  # a variance of sensor_msgs/Imu that marks a missing measu
 
 
 class Topic(NamedTuple):
-    """A topic and its number of messages in all bags."""
+    """A topic, with its messages in all bags."""
 
     name: str
     message_type: str
@@ -138,17 +135,13 @@ def _point_cloud2(message: Any) -> Columns:
 
 
 def _point_cloud(message: Any) -> Columns:
-    columns = {axis: _column(message.points, axis) for axis in "xyz"}
-    for channel in message.channels:
-        if len(channel.values) == len(message.points):
-            columns.setdefault(channel.name, channel.values)
-    return columns
+    channels = {c.name: c.values for c in message.channels[::-1] if len(c.values) == len(message.points)}
+    return channels | {axis: _column(message.points, axis) for axis in "xyz"}
 
 
 def _radar_scan(message: Any) -> Columns:
-    names = {"range": "range", "azimuth": "azimuth_rad", "elevation": "elevation_rad",
-             "doppler_velocity": "doppler_velocity", "amplitude": "amplitude"}  # fmt: skip
-    return {name: _column(message.returns, attribute) for attribute, name in names.items()}
+    names = ("range", "azimuth_rad", "elevation_rad", "doppler_velocity", "amplitude")
+    return {name: _column(message.returns, name.removesuffix("_rad")) for name in names}
 
 
 def _column(rows: list[Any], attribute: str) -> NDArray[np.float32]:
@@ -186,27 +179,15 @@ def _ars548(returns: Columns, invalid: NDArray[np.bool_]) -> Columns:
     return columns
 
 
-def _pose(message: Any, position: Any, rotation: Any) -> Pose:
+def _pose(message: Any) -> Pose:
+    """Pose of a stamped message with a pose, with or without a covariance, or with a transform."""
+    if hasattr(message, "transform"):
+        position, rotation = message.transform.translation, message.transform.rotation
+    else:
+        pose = getattr(message.pose, "pose", message.pose)
+        position, rotation = pose.position, pose.orientation
     values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
     return Pose(*_stamp(message), getattr(message, "child_frame_id", "").lstrip("/"), values)
-
-
-def _pose_stamped(message: Any) -> list[Pose]:
-    """Pose of a stamped message, with or without a covariance."""
-    pose = getattr(message.pose, "pose", message.pose)
-    return [_pose(message, pose.position, pose.orientation)]
-
-
-def _transform(message: Any) -> list[Pose]:
-    return [_pose(message, message.transform.translation, message.transform.rotation)]
-
-
-def _path(message: Any) -> list[Pose]:
-    return [pose for stamped in message.poses for pose in _pose_stamped(stamped)]
-
-
-def _transforms(message: Any) -> list[Pose]:
-    return [pose for stamped in message.transforms for pose in _transform(stamped)]
 
 
 def _imu(message: Any) -> list[tuple[float, ...] | None]:
@@ -229,22 +210,24 @@ _CLOUDS: dict[str, Callable[[Any], Columns]] = {
     "ars548_messages/msg/DetectionList": _ars548_list,
     PACKETS: _ars548_packets,
 }
-_POSES: dict[str, Callable[[Any], list[Pose]]] = {
-    "nav_msgs/msg/Odometry": _pose_stamped,
-    "geometry_msgs/msg/PoseStamped": _pose_stamped,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
-    "geometry_msgs/msg/TransformStamped": _transform,
-    PATH: _path,
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_GEOMETRY = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+_POSES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/{name}" for name in _GEOMETRY))
+CLOUD_TYPES, POSE_TYPES = tuple(_CLOUDS), (*_POSES, PATH)
+_READERS: dict[str, Callable[[Any], Any]] = {
+    **_CLOUDS,
+    **dict.fromkeys(_POSES, lambda message: [_pose(message)]),
+    PATH: lambda message: [_pose(stamped) for stamped in message.poses],
+    **dict.fromkeys(TRANSFORM_TYPES, lambda message: [_pose(stamped) for stamped in message.transforms]),
+    IMU: _imu,
 }
-_TRANSFORMS = dict.fromkeys(("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"), _transforms)
-_READERS: dict[str, Callable[[Any], Any]] = {**_CLOUDS, **_POSES, **_TRANSFORMS, IMU: _imu}
-CLOUD_TYPES, POSE_TYPES, TRANSFORM_TYPES = tuple(_CLOUDS), tuple(_POSES), tuple(_TRANSFORMS)
 
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a bag by its suffix, or a folder with the metadata of a ROS 2 bag whose files were not renamed."""
-    if path.suffix.lower() in BAG_SUFFIXES or not (path / _METADATA).is_file():
-        return path.suffix.lower() in BAG_SUFFIXES
+    named = path.suffix.lower() in BAG_SUFFIXES
+    if named or not (path / _METADATA).is_file():
+        return named
     listed = (path / _METADATA).read_text(encoding="utf-8", errors="replace")
     files = [file.name for file in path.iterdir() if file.suffix.lower() in BAG_SUFFIXES]
     return not files or any(name in listed for name in files)
@@ -261,11 +244,11 @@ def topics_of(paths: list[Path]) -> dict[str, Topic]:
     for path in paths:
         with _opened(path) as reader:
             for connection in reader.connections:
-                name = connection.topic
-                named = isinstance(name, str) and isinstance(connection.msgtype, str)
+                name, kind = connection.topic, connection.msgtype
+                named = isinstance(name, str) and isinstance(kind, str)
                 check(named, f"{path} is not a complete bag: a topic has no name or no type")
                 count = connection.msgcount + (topics[name].num_messages if name in topics else 0)
-                topics[name] = Topic(name, connection.msgtype, count)
+                topics[name] = Topic(name, kind, count)
     return topics
 
 
@@ -344,7 +327,6 @@ def _stream(path: Path, names: set[str]) -> Generator[tuple[float, Path, Any, An
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a bag with rosbags."""
     check_regular_file(path if path.is_file() or not (path / _METADATA).is_file() else path / _METADATA)
     require("rosbags", what=f"{path}: bags are read by")
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - an extra

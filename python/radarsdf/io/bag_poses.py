@@ -36,7 +36,6 @@ from radarsdf.io.poses import (
     trajectory_of,
 )
 from radarsdf.io.recordings import FindPoses, Request
-from radarsdf.scans import Notes
 
 # Names of topics with desired or assumed poses, not measured ones.
 _DESIRED_POSE = re.compile(
@@ -75,9 +74,8 @@ class Track:
         """Trajectory of the poses. Damaged ones are left out and noted."""
         count = len(self.numbers) // 9
         if damaged := count - len(self.table):
-            request.notes.add(
-                f"poses of {name} left out: {damaged} of {count} are not finite, with a unit quaternion"
-            )
+            what = f"{damaged} of {count} are not finite, with a unit quaternion"
+            request.notes.add(f"poses of {name} left out: {what}")
         times_s = self.table[:, :2].T
         clock = Clock.of(times_s, name, request.stamps, request.notes)
         return trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)
@@ -184,8 +182,7 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
 
     Of several sources, the topic `preferred` is used, or else the one that :func:`_choose` returns.
     """
-    notes, wanted = request.notes, request.pose_topic
-    topics = topics_of(paths)
+    notes, wanted, topics = request.notes, request.pose_topic, topics_of(paths)
     transforms = set(topics_with(TRANSFORM_TYPES, topics))
     fitting = set(topics_with(POSE_TYPES, topics))
     wants_tf = wanted in transforms or (wanted is not None and wanted.strip("/") == "tf" and bool(transforms))
@@ -195,27 +192,20 @@ def poses_in_bags(paths: list[Path], request: Request, frames: list[str], prefer
     names = {n for n in fitting if not _DESIRED_POSE.search(n)} if wanted is None else fitting & {wanted}
     tracks, tree = _tracks_and_tree(paths, names, transforms, request)
     sensor = next((frame for frame in frames if frame in tree.tracks), frames[0])
-    name = "" if wants_tf else wanted or _choose(tracks, tree, sensor, preferred)
-    if not name:
-        try:
-            find = _tree_poses(tree, sensor, request)
-        except ValueError:
-            if wants_tf or not tracks:
-                raise
-            listed = ", ".join(sorted(tracks))
-            what = "has several topics with poses: choose one with pose_topic"
-            check(len(tracks) == 1, f"{notes.about} {what}, of {listed}")
-            (name,) = tracks
+    name, find = "" if wants_tf else wanted or _choose(tracks, tree, sensor, preferred), None
+    try:
+        find = None if name else _tree_poses(tree, sensor, request)
+    except ValueError:
+        if wants_tf or not tracks:
+            raise
+        listed = ", ".join(sorted(tracks))
+        what = "has several topics with poses: choose one with pose_topic"
+        check(len(tracks) == 1, f"{notes.about} {what}, of {listed}")
+        (name,) = tracks
     for other in sorted(fitting - {name}):
         notes.add(f"poses of {other} are ignored; pose_topic selects them")
-    if not name:
-        return find
-    request.refuse(f"the poses are those of {name}, and not of TF", "world_frame")
-    check(name in tracks, f"{paths[0]}: {name} holds no poses")
-    trajectory = tracks[name].trajectory(name, request)
-    notes.add(f"poses: {len(trajectory.times_s)} of {name}")
-    base = sensor if request.extrinsic is not None else _base(tracks[name].child, name, tree, sensor, notes)
-    return tree.attach(trajectory, base, request)
+    check(find or name in tracks, f"{paths[0]}: {name} holds no poses")
+    return find or _topic_poses(name, tracks, tree, sensor, request)
 
 
 def _tracks_and_tree(
@@ -258,24 +248,32 @@ def _choose(tracks: dict[str, Track], tree: TransformTree, sensor: str, preferre
     return leading[0] if len(leading) == 1 else ""
 
 
-def _base(child: str, name: str, tree: TransformTree, sensor: str, notes: Notes) -> str:
-    """Frame of the poses of a topic; if it names none, the one that moves with the sensor."""
+def _topic_poses(
+    name: str, tracks: Mapping[str, Track], tree: TransformTree, sensor: str, request: Request
+) -> FindPoses:
+    """Poses of a topic: of the frame that it names, or else of the one that moves with the sensor."""
+    notes = request.notes
+    request.refuse(f"the poses are those of {name}, and not of TF", "world_frame")
+    trajectory = tracks[name].trajectory(name, request)
+    notes.add(f"poses: {len(trajectory.times_s)} of {name}")
+    if request.extrinsic is not None:
+        return tree.attach(trajectory, sensor, request)
+    child = tracks[name].child
     base = child or tree.mounted_on(sensor)
     if tree.mounted_on(base) != tree.mounted_on(sensor) or (not child and base == sensor):
         notes.add(
             f"no extrinsic is known between the frame of {name}, {child or '(unnamed)'}, and that of the scans, "
             f"{sensor or '(unnamed)'}: the poses are taken as those of the radar; give extrinsic if they are not"
         )
-        return sensor
-    if base != sensor:
+        base = sensor
+    elif base != sensor:
         notes.add(f"extrinsic of the poses of {name}: of the static transforms, {base} -> {sensor}")
-    return base
+    return tree.attach(trajectory, base, request)
 
 
 def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses:
     """Poses of the frames below the world. Raises a ValueError if TF has none of the sensor."""
-    about = request.notes.about
-    moving = tree.moving
+    about, moving = request.notes.about, tree.moving
     if not moving:
         what = "TF that moves" if tree.tracks else "Odometry, PoseStamped, Path or TF"
         msg = f"{about} has no poses ({what}): give a file of poses, such as TUM; {FIND_POSES}"
@@ -296,8 +294,6 @@ def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses
         raise NoPoses(msg)
     find = tree.finder(world, request)
     poses = find(base)
-    if poses is None:
-        msg = f"{about}: a transform between {world} and {base} has a single pose"
-        raise ValueError(msg)
+    check(poses, f"{about}: a transform between {world} and {base} has a single pose")
     request.notes.add(f"poses: TF, {' -> '.join(reversed(chain[: chain.index(world) + 1]))}")
-    return find if request.extrinsic is None else tree.attach(poses, sensor, request)
+    return tree.attach(poses, sensor, request) if poses and request.extrinsic is not None else find

@@ -73,8 +73,8 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     else:
         request.refuse("poses are given", "pose_topic", "world_frame")
         find = _user_poses(poses_of(poses, request.notes), paths, scan_topics, frames, raw_scans, request)
-    recorded = clocks[scan_topics[0].name].recorded
-    imu = partial(_read_imu, paths, _imu_topic(topics, request), frames[0], recorded, request)
+    imu_topic, recorded = _imu_topic(topics, request), clocks[scan_topics[0].name].recorded
+    imu = partial(_read_imu, paths, imu_topic, frames[0], recorded, request) if imu_topic else lambda: None
     return Scans.of_source(posed(raw_scans, find, request), request.notes, imu=imu)
 
 
@@ -107,14 +107,11 @@ def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
     check(fitting, f"{about} has no topic with points: it has {_listed(topics.values()) or 'no topics'}")
     decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
-    for fits in (lambda _: True, lambda t: t.name in KNOWN_TOPICS, _is_radar):
-        chosen = [topic for topic in decoded if fits(topic)]
-        if len(chosen) == 1:
-            break
-    else:
-        listed = _listed(fitting.values())
-        msg = f"{about} has several topics with points: choose one or several with topic, of {listed}"
-        raise ValueError(msg)
+    known = [topic for topic in decoded if topic.name in KNOWN_TOPICS]
+    candidates = (decoded, known, [topic for topic in decoded if _is_radar(topic)])
+    chosen = next((topics for topics in candidates if len(topics) == 1), [])
+    listed = _listed(fitting.values())
+    check(chosen, f"{about} has several topics with points: choose one or several with topic, of {listed}")
     unread = [t for t in topics.values() if t.name not in fitting and _RADAR.search(t.message_type)]
     what = f"messages of the radar cannot be read, {_listed(unread)}: give topic {chosen[0].name} to map that one"
     check(not unread or _is_radar(chosen[0]), f"{about}: {what}")
@@ -159,13 +156,11 @@ def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
 
 
 def _read_imu(
-    paths: list[Path], topic: str | None, sensor_frame: str, recorded: bool, request: Request
+    paths: list[Path], topic: str, sensor_frame: str, recorded: bool, request: Request
 ) -> Imu | None:
     """Read the inertial measurements of a topic; None if it has no gyroscope."""
     # If scans are stamped with record times (`recorded`), each measurement is shifted by the median delay from stamp to
     # record, because IMU messages are recorded in batches.
-    if topic is None:
-        return None
     numbers, frame = array("d"), ""
     for message in read_messages(paths, {topic}, request.notes):
         rates, force = message.content

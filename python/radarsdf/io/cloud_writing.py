@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 from radarsdf.checks import check, path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
+from radarsdf.io.fields import SIGMA, columns_of
 from radarsdf.io.files import check_fits_float32, whole_file
-from radarsdf.scans import Columns, Scan, Scans
+from radarsdf.scans import Columns, Scans
 
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # enough digits for a round trip
 _LAS_SCALE_M = 1e-4
@@ -59,25 +61,21 @@ def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
     """
     check_cloud_path(path)
     suffix = Path(path).suffix.lower()
-    parts = [_columns(number, scan) for number, scan in enumerate(scans)]
-    names = [name for name in parts[0] if all(name in part for part in parts)]
+    parts = []
+    for number, scan in enumerate(scans):
+        columns = columns_of(scan, scan.world_points) | {"scan": np.full(len(scan), number, np.int32)}
+        parts.append(columns if scan.time_s is None else columns | {"time": np.full(len(scan), scan.time_s)})
+    names = [name for name in parts[0] if name not in SIGMA and all(name in part for part in parts)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
-    for name in {"intensity", "doppler"} & set(columns):
-        columns[name] = columns[name].astype(np.float32)
+    columns |= {
+        name: columns[name].astype(np.float32) for name in ("intensity", "doppler") if name in columns
+    }
     if suffix == ".pcd":
         check_fits_float32(path, np.stack([columns[axis] for axis in "xyz"], axis=1))
         columns |= {axis: columns[axis].astype(np.float32) for axis in "xyz"}
     with whole_file(path) as file:
         _WRITERS[suffix](file, records(columns))
     return len(columns["scan"])
-
-
-def _columns(number: int, scan: Scan) -> Columns:
-    columns: dict[str, Any] = dict(zip("xyz", scan.world_points.T, strict=True))
-    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
-    columns |= {"scan": np.full(len(scan), number, np.int32)}
-    columns |= {"time": None if scan.time_s is None else np.full(len(scan), scan.time_s)}
-    return {name: values for name, values in columns.items() if values is not None}
 
 
 def _ply(file: BinaryIO, rows: NDArray[Any]) -> None:
@@ -110,7 +108,7 @@ def _csv(file: BinaryIO, rows: NDArray[Any]) -> None:
     np.savetxt(file, rows, formats, header=",".join(names), comments="")
 
 
-def _las(file: BinaryIO, rows: NDArray[Any], *, compressed: bool) -> None:
+def _las(compressed: bool, file: BinaryIO, rows: NDArray[Any]) -> None:
     laspy = require("laspy", what="LAS and LAZ files are written by")
     as_names = {"intensity": LAS_INTENSITY, "time": "gps_time"}
     header = laspy.LasHeader(point_format=_LAS_FORMAT, version="1.4")
@@ -156,8 +154,8 @@ def ply_header(dtype: np.dtype[Any], count: int, num_faces: int | None = None) -
 _WRITERS: dict[str, Callable[[BinaryIO, NDArray[Any]], None]] = {
     ".ply": _ply,
     ".pcd": _pcd,
-    ".las": lambda file, rows: _las(file, rows, compressed=False),
-    ".laz": lambda file, rows: _las(file, rows, compressed=True),
+    ".las": partial(_las, False),
+    ".laz": partial(_las, True),
     ".npy": np.save,
     ".csv": _csv,
 }

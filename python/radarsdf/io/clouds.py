@@ -309,3 +309,4 @@ READERS: dict[str, Callable[[Path, GivenColumns], Columns]] = {
 }
 
 CLOUD_SUFFIXES = tuple(READERS)
+UNNAMED = (".bin", ".npy", *TEXT_SUFFIXES)  # formats whose columns may have no names

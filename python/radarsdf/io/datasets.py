@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from radarsdf.checks import check, check_pose
 from radarsdf.io.files import reading
 from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
-from radarsdf.io.recordings import Request, lidar_map, natural, read_files
+from radarsdf.io.recordings import Request, first_file, lidar_map, natural, read_files
 from radarsdf.io.text import read_numbers, read_text
 from radarsdf.scans import Scans
 
@@ -53,7 +53,7 @@ def _coloradar(folder: Path, request: Request) -> Scans:
         request = replace(request, poses=poses)
     if request.extrinsic is None:
         places = [place / "calib/transforms" for place in (folder, *folder.resolve().parents[:2])]
-        file = next((f for place in places if (f := place / "base_to_single_chip.txt").is_file()), None)
+        file = first_file(places, ["base_to_single_chip.txt"])
         if file is None:
             request.notes.add("no base_to_single_chip.txt: the poses are taken as those of the radar")
         else:
@@ -118,14 +118,9 @@ _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
                            [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
 
 
-def _snail_points(folder: Path) -> Path | None:
-    return next((folder / radar for radar in _SNAIL_RADARS if (folder / radar).is_dir()), None)
-
-
 def _snail_radar(folder: Path, request: Request) -> Scans:
     """Read a sequence, such as ``data3``."""
-    points = _snail_points(folder)
-    assert points is not None
+    points = next(folder / radar for radar in _SNAIL_RADARS if (folder / radar).is_dir())
     if request.poses is None:
         path = folder / "utm50r_T_xt32.txt"
         check(path.is_file(), f"{folder} lacks {path.name}: copy it from full_trajs/<date>/<sequence>")
@@ -137,7 +132,7 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
 
 # The first one that fits a folder is used.
 DATASETS = (
-    Dataset("SNAIL-Radar", lambda f: _snail_points(f) is not None, _snail_radar),
+    Dataset("SNAIL-Radar", lambda f: any((f / radar).is_dir() for radar in _SNAIL_RADARS), _snail_radar),
     Dataset(
         "View-of-Delft",
         lambda f: (_delft_radar(f).parents[1] / "lidar/training/pose").is_dir(),

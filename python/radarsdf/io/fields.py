@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from radarsdf.checks import check
 from radarsdf.io.text import are_degrees
 from radarsdf.io.units import factor_of, known_factor, without_unit
-from radarsdf.scans import Notes, Scan, finite_returns
+from radarsdf.scans import Columns, Notes, Scan, finite_returns
 
 _XYZ = ("x", "y", "z")
 _POLAR = ("range", "azimuth", "elevation")
@@ -41,6 +41,7 @@ _DIMENSIONS = {
     **dict.fromkeys(("azimuth", "elevation", "sigma_azimuth", "sigma_elevation"), "angle"),
     "doppler": "speed",
 }  # intensities may have any unit
+_IN_DEGREES = ("aziaccu", "eleaccu")  # of the Oculii Eagle
 # Names of unnamed columns, by the number of columns.
 _COLUMNS: dict[int, tuple[str, ...]] = {
     3: ("x", "y", "z"),
@@ -94,9 +95,10 @@ class Fields:
         missing = ", ".join(role for role in wanted if role not in found)
         known = not missing or set(_POLAR) <= set(found)
         check(known, f"the fields {missing} are missing: there are {', '.join(names) or 'none'}")
-        useless = [r for r in _POLAR if (overrides or {}).get(r) is not None and not cls(found).polar]
+        fields = cls(found)
+        useless = [role for role in _POLAR if (overrides or {}).get(role) is not None and not fields.polar]
         check(not useless, f"fields {useless} have no effect next to x, y and z: set one of these to None")
-        return cls(found)
+        return fields
 
     @property
     def polar(self) -> bool:
@@ -119,9 +121,8 @@ class Fields:
         named = name.endswith(("]", ")")) or _squeeze(bare) in _ALIASES[role]
         if not named and known_factor(unit, dimension) is None:  # v_rad is a radial speed
             unit = ""
-        if not unit and self.in_degrees and dimension == "angle":
-            unit = "deg"
-        return factor_of(unit, dimension, name)
+        degrees = (self.in_degrees and dimension == "angle") or _squeeze(bare) in _IN_DEGREES
+        return factor_of("deg" if degrees and not unit else unit, dimension, name)
 
     def with_unit(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
         """Return these fields with the unit of their angles, from their names or else from the values in a cloud."""
@@ -151,40 +152,36 @@ class Fields:
         time_s: float | None,
         notes: Notes,
     ) -> Scan:
-        """Build a scan of the finite returns in the columns, (N,) each."""
-        for name in (self.names[role] for role in self.used):
-            check(columns[name].dtype.kind in "biuf", f"the field {name} holds no numbers")
+        """Build a scan of the finite returns in the columns, (N,) each. Positions are float64 if x, y or z need it, else float32."""
+        values: dict[str, NDArray[Any]] = {}  # m, rad, m/s
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are dropped
+            for role in self.used:
+                column, factor = columns[self.names[role]], self.factor(role)
+                check(column.dtype.kind in "biuf", f"the field {self.names[role]} holds no numbers")
+                values[role] = column if factor == 1 else column * np.float64(factor)
+            if self.polar:
+                ranges, azimuth, elevation = (values[role].astype(np.float64) for role in _POLAR)
+                flat = ranges * np.cos(elevation)
+                xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
+            else:
+                xyz = [values[axis] for axis in _XYZ]
+            in_double = not self.polar and any(part.dtype.itemsize > 4 for part in xyz)
+            points = np.stack(xyz, axis=1).astype(np.float64 if in_double else np.float32)
             intensities, doppler_mps = (
-                np.ascontiguousarray(self._values(columns, role), np.float32) if role in self.names else None
+                np.ascontiguousarray(values[role], np.float32) if role in values else None
                 for role in ("intensity", "doppler")
             )
-            points, sigma = self.points(columns), self._sigma(columns)
-        return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigma), notes)
+            sigma = [values[role].astype(np.float32) for role in SIGMA if role in values]
+        sigmas = np.stack(sigma, axis=1) if sigma else None
+        return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigmas), notes)
 
-    def _values(self, columns: Mapping[str, NDArray[Any]], role: str) -> NDArray[Any]:
-        """A column converted to m, rad or m/s."""
-        values, factor = columns[self.names[role]], self.factor(role)
-        return values if factor == 1 else values * np.float64(factor)
 
-    def points(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """(N, 3) sensor frame, m: float64 if the file has it, else float32."""
-        if not self.polar:
-            parts = [self._values(columns, axis) for axis in _XYZ]
-            dtype = np.float64 if any(part.dtype.itemsize > 4 for part in parts) else np.float32
-            return np.stack(parts, axis=1).astype(dtype)
-        ranges, azimuth, elevation = (self._values(columns, role).astype(np.float64) for role in _POLAR)
-        flat = ranges * np.cos(elevation)
-        xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)]
-        return np.stack(xyz, axis=1).astype(np.float32)
-
-    def _sigma(self, columns: Mapping[str, NDArray[Any]]) -> NDArray[np.float32] | None:
-        if not set(SIGMA) <= set(self.names):
-            return None
-        sigma = np.stack([self._values(columns, role) for role in SIGMA], axis=1).astype(np.float32)
-        if _squeeze(self.names["sigma_azimuth"]) == "aziaccu":  # Oculii Eagle gives its angles in degrees
-            sigma[:, 1:] = np.deg2rad(sigma[:, 1:])
-        return sigma
+def columns_of(scan: Scan, points: NDArray[Any]) -> Columns:
+    """Columns of a scan with these points (N, 3), in any frame, by role."""
+    columns: dict[str, Any] = dict(zip("xyz", points.T, strict=True))
+    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
+    columns |= dict(zip(SIGMA, () if scan.sigma is None else scan.sigma.T, strict=False))
+    return {name: values for name, values in columns.items() if values is not None}
 
 
 def plain_name(name: str) -> tuple[str, str]:

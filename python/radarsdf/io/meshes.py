@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from radarsdf.checks import check, path_of, positions
 from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.clouds import has_faces, ply_bytes, read_points
 from radarsdf.io.files import check_fits_float32, check_regular_file, write_whole
+from radarsdf.io.glb import SRGB_TO_LINEAR, encode_glb
 from radarsdf.io.npz import TRUTH_ARRAYS, arrays_of
 from radarsdf.scans import Columns
 
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
 _T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
-_COLOR = "_COLOR"  # trimesh writes COLOR_0 with 8 bits, too few for linear colours
 _SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 
@@ -64,19 +65,10 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
     """
     check_mesh_path(path)
     suffix = Path(path).suffix.lower()
-    if suffix == ".ply":
-        write_whole(path, _ply(mesh))
-        return
     if suffix in _FLOAT32_SUFFIXES:
         check_fits_float32(path, np.asarray(mesh.vertices, np.float64))
-    if suffix == ".glb":
-        import trimesh  # noqa: PLC0415 - takes long
-
-        scene: Any = trimesh.Scene()
-        scene.add_geometry(_for_gltf(mesh), transform=_T_GLTF_WORLD)
-        exported: Any = scene.export(file_type="glb", tree_postprocessor=_name_colors)
-    else:
-        exported = mesh.export(file_type=suffix[1:])
+    own: dict[str, Callable[[trimesh.Trimesh], bytes]] = {".ply": _ply, ".glb": _glb}
+    exported: Any = own[suffix](mesh) if suffix in own else mesh.export(file_type=suffix[1:])
     write_whole(path, exported.encode() if isinstance(exported, str) else exported)
 
 
@@ -119,8 +111,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     check(whole, f"{path}: a triangle refers to a vertex that does not exist")
     if file.suffix.lower() == ".glb":
         mesh.apply_transform(_T_GLTF_WORLD.T)
-    read: trimesh.Trimesh = mesh
-    return read
+    return cast("trimesh.Trimesh", mesh)
 
 
 def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
@@ -145,44 +136,29 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
     return read_points(file)
 
 
-def _for_gltf(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Copy with linear colours and a matt material, without numbers that JSON cannot hold."""
-    import trimesh  # noqa: PLC0415 - takes long
-
-    of_trimesh: Any = trimesh.visual  # incompletely typed
-    material = of_trimesh.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
-    attributes = {n: v for n, v in mesh.vertex_attributes.items() if np.isfinite(v).all()}
-    visual: Any = mesh.visual
-    if visual.kind == "vertex":
-        srgb = np.asarray(visual.vertex_colors)[:, :3] / 255
-        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-        attributes[_COLOR] = linear.astype(np.float32)
-    return trimesh.Trimesh(
-        mesh.vertices,
-        mesh.faces,
-        process=False,
-        vertex_attributes=attributes,
-        metadata={n: v for n, v in mesh.metadata.items() if not isinstance(v, float) or np.isfinite(v)},
-        visual=of_trimesh.TextureVisuals(material=material),
-    )
+def _scalars_and_colors(mesh: trimesh.Trimesh) -> tuple[Columns, NDArray[np.uint8] | None]:
+    """Scalar attributes (V,) float32 by name, and sRGB colours (V, 4), if there are any, of the vertices."""
+    attributes, visual = mesh.vertex_attributes.items(), cast(Any, mesh.visual)
+    scalars = {n: np.asarray(v, np.float32) for n, v in attributes if np.shape(v) == (len(mesh.vertices),)}
+    return scalars, np.asarray(visual.vertex_colors, np.uint8) if visual.kind == "vertex" else None
 
 
-def _name_colors(tree: Any) -> None:
-    for mesh in tree["meshes"]:
-        attributes = mesh["primitives"][0]["attributes"]
-        if _COLOR in attributes:
-            attributes["COLOR_0"] = attributes.pop(_COLOR)
+def _glb(mesh: trimesh.Trimesh) -> bytes:
+    """Encode as GLB, without what its JSON cannot hold: attributes and metadata that are not finite."""
+    scalars, colors = _scalars_and_colors(mesh)
+    attributes = {f"_{name}": values for name, values in scalars.items() if np.isfinite(values).all()}
+    if colors is not None:
+        attributes["COLOR_0"] = SRGB_TO_LINEAR[colors[:, :3]]
+    numbers = {n: v for n, v in mesh.metadata.items() if isinstance(v, (int, float)) and np.isfinite(v)}
+    check(len(mesh.faces), "the mesh has no triangle: .glb cannot hold it")
+    return encode_glb(mesh.vertices, mesh.faces, attributes, matrix=_T_GLTF_WORLD, extras=numbers)
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:
     """Encode as binary little-endian PLY with vertices in double precision."""
-    columns: Columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True))
-    for name, values in mesh.vertex_attributes.items():
-        if np.shape(values) == (len(mesh.vertices),):
-            columns[name] = np.asarray(values, np.float32)
-    visual: Any = mesh.visual
-    if visual.kind == "vertex":
-        colors = np.asarray(visual.vertex_colors, np.uint8)
+    scalars, colors = _scalars_and_colors(mesh)
+    columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True)) | scalars
+    if colors is not None:
         columns |= dict(zip(("red", "green", "blue", "alpha"), colors.T, strict=True))
     vertices = records(columns)
     header = ply_header(vertices.dtype, len(vertices), len(mesh.faces))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from datetime import datetime, timezone
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +38,7 @@ def times_in(stems: list[str], notes: Notes) -> list[float] | None:
     if kinds == {"dates"} and not any(fractions) and (whole_s % _DAY_S < 60).all():
         return None  # 20240501_000007 is the seventh scan of a day, not one of its first minute
     decimal_point = all(part[2] in (".", ",") for part in parts if part[3])
-    possible: list[
-        tuple[float, NDArray[np.float64], str]
-    ] = []  # deviation of the steps from their median, times, text
+    possible: list[tuple[float, Any, str]] = []  # deviation of the steps from their median, times, text
     for how, fractions_s in _readings(fractions, decimal_point).items():
         times_s = whole_s + fractions_s
         steps_s = np.diff(np.sort(times_s))

@@ -124,21 +124,17 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
         If the file cannot be written.
     """
     instance(scans, Scans, "scans")
-    lists = {
-        "points": scans.points,
-        "intensity": scans.intensities,
-        "doppler": scans.doppler_mps,
-        "sigma": scans.sigmas,
-    }
-    arrays = {name: np.concatenate(parts) for name, parts in lists.items() if parts is not None}
+    lists = (scans.points, scans.intensities, scans.doppler_mps, scans.sigmas)
+    named = zip(("points", "intensity", "doppler", "sigma"), lists, strict=True)
+    arrays = {name: np.concatenate(parts) for name, parts in named if parts is not None}
     arrays["frame"] = np.repeat(np.arange(len(scans.points), dtype=np.int32), [len(p) for p in scans.points])
     single = {"poses": scans.poses, "times": scans.times_s, "lidar_points": scans.ground_truth}
     if scans.imu is not None:
         single |= dict(zip(_IMU, vars(scans.imu).values(), strict=True))
     arrays |= {name: array for name, array in single.items() if array is not None}
     target = path_of(path, "path")
-    named = target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz")
-    write_arrays(named, arrays, compressed=True)
+    target = target if target.suffix == ".npz" else target.with_name(f"{target.name}.npz")
+    write_arrays(target, arrays, compressed=True)
 
 
 def array_in(path: Path) -> NDArray[Any]:

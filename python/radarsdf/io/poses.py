@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, pose_matrices, real_array
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
-from radarsdf.io.text import in_seconds, read_numbers, read_table
+from radarsdf.io.text import Table, in_seconds, read_numbers, read_table, read_text
 from radarsdf.io.units import scaled, without_unit
 from radarsdf.scans import Columns, Notes
 
@@ -35,6 +35,10 @@ _MAX_NUMBER = 1e9  # limit of numbers of scans; larger integers are times since 
 _POSITION = "(?:t|p|pos|position|trans|translation|loc|location|pose)"
 _QUATERNION = "(?:q|quat|quaternion|orientation|rot|rotation)"
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+_MATRIX = [f"m{row}{column}" for row in range(4) for column in range(4)]
+# Roles of the columns of a table whose head does not name them, by their number.
+_LAYOUTS = {8: _TUM, 12: _MATRIX[:12], 13: ["t", *_MATRIX[:12]], 16: _MATRIX, 17: ["t", *_MATRIX]}
+_LENGTHS = ("x", "y", "z", "m03", "m13", "m23")
 _TIMES = ("header stamp", "stamp", "timestamp", "time", "t")
 # Patterns of whole column names, and the role of a match.
 _ROLES = (
@@ -165,9 +169,10 @@ def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = N
         f"of {len(table)} poses are left out: not finite, no unit quaternion, or a repeated time; the first"
     )
     left_out = "" if kept.all() else f"{(~kept).sum()} {what}: pose {np.argmin(kept)}"
-    if len(times_s) < 2 or 2 * (~good & ~missing).sum() >= (~missing).sum():
-        msg = f"{name} holds {len(times_s)} poses at different times; at least two are needed; {left_out}"
-        raise ValueError(msg)
+    enough = len(times_s) >= 2 and 2 * (~good & ~missing).sum() < (~missing).sum()
+    check(
+        enough, f"{name} holds {len(times_s)} poses at different times; at least two are needed; {left_out}"
+    )
     if notes is not None and left_out:
         notes.add(f"{name}: {left_out}")
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
@@ -195,83 +200,76 @@ def read_poses(path: Path, notes: Notes) -> Poses:
     - 4 x 4 matrices, as lines of sixteen numbers or blocks of four lines, or an array (F, 4, 4) in an ``.npy`` file.
     - Lines of a number of a scan, or a time, and one of these matrices.
 
-    Times may be in ms, µs or ns since 1970, or in the unit of their column's name.
+    Times may be in ms, µs or ns since 1970, times and positions in the units that their columns are named with.
     """
     check_regular_file(path)
     if path.suffix.lower() == ".npy":
         return rigid_or_nan(np.array(array_in(path)), str(path), notes)
     with reading(path, "a table of poses"):
-        table = read_table(path)
-        values, width = table.values, table.values.shape[1]
-        check(len(values), "it has no rows of numbers")
-    heads = [head for head in reversed(table.heads) if len(head) == width]
-    for names in [*heads, *([_TUM] if width == len(_TUM) else [])]:
-        with reading(path, "a table of poses"):
-            columns = _pose_columns(names, values)
-        if columns:
-            return _from_columns(columns, path, notes)
-    names = heads[0] if heads else [""] * width
-    numbers = {12: 12, 13: 12, 16: 16, 17: 16}.get(width, 0)  # without a number of the scan, or a time
-    with reading(path, "a table of poses"):
-        for at in (3, 7, 11) if numbers else ():
-            values[:, at - numbers] = scaled(values[:, at - numbers], names[at - numbers], "length")
-    if numbers or (width == 4 and len(values) % 4 == 0):
-        rows = values[:, -numbers:].reshape(-1, 3 if numbers == 12 else 4, 4)
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, : rows.shape[1]] = rows
-        P = rigid_or_nan(poses, str(path), notes)
-        if numbers == 12:
+        columns = _pose_columns(read_table(path))
+    times = columns.get("time")
+    if "qw" in columns:
+        rows = np.column_stack([columns[role] for role in _TUM[1:]])
+        if times is None:
+            return rigid_or_nan(pose_matrices_of(rows), str(path), notes)
+    else:
+        entries = np.column_stack([columns[role] for role in _MATRIX if role in columns])
+        P = np.tile(np.eye(4), (len(entries), 1, 1))
+        P.reshape(-1, 16)[:, : entries.shape[1]] = entries
+        P = rigid_or_nan(P, str(path), notes)
+        if entries.shape[1] == 12:
             calibration = path.with_name("calib.txt")
             Tr = read_calibration(calibration) if calibration.is_file() else None
             how = "are taken as T_world_sensor: no" if Tr is None else "are camera poses, by Tr of"
             notes.add(f"{path.name}: KITTI poses {how} calib.txt")
             P = P if Tr is None else np.linalg.inv(Tr) @ P @ Tr
-        return _led_by(values[:, 0], P, path, notes) if width in (13, 17) else P
-    msg = f"{path} has {width} columns: poses have 8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
-    raise ValueError(msg)
+        if times is None:
+            return P
+        known = np.isfinite(times) & np.isfinite(P).all(axis=(1, 2))
+        times, P = times[known], P[known]
+        if (times == times.round()).all() and (np.abs(times) < _MAX_NUMBER).all():
+            notes.add(f"the first column of {path.name} is taken as the number of the scan")
+            return NumberedPoses(times.astype(int).tolist(), P)
+        rows = np.column_stack([P[:, :3, 3], Rotation.from_matrix(P[:, :3, :3]).as_quat()])
+    finite = np.isfinite(times)
+    times[finite] = in_seconds(times[finite], path.name, notes)
+    return trajectory_of(np.column_stack([times, rows]), str(path), notes)
 
 
-def _led_by(lead: NDArray[np.float64], P: NDArray[np.float64], path: Path, notes: Notes) -> Poses:
-    """Poses by the first column of a table: numbers of scans if it holds small integers, else times."""
-    known = np.isfinite(lead) & np.isfinite(P).all(axis=(1, 2))
-    lead, P = lead[known], P[known]
-    if (lead == lead.round()).all() and (np.abs(lead) < _MAX_NUMBER).all():
-        notes.add(f"the first column of {path.name} is taken as the number of the scan")
-        return NumberedPoses(lead.astype(int).tolist(), P)
-    quaternions = Rotation.from_matrix(P[:, :3, :3]).as_quat()
-    times_s = in_seconds(lead, path.name, notes)
-    return trajectory_of(np.column_stack([times_s, P[:, :3, 3], quaternions]), str(path), notes)
-
-
-def _pose_columns(names: list[str], table: NDArray[np.float64]) -> Columns:
-    """Columns by role, in s and m; empty if the names are not those of a pose."""
+def _pose_columns(table: Table) -> Columns:
+    """Columns by role, in s and m: of a quaternion or of a matrix, and ``time`` or the number of the scan, if there is one."""
+    values = table.values
+    check(len(values), "it has no rows of numbers")
+    if values.shape[1] == 4 and len(values) % 4 == 0:  # blocks of four lines
+        values = values.reshape(-1, 16)
+    width = values.shape[1]
+    heads = [head for head in reversed(table.heads) if len(head) == width]
+    for names in heads:
+        roles = [_role_of(name) for name in names]
+        if set(_TUM[1:]) <= set(roles):
+            break
+    else:
+        roles = _LAYOUTS.get(width, [])
+        kinds = "8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
+        check(roles, f"it has {width} columns: poses have {kinds}")
+        names = heads[0] if heads else roles
     found: dict[str, tuple[NDArray[np.float64], str]] = {}
-    for name, column in zip(names, table.T, strict=True):
-        words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
-        for pattern, template in _ROLES:
-            if match := re.fullmatch(pattern, words):
-                found.setdefault(template.format(*match.groups()), (column, name))
-                break
-    if not set(_TUM[1:]) <= set(found):
-        return {}
-    columns = {role: scaled(*found[role], "length") for role in "xyz"}
-    columns |= {role: found[role][0] for role in _TUM[4:]}
+    for role, name, column in zip(roles, names, values.T, strict=True):
+        found.setdefault(role, (column, name))
+    columns = {role: column for role, (column, _) in found.items()}
+    columns |= {role: scaled(*found[role], "length") for role in _LENGTHS if role in found}
     if {"sec", "nsec"} <= set(found):
-        columns["time"] = found["sec"][0] + 1e-9 * found["nsec"][0]
+        columns["time"] = columns["sec"] + 1e-9 * columns["nsec"]
     elif times := [name for name in (*_TIMES, "sec") if name in found]:
         columns["time"] = scaled(*found[times[0]], "time")
     return columns
 
 
-def _from_columns(columns: Columns, path: Path, notes: Notes) -> Poses:
-    """Build poses from named columns: by time if there is one, else in their order."""
-    poses = np.column_stack([columns[role] for role in _TUM[1:]])
-    if "time" not in columns:
-        return rigid_or_nan(pose_matrices_of(poses), str(path), notes)
-    times = columns["time"].copy()
-    finite = np.isfinite(times)
-    times[finite] = in_seconds(times[finite], path.name, notes)
-    return trajectory_of(np.column_stack([times, poses]), str(path), notes)
+def _role_of(name: str) -> str:
+    """Role of a named column in a pose; empty if it has none."""
+    words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
+    matches = ((re.fullmatch(pattern, words), role) for pattern, role in _ROLES)
+    return next((role.format(*match.groups()) for match, role in matches if match), "")
 
 
 def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.float64]:
@@ -300,16 +298,13 @@ def read_transform(path: Path) -> NDArray[np.float64] | None:
 def read_calibration(path: Path) -> NDArray[np.float64] | None:
     """Read ``Tr`` or ``Tr_velo_to_cam`` of a KITTI calibration as T_camera_sensor (4, 4); None if it has neither."""
     check_regular_file(path)
+    lines = [line.partition(":") for line in read_text(path).splitlines()]
+    found = {key.strip(): values.split() for key, _, values in lines}
+    numbers = found.get("Tr", found.get("Tr_velo_to_cam"))
+    if numbers is None:
+        return None
     with reading(path, "a KITTI calibration"):
-        text = path.read_text(encoding="utf-8", errors="replace")
-        lines = [line.partition(":") for line in text.splitlines()]
-        found = {key.strip(): values.split() for key, _, values in lines}
-        numbers = found.get("Tr", found.get("Tr_velo_to_cam"))
-        if numbers is None:
-            return None
-        T_camera_sensor = np.eye(4)
-        T_camera_sensor[:3] = np.array(numbers, np.float64).reshape(3, 4)
-        return check_pose(T_camera_sensor, "Tr")
+        return check_pose(np.array([*numbers, 0, 0, 0, 1], np.float64).reshape(4, 4), "Tr")
 
 
 def check_pose_suffix(path: str | PathLike[str]) -> None:
@@ -320,9 +315,8 @@ def check_pose_suffix(path: str | PathLike[str]) -> None:
 
 def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
     """Raise a ValueError if the format of the file needs times and there are none."""
-    if times_s is None and path_of(path, "path").suffix.lower() == ".tum":
-        msg = f"{path} needs times, s, and there are none: .kitti and .npy do without"
-        raise ValueError(msg)
+    possible = times_s is not None or path_of(path, "path").suffix.lower() != ".tum"
+    check(possible, f"{path} needs times, s, and there are none: .kitti and .npy do without")
 
 
 def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike | None = None) -> None:

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 
 from radarsdf.checks import check, check_pose, path_of, positions, positive
 from radarsdf.imu import checked_rotation
-from radarsdf.io import datasets
+from radarsdf.io import datasets, recordings
 from radarsdf.io.bag_messages import BAG_SUFFIXES, bags_in, is_bag
 from radarsdf.io.bags import read_bags
-from radarsdf.io.clouds import CLOUD_SUFFIXES, read_points
-from radarsdf.io.fields import SIGMA
+from radarsdf.io.clouds import READERS, read_points
+from radarsdf.io.fields import columns_of
 from radarsdf.io.npz import read_scans
 from radarsdf.io.poses import (
     MAX_GAP_S,
@@ -29,8 +29,7 @@ from radarsdf.io.poses import (
     read_transform,
     rigid_or_nan,
 )
-from radarsdf.io.recordings import BASE_T_RADAR, RawScan, Request, posed, read_files, read_folder, scan_poses
-from radarsdf.scans import Columns, Notes, Scan, Scans
+from radarsdf.scans import Notes, Scans
 
 
 def read(
@@ -133,7 +132,7 @@ def read(
         if not file.exists():  # many readers would not name it
             msg = f"{file} does not exist"
             raise FileNotFoundError(msg)
-    request = Request(
+    request = recordings.Request(
         poses=poses,
         extrinsic=None if extrinsic is None else check_pose(extrinsic, "extrinsic T_base_sensor"),
         topic=(topic,) if isinstance(topic, str) else tuple(topic or ()),
@@ -148,7 +147,7 @@ def read(
         notes=Notes(str(path) if single else "the bags"),
     )
     if poses is UNPOSED:
-        request.refuse("scans are read without poses", "extrinsic", "pose_topic", "world_frame")
+        request.refuse("scans are read without poses", *recordings.OF_POSES)
     scans = _read(paths[0], request) if single else read_bags(paths, request)
     if R_sensor_imu is not None and scans.imu is None:
         request.refuse(f"{request.notes.about} has no IMU, or several", "R_sensor_imu")
@@ -160,7 +159,7 @@ def read(
     return scans.with_ground_truth(lambda: points)
 
 
-def _read(path: Path, request: Request) -> Scans:
+def _read(path: Path, request: recordings.Request) -> Scans:
     """Dispatch on the kind of path: a bag, a data set, a folder of bags or of clouds, our own file, or a cloud."""
     if is_bag(path):
         return read_bags([path], request)
@@ -168,53 +167,46 @@ def _read(path: Path, request: Request) -> Scans:
     bags = bags_in(path) if path.is_dir() and dataset is None else []
     if bags:  # NTU4DRadLM and Viking Hill have files next to them
         if request.extrinsic is None:
-            request = dataclasses.replace(request, extrinsic=read_transform(path / BASE_T_RADAR))
-        file = next((path / name for name in POSE_FILES if (path / name).is_file()), None)
+            request = dataclasses.replace(request, extrinsic=read_transform(path / recordings.BASE_T_RADAR))
+        file = recordings.first_file([path], POSE_FILES)
         if file is not None and request.poses is None and request.pose_topic is None:
             request.notes.add(f"poses: of {file.name}")
             request = dataclasses.replace(request, poses=file)
         return read_bags(bags, request)
-    request.refuse(f"{path} is not a bag", "topic", "pose_topic", "imu_topic", "world_frame", "stamps")
+    request.refuse(f"{path} is not a bag", *recordings.OF_BAGS)
     if dataset is not None:
         return dataset.read(path, request)
-    suffix = path.suffix.lower()
     if path.is_dir():
-        return read_folder(path, request)
-    if suffix == ".npz":
-        return _npz(path, request)
-    if suffix in CLOUD_SUFFIXES:
-        return read_files([path], path.parent, request)
-    kinds = ", ".join((".npz", *BAG_SUFFIXES, *CLOUD_SUFFIXES))
-    msg = f"{path} is of no kind that can be read: {kinds}, or a folder of them"
-    raise ValueError(msg)
+        return recordings.read_files(
+            recordings.cloud_files(path, request.notes), path, request, partial(recordings.lidar_map, path)
+        )
+    suffix = path.suffix.lower()
+    kinds = ", ".join((".npz", *BAG_SUFFIXES, *READERS))
+    known = suffix == ".npz" or suffix in READERS
+    check(known, f"{path} is of no kind that can be read: {kinds}, or a folder of them")
+    return _npz(path, request) if suffix == ".npz" else recordings.read_files([path], path.parent, request)
 
 
-def _npz(path: Path, request: Request) -> Scans:
+def _npz(path: Path, request: recordings.Request) -> Scans:
     """Read our own file, with its poses or those passed by the user."""
     notes = request.notes
-    others = None if request.poses is UNPOSED else request.poses
     request.refuse(f"{path} has names of columns", "columns")
-    if others is None:
-        request.refuse(f"{path} contains its own poses T_world_sensor", "extrinsic")
     scans = read_scans(path)
-    truth = scans.ground_truth
-    if others is None:
+    if own := request.poses is None or request.poses is UNPOSED:
+        request.refuse(f"{path} contains its own poses T_world_sensor", "extrinsic")
         poses: Poses = rigid_or_nan(scans.poses, str(path), notes)
     else:
-        poses = poses_of(others, notes)
+        poses = poses_of(request.poses, notes)
         notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
-        truth = None
     times_s = None if scans.times_s is None else scans.times_s.tolist()
-    matched, _ = scan_poses(poses, len(scans), times_s, request.extrinsic, request)
-    raw = [RawScan(partial(_columns, s), s.time_s, f"{path}: scan {i}") for i, s in enumerate(scans)]
-    imu = scans.imu
+    matched, _ = recordings.scan_poses(poses, len(scans), times_s, request.extrinsic, request)
+    raw = [
+        recordings.RawScan(partial(columns_of, s, s.points), s.time_s, f"{path}: scan {i}")
+        for i, s in enumerate(scans)
+    ]
+    truth, imu = scans.ground_truth if own else None, scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    return Scans.of_source(posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu)
-
-
-def _columns(scan: Scan) -> Columns:
-    columns: dict[str, Any] = dict(zip("xyz", scan.points.T, strict=True))
-    columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}
-    columns |= dict(zip(SIGMA, () if scan.sigma is None else scan.sigma.T, strict=False))
-    return {name: values for name, values in columns.items() if values is not None}
+    return Scans.of_source(
+        recordings.posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu
+    )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import check
-from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, check_kitti, read_columns, read_points
+from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, UNNAMED, check_kitti, read_columns, read_points
 from radarsdf.io.fields import Fields
 from radarsdf.io.files import reading
 from radarsdf.io.name_times import times_in
@@ -53,6 +53,11 @@ Truth = Callable[[], NDArray[np.float64] | None]
 """Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
 
 FindPoses = Callable[[str], StampedPoses | NDArray[np.float64] | None]
+
+
+# Arguments of :func:`radarsdf.io.read` that only bags, and only scans with poses, can use.
+OF_BAGS = ("topic", "pose_topic", "imu_topic", "world_frame", "stamps")
+OF_POSES = ("extrinsic", "pose_topic", "world_frame")
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,13 +137,21 @@ def _scan(
     layouts: dict[tuple[str, ...], Fields],
     request: Request,
 ) -> Scan | None:
-    """Read a scan and attach its pose; None, and counted, if it is damaged or empty. Extends `layouts`."""
-    notes = request.notes
+    """Read a scan and attach its pose; None, and counted, if it is damaged or empty.
+
+    `layouts`: roles of the columns by topic and names, which are added when they first come.
+    """
+    notes, scan = request.notes, None
     try:
         columns = raw.read()
-        empty = not columns or not len(next(iter(columns.values())))
-        fields = None if empty else _fields(raw.topic, columns, layouts, request)
-        scan = fields.scan(columns, T_world_sensor, raw.time_s, notes) if fields else None
+        layout = (raw.topic, *columns)
+        if any(map(len, columns.values())):
+            if layout not in layouts:
+                fields = Fields.of(list(columns), request.fields).with_unit(columns, notes)
+                if not request.fields and raw.topic not in {topic for topic, *_ in layouts}:
+                    fields.note_use(columns, notes)
+                layouts[layout] = fields
+            scan = layouts[layout].scan(columns, T_world_sensor, raw.time_s, notes)
     except ValueError as error:
         known = "" if raw.name in str(error) else f"{raw.name}: "
         notes.count("scans left out: they cannot be read", example=f"{known}{error}")
@@ -146,17 +159,6 @@ def _scan(
     if not scan:
         notes.count("scans left out: they hold no returns")
     return scan or None
-
-
-def _fields(topic: str, columns: Columns, layouts: dict[tuple[str, ...], Fields], request: Request) -> Fields:
-    """Roles of the columns: those of an earlier scan of the topic with the same columns, or by name."""
-    layout, notes = (topic, *columns), request.notes
-    if layout not in layouts:
-        fields = Fields.of(list(columns), request.fields).with_unit(columns, notes)
-        if not request.fields and topic not in {known for known, *_ in layouts}:
-            fields.note_use(columns, notes)
-        layouts[layout] = fields
-    return layouts[layout]
 
 
 def scan_poses(
@@ -189,11 +191,6 @@ def scan_poses(
     return TransformChain((poses, T_base_sensor)), times_s
 
 
-def read_folder(folder: Path, request: Request) -> Scans:
-    """Read the scans of a folder; see :func:`radarsdf.io.read`."""
-    return read_files(cloud_files(folder, request.notes), folder, request, partial(lidar_map, folder))
-
-
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
     """Read scans from files, with the poses of the request or those found in or near the folder.
 
@@ -201,21 +198,20 @@ def read_files(files: list[Path], folder: Path, request: Request, truth: Truth =
     """
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
-    places = list(dict.fromkeys((folder, files[0].parent, files[0].parent.parent)))
     if poses is None:
-        poses = next((place / n for place in places for n in POSE_FILES if (place / n).is_file()), None)
-        if poses is not None and poses.parent != folder:
+        poses = first_file((folder, *files[0].parents[:2]), POSE_FILES)
+        if poses is None:
+            what = files[0] if len(files) == 1 else folder
+            msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
+            raise NoPoses(msg)
+        if poses.parent != folder:
             notes.add(f"poses: of {poses}")
-    if poses is None:
-        what = files[0] if len(files) == 1 else folder
-        msg = f"{what} has no poses: give a file of poses (TUM, KITTI, 4 x 4), or an array (F, 4, 4); {FIND_POSES}"
-        raise NoPoses(msg)
     known = poses_of(poses, notes)
     files, times_s, known = _by_time(files, known, notes)
     if T_base_sensor is None:
         T_base_sensor = read_transform(folder / BASE_T_RADAR)
     columns = request.columns
-    if files[0].suffix.lower() not in (".bin", ".npy", *TEXT_SUFFIXES):
+    if files[0].suffix.lower() not in UNNAMED:
         request.refuse(f"{files[0]} has names of columns", "columns")
     if columns is None and (raw := [path for path in files if path.suffix.lower() == ".bin"]):
         with reading(notes.about, "points of KITTI"):
@@ -255,6 +251,11 @@ def cloud_files(folder: Path, notes: Notes) -> list[Path]:
     return sorted(set(files) - set(odd), key=natural)
 
 
+def first_file(folders: Iterable[Path], names: Sequence[str]) -> Path | None:
+    """Return the first of these files that exists, folder by folder."""
+    return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
+
+
 def _words(path: Path) -> str:
     """Letters of the name of a file: those of scans differ only in their digits."""
     return re.sub(r"[\d\W_]+", "", path.stem)
@@ -268,8 +269,8 @@ def natural(path: Path) -> tuple[Any, ...]:
 
 def lidar_map(folder: Path) -> NDArray[np.float64] | None:
     """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``; None if there is neither."""
-    found = (folder / f"{_TRUTH_STEM}{suffix}" for suffix in (".pcd", ".ply"))
-    return next((read_points(path) for path in found if path.is_file()), None)
+    path = first_file([folder], (f"{_TRUTH_STEM}.pcd", f"{_TRUTH_STEM}.ply"))
+    return None if path is None else read_points(path)
 
 
 def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path], list[float] | None, Poses]:
@@ -284,8 +285,7 @@ def _by_time(files: list[Path], poses: Poses, notes: Notes) -> tuple[list[Path],
             groups = zip(*(map(int, re.findall(r"\d+", path.stem)[::-1]) for path in files), strict=False)
             numbers = next((group for group in groups if len(set(group)) == len(files)), range(len(files)))
             poses = _by_number(poses, numbers, notes)
-        places = [folder / name for folder in files[0].parents[:2] for name in TIME_FILES]
-        listed = next((path for path in places if path.is_file()), None)
+        listed = first_file(files[0].parents[:2], TIME_FILES)
         if listed is None:
             return files, None, poses
         times = _listed_times(listed, notes)

@@ -6,6 +6,7 @@ import json
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cached_property
 from os import PathLike
 from typing import Any
 
@@ -45,22 +46,23 @@ class TensorFile:
         self.names: list[str] = list(file.keys())
         self.metadata: dict[str, str] = file.metadata() or {}
         self._stated = self.metadata.pop(_CHECKSUMS, "{}")
-        self._checksums: dict[str, int] | None = None  # by name of the array, once the metadata are checked
 
-    def check_metadata(self) -> None:
-        """Raise a ValueError if the metadata or the names of the arrays differ from those written."""
-        found = json.loads(self._stated)
+    @cached_property
+    def checksums(self) -> dict[str, int]:
+        """CRC-32 by name of the array. Raises a ValueError if the metadata or the names differ from those written."""
+        found: dict[str, int] = json.loads(self._stated)
         whole = isinstance(found, dict) and set(found) == {"", *self.names}
         whole = whole and found[""] == _metadata_checksum(self.metadata)
         check(whole, "the checksum of its metadata is wrong")
-        self._checksums = found
+        return found
+
+    def check_metadata(self) -> None:
+        """Raise a ValueError if the metadata or the names of the arrays differ from those written."""
+        _ = self.checksums
 
     def array(self, name: str) -> Any:
         """Return an array as a view of the file. Raise a ValueError if its checksum is wrong."""
-        if self._checksums is None:
-            self.check_metadata()
-        assert self._checksums is not None
-        expected = self._checksums[name]
+        expected = self.checksums[name]
         array = self._file.get_tensor(name)
         found = _checksum(array.numpy() if isinstance(array, Tensor) else array)
         check(found == expected, f"the checksum of {name} is wrong")

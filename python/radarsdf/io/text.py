@@ -41,7 +41,12 @@ def read_table(path: Path) -> Table:
     for line in read_text(path).splitlines():
         bare = _COMMENT.sub("", line).strip()
         if not rows and line.strip():
-            words = _split_words((bare or line.strip().lstrip("/#% ")).rstrip(",; \t"))
+            head = (bare or line.strip().lstrip("/#% ")).rstrip(",; \t")
+            separator = _separator(head)
+            if separator is None:
+                head = re.sub(r"\s+(?=[\[(])", "", head)  # a unit belongs to its name
+            parts = (head.replace(",", ".") if separator == ";" else head).split(separator)
+            words = [part.strip().strip('"') for part in parts]
             if not bare or not any(map(_is_number, words)):
                 heads.append(words)
                 continue
@@ -52,7 +57,7 @@ def read_table(path: Path) -> Table:
 
 def _values(rows: list[str]) -> NDArray[np.float64]:
     """Parse rows to numbers (R, W): by NumPy at once or, if some are damaged, row by row."""
-    separator = next((sign for sign in (";", ",", "\t") if sign in rows[0]), None)
+    separator = _separator(rows[0])
     if separator == ";":
         rows = [row.replace(",", ".") for row in rows]
     with contextlib.suppress(ValueError):
@@ -102,14 +107,9 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _split_words(line: str) -> list[str]:
-    """Split a line at commas, semicolons, tabs or else white space."""
-    separator = next((sign for sign in (";", ",", "\t") if sign in line), None)
-    if separator == ";":
-        line = line.replace(",", ".")
-    if separator is None:
-        line = re.sub(r"\s+(?=[\[(])", "", line)  # a unit belongs to its name
-    return [word.strip().strip('"') for word in line.split(separator)]
+def _separator(line: str) -> str | None:
+    """Return the sign that separates the words of a line; None: white space."""
+    return next((sign for sign in ";,\t" if sign in line), None)
 
 
 def unit_since_1970(time: float) -> tuple[str, float]:

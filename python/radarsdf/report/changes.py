@@ -48,19 +48,17 @@ def write_changes_report(
         surface=surface,
         key=MEANING,
         regions=regions,
-        rows=[_row(number, region) for number, region in enumerate(regions[:_MAX_LISTED], 1)],
+        rows=[
+            (
+                number,
+                region.words,
+                centre_of(region),
+                "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0])),
+                fixed(region.area_m2, 2),
+                fixed(region.probability, 2),
+            )
+            for number, region in enumerate(regions[:_MAX_LISTED], 1)
+        ],
         kinds=[NAMES[kind] for kind in CHANGED],
         max_listed=_MAX_LISTED,
-    )
-
-
-def _row(number: int, region: Region) -> tuple[Any, ...]:
-    size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
-    return (
-        number,
-        region.words,
-        centre_of(region),
-        size,
-        fixed(region.area_m2, 2),
-        fixed(region.probability, 2),
     )

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from radarsdf.evaluation import intensity_metrics, surface_metrics, uncertainty_metrics
 from radarsdf.report import plots
 from radarsdf.report.subject import Subject
-from radarsdf.report.surface import colored, picture
+from radarsdf.report.surface import colored_picture
 from radarsdf.returns.moving import rays_as_measured
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
+from radarsdf.view.quantities import Scale
 
 _Floats = NDArray[np.float64]
 
@@ -31,13 +32,8 @@ def error_values(subject: Subject) -> dict[str, Any] | None:
     metrics = surface_metrics(mesh, truth, box=subject.box, samples=_SAMPLES)
     shown, _ = subject.shown
     shown_m, _ = subject.truth_tree.query(shown.vertices, workers=resolve_num_threads(0))
-    colors, legend = colored(shown_m, len(shown_m), "distance to the truth, m", (0.0, _MATCH_M))
-    return {
-        "metrics": metrics,
-        "picture": picture(shown, colors),
-        "legend": legend,
-        "in_box": subject.box is not None,
-    }
+    pictured = colored_picture(shown, shown_m, "distance to the truth, m", Scale(0.0, _MATCH_M))
+    return {"metrics": metrics, **pictured, "in_box": subject.box is not None}
 
 
 def uncertainty_values(subject: Subject) -> dict[str, Any] | None:
@@ -46,13 +42,10 @@ def uncertainty_values(subject: Subject) -> dict[str, Any] | None:
     if len(mesh.faces) == 0:
         return None
     sigma_m = np.asarray(mesh.vertex_attributes["uncertainty_m"], np.float64)
-    low, high = np.nanpercentile(sigma_m, [2, 98])
     shown_m = shown.vertex_attributes["uncertainty_m"]
-    colors, legend = colored(shown_m, len(shown_m), "standard error, m", (float(low), float(high)))
     percentiles, confidence = [10, 50, 90], mesh.vertex_attributes["confidence"]
     return {
-        "picture": picture(shown, colors),
-        "legend": legend,
+        **colored_picture(shown, shown_m, "standard error, m", Scale.of(sigma_m)),
         "percentiles": percentiles,
         "rows": [
             ("Uncertainty, m", *(f"{x:.3f}" for x in np.nanpercentile(sigma_m, percentiles))),

@@ -6,7 +6,7 @@ import base64
 import functools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from os import PathLike
 from typing import Any
 
@@ -15,6 +15,7 @@ import jinja2
 from radarsdf.extras import require
 from radarsdf.io.files import write_whole
 from radarsdf.view.pages import centre_of
+from radarsdf.view.quantities import css_color
 
 _NBSP = "\N{NO-BREAK SPACE}"
 
@@ -46,11 +47,6 @@ def data_uri(image: bytes) -> str:
     """Encode a PNG or JPEG file as a data URI."""
     kind = "png" if image.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(image).decode('ascii')}"
-
-
-def css_color(rgb: Sequence[int]) -> str:
-    """Format an sRGB colour, 0 to 255, as CSS."""
-    return "rgb({} {} {})".format(*rgb)
 
 
 @functools.cache

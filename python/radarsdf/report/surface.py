@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.map.colors import NEUTRAL, intensity_colors
+from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
-from radarsdf.report.page import css_color
 from radarsdf.report.subject import Subject
-from radarsdf.view.framing import CameraPose, framing_pose
+from radarsdf.view.framing import framing_pose
 from radarsdf.view.glb import glb
+from radarsdf.view.quantities import Scale
 from radarsdf.view.serving import free_port, set_initial_camera, start_server, stop_server
 
 _Floats = NDArray[np.float64]
@@ -40,9 +40,7 @@ def surface_values(subject: Subject) -> dict[str, Any] | None:
     mesh, spacing_m = subject.shown
     if len(mesh.faces) == 0:
         return None
-    colors, legend = colored(
-        mesh.vertex_attributes.get("intensity"), len(mesh.vertices), "intensity, sensor units"
-    )
+    colors, legend = colored(mesh, mesh.vertex_attributes.get("intensity"), "intensity, sensor units")
     origin = subject.radar_map.origin
     sensors = None if subject.scans is None else subject.scans.poses[:, :3, 3] - origin
     return {
@@ -60,18 +58,19 @@ def surface_values(subject: Subject) -> dict[str, Any] | None:
 
 
 def colored(
-    values: NDArray[Any] | None, count: int, label: str, limits: tuple[float, float] | None = None
+    mesh: Any, values: NDArray[Any] | None, label: str, scale: Scale | None = None
 ) -> tuple[_Colors, dict[str, Any] | None]:
-    """Map vertex values (V,) to colours (V, 3), with a legend. NaN is grey, as is everything without values.
-
-    `limits` None: the 2nd and the 98th percentile.
-    """
+    """Map values (V,) of the vertices to colours (V, 3), with a legend. NaN is grey, as is everything without values."""
     if values is None or not np.isfinite(values).any():
-        return np.full((count, 3), NEUTRAL, np.uint8), None
-    low, high = map(float, np.nanpercentile(values, [2, 98]) if limits is None else limits)
-    stops = intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3].tolist()
-    legend = {"low": low, "high": high, "label": label, "stops": [css_color(stop) for stop in stops]}
-    return intensity_colors(values, low, high)[:, :3], legend
+        return np.full((len(mesh.vertices), 3), NEUTRAL, np.uint8), None
+    scale = scale or Scale.of(values)
+    return scale(values), {"label": label, "scale": scale}
+
+
+def colored_picture(mesh: Any, values: NDArray[Any], label: str, scale: Scale) -> dict[str, Any]:
+    """Render a mesh coloured by values (V,) of its vertices, and describe the colours."""
+    colors, legend = colored(mesh, values, label, scale)
+    return {"picture": picture(mesh, colors), "legend": legend}
 
 
 def views(mesh: Any, colors: _Colors) -> dict[str, bytes]:
@@ -99,7 +98,7 @@ def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Flo
     """
     everything = vertices if sensors is None else np.concatenate([vertices, sensors])
     to_eye = eye_around(vertices, *_FIRST_SIDE) - middle_of(vertices)[0]
-    pose: CameraPose = framing_pose(everything, to_eye, _SCENE_ASPECT)
+    pose = framing_pose(everything, to_eye, _SCENE_ASPECT)
     host = "127.0.0.1"
     server: Any = start_server(host, free_port(host, 0))
     try:

@@ -42,6 +42,7 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
     """
     require_extras()
     report = subject.radar_map.report
+    settings, defaults = (flat_settings(of.to_dict()) for of in (subject.radar_map.config, FitConfig()))
     return write_page(
         path,
         "report.html",
@@ -57,8 +58,14 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
         intensity=intensity_values(subject),
         training=_training(report),
         durations=[(name, fixed(report[key], 2, "s")) for key, name in _DURATIONS.items() if key in report],
-        skipped=_skipped(report),
-        configuration=_configuration(subject.radar_map.config),
+        skipped=[
+            (name, "–" if seconds is None else f"about {seconds:.1f} s")
+            for name, seconds in itertools.zip_longest(report.get("skipped", []), report.get("skipped_s", []))
+        ],
+        changed=[
+            (name, value, defaults[name]) for name, value in settings.items() if value != defaults[name]
+        ],
+        toml=to_toml(subject.radar_map.config),
     )
 
 
@@ -86,17 +93,3 @@ def _training(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     for stage, done in report.get("iterations_done", {}).items():
         rows.append((f"Iterations, {stage}", f"{done:,} of {report['iterations'][stage]:,}"))
     return rows
-
-
-def _skipped(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    names, saved_s = report.get("skipped", []), report.get("skipped_s", [])
-    return [
-        (name, "–" if seconds is None else f"about {seconds:.1f} s")
-        for name, seconds in itertools.zip_longest(names, saved_s)
-    ]
-
-
-def _configuration(config: FitConfig) -> dict[str, Any]:
-    settings, defaults = flat_settings(config.to_dict()), flat_settings(FitConfig().to_dict())
-    changed = [(name, value, defaults[name]) for name, value in settings.items() if value != defaults[name]]
-    return {"changed": changed, "toml": to_toml(config)}

@@ -1,26 +1,19 @@
-"""GLB encoding of coloured meshes, the one format in which viser takes vertex colours, and compensation of tone mapping."""
+"""Coloured meshes as GLB, the one format in which viser takes vertex colours, and compensation of its tone mapping."""
 
 from __future__ import annotations
 
-import json
-import struct
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_UNLIT = "KHR_materials_unlit"  # show colours as they are, like those of point clouds and legends
-_MATERIAL = {
-    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-    "doubleSided": True,
-    "extensions": {_UNLIT: {}},
-}
-_FLOAT, _UNSIGNED_INT = 5126, 5125
+from radarsdf.io.glb import MATT, SRGB_TO_LINEAR, encode_glb
+
+# Colours as they are, like those of point clouds and legends.
+_UNLIT = MATT | {"extensions": {"KHR_materials_unlit": {}}}
 _TO_LIGHT = np.array([-0.35, -0.5, 0.79])
 _SHADE = 0.87  # lightness of faces averted from the light; higher keeps colours close to those of the legend
 
-_SRGB = np.arange(256) / 255
-_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
 # viser's page passes all meshes, even unlit ones, through three.js's ACESFilmicToneMapping, which turns indigo into navy
 # and yellow into olive. It is, on linear colours c:
 #     _OUT @ ((x² + a x - b) / (c x² + d x + e)), with x = _IN @ c / _EXPOSURE
@@ -33,39 +26,7 @@ _BITS = np.uint32(13)  # dropped mantissa bits, below the 256 levels of a screen
 
 def glb(vertices: NDArray[Any], faces: NDArray[Any], colors: NDArray[np.uint8]) -> bytes:
     """Encode vertices (V, 3), as float32, faces (F, 3) and sRGB colours (V, 3) as the bytes of a GLB file."""
-    positions = np.ascontiguousarray(vertices, np.float32)
-    indices = np.ascontiguousarray(faces, np.uint32).reshape(-1, 1)
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    size = 0
-    parts = (positions, indices, light_to_show(colors))
-    for part, component, kind in zip(
-        parts, (_FLOAT, _UNSIGNED_INT, _FLOAT), ("VEC3", "SCALAR", "VEC3"), strict=True
-    ):
-        accessors.append(
-            {"bufferView": len(views), "componentType": component, "count": len(part), "type": kind}
-        )
-        views.append({"buffer": 0, "byteOffset": size, "byteLength": part.nbytes})
-        size += part.nbytes
-    accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 2}, "indices": 1, "material": 0}
-    tree = {
-        "asset": {"version": "2.0"},
-        "extensionsUsed": [_UNLIT],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [_MATERIAL],
-        "buffers": [{"byteLength": size}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    text = json.dumps(tree, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    header = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + size)
-    chunks = [struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", size, b"BIN\0")]
-    return b"".join([header, *chunks, *(part.tobytes() for part in parts)])
+    return encode_glb(vertices, faces, {"COLOR_0": light_to_show(colors)}, material=_UNLIT)
 
 
 def lightness_of(normals: NDArray[Any]) -> NDArray[np.float32]:
@@ -76,16 +37,15 @@ def lightness_of(normals: NDArray[Any]) -> NDArray[np.float32]:
 
 def shaded(colors: NDArray[np.uint8], lightness: NDArray[Any]) -> NDArray[np.uint8]:
     """Scale the OKLab lightness and chroma of sRGB colours (V, 3) by factors (V,): both are cube roots of light."""
-    light = _LINEAR[colors] * np.asarray(lightness, np.float64)[:, None] ** 3
+    light = SRGB_TO_LINEAR[colors] * np.asarray(lightness, np.float64)[:, None] ** 3
     srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    shown: NDArray[np.uint8] = np.rint(255 * srgb).astype(np.uint8)
-    return shown
+    return np.asarray(np.rint(255 * srgb), np.uint8)
 
 
 def light_to_show(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(V, 3) linear colours of an unlit mesh that the page shows as these sRGB colours (V, 3): the inverse tone mapping."""
     a, b, c, d, e = _FIT
-    y = _LINEAR[colors] @ np.linalg.inv(_OUT).T
+    y = SRGB_TO_LINEAR[colors] @ np.linalg.inv(_OUT).T
     square, slope, rest = 1 - c * y, a - d * y, -b - e * y
     x = (-slope + np.sqrt(np.maximum(slope**2 - 4 * square * rest, 0))) / (2 * square)
     light = np.ascontiguousarray(_EXPOSURE * x @ np.linalg.inv(_IN).T, np.float32)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
+from radarsdf.checks import check
 from radarsdf.view.framing import framing_pose
 from radarsdf.view.glb import glb, lightness_of, shaded
 from radarsdf.view.quantities import key, paragraph, table
@@ -37,8 +38,8 @@ def centre_of(region: Region) -> str:
 class GrowingView(Page):
     """Serves the current surface and trajectory."""
 
-    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
-        super().__init__(host, port)
+    def __init__(self, **address: Any) -> None:
+        super().__init__(**address)
         self._start()
         self._origin: NDArray[np.float64] | None = None
 
@@ -63,20 +64,10 @@ class GrowingView(Page):
 class ChangesView(Page):
     """Serves the coloured surface of :meth:`Changes.mesh`, whose vertices are `edge_m` apart, and lists its regions."""
 
-    def __init__(
-        self,
-        changes: Changes,
-        regions: Sequence[Region],
-        edge_m: float,
-        *,
-        host: str = "127.0.0.1",
-        port: int | None = None,
-    ) -> None:
-        super().__init__(host, port)
+    def __init__(self, changes: Changes, regions: Sequence[Region], edge_m: float, **address: Any) -> None:
+        super().__init__(**address)
         mesh: Any = thinned(changes.mesh(), _MAX_VERTICES, edge_m)[0]
-        if len(mesh.faces) == 0:
-            msg = "the map has no surface here"
-            raise ValueError(msg)
+        check(len(mesh.faces), "the map has no surface here")
         vertices = np.asarray(mesh.vertices, np.float64)
         local = vertices - vertices.mean(axis=0)  # the page computes in float32
         colors = shaded(colors_of(mesh.vertex_attributes["kind"]), lightness_of(mesh.vertex_normals))

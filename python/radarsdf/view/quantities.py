@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -42,7 +42,7 @@ class Scale:
     @property
     def css(self) -> str:
         """The colours from low to high, as CSS."""
-        return ",".join(map(_css, self(np.linspace(self.low, self.high, 9)).tolist()))
+        return ",".join(map(css_color, intensity_colors(np.linspace(0, 1, 9), 0, 1)[:, :3].tolist()))
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,7 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     vertices, found = surface.vertices, {}
 
     def intensity(rows: _Rows, sensor: Position) -> NDArray[Any]:
-        values: NDArray[Any] = radar_map.intensity(vertices[rows], np.array(sensor))
-        return values
+        return np.asarray(radar_map.intensity(vertices[rows], np.array(sensor)))
 
     if radar_map.has_intensity:
         some = np.arange(0, len(vertices), max(1, len(vertices) // _SAMPLES))
@@ -106,7 +105,7 @@ def key(colors: Mapping[str, Color | Scale]) -> str:
             background = f"linear-gradient(135deg,{color.css})"
             limits = f", {color.low:.3g} to {color.high:.3g}"
         else:
-            background = _css(color)
+            background = css_color(color)
         mark = f"flex:none;width:0.8em;height:0.8em;border-radius:0.2em;background:{background}"
         rows.append(
             '<div style="display:flex;align-items:center;gap:0.5em">'
@@ -130,5 +129,6 @@ def _block(html: str) -> str:
     return f'<div style="margin:0.4em 0.8em;font-size:0.85em;line-height:1.4">{html}</div>'
 
 
-def _css(color: Color) -> str:
-    return "rgb({},{},{})".format(*color)
+def css_color(color: Sequence[int]) -> str:
+    """Format an sRGB colour, 0 to 255, as CSS."""
+    return "rgb({} {} {})".format(*color)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
-from radarsdf.scans import Scan, Scans
+from radarsdf.scans import Scans
 from radarsdf.view.glb import glb, shaded
 from radarsdf.view.quantities import Position, Quantity, Scale
 from radarsdf.view.serving import WAIT_STEP_S, wait_until_drawn
@@ -26,9 +26,8 @@ from radarsdf.view.surface import ShownSurface, spread_evenly
 
 HELD_S = 2.0  # delay after which the mesh is drawn if the sensor does not move
 SLID_S = 0.25  # a slider reports no end of a drag: this pause marks one
-PATH_COLOR = (40, 44, 52)
-MEASURED_COLOR = (0, 72, 140)  # colour without intensities
-PREDICTED_COLOR = (0, 158, 115)  # not on the intensity scale, so that predictions stand out from the surface
+# Measured returns without intensities; predictions are not on the intensity scale, and stand out from the surface.
+SCAN_COLORS = {"measured": (0, 72, 140), "predicted": (0, 158, 115), "trajectory": (40, 44, 52)}
 
 # On two cores, intensities of 30,000 points take about 0.025 s, of 400,000 about 0.4 s.
 _DRAG_POINTS = 30_000
@@ -214,7 +213,9 @@ class ScanClouds:
         self._server, self._map, self._scans = server, radar_map, list(scans)
         self._scale, self._text = scale, text
         self._shown: int | None = None
-        path = add_path(server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, PATH_COLOR)
+        path = add_path(
+            server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, SCAN_COLORS["trajectory"]
+        )
         self.nodes: dict[str, Any] = {"trajectory": path}
         self.show(0)
 
@@ -230,9 +231,13 @@ class ScanClouds:
         self._shown = index
         scan = self._scans[index]
         world, view = scan.world_points, self._map.render(scan.T_world_sensor)
+        colors: Any = np.full((len(scan), 3), SCAN_COLORS["measured"], np.uint8)
+        if scan.intensities is not None and self._scale is not None:
+            colors = self._scale(np.asarray(scan.intensities, np.float64))
+        predicted = np.full((len(view), 3), SCAN_COLORS["predicted"], np.uint8)
         with self._server.atomic():
-            self._draw("measured", world, self._colors_of(scan))
-            self._draw("predicted", view.world_points, np.full((len(view), 3), PREDICTED_COLOR, np.uint8))
+            self._draw("measured", world, colors)
+            self._draw("predicted", view.world_points, predicted)
         text = f"scan {index}: {len(scan)} returns measured, {len(view)} predicted"
         if scan.intensities is not None and self._map.has_intensity:
             found = self._map.intensity(world, scan.T_world_sensor[:3, 3], extrapolate=True)
@@ -240,12 +245,6 @@ class ScanClouds:
             errors = errors[np.isfinite(errors)]
             text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
         self._text.content = text
-
-    def _colors_of(self, scan: Scan) -> NDArray[np.uint8]:
-        """(N, 3) sRGB of measured returns."""
-        if scan.intensities is None or self._scale is None:
-            return np.full((len(scan), 3), MEASURED_COLOR, np.uint8)
-        return self._scale(np.asarray(scan.intensities, np.float64))
 
     def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
         local = (world - self._map.origin).astype(np.float32)

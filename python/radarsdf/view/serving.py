@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import gc
-import importlib.util
 import io
 import ipaddress
 import os
@@ -33,11 +32,6 @@ def require_viser() -> None:
     require("viser", what="the viewer needs")
 
 
-def has_viser() -> bool:
-    """Whether viser is installed."""
-    return importlib.util.find_spec("viser") is not None
-
-
 def free_port(host: str, port: int | None) -> int:
     """Port to listen on: `port`, or if it is None, the first free one from 8080.
 
@@ -50,8 +44,7 @@ def free_port(host: str, port: int | None) -> int:
         try:
             family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
             with socket.create_server((host, candidate), family=family) as listening:
-                found: int = listening.getsockname()[1]
-                return found
+                return int(listening.getsockname()[1])
         except OSError as error:  # raised also for an unknown host name
             reason = error.strerror or str(error)
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
@@ -120,7 +113,7 @@ def wait_until_drawn(server: Any, superseded: Callable[[], bool], patience_s: fl
 class Page:
     """A page served until it is stopped. Raises an OSError for a taken port before any work."""
 
-    def __init__(self, host: str, port: int | None) -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int | None = None) -> None:
         require_viser()
         self.host = host
         self.port = free_port(host, port)

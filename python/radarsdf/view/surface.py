@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import SurfaceTracer
-from radarsdf.checks import whole_number
+from radarsdf.checks import check, whole_number
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
 from radarsdf.view.glb import lightness_of
@@ -54,9 +54,7 @@ class ShownSurface:
         mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress, **limits)
         threshold = Threshold.of_mesh(mesh.metadata)
         mesh, spacing_m = thinned(mesh, max_vertices, voxel_size)
-        if len(mesh.vertices) == 0:
-            msg = "the map has no surface here"
-            raise ValueError(msg)
+        check(len(mesh.vertices), "the map has no surface here")
         return cls(
             np.asarray(mesh.vertices, np.float64),
             np.asarray(mesh.faces, np.int32),

@@ -12,17 +12,7 @@ from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.framing import FOV_RAD, CameraPose, framing_pose
 from radarsdf.view.quantities import key, legend, paragraph, quantities_of, table
-from radarsdf.view.scene import (
-    HELD_S,
-    MEASURED_COLOR,
-    PATH_COLOR,
-    PREDICTED_COLOR,
-    SLID_S,
-    Canvas,
-    Painter,
-    ScanClouds,
-    State,
-)
+from radarsdf.view.scene import HELD_S, SCAN_COLORS, SLID_S, Canvas, Painter, ScanClouds, State
 from radarsdf.view.serving import Page, set_initial_camera
 from radarsdf.view.surface import ShownSurface, first_hit
 
@@ -53,7 +43,7 @@ class Viewer(Page):
         **limits: Any,
     ) -> None:
         super().__init__(host, port)
-        self._map, self._voxel_size = radar_map, voxel_size
+        self._map = radar_map
         self.surface = ShownSurface.of(
             radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
         )
@@ -136,7 +126,7 @@ class Viewer(Page):
         """Add the returns of scans, and controls to choose a scan and its elements."""
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
-        colors = {"measured": scale or MEASURED_COLOR, "predicted": PREDICTED_COLOR, "trajectory": PATH_COLOR}
+        colors: dict[str, Any] = {**SCAN_COLORS, "measured": scale or SCAN_COLORS["measured"]}
         with tab, gui.add_folder("scans"):
             gui.add_html(key(colors))
             slider = gui.add_slider("scan", 0, max(len(scans) - 1, 1), 1, 0, disabled=len(scans) == 1)
@@ -203,10 +193,8 @@ class Viewer(Page):
 
         async def on_update(event: Any) -> None:
             sensor = self._map.origin + np.asarray(event.target.position, np.float64)
-            ended = event.phase == "end"
-            self._painter.change(
-                sensor=tuple(sensor.tolist()), coarse=not ended, settle_s=0.0 if ended else HELD_S
-            )
+            moving = event.phase != "end"
+            self._painter.change(sensor=tuple(sensor.tolist()), coarse=moving, settle_s=HELD_S * moving)
 
         self._gizmo.on_update(on_update)
 
@@ -243,15 +231,6 @@ class Viewer(Page):
             range_m = float(np.linalg.norm(self._clicked - sensor))
             rows["intensity"] = f"{self._map.intensity(x, sensor)[0]:.1f} from {range_m:.1f} m"
         self._answer.content = table(rows)
-
-    @property
-    def notes(self) -> list[str]:
-        """Sentences on reduced details of the page."""
-        shown, spacing_m = len(self.surface.vertices), self.surface.spacing_m
-        thinned = (
-            f"the mesh is thinned to {shown} vertices, {spacing_m:.2g} m apart: --max-vertices allows more"
-        )
-        return [thinned] if spacing_m > self._voxel_size else []
 
 
 def _aspect(camera: Any) -> float:
