@@ -15,6 +15,7 @@ from radarsdf.poses.imu import (
     cumulated,
     levelled,
 )
+from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
@@ -170,16 +171,16 @@ def test_a_bias_is_estimated_from_rotations(ride):
     times_s, poses, _ = ride
     steps = Rotation.from_matrix(poses[:-1, :3, :3]).inv() * Rotation.from_matrix(poses[1:, :3, :3])
     turns = steps.as_rotvec() + np.random.default_rng(3).normal(0, 0.005, (len(steps), 3))
-    covariance = np.tile(0.005**2 * np.eye(3), (len(steps), 1, 1))
+    shown = [MotionRate(10 * turn, 0.05**2 * np.eye(3)) for turn in turns]
     bias = np.array([0.01, -0.02, 0.015])
     rates = measured_imu(poses, times_s, gyroscope_bias_rad_s=tuple(bias))
-    found = Gyroscope.of(rates.angular_velocity, rates.times_s, times_s).learnt(turns, covariance)
+    found = Gyroscope.of(rates.angular_velocity, rates.times_s, times_s).learnt(shown)
     off = np.degrees(np.linalg.norm(found.turns - found.bias.mean * 0.1 - steps.as_rotvec(), axis=1))
     assert np.median(off) < 0.1
     # Three deviations of the mean of 299 rotations in 0.1 s, each with an error of 0.005 rad.
     np.testing.assert_allclose(found.bias.mean, bias, atol=3 * 0.05 / np.sqrt(299))
     with pytest.raises(UnusableGyroscopeError):
-        Gyroscope.of(np.degrees(rates.angular_velocity), rates.times_s, times_s).learnt(turns, covariance)
+        Gyroscope.of(np.degrees(rates.angular_velocity), rates.times_s, times_s).learnt(shown)
 
 
 def test_products_of_many_small_turns():

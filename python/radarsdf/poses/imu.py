@@ -13,6 +13,7 @@ each time offset on a grid initialises robust nonlinear least squares (Gauss-New
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,27 +107,29 @@ class Gyroscope:
         covariance = self.bias.covariance * duration_s**2 + self._noise[i] * np.eye(3)
         return MotionRate(self.turns[i] - self.bias.mean * duration_s, covariance)
 
-    def learnt(self, turns: Floats, covariance: Floats) -> Gyroscope:
-        """Estimate bias and noise from rotations (F - 1, 3) with covariance (F - 1, 3, 3); NaN where unknown.
+    def learnt(self, rates: Sequence[MotionRate | None]) -> Gyroscope:
+        """Estimate bias and noise from the rates (F - 1) of rotation between scans, rad/s, by another source. None: unknown.
 
-        Raises an UnusableGyroscopeError if the rotations contradict the rates.
+        Raises an UnusableGyroscopeError if they contradict the gyroscope.
         """
-        known = np.isfinite(turns).all(axis=1) & (self.durations_s > 0)
-        if known.sum() < 2:
+        known = {i: rate for i, rate in enumerate(rates) if rate is not None and self.durations_s[i] > 0}
+        if len(known) < 2:
             return self
-        off, covariance, durations_s = (self.turns - turns)[known], covariance[known], self.durations_s[known]
-        noise = self._noise[known]
-        weights = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3)).astype(np.float64)
-        _check(off, turns[known], durations_s, weights, covariance)
-        before = np.linalg.inv(self.bias.covariance).astype(np.float64)
-        bias, information, _ = _fitted_bias(off, durations_s, weights, before)
+        rows = list(known)
+        durations_s, noise = self.durations_s[rows], self._noise[rows]
+        turns = np.stack([rate.mean for rate in known.values()]) * durations_s[:, None]
+        covariance = np.stack([rate.covariance for rate in known.values()]) * durations_s[:, None, None] ** 2
+        off = self.turns[rows] - turns
+        weights = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3))
+        _check(off, turns, durations_s, weights, covariance)
+        bias, information, _ = _fit_bias(off, durations_s, weights, np.linalg.inv(self.bias.covariance))
         squares = (off - bias * durations_s[:, None]) ** 2 - np.einsum("fii->fi", covariance)
         noise_rad2 = np.maximum(squares * (self.noise_rad2 / noise)[:, None], 0.0).mean()
-        fitted = MotionRate(bias, np.linalg.inv(information).astype(np.float64))
+        fitted = MotionRate(bias, np.linalg.inv(information))
         return dataclasses.replace(self, bias=fitted, noise_rad2=float(max(noise_rad2, 1e-10)))
 
 
-def _fitted_bias(
+def _fit_bias(
     off: Floats, durations_s: Floats, weights: Floats, before: Floats | float = 0.0
 ) -> tuple[Floats, Floats, float]:
     """Fit a constant rate (3,) to residual rotations `off` (K, 3); return it, its information (3, 3) and the mean squared residual.
@@ -141,8 +144,8 @@ def _fitted_bias(
 
 def _check(off: Floats, turns: Floats, durations_s: Floats, weights: Floats, covariance: Floats) -> None:
     """Raise an UnusableGyroscopeError if the residual rotations `off` (K, 3) are too large or biased."""
-    bias, _, square = _fitted_bias(off, durations_s, weights)
-    constant = _fitted_bias(-turns, durations_s, weights)[2]
+    bias, _, square = _fit_bias(off, durations_s, weights)
+    constant = _fit_bias(-turns, durations_s, weights)[2]
     rate = float(np.linalg.norm(bias))
     contradicted = len(off) > _LEAST_STEPS and square > max(_CONTRADICTED, _CONTRADICTED_SHARE * constant)
     # Turns that the returns hardly observe share the error of their prediction.
