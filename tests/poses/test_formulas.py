@@ -20,7 +20,7 @@ from radarsdf.poses.doppler import (
     upright,
 )
 from radarsdf.poses.drive import Drive, rates_of, track_drive
-from radarsdf.poses.imu import Gyroscope
+from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.posed import PosedScans, pose_sigmas

@@ -6,15 +6,8 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
-from radarsdf.poses.imu import (
-    Gyroscope,
-    ImuAlignment,
-    Inertial,
-    UnusableGyroscopeError,
-    _windows,
-    cumulated,
-    levelled,
-)
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError, cumulated
+from radarsdf.poses.imu import ImuAlignment, Inertial, _windows, levelled
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
@@ -155,7 +148,7 @@ def test_straight_motion_leaves_the_rotation_undetermined():
 def test_two_windows_of_scans_are_the_fewest(ride, imu, monkeypatch, scans, enough):
     times_s, _, velocities = ride
     asked, rows = [], slice(0, 5 * scans, 5)
-    monkeypatch.setattr("radarsdf.poses.imu._first_guess", lambda *given: asked.append(given))
+    monkeypatch.setattr("radarsdf.poses.imu._solve_linearly", lambda *given: asked.append(given))
     assert ImuAlignment.of(imu, velocities.select(rows), times_s[rows]) is None
     assert bool(asked) == enough
 

@@ -10,7 +10,7 @@ from radarsdf.io import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.drive import Drive
-from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import aligned
 from radarsdf.simulate import measured_motion

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
-from radarsdf.poses.imu import Gyroscope
+from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, SteadyMotion
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import Floats, rotation

@@ -18,7 +18,8 @@ from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
 from radarsdf.poses.drive import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
-from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
+from radarsdf.poses.gyroscope import UnusableGyroscopeError
+from radarsdf.poses.imu import Inertial, levelled
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
