@@ -26,7 +26,7 @@ from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.posed import PosedScans, pose_sigmas
 from radarsdf.poses.refine import _by_biases
 from radarsdf.poses.rigid import (
-    alignment,
+    aligned,
     between,
     covariance_in,
     increments,
@@ -40,7 +40,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import Tracked, Tracker, _apart_m, _removed_share, begin_segment, thinned
+from radarsdf.poses.tracking import Tracked, Tracker, _apart_m, _removed_share, begin_segment, thin
 from radarsdf.poses.verdict import Verdict, _crowding, _gains
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
@@ -60,7 +60,7 @@ def test_increments_lead_from_pose_to_pose():
     assert_allclose(moved(first, increments(first, second)), second, atol=1e-12)
     assert_allclose(between(first, second), np.linalg.inv(first) @ second, atol=1e-12)
     whole = transform(np.array([0.1, 0.2, -0.9]), np.array([5.0, 6, 7]))
-    assert_allclose(alignment(first, whole @ first), whole, atol=1e-12)
+    assert_allclose(aligned(first, whole @ first), whole @ first, atol=1e-12)
     shifted = moved(first, np.tile([0.3, 0, 0.4, 0, 0.6, 0.8], (5, 1)))
     assert moved_by(first, shifted) == pytest.approx({"moved_m": 0.5, "moved_rad": 1.0})
     assert_allclose(turned_by(first, shifted), 1.0)
@@ -252,7 +252,7 @@ def test_returns_reduce_and_errors_increase_covariances():
     assert_allclose(M @ total @ M.T, turned @ np.diag([3.0, 0, 0]) @ turned.T, atol=1e-6)
     assert begin_segment(np.eye(4), 3).segment == 3
     assert np.isnan(begin_segment(np.eye(4)).agreeing)
-    assert [len(thinned(np.zeros((n, 3)), 10)) for n in (0, 10, 11, 20, 21)] == [0, 10, 6, 10, 7]
+    assert [len(thin(np.zeros((n, 3)), 10)) for n in (0, 10, 11, 20, 21)] == [0, 10, 6, 10, 7]
 
 
 def test_returns_are_selected_by_range_and_cells_match_their_spacing():

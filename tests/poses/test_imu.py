@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
-from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError, cumulated
-from radarsdf.poses.imu import ImuAlignment, Inertial, _windows, levelled
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError, cumulate_turns
+from radarsdf.poses.imu import ImuAlignment, Inertial, _windows, level_poses
 from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
@@ -65,8 +65,7 @@ def test_velocities_determine_its_rotation(ride, imu):
     np.testing.assert_allclose(found.lever_m, LEVER_M, atol=0.1)
     assert tilt(poses, found.up) < 1.5
     # Rates without bias lead to the last pose.
-    gyroscope = Gyroscope.of(found.angular_velocity, found.times_s, times_s + LATE_S)
-    end = poses[0, :3, :3] @ cumulated(gyroscope.turns)[-1]
+    end = poses[0, :3, :3] @ cumulate_turns(found.gyroscope.turns)[-1]
     assert angle(end, poses[-1, :3, :3]) < 3
 
 
@@ -83,7 +82,7 @@ def test_without_noise_it_is_exact(ride, monkeypatch, late_s):
     assert report["time_offset_s"] == pytest.approx(late_s, abs=1e-4)
     np.testing.assert_allclose(report["lever_m"], LEVER_M, atol=1e-3)
     assert tilt(poses, found.alignment.up) < 1e-2
-    turns = cumulated(found.gyroscope.turns)
+    turns = cumulate_turns(found.gyroscope.turns)
     assert max(angle(poses[0, :3, :3] @ turns[i], poses[i, :3, :3]) for i in (100, -1)) < 1e-2
     late = f"scans are {late_s:.3f} s late in its clock"
     assert f"found to {np.degrees(report['sigma_rad']):.1f} degrees, {late}" in found.alignment.words
@@ -178,7 +177,7 @@ def test_a_bias_is_estimated_from_rotations(ride):
 
 def test_products_of_many_small_turns():
     turns = np.random.default_rng(4).normal(0, 0.3, (101, 3))
-    found, at = cumulated(turns), np.eye(3)
+    found, at = cumulate_turns(turns), np.eye(3)
     assert len(found) == 102
     for i, turn in enumerate(turns):
         np.testing.assert_allclose(found[i], at, atol=1e-12)
@@ -192,7 +191,7 @@ def test_the_world_is_levelled(ride, up):
     up = np.array(up)
     seen = np.einsum("fji,j->fi", poses[:, :3, :3], up)
     covariance = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (len(poses), 1, 1))
-    level, turned = levelled(poses, covariance, seen)
+    level, turned = level_poses(poses, covariance, seen)
     np.testing.assert_allclose(
         np.einsum("fij,fj->fi", level[:, :3, :3], seen), [[0, 0, 1]] * len(poses), atol=1e-9
     )

@@ -13,7 +13,7 @@ from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope
-from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, SteadyMotion
+from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, Priors, SteadyMotion
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import Floats, rotation
 from radarsdf.poses.tracking import Tracked, Tracker
@@ -46,7 +46,7 @@ class Drive:
     moves: MotionPrior = _MOVES
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
     # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
-    steady: tuple[MotionPrior, MotionPrior] = _MOVES, _TURNS
+    steady: Priors = _MOVES, _TURNS
 
     def predict(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
         """Predict the step to scan `i` from the rates of the previous one; None if unknown."""
@@ -54,16 +54,16 @@ class Drive:
         before_s = float(self.times_s[i - 1] - self.times_s[i - 2]) if i > 1 else 0.0
         elapsed_s = (duration_s + before_s) / 2
         if self.gyroscope is not None:
-            by = self.gyroscope.step(i - 1)
+            turned = self.gyroscope.step(i - 1)
         else:
-            rate = self.turns.after(turn, elapsed_s)
-            by = MotionRate(rate.mean * duration_s, rate.covariance * duration_s**2)
+            turned = self.turns.after(turn, elapsed_s).integrate(duration_s)
         if self.velocities is not None:
             covariance = self.velocities.step_covariance(i - 1, duration_s)
             begin, end = self.velocities.mean_mps[i - 1 : i + 1]
-            return PredictedStep(by, begin, end, covariance, duration_s)
-        rate = self.moves.after(move, elapsed_s)
-        return PredictedStep(by, rate.mean, rate.mean, rate.covariance * duration_s**2, duration_s)
+        else:
+            velocity = self.moves.after(move, elapsed_s)
+            covariance, begin, end = velocity.integrate(duration_s).covariance, velocity.mean, velocity.mean
+        return PredictedStep(turned, begin, end, covariance, duration_s)
 
     @property
     def usual_turn_rad_s(self) -> float:

@@ -25,7 +25,7 @@ class UnusableGyroscopeError(ValueError):
     """The rates of a gyroscope contradict a drive."""
 
 
-def cumulated(turns: Floats) -> Floats:
+def cumulate_turns(turns: Floats) -> Floats:
     """Return the cumulative products (N + 1, 3, 3) of rotation vectors (N, 3), the identity first."""
     count = len(turns) + 1
     width = int(np.ceil(np.sqrt(count)))
@@ -42,7 +42,7 @@ def cumulated(turns: Floats) -> Floats:
 
 def integrate_rates(times_s: Floats, rates: Floats) -> Floats:
     """Return the rotations (G, 3, 3) to the first frame, from rates (G, 3), rad/s, by the trapezoidal rule."""
-    return cumulated(0.5 * (rates[1:] + rates[:-1]) * np.diff(times_s)[:, None])
+    return cumulate_turns(0.5 * (rates[1:] + rates[:-1]) * np.diff(times_s)[:, None])
 
 
 def interpolate(times_s: Floats, at_s: Floats, values: Floats) -> Floats:
@@ -90,17 +90,18 @@ class Gyroscope:
         known = {i: rate for i, rate in enumerate(rates) if rate is not None and self.durations_s[i] > 0}
         if len(known) < 2:
             return self
-        rows = list(known)
+        rows, motions = list(known), [rate.integrate(self.durations_s[i]) for i, rate in known.items()]
         durations_s, noise = self.durations_s[rows], self._noise[rows]
-        turns = np.stack([rate.mean for rate in known.values()]) * durations_s[:, None]
-        covariance = np.stack([rate.covariance for rate in known.values()]) * durations_s[:, None, None] ** 2
+        turns = np.stack([motion.mean for motion in motions])
+        covariance = np.stack([motion.covariance for motion in motions])
         off = self.turns[rows] - turns
-        weights = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3))
+        weights = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3)).astype(np.float64)
         _check_agreement(off, turns, durations_s, weights, covariance)
-        bias, information, _ = _fit_bias(off, durations_s, weights, np.linalg.inv(self.bias.covariance))
+        prior = np.linalg.inv(self.bias.covariance).astype(np.float64)
+        bias, information, _ = _fit_bias(off, durations_s, weights, prior)
         squares = (off - bias * durations_s[:, None]) ** 2 - np.einsum("fii->fi", covariance)
         noise_rad2 = np.maximum(squares * (self.noise_rad2 / noise)[:, None], 0.0).mean()
-        fitted = MotionRate(bias, np.linalg.inv(information))
+        fitted = MotionRate(bias, np.linalg.inv(information).astype(np.float64))
         return dataclasses.replace(self, bias=fitted, noise_rad2=float(max(noise_rad2, 1e-10)))
 
 

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -84,9 +85,7 @@ class ImuAlignment:
     sigma_rad: float  # its standard deviation about the least certain axis. 0: given
     time_offset_s: float  # delay of the times of scans in the clock of the IMU
     lever_m: Floats  # (3,) position of the radar in the axes of the IMU
-    angular_velocity: Floats  # (G, 3) rad/s, in the axes of the radar, without bias
-    bias_rad_s: float  # standard deviation of the remaining bias about the least certain axis
-    times_s: Floats  # (G,) in the clock of the scans
+    gyroscope: Gyroscope
     up: Floats  # (F, 3) unit vectors in the frame of the radar at each scan
 
     @property
@@ -97,15 +96,33 @@ class ImuAlignment:
 
     @classmethod
     def of(cls, imu: Imu, velocities: SensorVelocities, times_s: Floats) -> ImuAlignment | None:
-        """Estimate from velocities at ascending `times_s` (F,). None if it is not observable."""
+        """Estimate from velocities at ascending `times_s` (F,). None if it is not observable, or does not explain them."""
         if imu.specific_force is None or len(times_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
             return None
         rows, window = _windows(times_s)
         if len(rows) == 0 or times_s[-1] - times_s[0] < 4 * _UNRELATED_S:
             return None
-        sample = velocities.select(rows), times_s[rows], window
-        first = _solve_linearly(imu, *sample)
-        return None if first is None else _refine(imu, *sample, *first, times_s)
+        model = _AlignmentModel(imu, velocities.select(rows), times_s[rows], window)
+        if (solved := _solve_linearly(model)) is None:
+            return None
+        model, x = solved
+        x, covariance = _minimise(model.residuals, x)
+        if not np.isfinite(x).all():
+            return None
+        scale = float(np.median((model.velocity_residuals(x) ** 2).sum(axis=1))) / _MEDIAN
+        # A scale below 1 does not reduce the covariance: common errors of scans do not show in residuals.
+        covariance *= max(scale, 1.0)
+        known = imu.R_sensor_imu is not None
+        sigma_rad = 0.0 if known else float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        R, gravity, lever_m, late_s, motion = model.unpack(x)
+        if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(late_s) > 2 * _MAX_TIME_OFFSET_S:
+            return None
+        # Against gravity, Qᵀ g in the axes of the IMU.
+        up = -np.einsum("ij,fkj,k->fi", R, motion.at(times_s - late_s)[1], gravity)
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        rates, bias_rad_s = np.einsum("ij,gj->gi", R, motion.rates), np.sqrt(covariance.diagonal()[13:].max())
+        gyroscope = Gyroscope.of(rates, imu.times_s + late_s, times_s, float(bias_rad_s))
+        return cls(R, sigma_rad, late_s, lever_m, gyroscope, up)
 
 
 def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -121,26 +138,79 @@ def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return rows, np.unique(number[rows], return_inverse=True)[1].ravel()
 
 
-def _centred(values: Floats, window: NDArray[np.intp]) -> Floats:
-    """Subtract the mean of each window from values (K, ...)."""
-    first = np.searchsorted(window, np.arange(window[-1] + 1))
-    counts = np.bincount(window).reshape(-1, *[1] * (values.ndim - 1))
-    return values - (np.add.reduceat(values, first, axis=0) / counts)[window]
+@dataclass(frozen=True)
+class _AlignmentModel:
+    """Equation above for K scans, and its parameters.
+
+    These are a rotation vector, gravity, the bias of forces, the lever arm, the time offset, and the bias of rates at knots.
+    """
+
+    imu: Imu
+    velocities: SensorVelocities
+    times_s: Floats  # (K,)
+    window: NDArray[np.intp]  # (K,) ascending
+    R_first: Floats = field(default_factory=lambda: np.eye(3))  # that the rotation vector refines
+
+    @cached_property
+    def begins(self) -> NDArray[np.intp]:
+        """First scan of each window."""
+        return np.searchsorted(self.window, np.arange(self.window[-1] + 1))
+
+    @cached_property
+    def information(self) -> Floats:
+        """(K, 3, 3) of velocities."""
+        return np.linalg.inv(self.velocities.covariance).astype(np.float64)
+
+    @cached_property
+    def whitening(self) -> Floats:
+        """(K, 3, 3) of velocities."""
+        return np.linalg.cholesky(self.information).transpose(0, 2, 1).astype(np.float64)
+
+    def centre(self, values: Floats) -> Floats:
+        """Subtract the mean of each window from values (K, ...)."""
+        counts = np.bincount(self.window).reshape(-1, *[1] * (values.ndim - 1))
+        return values - (np.add.reduceat(values, self.begins, axis=0) / counts)[self.window]
+
+    def unpack(self, x: Floats) -> tuple[Floats, Floats, Floats, float, _ImuMotion]:
+        """Return the rotation, gravity, the lever arm, the time offset, and the motion without biases."""
+        turn, gravity, force_bias, lever_m, late_s, rate_bias = np.split(x, [3, 6, 9, 12, 13])
+        R = self.R_first if self.imu.R_sensor_imu is not None else self.R_first @ rotation(turn)
+        motion = _ImuMotion.of(self.imu, rate_bias.reshape(-1, 3), force_bias)
+        return R, gravity, lever_m, float(late_s[0]), motion
+
+    def velocity_residuals(self, x: Floats) -> Floats:
+        """Return whitened residual velocities (K, 3), with the mean of each window removed."""
+        R, gravity, lever_m, late_s, motion = self.unpack(x)
+        at_s = self.times_s - late_s
+        rates, turns, speeds = motion.at(at_s)
+        moved = np.einsum("ji,fj->fi", R, self.velocities.mean_mps) - np.cross(rates, lever_m)
+        since_s = at_s - self.imu.times_s[0]
+        left = np.einsum("fij,fj->fi", turns, moved) - speeds - since_s[:, None] * gravity
+        to_radar = np.einsum("ij,fkj->fik", R, turns)
+        weights = np.einsum("fji,fjk,fkl->fil", to_radar, self.information, to_radar)
+        sums = np.add.reduceat(np.einsum("fij,fj->fi", weights, left), self.begins)
+        means = np.linalg.solve(np.add.reduceat(weights, self.begins), sums[..., None])[..., 0]
+        return np.asarray(np.einsum("fij,fjk,fk->fi", self.whitening, to_radar, left - means[self.window]))
+
+    def residuals(self, x: Floats) -> Floats:
+        """Return the normalised residuals of velocities and priors."""
+        prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, x[13:16] / FIRST_BIAS_RAD_S]
+        changes = (x[16:] - x[13:-3]) / _BIAS_CHANGE_RAD_S
+        return np.concatenate([self.velocity_residuals(x).ravel(), *prior, changes])
 
 
-def _solve_linearly(
-    imu: Imu, velocities: SensorVelocities, times_s: Floats, window: NDArray[np.intp]
-) -> tuple[Floats, Floats, float] | None:
-    """Solve for rotation (3, 3), gravity (3,) and time offset by linear least squares. None if not significant."""
+def _solve_linearly(model: _AlignmentModel) -> tuple[_AlignmentModel, Floats] | None:
+    """Solve for rotation, gravity and time offset by linear least squares. None if not significant."""
+    imu, times_s = model.imu, model.times_s
     motion = _ImuMotion.of(imu, np.zeros((1, 3)), np.zeros(3))
 
     def fit(at_s: Floats) -> tuple[float, Floats]:
         """Return the residual sum of squares, and the entries of Rᵀ row by row, then gravity."""
         _, turns, speeds = motion.at(at_s)
         rows = np.zeros((len(at_s), 3, 12))
-        rows[:, :, :9] = np.einsum("fij,fk->fijk", turns, velocities.mean_mps).reshape(-1, 3, 9)
+        rows[:, :, :9] = np.einsum("fij,fk->fijk", turns, model.velocities.mean_mps).reshape(-1, 3, 9)
         rows[:, :, 9:] = -(at_s - at_s.mean())[:, None, None] * np.eye(3)
-        a, b = _centred(rows, window).reshape(-1, 12), _centred(speeds, window).ravel()
+        a, b = model.centre(rows).reshape(-1, 12), model.centre(speeds).ravel()
         matrix, vector = np.einsum("nk,nl->kl", a, a), np.einsum("nk,n->k", a, b)
         solved = np.linalg.solve(matrix + 1e-6 * np.trace(matrix) * np.eye(12), vector)
         return float((b**2).sum() - (solved * vector).sum()), solved
@@ -151,78 +221,13 @@ def _solve_linearly(
     # A mostly stationary drive has the same rotations and velocities at many times.
     span_s = times_s[-1] - times_s[0]
     away = np.linspace(_UNRELATED_S, span_s - _UNRELATED_S, _UNRELATED)
-    if fits[best][0] >= min(fit(times_s[0] + (times_s - times_s[0] + s) % span_s)[0] for s in away):
+    cost, solved = fits[best]
+    if cost >= min(fit(times_s[0] + (times_s - times_s[0] + s) % span_s)[0] for s in away):
         return None
-    solved = fits[best][1]
     R = nearest_rotation(solved[:9].reshape(3, 3).T) if imu.R_sensor_imu is None else imu.R_sensor_imu
-    return R, solved[9:], float(late[best])
-
-
-def _refine(
-    imu: Imu,
-    velocities: SensorVelocities,
-    times_s: Floats,
-    window: NDArray[np.intp],
-    R_first: Floats,
-    gravity: Floats,
-    time_offset_s: float,
-    all_times_s: Floats,
-) -> ImuAlignment | None:
-    """Refine by robust nonlinear least squares. None if the velocities are not explained, or the rotation is not observable."""
-    known = imu.R_sensor_imu is not None
-    first = np.searchsorted(window, np.arange(window[-1] + 1))
-    information = np.linalg.inv(velocities.covariance)
-    whiten = np.linalg.cholesky(information).transpose(0, 2, 1)
     knots = 1 + int(np.clip((imu.times_s[-1] - imu.times_s[0]) // _KNOT_S, 1, _KNOTS))
-
-    def unpack(x: Floats) -> tuple[Floats, Floats, Floats, float, _ImuMotion]:
-        """Return the rotation, gravity, the lever arm, the time offset, and the motion without biases."""
-        turn, gravity, force_bias, lever_m, late_s, rate_bias = np.split(x, [3, 6, 9, 12, 13])
-        R = R_first if known else R_first @ rotation(turn)
-        return R, gravity, lever_m, float(late_s[0]), _ImuMotion.of(imu, rate_bias.reshape(-1, 3), force_bias)
-
-    def velocity_residuals(x: Floats) -> Floats:
-        """Return whitened residual velocities (K, 3), with the mean of each window removed."""
-        R, gravity, lever_m, late_s, motion = unpack(x)
-        rates, turns, speeds = motion.at(times_s - late_s)
-        moved = np.einsum("ji,fj->fi", R, velocities.mean_mps) - np.cross(rates, lever_m)
-        since_s = times_s - late_s - imu.times_s[0]
-        left = np.einsum("fij,fj->fi", turns, moved) - speeds - since_s[:, None] * gravity
-        to_radar = np.einsum("ij,fkj->fik", R, turns)
-        weights = np.einsum("fji,fjk,fkl->fil", to_radar, information, to_radar)
-        sums = np.add.reduceat(np.einsum("fij,fj->fi", weights, left), first)
-        means = np.linalg.solve(np.add.reduceat(weights, first), sums[..., None])[..., 0]
-        return np.asarray(np.einsum("fij,fjk,fk->fi", whiten, to_radar, left - means[window]))
-
-    def residuals(x: Floats) -> Floats:
-        bias = x[13:].reshape(-1, 3)
-        prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, bias[0] / FIRST_BIAS_RAD_S]
-        changes = np.diff(bias, axis=0).ravel() / _BIAS_CHANGE_RAD_S
-        return np.concatenate([velocity_residuals(x).ravel(), *prior, changes])
-
-    start = np.concatenate([np.zeros(3), gravity, np.zeros(6), [time_offset_s], np.zeros(3 * knots)])
-    x, covariance = _minimise(residuals, start)
-    if not np.isfinite(x).all():
-        return None
-    scale = float(np.median((velocity_residuals(x) ** 2).sum(axis=1))) / _MEDIAN
-    # A scale below 1 does not reduce the covariance: common errors of scans do not show in residuals.
-    covariance *= max(scale, 1.0)
-    sigma_rad = 0.0 if known else float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-    R, gravity, lever_m, time_offset_s, motion = unpack(x)
-    if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(time_offset_s) > 2 * _MAX_TIME_OFFSET_S:
-        return None
-    # Against gravity, Qᵀ g in the axes of the IMU.
-    up = -np.einsum("ij,fkj,k->fi", R, motion.at(all_times_s - time_offset_s)[1], gravity)
-    return ImuAlignment(
-        R,
-        sigma_rad,
-        time_offset_s,
-        lever_m,
-        np.einsum("ij,gj->gi", R, motion.rates),
-        float(np.sqrt(covariance.diagonal()[13:].max())),
-        imu.times_s + time_offset_s,
-        up / np.linalg.norm(up, axis=1, keepdims=True),
-    )
+    x = np.concatenate([np.zeros(3), solved[9:], np.zeros(6), [late[best]], np.zeros(3 * knots)])
+    return dataclasses.replace(model, R_first=R), x
 
 
 def _minimise(residuals: Callable[[Floats], Floats], x: Floats) -> tuple[Floats, Floats]:
@@ -265,10 +270,8 @@ class Inertial:
         imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             return cls(None).without("it measured before or after all scans. Are both times of one clock?")
-        alignment = None if velocities is None else ImuAlignment.of(imu, velocities, times_s)
-        if alignment is not None:
-            rates, at_s = alignment.angular_velocity, alignment.times_s
-            return cls(Gyroscope.of(rates, at_s, times_s, alignment.bias_rad_s), alignment)
+        if velocities is not None and (found := ImuAlignment.of(imu, velocities, times_s)) is not None:
+            return cls(found.gyroscope, found)
         if imu.R_sensor_imu is None:
             return cls(None).without(
                 "its rotation on the radar is unknown, as accelerometer and Doppler do not determine it: give R_sensor_imu"
@@ -289,7 +292,7 @@ class Inertial:
         return {key: np.asarray(getattr(found, key)).tolist() for key in keys}
 
 
-def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
+def level_poses(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
     """Rotate poses (F, 4, 4) and covariances (F, 6, 6) to a world with z up, by `up` (F, 3) in the frame of the radar.
 
     The first position stays at the origin; the rotation is minimal.

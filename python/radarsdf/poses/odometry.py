@@ -19,7 +19,7 @@ from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
 from radarsdf.poses.drive import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
 from radarsdf.poses.gyroscope import UnusableGyroscopeError
-from radarsdf.poses.imu import Inertial, levelled
+from radarsdf.poses.imu import Inertial, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
@@ -159,7 +159,7 @@ def odometry(
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
     if inertial.alignment is not None:
-        poses, covariance = levelled(poses, covariance, inertial.alignment.up)
+        poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     length_m = float(lengths_m[np.diff(segments) == 0].sum())
     gyroscope = drive.gyroscope

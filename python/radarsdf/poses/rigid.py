@@ -43,14 +43,6 @@ def between(first: Floats, second: Floats) -> Floats:
     return found
 
 
-def alignment(poses: Floats, reference: Floats) -> Floats:
-    """Return the motion (4, 4) that aligns the mean position and mean rotation of poses (F, 4, 4) with `reference`."""
-    turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
-    whole = np.eye(4)
-    whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
-    return placed(whole, poses, reference)
-
-
 def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
     """Return the motion (4, 4) with the rotation of `turn` that aligns the mean position of poses (F, 4, 4) with `reference`."""
     whole = turn.copy()
@@ -61,7 +53,10 @@ def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
 
 def aligned(poses: Floats, reference: Floats) -> Floats:
     """Rigidly align poses (F, 4, 4) with the mean position and mean rotation of `reference`."""
-    return np.asarray(np.einsum("ij,fjk->fik", alignment(poses, reference), poses))
+    turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
+    whole = np.eye(4)
+    whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
+    return np.asarray(np.einsum("ij,fjk->fik", placed(whole, poses, reference), poses))
 
 
 def turned_by(poses: Floats, others: Floats) -> Floats:

@@ -81,7 +81,7 @@ class Tracker:
         """Register a scan (N, 3), sensor frame, m, with the map, near the predicted step. None: the first scan."""
         if predicted is None or not self._planes:
             return begin_segment(np.eye(4))
-        scan = thinned(scan, _MOST_RETURNS)
+        scan = thin(scan, _MOST_RETURNS)
         if len(scan) == 0:
             return self._dead_reckon(predicted)
         radius_m = float(np.median(np.linalg.norm(scan, axis=1)))
@@ -145,12 +145,14 @@ class Tracker:
                 *equations, inliers = planes.agreement(scan, pose, self._variances)
                 hessian, gradient = _discount_tilts(*equations)
                 total = hessian + information
-                step = -np.linalg.solve(total, gradient + information @ increments(mean, pose))
+                off = gradient + information @ increments(mean, pose)
+                step = -np.linalg.solve(total, off).astype(np.float64)
                 pose = moved(pose, step)
                 if step @ total @ step < 6 * _SETTLED**2:
                     break
         covariance = self._discount_chance(scan, pose, prior, np.linalg.inv(total))
-        observed = tuple(_removed_share(prior[k, k], covariance[k, k]) for k in (slice(0, 3), slice(3, 6)))
+        moved_share = _removed_share(prior[:3, :3], covariance[:3, :3])
+        observed = moved_share, _removed_share(prior[3:, 3:], covariance[3:, 3:])
         turn = rotation_vector(last_R.T @ pose[:3, :3], turn)
         return Tracked(pose, covariance, inliers / len(scan), self.last.segment, turn, observed)
 
@@ -178,7 +180,7 @@ class Tracker:
         self, scan: Floats, predicted: PredictedStep, capture_m: float, radius_m: float
     ) -> Tracked | None:
         """Search many poses for the best, if the returns agree there significantly better than elsewhere and than by chance."""
-        coarse, sample = self._planes[0], thinned(scan, _SCORED_RETURNS)
+        coarse, sample = self._planes[0], thin(scan, _SCORED_RETURNS)
 
         def score(poses: Floats) -> Floats:
             return coarse.scores(sample, np.ascontiguousarray(poses), self._variances)
@@ -232,9 +234,10 @@ def _best(scores: Floats) -> NDArray[np.intp]:
 def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
     """Return upper bounds (K,) of the displacement, m, of a return at range `radius_m` between poses (K, 4, 4) and `pose`."""
     off = increments(np.broadcast_to(pose, poses.shape), poses)
-    return np.linalg.norm(off[:, :3], axis=1) + radius_m * np.linalg.norm(off[:, 3:], axis=1)
+    moved_m, turned_rad = (np.linalg.norm(of, axis=1) for of in (off[:, :3], off[:, 3:]))
+    return np.asarray(moved_m + radius_m * turned_rad)
 
 
-def thinned(scan: Floats, most: int) -> Floats:
+def thin(scan: Floats, most: int) -> Floats:
     """Subsample a scan evenly to about `most` returns."""
     return np.ascontiguousarray(scan[:: max(1, -(-len(scan) // most))])
