@@ -157,14 +157,10 @@ class _AlignmentModel:
         return np.searchsorted(self.window, np.arange(self.window[-1] + 1))
 
     @cached_property
-    def information(self) -> Floats:
-        """(K, 3, 3) of velocities."""
-        return np.linalg.inv(self.velocities.covariance).astype(np.float64)
-
-    @cached_property
-    def whitening(self) -> Floats:
-        """(K, 3, 3) of velocities."""
-        return np.linalg.cholesky(self.information).transpose(0, 2, 1).astype(np.float64)
+    def weights(self) -> tuple[Floats, Floats]:
+        """Information (K, 3, 3) of the velocities, and matrices (K, 3, 3) that whiten them."""
+        information = np.linalg.inv(self.velocities.covariance).astype(np.float64)
+        return information, np.linalg.cholesky(information).transpose(0, 2, 1).astype(np.float64)
 
     def centre(self, values: Floats) -> Floats:
         """Subtract the mean of each window from values (K, ...)."""
@@ -183,14 +179,15 @@ class _AlignmentModel:
         R, gravity, lever_m, late_s, motion = self.unpack(x)
         at_s = self.times_s - late_s
         rates, turns, speeds = motion.at(at_s)
+        information, whitening = self.weights
         moved = np.einsum("ji,fj->fi", R, self.velocities.mean_mps) - np.cross(rates, lever_m)
         since_s = at_s - self.imu.times_s[0]
         left = np.einsum("fij,fj->fi", turns, moved) - speeds - since_s[:, None] * gravity
         to_radar = np.einsum("ij,fkj->fik", R, turns)
-        weights = np.einsum("fji,fjk,fkl->fil", to_radar, self.information, to_radar)
+        weights = np.einsum("fji,fjk,fkl->fil", to_radar, information, to_radar)
         sums = np.add.reduceat(np.einsum("fij,fj->fi", weights, left), self.begins)
         means = np.linalg.solve(np.add.reduceat(weights, self.begins), sums[..., None])[..., 0]
-        return np.asarray(np.einsum("fij,fjk,fk->fi", self.whitening, to_radar, left - means[self.window]))
+        return np.asarray(np.einsum("fij,fjk,fk->fi", whitening, to_radar, left - means[self.window]))
 
     def residuals(self, x: Floats) -> Floats:
         """Return the normalised residuals of velocities and priors."""
