@@ -1,7 +1,9 @@
 """The names of the package: complete, imported only when they are used, and with examples that run."""
 
+import ast
 import doctest
 import importlib
+import itertools
 import os
 import pkgutil
 import re
@@ -134,3 +136,13 @@ def test_example(test, tmp_path, monkeypatch):
 
 def test_public_names_have_docstrings():
     assert [name for name in radarsdf.__all__ if not (getattr(radarsdf, name).__doc__ or "").strip()] == []
+
+
+def test_docstrings_describe_each_parameter():
+    """Regression: without an indent, a page showed the description of a parameter as its name."""
+    for path in sorted(Path(radarsdf.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            doc = ast.get_docstring(node) if isinstance(node, ast.FunctionDef) else None
+            section = re.search(r"^Parameters\n-+\n(.*?)(\n\n|\Z)", doc or "", re.DOTALL | re.MULTILINE)
+            for name, described in itertools.pairwise(section[1].splitlines() if section else []):
+                assert name.startswith(" ") or described.startswith(" "), (path.name, node.name, name)

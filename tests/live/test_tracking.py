@@ -8,7 +8,7 @@ from radarsdf.live.store import LoggedScan
 from radarsdf.live.tracking import Lost, Step, _signed
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.rigid import aligned
-from radarsdf.poses.tracking import begun
+from radarsdf.poses.tracking import begin_segment
 from radarsdf.returns.moving import SensorVelocity
 
 from ..poses.drift import first, thinned
@@ -165,8 +165,8 @@ def test_a_sensor_moves_if_its_velocity_is_five_deviations_from_zero():
         ([0, 0, 4.9], False),
     ):
         velocity = SensorVelocity(np.array(mean), covariance, np.ones(3, bool))
-        assert Step(0, logged, velocity, begun(np.eye(4))).moves == moves
-    assert Step(0, logged, None, begun(np.eye(4))).moves
+        assert Step(0, logged, velocity, begin_segment(np.eye(4))).moves == moves
+    assert Step(0, logged, None, begin_segment(np.eye(4))).moves
 
 
 def test_a_velocity_of_undetermined_sign_is_zero_with_its_speed_as_deviation():

@@ -19,13 +19,14 @@ from radarsdf.poses.doppler import (
     sign_significance,
     upright,
 )
-from radarsdf.poses.imu import Gyroscope
+from radarsdf.poses.drive import Drive, rates_of, track_drive
+from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion, MotionRate, PredictedStep, spans_of, unsteadiness, way
 from radarsdf.poses.planes import SensorReturns, plane_cell_m, reduction
 from radarsdf.poses.posed import PosedScans, pose_sigmas
 from radarsdf.poses.refine import _by_biases
 from radarsdf.poses.rigid import (
-    alignment,
+    aligned,
     between,
     covariance_in,
     increments,
@@ -39,17 +40,7 @@ from radarsdf.poses.rigid import (
     transform,
     turned_by,
 )
-from radarsdf.poses.tracking import (
-    Drive,
-    Tracked,
-    Tracker,
-    _apart_m,
-    _removed_share,
-    begun,
-    followed,
-    rates_of,
-    thinned,
-)
+from radarsdf.poses.tracking import Tracked, Tracker, _apart_m, _removed_share, begin_segment, thin
 from radarsdf.poses.verdict import Verdict, _crowding, _gains
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.simulate import drifted
@@ -69,7 +60,7 @@ def test_increments_lead_from_pose_to_pose():
     assert_allclose(moved(first, increments(first, second)), second, atol=1e-12)
     assert_allclose(between(first, second), np.linalg.inv(first) @ second, atol=1e-12)
     whole = transform(np.array([0.1, 0.2, -0.9]), np.array([5.0, 6, 7]))
-    assert_allclose(alignment(first, whole @ first), whole, atol=1e-12)
+    assert_allclose(aligned(first, whole @ first), whole @ first, atol=1e-12)
     shifted = moved(first, np.tile([0.3, 0, 0.4, 0, 0.6, 0.8], (5, 1)))
     assert moved_by(first, shifted) == pytest.approx({"moved_m": 0.5, "moved_rad": 1.0})
     assert_allclose(turned_by(first, shifted), 1.0)
@@ -226,14 +217,14 @@ def test_rates_of_a_step_lead_to_the_next_one():
     assert_allclose(turning.covariance, R.T @ covariance[3:, 3:] @ R / duration_s**2)
     assert_allclose(moving.covariance, half.T @ covariance[:3, :3] @ half / duration_s**2)
     drive = Drive([np.zeros((0, 3))] * 3, np.array([0.0, 0.2, 0.5]), None, None)
-    next_step = drive.expected(2, turning, moving)
+    next_step = drive.predict(2, turning, moving)
     rate = drive.turns.after(turning, 0.25)
     assert_allclose(next_step.turn.mean, 0.3 * rate.mean)
     assert_allclose(next_step.turn.covariance, 0.09 * rate.covariance)
     assert_allclose(next_step.begin_mps, speed)
     expected = (moving.covariance + 0.25 * np.diag(drive.moves.change)) * 0.09
     assert_allclose(next_step.translation_covariance, expected)
-    assert drive.expected(1, None, None).duration_s == 0.2
+    assert drive.predict(1, None, None).duration_s == 0.2
     assert drive.usual_turn_rad_s == pytest.approx(0.3)
     fast = dataclasses.replace(drive, velocities=velocities_of(np.tile([0, 25.0, 0], (3, 1)), np.eye(3)))
     assert fast.usual_turn_rad_s == pytest.approx(2 / 25)
@@ -243,13 +234,11 @@ def test_rates_of_a_step_lead_to_the_next_one():
 
 def test_a_gyroscope_learns_from_turns_with_the_covariance_of_their_rates(monkeypatch):
     rate, asked = MotionRate(np.array([0.1, -0.2, 0.3]), spread(12, 3)), []
-    passed = [begun(np.eye(4))] * 3, [(rate, rate), (None, None)]
-    monkeypatch.setattr("radarsdf.poses.tracking.tracked_once", lambda *_: passed)
-    gyroscope = SimpleNamespace(learnt=lambda *turns: asked.append(turns))
-    followed(Drive([np.eye(3)] * 3, np.array([0, 0.5, 0.7]), None, gyroscope), FitConfig(), 1, False)
-    ((vectors, covariance),) = asked
-    assert_allclose(vectors, [0.5 * rate.mean, [np.nan] * 3])
-    assert_allclose(covariance[0], 0.25 * rate.covariance)
+    passed = [begin_segment(np.eye(4))] * 3, [(rate, rate), (None, None)]
+    monkeypatch.setattr("radarsdf.poses.drive.track_once", lambda *_: passed)
+    gyroscope = SimpleNamespace(learnt=asked.append)
+    track_drive(Drive([np.eye(3)] * 3, np.array([0, 0.5, 0.7]), None, gyroscope), FitConfig(), 1, False)
+    assert asked == [[rate, None]]
 
 
 def test_returns_reduce_and_errors_increase_covariances():
@@ -261,9 +250,9 @@ def test_returns_reduce_and_errors_increase_covariances():
     total, part = (turned @ m @ turned.T for m in (total, part))
     M = reduction(total, part)
     assert_allclose(M @ total @ M.T, turned @ np.diag([3.0, 0, 0]) @ turned.T, atol=1e-6)
-    assert begun(np.eye(4), 3).segment == 3
-    assert np.isnan(begun(np.eye(4)).agreeing)
-    assert [len(thinned(np.zeros((n, 3)), 10)) for n in (0, 10, 11, 20, 21)] == [0, 10, 6, 10, 7]
+    assert begin_segment(np.eye(4), 3).segment == 3
+    assert np.isnan(begin_segment(np.eye(4)).agreeing)
+    assert [len(thin(np.zeros((n, 3)), 10)) for n in (0, 10, 11, 20, 21)] == [0, 10, 6, 10, 7]
 
 
 def test_returns_are_selected_by_range_and_cells_match_their_spacing():
@@ -333,7 +322,7 @@ def test_common_errors_of_steps_equal_the_joint_inverse():
 def test_motions_of_a_tracked_drive():
     poses = trajectory(5)
     rotation_vectors = np.stack([rotation_vector(step[:3, :3]) for step in between(poses[:-1], poses[1:])])
-    tracked = [begun(poses[0])] + [
+    tracked = [begin_segment(poses[0])] + [
         Tracked(p, np.eye(6), 1.0, 0, t) for p, t in zip(poses[1:], rotation_vectors, strict=True)
     ]
     drive = Drive([np.zeros((0, 3))] * 5, 0.5 * np.arange(5.0), None, None)
@@ -379,11 +368,11 @@ def test_information_independent_of_the_pose_is_subtracted():
     tracker._planes = [None, SimpleNamespace(agreement=agreement)]
     prior, pose = np.eye(6), transform(np.zeros(3), np.array([5.0, 0, 0]))
     covariance = np.diag([1 / 101] + [1e-6] * 5)
-    found = tracker._without_chance(None, pose, prior, covariance)
+    found = tracker._discount_chance(None, pose, prior, covariance)
     assert_allclose(found, np.diag([1 / 61] + [1e-6] * 5), rtol=1e-9)
     assert len(asked) == 5
     sure = (0.05 * 0.8) ** 2 * 0.99  # in cells of 0.8 m, this needs no returns
-    assert tracker._without_chance(None, pose, sure * prior, covariance) is covariance
+    assert tracker._discount_chance(None, pose, sure * prior, covariance) is covariance
 
 
 def test_gains_equal_a_brute_force_search():

@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.io import UNPOSED, Imu
-from radarsdf.poses.imu import (
-    Gyroscope,
-    ImuAlignment,
-    Inertial,
-    UnusableGyroscopeError,
-    _windows,
-    cumulated,
-    levelled,
-)
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError, cumulate_turns
+from radarsdf.poses.imu import ImuAlignment, Inertial, _windows, level_poses
+from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import rotation
 from radarsdf.simulate import measured_imu
 from scipy.spatial.transform import Rotation
@@ -71,8 +65,7 @@ def test_velocities_determine_its_rotation(ride, imu):
     np.testing.assert_allclose(found.lever_m, LEVER_M, atol=0.1)
     assert tilt(poses, found.up) < 1.5
     # Rates without bias lead to the last pose.
-    gyroscope = Gyroscope.of(found.angular_velocity, found.times_s, times_s + LATE_S)
-    end = poses[0, :3, :3] @ cumulated(gyroscope.turns)[-1]
+    end = poses[0, :3, :3] @ cumulate_turns(found.gyroscope.turns)[-1]
     assert angle(end, poses[-1, :3, :3]) < 3
 
 
@@ -89,7 +82,7 @@ def test_without_noise_it_is_exact(ride, monkeypatch, late_s):
     assert report["time_offset_s"] == pytest.approx(late_s, abs=1e-4)
     np.testing.assert_allclose(report["lever_m"], LEVER_M, atol=1e-3)
     assert tilt(poses, found.alignment.up) < 1e-2
-    turns = cumulated(found.gyroscope.turns)
+    turns = cumulate_turns(found.gyroscope.turns)
     assert max(angle(poses[0, :3, :3] @ turns[i], poses[i, :3, :3]) for i in (100, -1)) < 1e-2
     late = f"scans are {late_s:.3f} s late in its clock"
     assert f"found to {np.degrees(report['sigma_rad']):.1f} degrees, {late}" in found.alignment.words
@@ -154,7 +147,7 @@ def test_straight_motion_leaves_the_rotation_undetermined():
 def test_two_windows_of_scans_are_the_fewest(ride, imu, monkeypatch, scans, enough):
     times_s, _, velocities = ride
     asked, rows = [], slice(0, 5 * scans, 5)
-    monkeypatch.setattr("radarsdf.poses.imu._first_guess", lambda *given: asked.append(given))
+    monkeypatch.setattr("radarsdf.poses.imu._solve_linearly", lambda *given: asked.append(given))
     assert ImuAlignment.of(imu, velocities.select(rows), times_s[rows]) is None
     assert bool(asked) == enough
 
@@ -170,21 +163,21 @@ def test_a_bias_is_estimated_from_rotations(ride):
     times_s, poses, _ = ride
     steps = Rotation.from_matrix(poses[:-1, :3, :3]).inv() * Rotation.from_matrix(poses[1:, :3, :3])
     turns = steps.as_rotvec() + np.random.default_rng(3).normal(0, 0.005, (len(steps), 3))
-    covariance = np.tile(0.005**2 * np.eye(3), (len(steps), 1, 1))
+    shown = [MotionRate(10 * turn, 0.05**2 * np.eye(3)) for turn in turns]
     bias = np.array([0.01, -0.02, 0.015])
     rates = measured_imu(poses, times_s, gyroscope_bias_rad_s=tuple(bias))
-    found = Gyroscope.of(rates.angular_velocity, rates.times_s, times_s).learnt(turns, covariance)
+    found = Gyroscope.of(rates.angular_velocity, rates.times_s, times_s).learnt(shown)
     off = np.degrees(np.linalg.norm(found.turns - found.bias.mean * 0.1 - steps.as_rotvec(), axis=1))
     assert np.median(off) < 0.1
     # Three deviations of the mean of 299 rotations in 0.1 s, each with an error of 0.005 rad.
     np.testing.assert_allclose(found.bias.mean, bias, atol=3 * 0.05 / np.sqrt(299))
     with pytest.raises(UnusableGyroscopeError):
-        Gyroscope.of(np.degrees(rates.angular_velocity), rates.times_s, times_s).learnt(turns, covariance)
+        Gyroscope.of(np.degrees(rates.angular_velocity), rates.times_s, times_s).learnt(shown)
 
 
 def test_products_of_many_small_turns():
     turns = np.random.default_rng(4).normal(0, 0.3, (101, 3))
-    found, at = cumulated(turns), np.eye(3)
+    found, at = cumulate_turns(turns), np.eye(3)
     assert len(found) == 102
     for i, turn in enumerate(turns):
         np.testing.assert_allclose(found[i], at, atol=1e-12)
@@ -198,7 +191,7 @@ def test_the_world_is_levelled(ride, up):
     up = np.array(up)
     seen = np.einsum("fji,j->fi", poses[:, :3, :3], up)
     covariance = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (len(poses), 1, 1))
-    level, turned = levelled(poses, covariance, seen)
+    level, turned = level_poses(poses, covariance, seen)
     np.testing.assert_allclose(
         np.einsum("fij,fj->fi", level[:, :3, :3], seen), [[0, 0, 1]] * len(poses), atol=1e-9
     )

@@ -9,9 +9,10 @@ from radarsdf import FitConfig
 from radarsdf.io import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.imu import Gyroscope, UnusableGyroscopeError
+from radarsdf.poses.drive import Drive
+from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
+from radarsdf.poses.motion import MotionRate
 from radarsdf.poses.rigid import aligned
-from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
 
 from scenes.kinds import KINDS
@@ -122,13 +123,13 @@ def test_an_implausible_gyroscope_bias_is_named(bias_rad_s, named):
     rng = np.random.default_rng(0)
     turns = 0.02 * rng.standard_normal((40, 3))
     rates = Gyroscope.of(np.zeros((41, 3)), np.arange(41) / 10, np.arange(41) / 10)
-    covariance = np.tile(1e-6 * np.eye(3), (40, 1, 1))
+    shown = [MotionRate(10 * turn, 1e-4 * np.eye(3)) for turn in turns]
     measured = dataclasses.replace(rates, turns=turns + [0, 0, bias_rad_s / 10])
     if named is None:
-        assert measured.learnt(turns, covariance).bias.mean[2] == pytest.approx(bias_rad_s, rel=0.1)
+        assert measured.learnt(shown).bias.mean[2] == pytest.approx(bias_rad_s, rel=0.1)
         return
     with pytest.raises(UnusableGyroscopeError, match=named):
-        measured.learnt(turns, covariance)
+        measured.learnt(shown)
 
 
 def test_a_gap_of_a_day_starts_a_new_segment(drive, motion):

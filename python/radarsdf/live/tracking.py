@@ -26,9 +26,10 @@ from radarsdf.poses.doppler import (
     sign_significance,
     upright,
 )
+from radarsdf.poses.drive import LEAST_OBSERVED, Drive, rates_of, track_drive
 from radarsdf.poses.motion import MotionRate, PredictedStep
 from radarsdf.poses.rigid import Floats, rotation_vector
-from radarsdf.poses.tracking import LEAST_OBSERVED, WINDOW, Drive, Tracked, Tracker, begun, followed, rates_of
+from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begin_segment
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
@@ -113,7 +114,7 @@ class Follower:
     def seek(self, track: Track, log: ScanLog, scan_id: ScanId, logged: LoggedScan) -> list[Step]:
         """Register a scan, ignoring its own pose: the last of the steps returned. Those before it are re-estimated scans."""
         self._synchronise(track, log)
-        new = Step(scan_id, logged, self._velocity(logged), begun(np.eye(4)), given=False)
+        new = Step(scan_id, logged, self._velocity(logged), begin_segment(np.eye(4)), given=False)
         if not self._steps:
             if len(log):
                 msg = "the map has scans, but none with a time to continue from: give the pose of the scan, and its time"
@@ -236,7 +237,7 @@ class Follower:
             self._rates.append(rates_of(before.found.pose, step.found, step.time_s - before.time_s))
         self._steps.append(step)
         if planes:
-            self._tracker.keep(step.scan, step.found)
+            self._tracker.add(step.scan, step.found)
 
     def _velocity(self, logged: LoggedScan) -> SensorVelocity | None:
         """Estimate the velocity from the Doppler of a scan, if that yields one."""
@@ -262,8 +263,8 @@ class Follower:
             usual.moves.learnt(moves, durations_s),
         )
         turn, move = self._rates[-1] if self._rates else (None, None)
-        expected = drive.expected(len(steps) - 1, turn, move)
-        found = self._tracker.seek(drive.scans[-1], expected)
+        expected = drive.predict(len(steps) - 1, turn, move)
+        found = self._tracker.register(drive.scans[-1], expected)
         pull = (
             np.nan if drive.velocities is None or found.segment else _pull(steps[-2].found, found, expected)
         )
@@ -334,7 +335,7 @@ class Follower:
             ]
             turns = drive.turns.learnt(rates, durations_s)
             drive = dataclasses.replace(drive, velocities=_signed(velocities, likelier), turns=turns)
-        return sign, followed(drive, self.config, self.config.num_threads)[1]
+        return sign, track_drive(drive, self.config, self.config.num_threads)[1]
 
 
 def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:

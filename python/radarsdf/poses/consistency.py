@@ -20,9 +20,10 @@ from radarsdf.poses.doppler import (
     log_distance_gains,
     shift_losses,
 )
+from radarsdf.poses.drive import Drive, track_once
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import Floats, steps
-from radarsdf.poses.tracking import Drive, Tracked, Tracker, tracked_once
+from radarsdf.poses.tracking import Tracked, Tracker
 
 _BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
 _FEWEST_STEPS = 6  # of a window
@@ -208,7 +209,7 @@ class Consistency:
         free = compared.scaled(1.0, _FREE_SCALE)
         free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads)
-        tracked, _ = tracked_once(Drive(scans, times_s, free, None), tracker)
+        tracked, _ = track_once(Drive(scans, times_s, free, None), tracker)
         segments, counts = np.array(
             [(found.segment, len(scan)) for found, scan in zip(tracked, scans, strict=True)]
         ).T

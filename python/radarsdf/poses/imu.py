@@ -1,4 +1,4 @@
-"""Rotations from a gyroscope, and the alignment of an IMU with a radar: axes, vertical, and time offset.
+"""Alignment of an IMU with a radar: axes, vertical, and time offset.
 
 Changes of the Doppler velocity match the accelerometer once the gyroscope rotates both into one frame. With R the rotation
 from the IMU's axes to the radar's, Q(t) that of the IMU since the beginning, and v the velocity of the radar in its own
@@ -13,26 +13,20 @@ each time offset on a grid initialises robust nonlinear least squares (Gauss-New
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from radarsdf.imu import Imu
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.poses.motion import MotionRate
+from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S, Gyroscope, integrate_rates, interpolate
 from radarsdf.poses.rigid import Floats, covariance_in, nearest_rotation, rotation
-
-# Prior bias and noise, of cheap gyroscopes, until they are estimated from the drive.
-_FIRST_BIAS_RAD_S = 0.02
-_FIRST_NOISE_RAD = 0.003
-_LEAST_STEPS = 4  # minimum number of turns for a contradiction
-_MOST_BIAS_RAD_S = 0.35  # zero-rate offset of the cheapest gyroscopes: 20 degrees a second
-# Gate on the mean squared residual of turns from the rates, absolute and relative to that from a constant rate. Simulated
-# drives of 9 kinds: 0.02 to 0.63 times; in wrong units, signs or axes 1.3 times and more.
-_CONTRADICTED, _CONTRADICTED_SHARE = 12.0, 1.2
 
 # Minimum length of a window: longer ones gave the same rotation for the real walk, to 0.5 degrees.
 _WINDOW_S, _WINDOW_SCANS = 4.0, 10
@@ -53,108 +47,6 @@ _ITERATIONS, _SETTLED, _DIFFERENCE = 20, 0.03, 1e-6  # maximum, tolerance in dev
 _MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
 
 
-class UnusableGyroscopeError(ValueError):
-    """The rates of a gyroscope contradict a drive."""
-
-
-def cumulated(turns: Floats) -> Floats:
-    """Return the cumulative products (N + 1, 3, 3) of rotation vectors (N, 3), the identity first."""
-    count = len(turns) + 1
-    width = int(np.ceil(np.sqrt(count)))
-    padded = np.zeros((width * width, 3))
-    padded[1:count] = turns
-    found: Floats = Rotation.from_rotvec(padded).as_matrix().reshape(width, width, 3, 3)
-    # Scan within rows in parallel, then across rows: few steps of many products each.
-    for k in range(1, width):
-        found[:, k] = found[:, k - 1] @ found[:, k]
-    for row in range(1, width):
-        found[row] = found[row - 1, -1] @ found[row]
-    return found.reshape(-1, 3, 3)[:count]
-
-
-@dataclass(frozen=True)
-class Gyroscope:
-    """Rotations between F scans, with their errors."""
-
-    turns: Floats  # (F - 1, 3) rotation vectors in the frame of the first of two scans, rad
-    durations_s: Floats  # (F - 1,)
-    bias: MotionRate  # bias of the measured rate, rad/s
-    noise_rad2: float = _FIRST_NOISE_RAD**2  # variance of a rotation over the median duration
-
-    @classmethod
-    def of(
-        cls, angular_velocity: Floats, at_s: Floats, times_s: Floats, bias_rad_s: float = _FIRST_BIAS_RAD_S
-    ) -> Gyroscope:
-        """Integrate rates (G, 3), rad/s, at ascending times (G,) between scans at `times_s` (F,)."""
-        # Between two neighbouring times, of scans or rates, the rate is their mean (the trapezoidal rule).
-        inner = at_s[(at_s > times_s[0]) & (at_s < times_s[-1])]
-        edges = np.union1d(inner, times_s)
-        rates = np.stack([np.interp(edges, at_s, angular_velocity[:, axis]) for axis in range(3)], 1)
-        poses = cumulated(0.5 * (rates[1:] + rates[:-1]) * np.diff(edges)[:, None])
-        poses = poses[np.searchsorted(edges, times_s)]
-        turns = Rotation.from_matrix(np.einsum("fji,fjk->fik", poses[:-1], poses[1:])).as_rotvec()
-        return cls(turns, np.diff(times_s), MotionRate(np.zeros(3), bias_rad_s**2 * np.eye(3)))
-
-    @property
-    def _noise(self) -> Floats:
-        """Variance (F - 1,) of each component of a rotation, rad²."""
-        return self.noise_rad2 * self.durations_s / max(float(np.median(self.durations_s)), 1e-9)
-
-    def step(self, i: int) -> MotionRate:
-        """Return the rotation vector from scan `i` to the next, rad."""
-        duration_s = self.durations_s[i]
-        covariance = self.bias.covariance * duration_s**2 + self._noise[i] * np.eye(3)
-        return MotionRate(self.turns[i] - self.bias.mean * duration_s, covariance)
-
-    def learnt(self, turns: Floats, covariance: Floats) -> Gyroscope:
-        """Estimate bias and noise from rotations (F - 1, 3) with covariance (F - 1, 3, 3); NaN where unknown.
-
-        Raises an UnusableGyroscopeError if the rotations contradict the rates.
-        """
-        known = np.isfinite(turns).all(axis=1) & (self.durations_s > 0)
-        if known.sum() < 2:
-            return self
-        off, covariance, durations_s = (self.turns - turns)[known], covariance[known], self.durations_s[known]
-        noise = self._noise[known]
-        weights = np.linalg.inv(covariance + noise[:, None, None] * np.eye(3)).astype(np.float64)
-        _check(off, turns[known], durations_s, weights, covariance)
-        before = np.linalg.inv(self.bias.covariance).astype(np.float64)
-        bias, information, _ = _fitted_bias(off, durations_s, weights, before)
-        squares = (off - bias * durations_s[:, None]) ** 2 - np.einsum("fii->fi", covariance)
-        noise_rad2 = np.maximum(squares * (self.noise_rad2 / noise)[:, None], 0.0).mean()
-        fitted = MotionRate(bias, np.linalg.inv(information).astype(np.float64))
-        return dataclasses.replace(self, bias=fitted, noise_rad2=float(max(noise_rad2, 1e-10)))
-
-
-def _fitted_bias(
-    off: Floats, durations_s: Floats, weights: Floats, before: Floats | float = 0.0
-) -> tuple[Floats, Floats, float]:
-    """Fit a constant rate (3,) to residual rotations `off` (K, 3); return it, its information (3, 3) and the mean squared residual.
-
-    Weighted least squares; `before` is the information of a prior at 0.
-    """
-    information = before + np.einsum("fij,f->ij", weights, durations_s**2)
-    bias: Floats = np.linalg.solve(information, np.einsum("fij,fj,f->i", weights, off, durations_s))
-    left = off - bias * durations_s[:, None]
-    return bias, information, float(np.einsum("fi,fij,fj->f", left, weights, left).mean())
-
-
-def _check(off: Floats, turns: Floats, durations_s: Floats, weights: Floats, covariance: Floats) -> None:
-    """Raise an UnusableGyroscopeError if the residual rotations `off` (K, 3) are too large or biased."""
-    bias, _, square = _fitted_bias(off, durations_s, weights)
-    constant = _fitted_bias(-turns, durations_s, weights)[2]
-    rate = float(np.linalg.norm(bias))
-    contradicted = len(off) > _LEAST_STEPS and square > max(_CONTRADICTED, _CONTRADICTED_SHARE * constant)
-    # Turns that the returns hardly observe share the error of their prediction.
-    unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
-    if contradicted or rate >= _MOST_BIAS_RAD_S + 3 * unknown:
-        msg = (
-            f"its rates differ from the turns that the returns show by {np.sqrt(square / 3):.1f} standard deviations and a bias "
-            f"of {rate:.2f} rad/s: are they in rad/s, and in the axes of the radar?"
-        )
-        raise UnusableGyroscopeError(msg)
-
-
 @dataclass(frozen=True)
 class _ImuMotion:
     """Integrated motion of an IMU."""
@@ -169,12 +61,10 @@ class _ImuMotion:
         """Integrate `imu` corrected for biases (K, 3) of rates at evenly spaced knots, and (3,) of forces."""
         assert imu.specific_force is not None
         at = np.linspace(imu.times_s[0], imu.times_s[-1], len(rate_bias))
-        rates = imu.angular_velocity - np.stack([np.interp(imu.times_s, at, bias) for bias in rate_bias.T], 1)
-        durations = np.diff(imu.times_s)[:, None]
-        turns = cumulated(0.5 * (rates[1:] + rates[:-1]) * durations)
+        rates = imu.angular_velocity - interpolate(imu.times_s, at, rate_bias)
+        turns = integrate_rates(imu.times_s, rates)
         forces = np.einsum("gij,gj->gi", turns, imu.specific_force - force_bias)
-        speeds = np.zeros_like(forces)
-        np.cumsum(0.5 * (forces[1:] + forces[:-1]) * durations, axis=0, out=speeds[1:])
+        speeds = cumulative_trapezoid(forces, imu.times_s, axis=0, initial=0)
         return cls(imu.times_s, rates, turns, speeds)
 
     def at(self, times_s: Floats) -> tuple[Floats, Floats, Floats]:
@@ -183,10 +73,7 @@ class _ImuMotion:
         before = np.clip(np.searchsorted(self.times_s, times_s) - 1, 0, len(self.times_s) - 2)
         left = (times_s - self.times_s[before])[:, None]
         turns = np.einsum("fij,fjk->fik", self.turns[before], rotation(self.rates[before] * left))
-        rates, speeds = (
-            np.stack([np.interp(times_s, self.times_s, column) for column in values.T], 1)
-            for values in (self.rates, self.speeds)
-        )
+        rates, speeds = (interpolate(times_s, self.times_s, of) for of in (self.rates, self.speeds))
         return rates, turns, speeds
 
 
@@ -198,9 +85,7 @@ class ImuAlignment:
     sigma_rad: float  # its standard deviation about the least certain axis. 0: given
     time_offset_s: float  # delay of the times of scans in the clock of the IMU
     lever_m: Floats  # (3,) position of the radar in the axes of the IMU
-    angular_velocity: Floats  # (G, 3) rad/s, in the axes of the radar, without bias
-    bias_rad_s: float  # standard deviation of the remaining bias about the least certain axis
-    times_s: Floats  # (G,) in the clock of the scans
+    gyroscope: Gyroscope
     up: Floats  # (F, 3) unit vectors in the frame of the radar at each scan
 
     @property
@@ -211,17 +96,33 @@ class ImuAlignment:
 
     @classmethod
     def of(cls, imu: Imu, velocities: SensorVelocities, times_s: Floats) -> ImuAlignment | None:
-        """Estimate from velocities at ascending `times_s` (F,). None if it is not observable."""
+        """Estimate from velocities at ascending `times_s` (F,). None if it is not observable, or does not explain them."""
         if imu.specific_force is None or len(times_s) < 2 * _WINDOW_SCANS or len(imu) < 2:
             return None
-        if times_s[-1] - times_s[0] < 4 * _UNRELATED_S:
-            return None
         rows, window = _windows(times_s)
-        if len(rows) == 0:
+        if len(rows) == 0 or times_s[-1] - times_s[0] < 4 * _UNRELATED_S:
             return None
-        given = velocities.mean_mps[rows], velocities.covariance[rows], times_s[rows], window
-        first = _first_guess(imu, *given)
-        return None if first is None else _fitted(imu, times_s, *given, *first)
+        model = _AlignmentModel(imu, velocities.select(rows), times_s[rows], window)
+        if (solved := _solve_linearly(model)) is None:
+            return None
+        model, x = solved
+        x, covariance = _minimise(model.residuals, x)
+        if not np.isfinite(x).all():
+            return None
+        scale = float(np.median((model.velocity_residuals(x) ** 2).sum(axis=1))) / _MEDIAN
+        # A scale below 1 does not reduce the covariance: common errors of scans do not show in residuals.
+        covariance *= max(scale, 1.0)
+        known = imu.R_sensor_imu is not None
+        sigma_rad = 0.0 if known else float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        R, gravity, lever_m, late_s, motion = model.unpack(x)
+        if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(late_s) > 2 * _MAX_TIME_OFFSET_S:
+            return None
+        # Against gravity, Qᵀ g in the axes of the IMU.
+        up = -np.einsum("ij,fkj,k->fi", R, motion.at(times_s - late_s)[1], gravity)
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        rates, bias_rad_s = np.einsum("ij,gj->gi", R, motion.rates), np.sqrt(covariance.diagonal()[13:].max())
+        gyroscope = Gyroscope.of(rates, imu.times_s + late_s, times_s, float(bias_rad_s))
+        return cls(R, sigma_rad, late_s, lever_m, gyroscope, up)
 
 
 def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -237,27 +138,76 @@ def _windows(times_s: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return rows, np.unique(number[rows], return_inverse=True)[1].ravel()
 
 
-def _centred(values: Floats, window: NDArray[np.intp]) -> Floats:
-    """Subtract the mean of each window from values (K, ...)."""
-    first = np.searchsorted(window, np.arange(window[-1] + 1))
-    counts = np.bincount(window).reshape(-1, *[1] * (values.ndim - 1))
-    centred: Floats = values - (np.add.reduceat(values, first, axis=0) / counts)[window]
-    return centred
+@dataclass(frozen=True)
+class _AlignmentModel:
+    """Equation above for K scans, and its parameters.
+
+    These are a rotation vector, gravity, the bias of forces, the lever arm, the time offset, and the bias of rates at knots.
+    """
+
+    imu: Imu
+    velocities: SensorVelocities
+    times_s: Floats  # (K,)
+    window: NDArray[np.intp]  # (K,) ascending
+    R_first: Floats = field(default_factory=lambda: np.eye(3))  # that the rotation vector refines
+
+    @cached_property
+    def begins(self) -> NDArray[np.intp]:
+        """First scan of each window."""
+        return np.searchsorted(self.window, np.arange(self.window[-1] + 1))
+
+    @cached_property
+    def weights(self) -> tuple[Floats, Floats]:
+        """Information (K, 3, 3) of the velocities, and matrices (K, 3, 3) that whiten them."""
+        information = np.linalg.inv(self.velocities.covariance).astype(np.float64)
+        return information, np.linalg.cholesky(information).transpose(0, 2, 1).astype(np.float64)
+
+    def centre(self, values: Floats) -> Floats:
+        """Subtract the mean of each window from values (K, ...)."""
+        counts = np.bincount(self.window).reshape(-1, *[1] * (values.ndim - 1))
+        return values - (np.add.reduceat(values, self.begins, axis=0) / counts)[self.window]
+
+    def unpack(self, x: Floats) -> tuple[Floats, Floats, Floats, float, _ImuMotion]:
+        """Return the rotation, gravity, the lever arm, the time offset, and the motion without biases."""
+        turn, gravity, force_bias, lever_m, late_s, rate_bias = np.split(x, [3, 6, 9, 12, 13])
+        R = self.R_first if self.imu.R_sensor_imu is not None else self.R_first @ rotation(turn)
+        motion = _ImuMotion.of(self.imu, rate_bias.reshape(-1, 3), force_bias)
+        return R, gravity, lever_m, float(late_s[0]), motion
+
+    def velocity_residuals(self, x: Floats) -> Floats:
+        """Return whitened residual velocities (K, 3), with the mean of each window removed."""
+        R, gravity, lever_m, late_s, motion = self.unpack(x)
+        at_s = self.times_s - late_s
+        rates, turns, speeds = motion.at(at_s)
+        information, whitening = self.weights
+        moved = np.einsum("ji,fj->fi", R, self.velocities.mean_mps) - np.cross(rates, lever_m)
+        since_s = at_s - self.imu.times_s[0]
+        left = np.einsum("fij,fj->fi", turns, moved) - speeds - since_s[:, None] * gravity
+        to_radar = np.einsum("ij,fkj->fik", R, turns)
+        weights = np.einsum("fji,fjk,fkl->fil", to_radar, information, to_radar)
+        sums = np.add.reduceat(np.einsum("fij,fj->fi", weights, left), self.begins)
+        means = np.linalg.solve(np.add.reduceat(weights, self.begins), sums[..., None])[..., 0]
+        return np.asarray(np.einsum("fij,fjk,fk->fi", whitening, to_radar, left - means[self.window]))
+
+    def residuals(self, x: Floats) -> Floats:
+        """Return the normalised residuals of velocities and priors."""
+        prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, x[13:16] / FIRST_BIAS_RAD_S]
+        changes = (x[16:] - x[13:-3]) / _BIAS_CHANGE_RAD_S
+        return np.concatenate([self.velocity_residuals(x).ravel(), *prior, changes])
 
 
-def _first_guess(
-    imu: Imu, v: Floats, _: Floats, times_s: Floats, window: NDArray[np.intp]
-) -> tuple[Floats, Floats, float] | None:
-    """Solve for rotation (3, 3), gravity (3,) and time offset by linear least squares. None if not significant."""
+def _solve_linearly(model: _AlignmentModel) -> tuple[_AlignmentModel, Floats] | None:
+    """Solve for rotation, gravity and time offset by linear least squares. None if not significant."""
+    imu, times_s = model.imu, model.times_s
     motion = _ImuMotion.of(imu, np.zeros((1, 3)), np.zeros(3))
 
     def fit(at_s: Floats) -> tuple[float, Floats]:
         """Return the residual sum of squares, and the entries of Rᵀ row by row, then gravity."""
         _, turns, speeds = motion.at(at_s)
         rows = np.zeros((len(at_s), 3, 12))
-        rows[:, :, :9] = np.einsum("fij,fk->fijk", turns, v).reshape(-1, 3, 9)
+        rows[:, :, :9] = np.einsum("fij,fk->fijk", turns, model.velocities.mean_mps).reshape(-1, 3, 9)
         rows[:, :, 9:] = -(at_s - at_s.mean())[:, None, None] * np.eye(3)
-        a, b = _centred(rows, window).reshape(-1, 12), _centred(speeds, window).ravel()
+        a, b = model.centre(rows).reshape(-1, 12), model.centre(speeds).ravel()
         matrix, vector = np.einsum("nk,nl->kl", a, a), np.einsum("nk,n->k", a, b)
         solved = np.linalg.solve(matrix + 1e-6 * np.trace(matrix) * np.eye(12), vector)
         return float((b**2).sum() - (solved * vector).sum()), solved
@@ -268,87 +218,27 @@ def _first_guess(
     # A mostly stationary drive has the same rotations and velocities at many times.
     span_s = times_s[-1] - times_s[0]
     away = np.linspace(_UNRELATED_S, span_s - _UNRELATED_S, _UNRELATED)
-    if fits[best][0] >= min(fit(times_s[0] + (times_s - times_s[0] + s) % span_s)[0] for s in away):
+    cost, solved = fits[best]
+    if cost >= min(fit(times_s[0] + (times_s - times_s[0] + s) % span_s)[0] for s in away):
         return None
-    solved = fits[best][1]
     R = nearest_rotation(solved[:9].reshape(3, 3).T) if imu.R_sensor_imu is None else imu.R_sensor_imu
-    return R, solved[9:], float(late[best])
-
-
-def _fitted(
-    imu: Imu,
-    all_times_s: Floats,
-    v: Floats,
-    covariance: Floats,
-    times_s: Floats,
-    window: NDArray[np.intp],
-    R_first: Floats,
-    gravity: Floats,
-    time_offset_s: float,
-) -> ImuAlignment | None:
-    """Refine by robust nonlinear least squares. None if the velocities are not explained, or the rotation is not observable."""
-    known = imu.R_sensor_imu is not None
-    first = np.searchsorted(window, np.arange(window[-1] + 1))
-    information = np.linalg.inv(covariance)
-    whiten = np.linalg.cholesky(information).transpose(0, 2, 1)
     knots = 1 + int(np.clip((imu.times_s[-1] - imu.times_s[0]) // _KNOT_S, 1, _KNOTS))
+    x = np.concatenate([np.zeros(3), solved[9:], np.zeros(6), [late[best]], np.zeros(3 * knots)])
+    return dataclasses.replace(model, R_first=R), x
 
-    def rotated(x: Floats) -> Floats:
-        return R_first if known else R_first @ rotation(x[:3])
 
-    def off(x: Floats) -> Floats:
-        """Return whitened residual velocities (K, 3), with the mean of each window removed."""
-        R, at_s = rotated(x), times_s - x[12]
-        rates, turns, speeds = _ImuMotion.of(imu, x[13:].reshape(-1, 3), x[6:9]).at(at_s)
-        moved = np.einsum("ji,fj->fi", R, v) - np.cross(rates, x[9:12])
-        left = np.einsum("fij,fj->fi", turns, moved) - speeds - (at_s - imu.times_s[0])[:, None] * x[3:6]
-        to_radar = np.einsum("ij,fkj->fik", R, turns)
-        weights = np.einsum("fji,fjk,fkl->fil", to_radar, information, to_radar)
-        sums = np.add.reduceat(np.einsum("fij,fj->fi", weights, left), first)
-        means = np.linalg.solve(np.add.reduceat(weights, first), sums[..., None])[..., 0]
-        whitened: Floats = np.einsum("fij,fjk,fk->fi", whiten, to_radar, left - means[window])
-        return whitened
-
-    def residuals(x: Floats) -> Floats:
-        bias = x[13:].reshape(-1, 3)
-        prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, bias[0] / _FIRST_BIAS_RAD_S]
-        changes = np.diff(bias, axis=0).ravel() / _BIAS_CHANGE_RAD_S
-        return np.concatenate([off(x).ravel(), *prior, changes])
-
-    x = np.concatenate([np.zeros(3), gravity, np.zeros(6), [time_offset_s], np.zeros(3 * knots)])
-    deviations = np.zeros((len(x), len(x)))
+def _minimise(residuals: Callable[[Floats], Floats], x: Floats) -> tuple[Floats, Floats]:
+    """Minimise Cauchy's loss of normalised residuals by Gauss-Newton; return the parameters and their covariance."""
     for _ in range(_ITERATIONS):
         now = residuals(x)
         slopes = (np.stack([residuals(x + h) for h in _DIFFERENCE * np.eye(len(x))]) - now) / _DIFFERENCE
-        weighted = slopes / (1 + (now / _ROBUST) ** 2)  # of Cauchy's loss
-        deviations = np.linalg.inv(np.einsum("kn,ln->kl", weighted, slopes))
-        step = -np.einsum("kl,ln,n->k", deviations, weighted, now)
+        weighted = slopes / (1 + (now / _ROBUST) ** 2)
+        covariance = np.linalg.inv(np.einsum("kn,ln->kl", weighted, slopes))
+        step = -np.einsum("kl,ln,n->k", covariance, weighted, now)
         x = x + step
-        if (np.abs(step) < _SETTLED * np.sqrt(deviations.diagonal())).all():
+        if (np.abs(step) < _SETTLED * np.sqrt(covariance.diagonal())).all():
             break
-    if not np.isfinite(x).all():
-        return None
-    scale = float(np.median((off(x) ** 2).sum(axis=1))) / _MEDIAN
-    # A scale below 1 does not reduce the covariance: common errors of scans do not show in residuals.
-    deviations *= max(scale, 1.0)
-    sigma_rad = 0.0 if known else float(np.sqrt(np.linalg.eigvalsh(deviations[:3, :3])[-1]))
-    time_offset_s = float(x[12])
-    if scale > _LEFT or sigma_rad > _KNOWN_RAD or abs(time_offset_s) > 2 * _MAX_TIME_OFFSET_S:
-        return None
-    R = rotated(x)
-    motion = _ImuMotion.of(imu, x[13:].reshape(-1, 3), x[6:9])
-    # Against gravity, Qᵀ g in the axes of the IMU.
-    up = -np.einsum("ij,fkj,k->fi", R, motion.at(all_times_s - time_offset_s)[1], x[3:6])
-    return ImuAlignment(
-        R,
-        sigma_rad,
-        time_offset_s,
-        x[9:12],
-        np.einsum("ij,gj->gi", R, motion.rates),
-        float(np.sqrt(deviations.diagonal()[13:].max())),
-        imu.times_s + time_offset_s,
-        up / np.linalg.norm(up, axis=1, keepdims=True),
-    )
+    return x, covariance
 
 
 @dataclass(frozen=True)
@@ -377,10 +267,8 @@ class Inertial:
         imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             return cls(None).without("it measured before or after all scans. Are both times of one clock?")
-        alignment = None if velocities is None else ImuAlignment.of(imu, velocities, times_s)
-        if alignment is not None:
-            rates, at_s = alignment.angular_velocity, alignment.times_s
-            return cls(Gyroscope.of(rates, at_s, times_s, alignment.bias_rad_s), alignment)
+        if velocities is not None and (found := ImuAlignment.of(imu, velocities, times_s)) is not None:
+            return cls(found.gyroscope, found)
         if imu.R_sensor_imu is None:
             return cls(None).without(
                 "its rotation on the radar is unknown, as accelerometer and Doppler do not determine it: give R_sensor_imu"
@@ -401,7 +289,7 @@ class Inertial:
         return {key: np.asarray(getattr(found, key)).tolist() for key in keys}
 
 
-def levelled(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
+def level_poses(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
     """Rotate poses (F, 4, 4) and covariances (F, 6, 6) to a world with z up, by `up` (F, 3) in the frame of the radar.
 
     The first position stays at the origin; the rotation is minimal.

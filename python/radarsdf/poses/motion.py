@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from radarsdf.poses.rigid import Floats, between, rotation, skew, step_vectors, steps, transform
+from radarsdf.poses.rigid import Floats, rotation, rotation_vector, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # weight of the initial motion prior, steps
 _SPAN = 4.0  # width of a search, standard deviations
@@ -83,14 +82,20 @@ class MotionRate:
     mean: Floats  # (3,)
     covariance: Floats  # (3, 3)
 
+    def integrate(self, duration_s: float) -> MotionRate:
+        """Return the motion at this constant rate, with its covariance."""
+        return MotionRate(self.mean * duration_s, self.covariance * duration_s**2)
+
+
+Priors = tuple[MotionPrior, MotionPrior]  # translation, rotation
+
 
 def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Floats) -> Floats:
     """Return the translation (..., 3), m, in the first frame, of a sensor with a constant rate of rotation over `turn` (..., 3)
     and linearly changing velocity."""
     middle = np.einsum("...ij,...j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
     end = np.einsum("...ij,...j->...i", rotation(turn), end_mps)
-    found: Floats = duration_s / 6 * (begin_mps + 4 * middle + end)
-    return found
+    return np.asarray(duration_s / 6 * (begin_mps + 4 * middle + end))
 
 
 @dataclass(frozen=True)
@@ -114,9 +119,9 @@ class PredictedStep:
         # Derivative of the translation by the turn: about that of its second half.
         swept = -skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
         both = np.concatenate([swept, np.eye(3)])
-        found: Floats = both @ self.turn.covariance @ both.T
-        found[:3, :3] += self.translation_covariance
-        return found
+        covariance = np.asarray(both @ self.turn.covariance @ both.T)
+        covariance[:3, :3] += self.translation_covariance
+        return covariance
 
     def spread_m(self, radius_m: float) -> float:
         """Return the largest standard deviation of the position of a return at range `radius_m`, m."""
@@ -134,9 +139,8 @@ class PredictedStep:
         # A quasi-random sequence covers space more evenly than random numbers (Sobol 1967).
         draws = qmc.MultivariateNormalQMC(np.zeros(6), seed=0).random(count) * deviations
         drawn = self.turn.mean + draws[:, :3] @ turn_axes.T
-        shifts: NDArray[np.float64] = draws[:, 3:] @ way_axes.T
         poses = self.pose(drawn)
-        poses[:, :3, 3] += shifts
+        poses[:, :3, 3] += draws[:, 3:] @ way_axes.T
         return drawn, poses
 
 
@@ -155,8 +159,8 @@ def step_variances(poses: Floats, diagonal: Floats, below: Floats) -> Floats:
     """Return variances (F - 1, 6) of the steps of `poses`, whose covariance has blocks (F, 6, 6) and (F - 1, 6, 6)."""
     first, second = _jacobians(poses)
     blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
-    found: Floats = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
-    return np.maximum(found, _LEAST_RAD**2)  # of a weak prior, blocks cancel
+    variances = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
+    return np.asarray(np.maximum(variances, _LEAST_RAD**2))  # of a weak prior, blocks cancel
 
 
 @dataclass(frozen=True)
@@ -165,8 +169,7 @@ class Motion:
 
     steps: Floats  # (F - 1, 4, 4)
     bias: Floats  # (6,) bias of a step: translation, m, rotation vector, rad, in the sensor frame
-    # (2,) variances of a component of a step's translation, m², and rotation, rad², at share 1.
-    variances: Floats
+    variances: Floats  # (2,) of a component of a step's translation, m², and rotation, rad², at share 1
     shares: Floats  # (F - 1, 6) factors of these variances. Infinite for components that are not measured
     spans: Floats  # (F - 1,) duration of each step relative to the median, to which biases are proportional
     # (6,) standard deviation of the systematic part of the bias, not observable from this source.
@@ -191,9 +194,9 @@ class Motion:
     def errors(self, poses: Floats) -> Floats:
         """Return residuals (F - 1, 6) of `poses` (F, 4, 4) against the measured steps: translations, m, rotation vectors, rad."""
         found = steps(poses)
-        turns = between(self.steps, found)[:, :3, :3]
+        turns = np.einsum("fji,fjk->fik", self.steps[:, :3, :3], found[:, :3, :3])
         off_m = found[:, :3, 3] - self.steps[:, :3, 3]
-        return np.concatenate([off_m, Rotation.from_matrix(turns).as_rotvec()], 1)
+        return np.concatenate([off_m, rotation_vector(turns)], 1)
 
     def prior(self, poses: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the normal equations of increments of `poses`: diagonal blocks (F, 6, 6), sub-diagonal ones, gradient (F, 6)."""
@@ -222,9 +225,8 @@ class Motion:
         poses, the gauge freedom would count as step errors. One step of expectation maximisation (Dempster et al. 1977): the
         expected square of an error is the square of its estimate plus its variance.
         """
-        left = step_variances(before, diagonal, below)
-        errors, spans, weights = self.errors(poses), self.spans[:, None], 1 / self.shares
-        counts = np.isfinite(self.shares).sum(axis=0)
+        left, errors = step_variances(before, diagonal, below), self.errors(poses)
+        spans, weights, counts = self.spans[:, None], 1 / self.shares, np.isfinite(self.shares).sum(axis=0)
         bias = (weights * spans * errors).sum(axis=0) / np.maximum((weights * spans**2).sum(axis=0), 1e-30)
         # Where the returns hardly constrain the poses, along a corridor say, bias and poses would drift together without end:
         # a straight corridor shrank by 3 cm a step. So the bias is shrunk by the share of the variance that remains. Not in yaw:
@@ -256,18 +258,13 @@ class SteadyMotion(KnownMotion):
     errors that they share with the returns: heights in a forest were wrong by 2 to 7 times as much.
     """
 
-    priors: tuple[MotionPrior, MotionPrior]  # translation, rotation
+    priors: Priors
     durations_s: Floats  # (F - 1,)
     usual: Floats  # (2,) variances of a step given the usual rates only, m² and rad²
 
     @classmethod
     def by(
-        cls,
-        priors: tuple[MotionPrior, MotionPrior],
-        usual: Floats,
-        times_s: Floats,
-        poses: Floats,
-        measured: NDArray[np.bool_],
+        cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, measured: NDArray[np.bool_]
     ) -> SteadyMotion:
         """Build from times (F,) and approximate poses (F, 4, 4) of scans.
 
@@ -312,9 +309,7 @@ def unsteadiness(poses: Floats, times_s: Floats | None) -> tuple[float, float]:
 
 def spans_of(times_s: Floats | None, num_scans: int) -> Floats:
     """Return durations (F - 1,) of steps relative to the median. Without times, all are 1."""
-    spans = np.ones(num_scans - 1)
-    if times_s is None:
-        return spans
-    durations = np.maximum(np.diff(times_s), 0.0)
+    equal = np.ones(num_scans - 1)
+    durations = equal if times_s is None else np.maximum(np.diff(times_s), 0.0)
     median = float(np.median(durations)) if len(durations) else 0.0
-    return np.maximum(durations / median, _LEAST_SPAN) if median > 0 else spans
+    return np.maximum(durations / median, _LEAST_SPAN) if median > 0 else equal

@@ -17,12 +17,14 @@ from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
 from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
-from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
+from radarsdf.poses.drive import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
+from radarsdf.poses.gyroscope import UnusableGyroscopeError
+from radarsdf.poses.imu import Inertial, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
 from radarsdf.poses.rigid import Floats, steps
-from radarsdf.poses.tracking import LATERAL_MPS2, LEAST_OBSERVED, WINDOW, Drive, Tracked, followed
+from radarsdf.poses.tracking import WINDOW, Tracked
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
@@ -83,7 +85,7 @@ def odometry(
     doppler_mps : sequence of F arrays, optional
         (N_i,) each, radial speed, m/s, of either sign, aliased or not; NaN where it was not measured.
     times_s : (F,) array_like
-    Times of the scans, s.
+        Times of the scans, s.
     imu : Imu, optional
         A gyroscope, optionally with an accelerometer. Default: that of `Scans`. Without `R_sensor_imu`, its mounting rotation is
         estimated, and with an accelerometer and Doppler its time offset and the vertical, too.
@@ -128,16 +130,15 @@ def odometry(
         raise ValueError(msg)
     checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
-    if velocities is not None:
-        sign = -1 if sign_significance(checked.scans, velocities, times_s)[0] < -CLEAR else 1
-        velocities = velocities.scaled(-1.0) if sign < 0 else velocities
+    if velocities is not None and sign_significance(checked.scans, velocities, times_s)[0] < -CLEAR:
+        velocities, sign = velocities.scaled(-1.0), -1
     if imu is None and isinstance(points, Scans):
         imu = points.imu
     limits, notes = config.returns, [*checked.notes]
     with ThreadPool(config.num_threads) as pool:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-        drive = Drive(scans, times_s, velocities, None)
         if velocities is not None:
+            drive = Drive(scans, times_s, velocities, None)
             consistency = Consistency.of_returns(drive, config, pool.num_threads)
             velocities, tested = consistency.applied(velocities)
             notes += tested
@@ -145,27 +146,25 @@ def odometry(
                 times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
                 velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
-        drive = dataclasses.replace(
-            drive, times_s=times_s, velocities=velocities, gyroscope=inertial.gyroscope
-        )
+        drive = Drive(scans, times_s, velocities, inertial.gyroscope)
         try:
-            drive, tracked = followed(drive, config, pool.num_threads, progress)
+            drive, tracked = track_drive(drive, config, pool.num_threads, progress)
         except UnusableGyroscopeError as why:
             inertial = inertial.without(why)
             drive = dataclasses.replace(drive, gyroscope=None)
-            drive, tracked = followed(drive, config, pool.num_threads, progress)
+            drive, tracked = track_drive(drive, config, pool.num_threads, progress)
         notes += inertial.notes
-        _check_measured(tracked, drive, notes)
+        notes += _check_observed(tracked, drive, notes)
         segments = np.array([found.segment for found in tracked])
-        poses, covariance, loops = _together(drive, tracked, segments, config, pool.num_threads)
+        poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
-        if inertial.alignment is not None:
-            poses, covariance = levelled(poses, covariance, inertial.alignment.up)
+    if inertial.alignment is not None:
+        poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     length_m = float(lengths_m[np.diff(segments) == 0].sum())
     gyroscope = drive.gyroscope
     report = {
-        "verdict": _verdict(segments, length_m, velocities is not None, inertial),
+        "verdict": _summarize(segments, length_m, velocities is not None, inertial),
         "length_m": length_m,
         "segments": int(segments[-1]) + 1,
         "doppler": velocities is not None,
@@ -181,7 +180,7 @@ def odometry(
     return Odometry(poses, covariance, segments, report)
 
 
-def _together(
+def _estimate_jointly(
     drive: Drive, tracked: list[Tracked], segments: NDArray[np.int64], config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats, list[str]]:
     """Jointly estimate poses and covariances of all scans of each segment; return them with notes on open loops."""
@@ -201,50 +200,45 @@ def _together(
     return np.einsum("ij,fjk->fik", np.linalg.inv(poses[0]), poses), covariance, notes
 
 
-def _check_measured(tracked: list[Tracked], drive: Drive, notes: list[str]) -> None:
-    """Raise an UnobservedMotionError if a part of the motion is not observable; append notes on assumptions."""
+def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> list[str]:
+    """Return notes on assumptions. Raise an UnobservedMotionError if a part of the motion is not observable."""
     if len(tracked) < 2:
-        return
-    way, turn = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
+        return []
+
+    def refuse(moved: str, why: str, missing: str) -> None:
+        msg = f"the returns alone do not observe how the sensor {moved}: {why}. Give {missing}, or poses"
+        raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
+
+    moved, turned = np.median([found.observed for found in tracked[1:]], axis=0).tolist()
+    removed = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
     doppler = "their Doppler (doppler_mps)"
     if any(note.startswith(NOT_USED) for note in notes):
         doppler = "Doppler that most returns of a scan agree on"
-    by_returns = drive.velocities is None
-    significance = _significance_of_steps(tracked, drive) if by_returns else np.inf
-    turns_known = drive.gyroscope is not None or drive.turns_slowly
-    share = "of a step's variance, they remove {:.1%}, and {:.0%} is needed"
-    for refused, moved, why, missing in (
-        (by_returns and way < LEAST_OBSERVED, "moved", share.format(way, LEAST_OBSERVED), doppler),
-        (
-            not turns_known and turn < _LEAST_OBSERVED_TURN,
-            "turned",
-            share.format(turn, _LEAST_OBSERVED_TURN),
-            "a gyroscope (imu)",
-        ),
-        (significance < -ERRORS, "moved", "scans agree better without any motion", doppler),
-    ):
-        if refused:
-            msg = f"the returns alone do not observe how the sensor {moved}: {why}. Give {missing}, or poses"
-            raise UnobservedMotionError(". ".join([msg, *(note.rstrip(".") for note in notes)]))
-    if significance < ERRORS:
-        notes.append(
-            "Assumed: the sensor moved as estimated; neighbouring scans agree as well without any motion."
-        )
-    if drive.gyroscope is None and turn < _LEAST_OBSERVED_TURN:
-        notes.append(
+    if drive.velocities is None and moved < LEAST_OBSERVED:
+        refuse("moved", removed.format(moved, LEAST_OBSERVED), doppler)
+    if drive.gyroscope is None and not drive.turns_slowly and turned < _LEAST_OBSERVED_TURN:
+        refuse("turned", removed.format(turned, _LEAST_OBSERVED_TURN), "a gyroscope (imu)")
+    assumed = []
+    if drive.velocities is None:
+        within = np.flatnonzero(np.diff([found.segment for found in tracked]) == 0)
+        motions = steps(np.stack([found.pose for found in tracked]))[within]
+        pairs = [(drive.scans[i], drive.scans[i + 1]) for i in within]
+        if (significance := motion_significance(pairs, motions)) < -ERRORS:
+            refuse("moved", "scans agree better without any motion", doppler)
+        if significance < ERRORS:
+            assumed.append(
+                "Assumed: the sensor moved as estimated; neighbouring scans agree as well without any motion."
+            )
+    if drive.gyroscope is None and turned < _LEAST_OBSERVED_TURN:
+        assumed.append(
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
             "trajectory make of its speed; the returns of a scan hardly measure it."
         )
+    return assumed
 
 
-def _significance_of_steps(tracked: list[Tracked], drive: Drive) -> float:
-    """Return :func:`motion_significance` of the steps within segments."""
-    followed_by = np.flatnonzero(np.diff([found.segment for found in tracked]) == 0)
-    motions = steps(np.stack([found.pose for found in tracked]))[followed_by]
-    return motion_significance([(drive.scans[i], drive.scans[i + 1]) for i in followed_by], motions)
-
-
-def _verdict(segments: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
+def _summarize(segments: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
+    """Return the verdict in words."""
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
     sentences = [f"{len(segments)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]
     if inertial.alignment is not None:

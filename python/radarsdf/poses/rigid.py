@@ -10,19 +10,17 @@ Floats = NDArray[np.float64]
 
 
 def moved(poses: Floats, increments: Floats) -> Floats:
-    """Apply increments (F, 6) to poses (F, 4, 4): a translation, m, and a rotation about the sensor, rad, in world axes."""
+    """Apply increments (..., 6) to poses (..., 4, 4): a translation, m, and a rotation about the sensor, rad, in world axes."""
     found = poses.copy()
-    turn = Rotation.from_rotvec(increments[:, 3:]).as_matrix()
-    found[:, :3, :3] = np.einsum("fij,fjk->fik", turn, poses[:, :3, :3])
-    found[:, :3, 3] += increments[:, :3]
+    found[..., :3, :3] = np.einsum("...ij,...jk->...ik", rotation(increments[..., 3:]), poses[..., :3, :3])
+    found[..., :3, 3] += increments[..., :3]
     return found
 
 
 def increments(first: Floats, second: Floats) -> Floats:
-    """Return the increments (F, 6) from `first` to `second` poses (F, 4, 4), the inverse of :func:`moved`."""
-    turns = np.einsum("fij,fkj->fik", second[:, :3, :3], first[:, :3, :3])
-    translations = second[:, :3, 3] - first[:, :3, 3]
-    return np.concatenate([translations, Rotation.from_matrix(turns).as_rotvec()], axis=1)
+    """Return the increments (..., 6) from `first` to `second` poses (..., 4, 4), the inverse of :func:`moved`."""
+    turns = np.einsum("...ij,...kj->...ik", second[..., :3, :3], first[..., :3, :3])
+    return np.concatenate([second[..., :3, 3] - first[..., :3, 3], rotation_vector(turns)], axis=-1)
 
 
 def steps(poses: Floats) -> Floats:
@@ -33,7 +31,7 @@ def steps(poses: Floats) -> Floats:
 def step_vectors(poses: Floats) -> Floats:
     """Return the translations, m, and rotation vectors, rad, (F - 1, 6) of :func:`steps`."""
     motions = steps(poses)
-    return np.concatenate([motions[:, :3, 3], Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()], axis=1)
+    return np.concatenate([motions[:, :3, 3], rotation_vector(motions[:, :3, :3])], axis=1)
 
 
 def between(first: Floats, second: Floats) -> Floats:
@@ -43,14 +41,6 @@ def between(first: Floats, second: Floats) -> Floats:
     found[:, :3, :3] = np.einsum("fji,fjk->fik", back, second[:, :3, :3])
     found[:, :3, 3] = np.einsum("fji,fj->fi", back, second[:, :3, 3] - first[:, :3, 3])
     return found
-
-
-def alignment(poses: Floats, reference: Floats) -> Floats:
-    """Return the motion (4, 4) that aligns the mean position and mean rotation of poses (F, 4, 4) with `reference`."""
-    turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
-    whole = np.eye(4)
-    whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
-    return placed(whole, poses, reference)
 
 
 def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
@@ -63,14 +53,15 @@ def placed(turn: Floats, poses: Floats, reference: Floats) -> Floats:
 
 def aligned(poses: Floats, reference: Floats) -> Floats:
     """Rigidly align poses (F, 4, 4) with the mean position and mean rotation of `reference`."""
-    found: Floats = np.einsum("ij,fjk->fik", alignment(poses, reference), poses)
-    return found
+    turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
+    whole = np.eye(4)
+    whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
+    return np.asarray(np.einsum("ij,fjk->fik", placed(whole, poses, reference), poses))
 
 
 def turned_by(poses: Floats, others: Floats) -> Floats:
     """Return the angles (F,) between the rotations of two sets of poses (F, 4, 4), rad."""
-    found: Floats = Rotation.from_matrix(between(poses, others)[:, :3, :3]).magnitude()
-    return found
+    return np.asarray(Rotation.from_matrix(between(poses, others)[:, :3, :3]).magnitude())
 
 
 def moved_by(before: Floats, after: Floats) -> dict[str, float]:
@@ -84,16 +75,15 @@ def moved_by(before: Floats, after: Floats) -> dict[str, float]:
 def nearest_rotation(matrix: Floats) -> Floats:
     """Return the nearest rotation (3, 3) to a matrix, not a reflection; for Σ b aᵀ, the one that best maps a to b (Kabsch)."""
     u, _, vt = np.linalg.svd(matrix)
-    found: Floats = np.einsum("ij,j,jk->ik", u, [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))], vt)
-    return found
+    signs = [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))]
+    return np.asarray(np.einsum("ij,j,jk->ik", u, signs, vt))
 
 
 def covariance_in(covariance: Floats, R: Floats) -> Floats:
-    """Rotate covariances (F, 6, 6) of translations and rotation vectors by R (3, 3)."""
+    """Rotate covariances (..., 6, 6) of translations and rotation vectors by R (3, 3)."""
     whole = np.zeros((6, 6))
     whole[:3, :3] = whole[3:, 3:] = R
-    found: Floats = np.einsum("ij,fjk,lk->fil", whole, covariance, whole)
-    return found
+    return np.asarray(np.einsum("ij,...jk,lk->...il", whole, covariance, whole))
 
 
 def skew(vectors: Floats) -> Floats:
@@ -105,8 +95,7 @@ def skew(vectors: Floats) -> Floats:
 
 def rotation(vector: Floats) -> Floats:
     """Convert rotation vectors (3,) or (N, 3), rad, to matrices (..., 3, 3)."""
-    found: Floats = Rotation.from_rotvec(vector).as_matrix()
-    return found
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def transform(turn: Floats, translation: Floats) -> Floats:
@@ -120,11 +109,10 @@ def transform(turn: Floats, translation: Floats) -> Floats:
 
 def rotation_vector(matrix: Floats, near: Floats | None = None) -> Floats:
     """Convert rotations (..., 3, 3) to the rotation vectors (..., 3), rad, nearest to `near`, or to 0, up to whole turns."""
-    found: Floats = Rotation.from_matrix(matrix).as_rotvec()
+    found = np.asarray(Rotation.from_matrix(matrix).as_rotvec())
     if near is None:
         return found
     angle = np.linalg.norm(found, axis=-1, keepdims=True)
     axis = found / np.where(angle > 0, angle, 1.0)
     whole_turns = np.round((np.einsum("...i,...i->...", axis, near)[..., None] - angle) / (2 * np.pi))
-    unwound: Floats = found + 2 * np.pi * whole_turns * axis
-    return unwound
+    return np.asarray(found + 2 * np.pi * whole_turns * axis)

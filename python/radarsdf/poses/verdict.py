@@ -125,15 +125,13 @@ def _gains(
     floor = float(np.median(densities[0]))
     if floor == 0:  # the scans do not overlap
         return np.zeros(len(held))
-    gains: Floats = np.log((densities[1] + floor) / (densities[0] + floor))
-    return gains
+    return np.asarray(np.log((densities[1] + floor) / (densities[0] + floor)))
 
 
 def density(distances_m: Floats, variances_m2: Floats) -> Floats:
     """Return normal densities of errors of these lengths, up to a factor."""
     with np.errstate(under="ignore"):
-        found: Floats = np.exp(-0.5 * distances_m**2 / variances_m2) / variances_m2**1.5
-    return found
+        return np.asarray(np.exp(-0.5 * distances_m**2 / variances_m2) / variances_m2**1.5)
 
 
 def median_apart_m(distances_m: Floats, others: NDArray[np.bool_]) -> float:
@@ -157,5 +155,4 @@ def _crowding(held: SensorReturns, used: SensorReturns, before: Floats, after: F
         in_cell = np.asarray(table.sum(axis=1)).ravel()[of_held]
         counts.append(in_cell - np.asarray(table[of_held, held.scans]).ravel())
     floor = max(float(np.median(counts[0])), 1.0)
-    crowding: Floats = np.log((counts[1] + floor) / (counts[0] + floor))
-    return crowding
+    return np.asarray(np.log((counts[1] + floor) / (counts[0] + floor)))
