@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import real_array
 
 CALIBRATION_PROTOCOL = "radarsdf-calibration-1"  # changes with the meaning of a number
 
-_Floats = NDArray[np.float64]
 _ENCE_BINS = 20
 _DECILES = 10
 _LEAST_M = 1e-12  # keeps ratios of squares from overflowing
@@ -158,7 +158,7 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
     }
 
 
-def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[_Floats, _Floats]:
+def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[Floats, Floats]:
     """Convert two arguments to arrays (N,)."""
     first, second = real_array(a, name_a), real_array(b, name_b)
     if first.ndim != 1 or first.shape != second.shape:
@@ -167,7 +167,7 @@ def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[_Floa
     return first, second
 
 
-def _by_uncertainty(error: _Floats, sigma: _Floats, bins: int) -> tuple[_Floats, _Floats]:
+def _by_uncertainty(error: Floats, sigma: Floats, bins: int) -> tuple[Floats, Floats]:
     """Root mean squares (bins,) of uncertainties and errors, in equally filled bins of ascending uncertainty."""
     levels, level, count = np.unique(sigma, return_inverse=True, return_counts=True)
     squared_error = np.bincount(level, error**2) / count

@@ -6,15 +6,15 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import positions, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"  # changes with the meaning of a number
 
-_Floats = NDArray[np.float64]
 _CHUNK = 1 << 21  # candidates of all queries processed at once: about 130 MB
 _DISTANCE_M, _ANGLE_RAD = 0.1, 0.1  # noise of the returns: smaller differences hardly change a weight
 _SETTINGS = ((4, 4), (8, 8), (16, 16), (16, 64), (16, 128), (16, 256))  # (k, candidates)
@@ -58,7 +58,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
     }
 
 
-def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     """Split scans into training and held-out ones: in ascending order, scans 0, `every`, 2 · `every`, … are held out.
 
     Parameters
@@ -214,7 +214,7 @@ class KNNIntensity:
         k, candidates = min(_SETTINGS, key=error)
         return cls(points, sensors, values, candidates=candidates, k=k)
 
-    def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> _Floats:
+    def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> Floats:
         """Predict the intensity of returns.
 
         Parameters
@@ -252,7 +252,7 @@ class KNNIntensity:
         return predicted
 
 
-def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[_Floats, _Floats]:
+def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[Floats, Floats]:
     """Points (N, 3) and the unit vectors (N, 3) from the sensor to each, after checks of both arguments."""
     x = positions(points, "points")
     s = positions(np.atleast_2d(real_array(sensors, "sensor positions")), "sensor positions")

@@ -6,10 +6,11 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
+from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.checks import check_box, positions, whole_number
 from radarsdf.threads import resolve_num_threads
 
@@ -23,8 +24,6 @@ PROTOCOL = "radarsdf-surface-1"  # changes with the meaning of a number
 _THRESHOLD_M, _OUTLIER_M, _TRUNCATION_M = 0.2, 0.4, 2.0
 _CHUNK = 500_000  # samples at a time, to limit memory; the protocol's random numbers depend on it
 _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in float64 over an edge of 1 cm
-_Points = NDArray[np.float64]
-_Faces = NDArray[np.int64]
 
 
 def surface_metrics(
@@ -192,7 +191,7 @@ def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
 
 
-def _triangles(mesh: trimesh.Trimesh) -> tuple[_Points, _Faces]:
+def _triangles(mesh: trimesh.Trimesh) -> tuple[Floats, Ints]:
     """Vertices (V, 3), world, m, and faces (F, 3) of a mesh of any program."""
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         msg = f"mesh must have vertices and faces, not be {mesh!r:.50}"
@@ -207,16 +206,14 @@ def _triangles(mesh: trimesh.Trimesh) -> tuple[_Points, _Faces]:
     return vertices, faces.reshape(-1, 3).astype(np.int64)
 
 
-def _in_box(points: _Points, corners: _Points | None) -> _Points:
+def _in_box(points: Floats, corners: Floats | None) -> Floats:
     if corners is None:
         return points
-    inside: NDArray[np.bool_] = ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
+    inside: Bools = ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
     return points[inside]
 
 
-def _sample_blocks(
-    vertices: _Points, faces: _Faces, corners: _Points | None, samples: int
-) -> Iterator[_Points]:
+def _sample_blocks(vertices: Floats, faces: Ints, corners: Floats | None, samples: int) -> Iterator[Floats]:
     """Sample uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
     rng = np.random.default_rng(0)
     if corners is not None and len(faces):
@@ -243,7 +240,7 @@ def _sample_blocks(
             yield block
 
 
-def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -> None:
+def _shorten(shortest: Floats, points: Floats, block: Floats, workers: int) -> None:
     """Update `shortest` (M,), the distances of points to all samples so far, with the samples of `block`."""
     low, high = block.min(axis=0), block.max(axis=0)
     gap = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
@@ -257,7 +254,7 @@ def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -
     shortest[candidates] = np.minimum(shortest[candidates], distance)
 
 
-def _angles(vertices: _Points, faces: _Faces, corners: _Points | None) -> _Points:
+def _angles(vertices: Floats, faces: Ints, corners: Floats | None) -> Floats:
     """Angles (E,) between the triangles of each edge with two: 0 in a plane, π where one is folded onto the other."""
     from trimesh.graph import face_adjacency  # noqa: PLC0415 - slow to import
 

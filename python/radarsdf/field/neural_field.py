@@ -7,13 +7,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
+from radarsdf.arrays import Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.kernels import fourier, interpolate, large_zeros, mlp, spherical_harmonics
@@ -52,7 +51,7 @@ class VertexFeatures(nn.Module):
 
     def __init__(
         self,
-        leaf_keys: NDArray[np.uint64],
+        leaf_keys: Keys,
         leaf_size_m: float,
         num_levels: int,
         encoding: Encoding,
@@ -84,7 +83,7 @@ class NeuralField(Field):
     """
 
     def __init__(
-        self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool, num_threads: int = 0
+        self, leaf_keys: Keys, config: FitConfig, *, with_intensity: bool, num_threads: int = 0
     ) -> None:
         super().__init__()
         encoding = Encoding.TRI_QUADTREE if config.encoding.kind == "tri-quadtree" else Encoding.OCTREE
@@ -118,7 +117,7 @@ class NeuralField(Field):
 
     def logit(self, points: Tensor) -> Tensor:
         """Return signed distances / sigma (N,), positive in free space, at points (N, 3), local frame, m."""
-        return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
+        return self.sdf_network(self.encode(points))[0]
 
     def sdf(self, points: Tensor) -> Tensor:
         return self.logit(points) * self.sigma_m

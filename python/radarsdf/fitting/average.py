@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from radarsdf._core import CellSet, VertexTable, cell_keys, count_scans, stable_order
+from radarsdf.arrays import Bools, Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.field.grid_field import GridField
@@ -21,7 +21,7 @@ from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise, onto_surfels, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.reflectance import Float32, Reflectance
+from radarsdf.returns.reflectance import Reflectance
 from radarsdf.returns.sums import MeanRays, ReturnCells, ScanSums
 
 BAND_CELLS = 2.0
@@ -49,7 +49,7 @@ class SurfaceReturns:
     noise: SensorNoise
     means: MeanRays | None  # mean rays of the leaf cells without ghosts, to average. None for training
     # (N,) False for ghosts. None if ghosts are not detected, or nothing needs it.
-    true: NDArray[np.bool_] | None
+    true: Bools | None
 
     @classmethod
     def of(
@@ -57,7 +57,7 @@ class SurfaceReturns:
         rays: Rays,
         config: FitConfig,
         num_threads: int,
-        inside: NDArray[np.bool_] | None = None,
+        inside: Bools | None = None,
         sums: ScanSums | None = None,
     ) -> SurfaceReturns:
         """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`: of the rays, if known."""
@@ -102,7 +102,7 @@ class SurfaceReturns:
 
 def occupied_cells(
     surface: SurfaceReturns, config: FitConfig, num_threads: int
-) -> tuple[NDArray[np.uint64], ReturnsOfCells]:
+) -> tuple[Keys, ReturnsOfCells]:
     """Return the ascending keys (C,) of the leaf cells near returns or bridging gaps, and the returns of cells."""
     if surface.means is None:
         keys = near_leaf_keys(surface.rays, config, num_threads)
@@ -114,7 +114,7 @@ def occupied_cells(
     return bridged(keys, returns.keys, returns.counts, bridges, num_threads), returns
 
 
-def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> NDArray[np.uint64]:
+def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> Keys:
     """Return the ascending Morton keys (C,) of the leaf cells that can contain a sample near the surface."""
     # Points every half cell along the near band of each ray: random samples would make the cells depend on the seed.
     band_m = config.metres(NEAR_BAND_CELLS)
@@ -149,7 +149,7 @@ def returns_of_means(means: MeanRays, noise: SensorNoise, config: ReturnsConfig)
 
 @torch.no_grad()
 def average_surface(
-    leaf_keys: NDArray[np.uint64],
+    leaf_keys: Keys,
     means: MeanRays,
     returns: ReturnsOfCells,
     surfels: Surfels,
@@ -167,7 +167,7 @@ def average_surface(
     return field
 
 
-def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> NDArray[np.float32]:
+def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> Floats32:
     """Return the normals (M, 3) of the planes at the ends of rays: of a flat surfel, else towards the sensor."""
     plane = surfels.flat_planes_of(surfels.cells_of_leaves(rays.keys, num_threads))
     flat, normals = np.flatnonzero(plane >= 0), -rays.directions
@@ -182,10 +182,10 @@ def average_at_corners(
     table: VertexTable,
     rays: MeanRays,
     returns: ReturnsOfCells,
-    normals: NDArray[np.float32],
+    normals: Floats32,
     config: FitConfig,
     num_threads: int,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Return the smoothed average (V,) of the distances to the planes of rays, at the corners of the cells of `table`, m.
 
     A ray contributes to the corners of the cells that it crosses, up to `TRUNCATION_CELLS` before and behind its return. Its
@@ -214,7 +214,7 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     rays = _in_order(rays, surfels, num_threads)
     assert rays.intensities is not None
 
-    def network(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
+    def network(points: Floats32, directions: Floats32, ranges_m: Floats32) -> Floats32:
         sensors = torch.from_numpy(points - directions * ranges_m[:, None])
         places = torch.from_numpy(points)
         return scale.to_unit(queries.intensity(contents, places, sensors, extrapolate=True).numpy())

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from radarsdf._core import FEATURE_DIM, CellSet
+from radarsdf.arrays import Bools
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
@@ -111,7 +112,7 @@ def estimate(
     return estimate_rays(rays, config)
 
 
-def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> Estimate:
+def estimate_rays(rays: Rays, config: FitConfig, inside: Bools | None = None) -> Estimate:
     """:func:`estimate` for rays of which those `inside`, (N,), are fitted; None for all."""
     threads = resolve_num_threads(config.num_threads)
     points = rays.points if inside is None else rays.points[inside]
@@ -206,7 +207,7 @@ def skipped_parts(
     return skipped
 
 
-def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> None:
+def check_fit(rays: Rays, config: FitConfig, inside: Bools | None = None) -> None:
     """Raise a MemoryError if a fit needs more than `max_memory_bytes`, or than is available."""
     available = limit_bytes(config.max_memory_bytes)
     # There are at most as many cells with returns as returns. If this bound fits, cells need not be counted.

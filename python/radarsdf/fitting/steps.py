@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Bools, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
@@ -42,12 +42,12 @@ class FitInput:
     poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans, used to estimate the `sensor`
     moving: int = 0  # number of moving returns left out
     why_none_moving: str | None = None  # see :class:`radarsdf.returns.moving.MovingReturns`
-    inside: NDArray[np.bool_] | None = None
+    inside: Bools | None = None
     """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
     clutter_ratio: float | None = None  # share of the returns not on a thin surface
     returns_per_cell: float | None = None  # mean number of returns in the cells of surfels
     sensor: Sensor | None = None
-    box_cells: NDArray[np.int64] | None = None
+    box_cells: Ints | None = None
     """(2, 3) box [lower, upper) of free-space crossings to store, leaf cells from the origin. None: no limit."""
     sums: ScanSums | None = None  # sums over the scans of the rays, if updated incrementally
     visibility: VisibilityCounts | None = None  # visibility counts, if updated incrementally
@@ -147,7 +147,7 @@ def _contents(
     given: FitInput,
     learnt: Rays,
     surface: SurfaceReturns,
-    leaf_keys: NDArray[np.uint64],
+    leaf_keys: Keys,
     returns: ReturnsOfCells,
     field: Field,
     report: dict[str, Any],

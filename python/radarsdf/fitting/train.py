@@ -12,10 +12,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf.arrays import Array
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import NeuralField
@@ -87,7 +87,7 @@ class LossHistory:
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
         self._started_s = time.perf_counter() - before_s
 
-    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: NDArray[Any]) -> None:
+    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: Array) -> None:
         """Add the losses of an iteration on samples with labels `sdf_m` (B,), m. `done`: iterations done, it included."""
         now_s = time.perf_counter() - self._started_s
         # The cross-entropy of distances with the wrong sign is below 1 + distance / sigma, and the absolute error of

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Array, Floats
 from radarsdf.checks import number, usable_poses
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays, prepare
@@ -78,7 +79,7 @@ class Sensor:
         """Width of a beam in azimuth and elevation, rad: the full width at half maximum of the noise."""
         return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
 
-    def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
+    def threshold(self, ranges_m: Array) -> Floats:
         """Interpolate the detection threshold.
 
         Parameters
@@ -94,10 +95,9 @@ class Sensor:
         if not self.thresholds:
             return np.full(len(ranges_m), -np.inf)
         at_m, weakest = np.transpose(self.thresholds)
-        interpolated: NDArray[np.float64] = np.interp(ranges_m, at_m, weakest)
-        return interpolated
+        return np.interp(ranges_m, at_m, weakest)
 
-    def directions(self, azimuth_rad: NDArray[Any], elevation_rad: NDArray[Any]) -> NDArray[np.float64]:
+    def directions(self, azimuth_rad: Array, elevation_rad: Array) -> Floats:
         """Convert azimuths and elevations to unit vectors.
 
         Parameters
@@ -192,7 +192,7 @@ def _pair(values: Any, name: str) -> tuple[float, float]:
     return number(values[0], name), number(values[1], name)
 
 
-def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
+def _limits(values: Floats) -> tuple[float, float]:
     """Return robust lower and upper limits."""
     low, high = np.quantile(values, [_STRAY, 1 - _STRAY])
     if low == high:  # very few returns
@@ -200,9 +200,7 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _thresholds(
-    ranges_m: NDArray[np.float64], intensities: NDArray[np.float64]
-) -> tuple[tuple[float, float], ...]:
+def _thresholds(ranges_m: Floats, intensities: Floats) -> tuple[tuple[float, float], ...]:
     """Return the median range and the robust weakest intensity of range bins with equal counts."""
     order = np.lexsort((intensities, ranges_m))  # equal ranges in an order of their own
     bins = [part for part in np.array_split(order, _RANGE_BINS) if len(part)]
