@@ -16,16 +16,20 @@ from radarsdf.arrays import Bools, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
-from radarsdf.fitting.average import SurfaceReturns, average_surface, closed_form, occupied_cells
+from radarsdf.fitting.average import average_surface
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.closed_form import closed_form
 from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
+from radarsdf.fitting.occupied_cells import occupied_cells
 from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.surface_returns import SurfaceReturns
 from radarsdf.fitting.train import Diverged, Interrupted, Training
 from radarsdf.map.contents import Deferred, MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
 from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import ScanSums
@@ -84,22 +88,79 @@ def _fit(
     pool: ThreadPool,
 ) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
     """Return the contents of the map, and the reason for an early end of the training, if any."""
-    num_threads, clock = pool.num_threads, [time.perf_counter()]
-    seconds: dict[str, float] = {}
+    clock = _Clock()
+    parts, stop = _trained(read, config, progress, checkpoint, pool, clock)
+    field, contents, learnt = parts.field, parts.contents, parts.intensities
+    # The residuals of a diverged network are arbitrary.
+    if learnt is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
+        scale, range_m = contents["intensity_scale"], contents["sensor"].range_m
+        field.reflectance = closed_form(field, *learnt, scale, config, range_m, pool.num_threads)
+    field.requires_grad_(False)
+    clock.lap("training_s")
+    return MapContents(field=field, config=config, report=parts.report | clock.seconds, **contents), stop
 
-    def lap(step: str) -> None:
-        clock.append(time.perf_counter())
-        seconds[step] = clock[-1] - clock[-2]
 
-    given = read()
+class _Clock:
+    """Wall-clock times of the steps of a fit."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last_s = time.perf_counter()
+
+    def lap(self, step: str) -> None:
+        now_s = time.perf_counter()
+        self.seconds[step], self._last_s = now_s - self._last_s, now_s
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Parts of the map without its closed form."""
+
+    field: Field
+    contents: dict[str, Any]  # of the map, besides its field, configuration and report
+    report: dict[str, Any]
+    intensities: tuple[Rays, Surfels] | None  # for the closed form
+
+
+def _trained(
+    read: Callable[[], FitInput],
+    config: FitConfig,
+    progress: bool | None,
+    checkpoint: str | PathLike[str] | None,
+    pool: ThreadPool,
+    clock: _Clock,
+) -> tuple[_Parts, KeyboardInterrupt | Diverged | None]:
+    """Train the field, if it has to be. The state of the training is freed at the end."""
+    parts, training, saved = _prepared(read, config, checkpoint, pool, clock)
+    stop: KeyboardInterrupt | Diverged | None = None
+    if training is not None:
+        if saved is not None:
+            saved.resume(training)
+        try:
+            training.run(progress, saved)
+        except (KeyboardInterrupt, Diverged) as early:
+            stop = early
+        parts.report.update(training.report())
+    return parts, stop
+
+
+def _prepared(
+    read: Callable[[], FitInput],
+    config: FitConfig,
+    checkpoint: str | PathLike[str] | None,
+    pool: ThreadPool,
+    clock: _Clock,
+) -> tuple[_Parts, Training | None, Checkpoint | None]:
+    """Do all before the training. Most of the memory for it is freed at the end: the training copies its rays."""
+    given, num_threads = read(), pool.num_threads
     check_extent(given.rays, config)
     check_fit(given.rays, config, given.inside)
     saved = None if checkpoint is None else Checkpoint(checkpoint, given.rays, given.scale, config)
-    lap("prepare_s")
+    clock.lap("prepare_s")
 
     surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
     learnt = given.rays if given.inside is None else given.rays.select(given.inside)
-    lap("ghosts_s")
+    clock.lap("ghosts_s")
 
     leaf_keys, returns = occupied_cells(surface, config, num_threads)
     with_network = config.trains_intensity and learnt.intensities is not None
@@ -109,38 +170,19 @@ def _fit(
         field.initialise(torch.Generator("cpu").manual_seed(config.seed))
     else:
         field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
-    lap("occupied_cells_s")
+    clock.lap("occupied_cells_s")
 
     sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
     schedule = Schedule.of(config, with_intensity=with_network, **sizes)
     report = _report(given, learnt, surface, field, schedule, config)
-    contents = _contents(given, learnt, surface, leaf_keys, returns, field, report, config, num_threads)
-    lap("start_s")
-
-    scale = given.scale if config.trains_intensity else None
-    closes = learnt.intensities is not None and config.closes_intensity
-    of_intensity = (learnt, surface.surfels) if closes else None
-    surface_rays = surface.rays
-    del given, surface, returns, leaf_keys  # frees most of the memory for the training
-    stop: KeyboardInterrupt | Diverged | None = None
+    contents = _contents(given, learnt, surface, leaf_keys, returns, config, num_threads)
+    training = None
     if isinstance(field, NeuralField):
-        training = Training(field, surface_rays, learnt, scale, schedule, config, pool)
-        del surface_rays, learnt  # the training has a copy
-        if saved is not None:
-            saved.resume(training)
-        try:
-            training.run(progress, saved)
-        except (KeyboardInterrupt, Diverged) as early:
-            stop = early
-        report.update(training.report())
-        del training  # frees rays and moments, which the closed form does not need
-        # The residuals of a diverged network are arbitrary.
-    if of_intensity is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
-        field.reflectance = closed_form(contents, *of_intensity, num_threads)
-    field.requires_grad_(False)
-    lap("training_s")
-    report.update(seconds)
-    return contents, stop
+        scale = given.scale if config.trains_intensity else None
+        training = Training(field, surface.rays, learnt, scale, schedule, config, pool)
+    clock.lap("start_s")
+    closes = learnt.intensities is not None and config.closes_intensity
+    return _Parts(field, contents, report, (learnt, surface.surfels) if closes else None), training, saved
 
 
 def _contents(
@@ -149,12 +191,10 @@ def _contents(
     surface: SurfaceReturns,
     leaf_keys: Keys,
     returns: ReturnsOfCells,
-    field: Field,
-    report: dict[str, Any],
     config: FitConfig,
     num_threads: int,
-) -> MapContents:
-    """Return the contents of the map, with the untrained field."""
+) -> dict[str, Any]:
+    """Return the contents of the map by name, except for field, configuration and report."""
     rays, scale, surfels, leaf_m = given.rays, given.scale, surface.surfels, config.leaf_size_m
     sensor, clutter_ratio, returns_per_cell = given.sensor, given.clutter_ratio, given.returns_per_cell
     if sensor is None:
@@ -163,9 +203,8 @@ def _contents(
     noise, true, box_cells = surface.noise, surface.true, given.box_cells
 
     def free_space() -> FreeSpace:
-        return FreeSpace.of(
-            rays if true is None else rays.select(true), noise, leaf_m, box_cells, num_threads
-        )
+        of_true = rays if true is None else rays.select(true)
+        return FreeSpace.of(of_true, noise, leaf_m, box_cells, num_threads)
 
     def view_statistics() -> ViewStatistics:
         known = learnt.with_intensity
@@ -177,19 +216,16 @@ def _contents(
 
     # Only grids, comparisons and files ask for these, which took a third of a fit. The map keeps the rays until then.
     deferred = config.returns.free_space
-    return MapContents(
-        field=field,
-        origin=rays.origin,
-        intensity_scale=scale,
-        config=config,
-        evidence=Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.visibility),
-        free_space=Deferred(free_space) if deferred else FreeSpace.none,
-        view_statistics=Deferred(view_statistics) if deferred else ViewStatistics.none,
-        clutter_ratio=surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
-        returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
-        sensor=sensor,
-        report=report,
-    )
+    return {
+        "origin": rays.origin,
+        "intensity_scale": scale,
+        "evidence": Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.visibility),
+        "free_space": Deferred(free_space) if deferred else FreeSpace.none,
+        "view_statistics": Deferred(view_statistics) if deferred else ViewStatistics.none,
+        "clutter_ratio": surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
+        "returns_per_cell": surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
+        "sensor": sensor,
+    }
 
 
 def _report(

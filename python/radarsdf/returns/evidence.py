@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_visibility
+from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_scans, count_visibility
 from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sums import merged_keys
+from radarsdf.returns.sums import MeanRays, ReturnCells, merged_keys
+from radarsdf.returns.weights import weights_of
 
 CELLS_OF_SURFACE = 9
 """Approximate number of cells that a plane crosses in a 3 × 3 × 3 neighbourhood."""
@@ -61,15 +63,39 @@ class Evidence:
 
 @dataclass(frozen=True)
 class ReturnsOfCells:
-    """Information, number of scans and number of returns of each leaf cell, in the order of the keys."""
+    """Weights, number of scans and number of returns of each leaf cell, in the order of the keys."""
 
     keys: Keys  # (M,) Morton keys of the leaf cells with returns, ascending
+    weights: Floats32  # (M,) sum of the weights of its returns in averages of distances
     information: Floats32  # (M,) 1 / variance of the position estimated from its returns, m⁻²
     scans: Counts32  # (M,) number of different scans with returns
     counts: Floats  # (M,) number of returns
 
+    @classmethod
+    def of_rays(
+        cls, rays: Rays, noise: SensorNoise, leaf_size_m: float, config: ReturnsConfig, num_threads: int
+    ) -> ReturnsOfCells:
+        """Sum over all returns in each leaf cell."""
+        cells = ReturnCells.of(rays, leaf_size_m, num_threads)
+        ones = np.broadcast_to(np.float32(1), len(rays))
+        sums = [
+            np.bincount(cells.cell_of_ray, values, len(cells.keys)).astype(np.float32)
+            for values in weights_of(ones, rays.ranges_m, noise)
+        ]
+        scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
+        ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m, len(cells.keys)) / cells.counts
+        found = cls(cells.keys, *sums, scans, cells.counts)
+        return found.with_uncertain_poses(ranges_m.astype(np.float32), config)
+
+    @classmethod
+    def of_means(cls, means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
+        """Weigh the mean ray of each leaf cell, whose returns have nearly the same range if seen from the same position."""
+        weights = weights_of(means.counts, means.ranges_m, noise)
+        found = cls(means.keys, *weights, means.scans, means.counts.astype(np.float64))
+        return found.with_uncertain_poses(means.ranges_m, config)
+
     def select(self, part: Bools) -> ReturnsOfCells:
-        return ReturnsOfCells(self.keys[part], self.information[part], self.scans[part], self.counts[part])
+        return ReturnsOfCells(*(column[part] for column in vars(self).values()))
 
     def with_uncertain_poses(self, ranges_m: Floats32, config: ReturnsConfig) -> ReturnsOfCells:
         """Include the pose uncertainty of `config`. `ranges_m` (M,): mean range of the returns in each cell, m."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radarsdf._core import move_onto_planes
-from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import AnyFloats, Bools, Floats, Ints, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
@@ -56,16 +56,13 @@ class SensorNoise:
         """Standard deviation across the beam: root mean square of azimuth and elevation, rad."""
         return float(np.hypot(self.azimuth_rad, self.elevation_rad) / np.sqrt(2))
 
-    def variances_m2(self, ranges_m: Floats32) -> Floats32:
-        """Return the sum (N,) of the variances along and across the beam at ranges (N,), m²."""
-        across_m = np.float32(self.angle_rad) * ranges_m
-        return np.float32(self.range_m**2) + np.square(across_m)
+    def variances_m2(self, ranges_m: AnyFloats, axes_across: int = 1) -> AnyFloats:
+        """Return the sum (N,) of the variances along the beam and on one or both axes across it, at ranges (N,), m²."""
+        return self.range_m**2 + axes_across * np.square(self.angle_rad * ranges_m)
 
-    def mean_variances_m2(self, ranges_m: Floats32) -> Floats:
+    def mean_variances_m2(self, ranges_m: AnyFloats) -> Floats:
         """Return the mean (N,) of the variances along the three axes at ranges (N,), m²."""
-        across_rad2 = self.azimuth_rad**2 + self.elevation_rad**2
-        sums: Floats = self.range_m**2 + across_rad2 * np.square(ranges_m, dtype=np.float64)
-        return sums / 3
+        return self.variances_m2(ranges_m.astype(np.float64), axes_across=2) / 3
 
 
 def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> SensorNoise:

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from radarsdf._core import cell_keys
 from radarsdf.checks import are_rigid, one_for_each_scan
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.average import SurfaceReturns
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import StaticReturns
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
@@ -216,9 +216,8 @@ class _Planner:
             if len(noises) == _SAMPLED_TILES:
                 continue
             with ThreadPool(plan.config.num_threads) as workers:
-                surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
-            noises.append(surface.noise)
-            surfels = surface.surfels
+                surfels = Surfels.of(rays, plan.config.leaf_size_m, workers.num_threads)
+                noises.append(sensor_noise(surfels, rays, plan.config.returns, workers.num_threads))
             clutter += surfels.clutter_ratio() * len(rays)
             returns += len(rays)
             # Of the cells beyond, the tile has only the returns whose rays cross it.
