@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import are_rigid, real_array
+from radarsdf.checks import are_rigid, check, real_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +38,10 @@ class Imu:
             if (values := getattr(self, name)) is None:
                 continue
             array = real_array(values, name)
-            if array.shape != shape or array.size == 0 or not np.isfinite(array).all():
-                msg = f"{name} of an IMU must be finite numbers of shape {shape}, not {array.shape}"
-                raise ValueError(msg)
+            fits = array.shape == shape and array.size != 0 and np.isfinite(array).all()
+            check(fits, f"{name} of an IMU must be finite numbers of shape {shape}, not {array.shape}")
             object.__setattr__(self, name, array)
-        if (np.diff(self.times_s) < 0).any():
-            msg = "times_s of an IMU must ascend"
-            raise ValueError(msg)
+        check(not (np.diff(self.times_s) < 0).any(), "times_s of an IMU must ascend")
         if self.R_sensor_imu is not None:
             object.__setattr__(self, "R_sensor_imu", checked_rotation(self.R_sensor_imu))
 

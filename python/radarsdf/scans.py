@@ -12,7 +12,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from radarsdf.arrays import Array, Floats, Ints
-from radarsdf.checks import MISSING_POSES, one_for_each_scan
+from radarsdf.checks import MISSING_POSES, check, one_for_each_scan
 from radarsdf.imu import Imu
 
 _LOG = logging.getLogger("radarsdf.io")
@@ -297,9 +297,7 @@ class Scans:
             times_s.append(scan.time_s)
             yield scan
         self._notes.end_pass()
-        if not poses:
-            msg = f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}"
-            raise ValueError(msg)
+        check(poses, f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}")
         self._poses = np.stack(poses)
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
 

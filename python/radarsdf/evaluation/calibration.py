@@ -10,7 +10,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import real_array
+from radarsdf.checks import check, real_array
 
 CALIBRATION_PROTOCOL = "radarsdf-calibration-1"  # changes with the meaning of a number
 
@@ -67,14 +67,11 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
     (2.0, 1.0)
     """
     error, sigma = _paired(error_m, "error_m", uncertainty_m, "uncertainty_m")
-    if np.isinf(error).any() or ((sigma < _LEAST_M) | np.isinf(sigma)).any():
-        msg = f"error_m must be finite or NaN, and uncertainty_m at least {_LEAST_M:g} m"
-        raise ValueError(msg)
+    fits = not np.isinf(error).any() and not ((sigma < _LEAST_M) | np.isinf(sigma)).any()
+    check(fits, f"error_m must be finite or NaN, and uncertainty_m at least {_LEAST_M:g} m")
     known = ~(np.isnan(error) | np.isnan(sigma))
     error, sigma = error[known], sigma[known]
-    if len(error) < _ENCE_BINS:
-        msg = f"{len(error)} points are too few for {_ENCE_BINS} bins"
-        raise ValueError(msg)
+    check(len(error) >= _ENCE_BINS, f"{len(error)} points are too few for {_ENCE_BINS} bins")
     z = error / sigma
     predicted, measured = _by_uncertainty(error, sigma, _ENCE_BINS)
     decile_predicted, decile_measured = _by_uncertainty(error, sigma, _DECILES)
@@ -135,9 +132,8 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
     p, truth = _paired(confidence, "confidence", is_true, "is_true")
     known = ~np.isnan(p)
     p, truth = p[known], truth[known]
-    if len(p) == 0 or ((p < 0) | (p > 1)).any() or not np.isin(truth, (0, 1)).all():
-        msg = "confidence must be in [0, 1], or NaN but for some, and is_true True or False"
-        raise ValueError(msg)
+    fits = len(p) != 0 and not ((p < 0) | (p > 1)).any() and np.isin(truth, (0, 1)).all()
+    check(fits, "confidence must be in [0, 1], or NaN but for some, and is_true True or False")
     count, mean, share = (
         np.histogram(p, _DECILES, (0, 1), weights=weights)[0] for weights in (None, p, truth)
     )
@@ -161,9 +157,8 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
 def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[Floats, Floats]:
     """Convert two arguments to arrays (N,)."""
     first, second = real_array(a, name_a), real_array(b, name_b)
-    if first.ndim != 1 or first.shape != second.shape:
-        msg = f"{name_a} {first.shape} and {name_b} {second.shape} must both be (N,)"
-        raise ValueError(msg)
+    fits = first.ndim == 1 and first.shape == second.shape
+    check(fits, f"{name_a} {first.shape} and {name_b} {second.shape} must both be (N,)")
     return first, second
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from radarsdf.arrays import Floats, Ints
-from radarsdf.checks import positions, real_array, whole_number
+from radarsdf.checks import check, positions, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"  # changes with the meaning of a number
@@ -43,13 +43,10 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
         If the values are not real numbers.
     """
     p, m = real_array(predicted, "predicted"), real_array(measured, "measured")
-    if p.ndim != 1 or p.shape != m.shape or p.size == 0:
-        msg = f"predicted {p.shape} and measured {m.shape} must both be (N,), with at least one return"
-        raise ValueError(msg)
+    fits = p.ndim == 1 and p.shape == m.shape and p.size != 0
+    check(fits, f"predicted {p.shape} and measured {m.shape} must both be (N,), with at least one return")
     error = np.abs(p - m)
-    if not np.isfinite(error).all():
-        msg = "predicted and measured must be finite"
-        raise ValueError(msg)
+    check(np.isfinite(error).all(), "predicted and measured must be finite")
     return {
         "protocol": INTENSITY_PROTOCOL,
         "mae": float(error.mean()),
@@ -90,9 +87,8 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     else:
         real_array(frames, "frames")
         numbers = np.asarray(frames)
-    if numbers.size and numbers.dtype.kind not in "iu":
-        msg = "frames must be a number of scans or integer frame numbers"
-        raise ValueError(msg)
+    fits = not numbers.size or numbers.dtype.kind in "iu"
+    check(fits, "frames must be a number of scans or integer frame numbers")
     numbers = np.unique(numbers)
     if every < 2 or numbers.size < 2:
         msg = f"cannot hold out every {every}th of {numbers.size} scans: at least one must remain to train on"
@@ -148,15 +144,11 @@ class KNNIntensity:
     ) -> None:
         points, self._directions = _rays(points_world, sensor_positions)
         self._values = real_array(intensities, "intensities")
-        if len(points) == 0:
-            msg = "the baseline needs at least one return"
-            raise ValueError(msg)
-        if self._values.shape != (len(points),) or not np.isfinite(self._values).all():
-            msg = f"intensities must be ({len(points)},) and finite, but have shape {self._values.shape}"
-            raise ValueError(msg)
-        if whole_number(k, "k", 1) > whole_number(candidates, "candidates", 1):
-            msg = f"1 <= k <= candidates is needed, not k={k}, candidates={candidates}"
-            raise ValueError(msg)
+        check(len(points), "the baseline needs at least one return")
+        fits = self._values.shape == (len(points),) and np.isfinite(self._values).all()
+        check(fits, f"intensities must be ({len(points)},) and finite, but have shape {self._values.shape}")
+        fits = whole_number(k, "k", 1) <= whole_number(candidates, "candidates", 1)
+        check(fits, f"1 <= k <= candidates is needed, not k={k}, candidates={candidates}")
         self._origin = points.mean(axis=0)
         self._tree = cKDTree(points - self._origin)
         self.candidates = min(candidates, len(points))
@@ -197,9 +189,8 @@ class KNNIntensity:
         points, values = positions(points_world, "points"), real_array(intensities, "intensities")
         sensors = np.broadcast_to(real_array(sensor_positions, "sensor positions"), points.shape)
         numbers = np.asarray(scans)
-        if numbers.shape != values.shape or not np.issubdtype(numbers.dtype, np.integer):
-            msg = f"scans must be ({len(values)},) integers, not {numbers.shape} {numbers.dtype}"
-            raise ValueError(msg)
+        fits = numbers.shape == values.shape and np.issubdtype(numbers.dtype, np.integer)
+        check(fits, f"scans must be ({len(values)},) integers, not {numbers.shape} {numbers.dtype}")
         if numbers.min() == numbers.max():
             return cls(points, sensors, values)
         test = np.isin(numbers, holdout(numbers, _EVERY)[1])
@@ -256,12 +247,8 @@ def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[Floats, Floats]:
     """Points (N, 3) and the unit vectors (N, 3) from the sensor to each, after checks of both arguments."""
     x = positions(points, "points")
     s = positions(np.atleast_2d(real_array(sensors, "sensor positions")), "sensor positions")
-    if len(s) not in {1, len(x)}:
-        msg = f"sensor positions must be ({len(x)}, 3) or (3,), not {s.shape}"
-        raise ValueError(msg)
+    check(len(s) in {1, len(x)}, f"sensor positions must be ({len(x)}, 3) or (3,), not {s.shape}")
     ray = x - s
     length = np.linalg.norm(ray, axis=1, keepdims=True)
-    if (length == 0).any():
-        msg = "a point lies at its sensor position: it has no viewing direction"
-        raise ValueError(msg)
+    check(not (length == 0).any(), "a point lies at its sensor position: it has no viewing direction")
     return x, ray / length

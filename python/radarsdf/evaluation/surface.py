@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
 from radarsdf.arrays import Bools, Floats, Ints
-from radarsdf.checks import check_box, positions, whole_number
+from radarsdf.checks import check, check_box, positions, whole_number
 from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
@@ -83,9 +83,7 @@ def surface_metrics(
     corners = None if box is None else check_box(box)
     in_the_box = "" if corners is None else " in the box"
     points = _in_box(positions(ground_truth, "ground_truth"), corners)
-    if len(points) == 0:
-        msg = f"there are no ground-truth points{in_the_box}"
-        raise ValueError(msg)
+    check(len(points), f"there are no ground-truth points{in_the_box}")
     vertices, faces = _triangles(mesh)
     # From here on relative to the mean: differences of large coordinates would lose precision.
     origin = points.mean(axis=0)
@@ -109,9 +107,7 @@ def surface_metrics(
         kept_sum += float(inliers.sum())
         right += int(np.count_nonzero(inliers < _THRESHOLD_M))
         _shorten(completion, points, block, workers)
-    if total == 0:
-        msg = f"the mesh has no surface{in_the_box}"
-        raise ValueError(msg)
+    check(total, f"the mesh has no surface{in_the_box}")
 
     accuracy_ratio, precision = right / kept if kept else 0.0, right / total
     completion_ratio = float(np.mean(completion < _THRESHOLD_M))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats
-from radarsdf.checks import check_poses, real_array
+from radarsdf.checks import check, check_poses, real_array
 from radarsdf.poses.rigid import aligned, between, nearest_rotation, placed, steps, turned_by
 
 Alignment = Literal["positions", "poses", "none"]
@@ -61,9 +61,8 @@ def trajectory_metrics(
     >>> round(metrics["relative_ratio"], 3), round(metrics["step_m"], 3)
     (0.02, 0.02)
     """
-    if align not in get_args(Alignment):
-        msg = f"align must be one of {', '.join(get_args(Alignment))}, not {align!r:.50}"
-        raise ValueError(msg)
+    fits = align in get_args(Alignment)
+    check(fits, f"align must be one of {', '.join(get_args(Alignment))}, not {align!r:.50}")
     true = check_poses(real_array(true_poses, "true_poses"))
     found = check_poses(poses, len(true))
     at = found

@@ -19,6 +19,7 @@ from radarsdf._core import (
     stable_order,
 )
 from radarsdf.arrays import Bytes, Floats32, Ints, Ints32
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import Rays
 
@@ -133,9 +134,8 @@ class RaySampler:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         following = int(state["next"])
-        if not -1 <= following <= len(self._rays) + self._neighbours:
-            msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
-            raise ValueError(msg)
+        fits = -1 <= following <= len(self._rays) + self._neighbours
+        check(fits, f"a sampler of {len(self._rays)} rays cannot be at ray {following}")
         if following >= 0:
             self._generator.set_state(state["order_from"])
             self._draw_order()

@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from radarsdf.arrays import Array
-from radarsdf.checks import hides_bar
+from radarsdf.checks import check, hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
@@ -231,9 +231,8 @@ class Training:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restore a :meth:`state` of the same fit. Raise a ValueError if it is invalid."""
         done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
-        if not all(0 <= done[name] <= self.iterations[name] for name in done):
-            msg = f"{done} iterations of {self.iterations}"
-            raise ValueError(msg)
+        fits = all(0 <= done[name] <= self.iterations[name] for name in done)
+        check(fits, f"{done} iterations of {self.iterations}")
         self.iterations_done.update(done)
         losses = zip(done, state["losses"].tolist(), strict=True)
         self.losses.update({name: loss for name, loss in losses if done[name]})

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from radarsdf.arrays import Array, Bools, Floats32, Keys
-from radarsdf.checks import real_array
+from radarsdf.checks import check, real_array
 from radarsdf.returns.sampling import hashes, sample
 
 # An intensity is an outlier if it lies beyond a gap and significantly outside the extrapolated tail of the inliers.
@@ -126,9 +126,8 @@ class IntensityScale:
     def between(cls, intensity_range: ArrayLike) -> IntensityScale:
         """Build from a range (low, high). Raise a ValueError unless it is finite and ascending."""
         ends = real_array(intensity_range, "intensity_range")
-        if ends.shape != (2,) or not -np.inf < ends[0] < ends[1] < np.inf:
-            msg = "intensity_range must be two finite numbers, the lower one first"
-            raise ValueError(msg)
+        fits = ends.shape == (2,) and -np.inf < ends[0] < ends[1] < np.inf
+        check(fits, "intensity_range must be two finite numbers, the lower one first")
         return cls(*ends.tolist())
 
     def to_unit(self, intensities: Floats32) -> Floats32:

@@ -15,6 +15,7 @@ from radarsdf._core import scan_rays
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints32, Keys
 from radarsdf.checks import (
     MAX_POSITION_M,
+    check,
     check_scan_shape,
     check_scan_shapes,
     check_values_of_scans,
@@ -283,21 +284,17 @@ def prepare(
     )
     rays = rays.without_outliers() if whole else rays
     if rays.intensities is not None and whole:
-        if not rays.with_intensity.any():
-            msg = "no intensity is finite: omit intensities if the sensor does not measure them"
-            raise ValueError(msg)
+        fits = rays.with_intensity.any()
+        check(fits, "no intensity is finite: omit intensities if the sensor does not measure them")
         check_range(float(np.nanmin(rays.intensities)), float(np.nanmax(rays.intensities)))
     return rays
 
 
 def check_range(low: float, high: float) -> None:
     """Raise a ValueError if intensities from `low` to `high`, sensor units, are all equal or too far apart for float32."""
-    if low == high:
-        msg = f"all intensities are {low}: omit them if the sensor does not measure them"
-        raise ValueError(msg)
-    if high - low > float(np.finfo(np.float32).max):
-        msg = f"intensities from {low} to {high} are too far apart for float32"
-        raise ValueError(msg)
+    check(low != high, f"all intensities are {low}: omit them if the sensor does not measure them")
+    fits = high - low <= float(np.finfo(np.float32).max)
+    check(fits, f"intensities from {low} to {high} are too far apart for float32")
 
 
 def rays_from(

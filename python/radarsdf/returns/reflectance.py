@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints32, Keys
+from radarsdf.checks import check
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.response import NUM_COEFFICIENTS, NUM_KINDS, TABLE_SHAPE, Response, kinds_of
@@ -76,9 +77,8 @@ class Reflectance:
     def check(self) -> None:
         """Raise a ValueError if keys are not ascending, or shapes do not match."""
         shapes = self.coefficients.shape, self.table.shape, self.normals.shape
-        if shapes != ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3)):
-            msg = "the reflectance has arrays of wrong shapes"
-            raise ValueError(msg)
+        fits = shapes == ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3))
+        check(fits, "the reflectance has arrays of wrong shapes")
         _ = self._planes, self._cells  # their constructors check the keys
 
     @classmethod

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Array, Floats
-from radarsdf.checks import number, usable_poses
+from radarsdf.checks import check, number, usable_poses
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sampling import sample
@@ -62,16 +62,14 @@ class Sensor:
                 msg = f"{name} must be two ascending numbers up to {most:.4g}, not {low:.6g} and {high:.6g}"
                 raise ValueError(msg)
             object.__setattr__(self, name, found)
-        if not 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7:
-            msg = f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}"
-            raise ValueError(msg)
+        fits = 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7
+        check(fits, f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}")
         if any(not 0 <= number(value, "noise") < math.inf for value in dataclasses.astuple(self.noise)):
             msg = f"noise must be finite and at least 0, not {self.noise}"
             raise ValueError(msg)
         steps = tuple(_pair(step, "thresholds") for step in self.thresholds)
-        if any(a >= b for (a, _), (b, _) in itertools.pairwise(steps)):
-            msg = "thresholds must have ascending ranges"
-            raise ValueError(msg)
+        fits = not any(a >= b for (a, _), (b, _) in itertools.pairwise(steps))
+        check(fits, "thresholds must have ascending ranges")
         object.__setattr__(self, "thresholds", steps)
 
     @property
@@ -151,9 +149,7 @@ class Sensor:
         poses = np.tile(np.eye(4), (len(points), 1, 1))
         limits: dict[str, Any] = {"min_range_m": min_range_m, "max_range_m": max_range_m}
         rays = prepare(points, poses, intensities, whole=False, **limits)
-        if len(rays) == 0:
-            msg = "no return lies within the ranges: a sensor cannot be estimated from its scans"
-            raise ValueError(msg)
+        check(len(rays), "no return lies within the ranges: a sensor cannot be estimated from its scans")
         return cls.of_rays(
             rays.without_outliers(), poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise
         )
@@ -186,9 +182,8 @@ class Sensor:
 
 
 def _pair(values: Any, name: str) -> tuple[float, float]:
-    if not isinstance(values, (tuple, list)) or len(values) != 2:
-        msg = f"{name} must be two numbers, not {values!r:.50}"
-        raise ValueError(msg)
+    fits = isinstance(values, (tuple, list)) and len(values) == 2
+    check(fits, f"{name} must be two numbers, not {values!r:.50}")
     return number(values[0], name), number(values[1], name)
 
 

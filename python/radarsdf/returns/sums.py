@@ -17,6 +17,7 @@ from radarsdf._core import (
     sum_returns,
 )
 from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.checks import check
 from radarsdf.returns.rays import Rays
 
 MAX_CELLS_FROM_ORIGIN = 1_000_000
@@ -114,9 +115,7 @@ class ScanSums:
         return self._with(other, -1)
 
     def _with(self, other: ScanSums, sign: int) -> ScanSums:
-        if self.leaf_size_m != other.leaf_size_m:
-            msg = "sums over cells of different sizes cannot be added"
-            raise ValueError(msg)
+        check(self.leaf_size_m == other.leaf_size_m, "sums over cells of different sizes cannot be added")
         keys = np.union1d(self.keys, other.keys)
         sums = np.zeros((len(keys), self.sums.shape[1]), np.int64)
         scans = np.zeros(len(keys), np.int64)

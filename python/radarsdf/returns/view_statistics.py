@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from radarsdf._core import cell_rows
 from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints32
+from radarsdf.checks import check
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 
@@ -100,13 +101,11 @@ class ViewStatistics:
         """Raise a ValueError if the arrays read from a file are inconsistent."""
         count, limit_m = len(self.counts), MAX_CELLS_FROM_ORIGIN * leaf_size_m
         shapes = [getattr(self, name).shape for name in _COLUMNS]
-        if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
-            msg = "the view statistics have arrays of wrong shapes"
-            raise ValueError(msg)
+        fits = shapes == [(count, 3), (count, 3), (count,), (count,), (count,)]
+        check(fits, "the view statistics have arrays of wrong shapes")
         near = (np.abs(self.points) <= limit_m).all() and (self.ranges_m >= 0).all()
-        if not (near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf):
-            msg = "the view statistics hold numbers out of range"
-            raise ValueError(msg)
+        fits = near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf
+        check(fits, "the view statistics hold numbers out of range")
 
     def in_world(self, origin: Floats, low: float, high: float) -> ViewStatisticsAt:
         """Convert to the world frame. `origin` (3,): of the local frame, m. `low`, `high`: values of 0 and 1, sensor units."""

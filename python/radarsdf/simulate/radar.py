@@ -11,7 +11,7 @@ from pydantic import Field
 from scipy.special import gammaincinv
 
 from radarsdf.arrays import Floats, Floats32, Ints
-from radarsdf.checks import whole_number
+from radarsdf.checks import check, whole_number
 from radarsdf.settings import settings
 
 from .world import Hits, Scene
@@ -123,12 +123,10 @@ class RadarSensor:
     sidelobe_fov_rad: _Height = 0.52  # full height of the false elevations, uniform in their sine [rad]
 
     def __post_init__(self) -> None:
-        if self.min_range_m >= self.max_range_m:
-            msg = f"min_range_m must be below max_range_m, {self.max_range_m}, not {self.min_range_m}"
-            raise ValueError(msg)
-        if self.saturation_db <= self._least_db:
-            msg = f"saturation_db must be above threshold_db and floor_db, not {self.saturation_db}"
-            raise ValueError(msg)
+        fits = self.min_range_m < self.max_range_m
+        check(fits, f"min_range_m must be below max_range_m, {self.max_range_m}, not {self.min_range_m}")
+        fits = self.saturation_db > self._least_db
+        check(fits, f"saturation_db must be above threshold_db and floor_db, not {self.saturation_db}")
 
     @property
     def _least_db(self) -> float:
