@@ -158,11 +158,7 @@ class KNNIntensity:
 
     @classmethod
     def chosen(
-        cls,
-        points_world: ArrayLike,
-        sensor_positions: ArrayLike,
-        intensities: ArrayLike,
-        scans: ArrayLike,
+        cls, points_world: ArrayLike, sensor_positions: ArrayLike, intensities: ArrayLike, scans: ArrayLike
     ) -> KNNIntensity:
         """Build the baseline with the best `candidates` and `k` for these training scans.
 

@@ -27,11 +27,7 @@ _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in flo
 
 
 def surface_metrics(
-    mesh: trimesh.Trimesh,
-    ground_truth: ArrayLike,
-    *,
-    box: ArrayLike | None = None,
-    samples: int = 10_000_000,
+    mesh: trimesh.Trimesh, ground_truth: ArrayLike, *, box: ArrayLike | None = None, samples: int = 10_000_000
 ) -> dict[str, Any]:
     """Compute the errors of a mesh against ground-truth points by the paper's definitions.
 

@@ -50,12 +50,7 @@ class VertexFeatures(nn.Module):
     """
 
     def __init__(
-        self,
-        leaf_keys: Keys,
-        leaf_size_m: float,
-        num_levels: int,
-        encoding: Encoding,
-        num_threads: int = 0,
+        self, leaf_keys: Keys, leaf_size_m: float, num_levels: int, encoding: Encoding, num_threads: int = 0
     ) -> None:
         super().__init__()
         self._summed = encoding == Encoding.OCTREE

@@ -166,13 +166,7 @@ _MIN_SUPPORT = 0.5
 _MAX_SUPPORT = 9.0
 
 
-def bridged(
-    leaf_keys: Keys,
-    keys: Keys,
-    counts: Floats,
-    max_cells: int,
-    num_threads: int = 0,
-) -> Keys:
+def bridged(leaf_keys: Keys, keys: Keys, counts: Floats, max_cells: int, num_threads: int = 0) -> Keys:
     """Add gaps of at most `max_cells` between two cells with returns, along 13 directions, to ascending `leaf_keys` (C,).
 
     `counts` (M,): number of returns in the cells with ascending `keys` (M,).

@@ -31,11 +31,7 @@ _MIN_SHARE = 0.5
 
 
 def find_ghosts(
-    surfels: Surfels,
-    rays: Rays | MeanRays,
-    cell_of_ray: Ints32,
-    noise: SensorNoise,
-    num_threads: int = 0,
+    surfels: Surfels, rays: Rays | MeanRays, cell_of_ray: Ints32, noise: SensorNoise, num_threads: int = 0
 ) -> Bools:
     """Return a mask (C,) of the cells of `surfels` that hold ghosts.
 

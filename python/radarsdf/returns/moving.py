@@ -99,10 +99,7 @@ def sensor_velocity(
 
 
 def _most_agreed(
-    away: Floats,
-    measured: Floats,
-    residuals: Callable[[Floats], Floats],
-    interval_mps: float | None,
+    away: Floats, measured: Floats, residuals: Callable[[Floats], Floats], interval_mps: float | None
 ) -> Floats:
     """Return the velocity (3,) with the most inliers among random draws of three returns (RANSAC)."""
     rng = np.random.default_rng(0)
@@ -136,9 +133,7 @@ def folding_interval_mps(doppler_mps: Sequence[Array]) -> float | None:
 
 
 def sensor_velocities(
-    points: Sequence[Array],
-    doppler_mps: Sequence[Array],
-    others_mps: Sequence[Array] = (),
+    points: Sequence[Array], doppler_mps: Sequence[Array], others_mps: Sequence[Array] = ()
 ) -> list[SensorVelocity]:
     """Estimate the velocity in each of K scans of a sensor. `others_mps`: further speeds to find the ambiguity interval."""
     interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None

@@ -97,11 +97,7 @@ def neighbour_support(blocks: CellBlocks, keys: Keys, of_cells: Floats, num_thre
 
 
 def neighbour_planes(
-    blocks: CellBlocks,
-    keys: Keys,
-    of_cells: Floats,
-    cell_size_m: float,
-    num_threads: int = 0,
+    blocks: CellBlocks, keys: Keys, of_cells: Floats, cell_size_m: float, num_threads: int = 0
 ) -> tuple[Floats, Floats, Floats32, Floats]:
     """Return centres, normals, widest axes and variances (K, 3) of the surfels at `keys` (K,); see :func:`neighbour_support`."""
     moments = blocks.neighbour_sums(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)

@@ -7,15 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from radarsdf._core import (
-    CellBlocks,
-    CellSet,
-    cell_keys,
-    count_scans,
-    mean_rays,
-    merge_sums,
-    sum_returns,
-)
+from radarsdf._core import CellBlocks, CellSet, cell_keys, count_scans, mean_rays, merge_sums, sum_returns
 from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Ints, Ints32, Keys
 from radarsdf.checks import check
 from radarsdf.returns.rays import Rays
