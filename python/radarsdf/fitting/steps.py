@@ -36,6 +36,8 @@ from radarsdf.returns.sums import ScanSums
 from radarsdf.returns.view_statistics import ViewStatistics
 from radarsdf.threads import ThreadPool
 
+_Stop = KeyboardInterrupt | Diverged | None
+
 
 @dataclass(frozen=True)
 class FitInput:
@@ -68,7 +70,7 @@ def fit_rays(
     try:
         # A map created in inference mode could not compute gradients later.
         with torch.inference_mode(mode=False), ThreadPool(config.num_threads) as pool:
-            contents, stop = _fit(read, config, progress, checkpoint, pool)
+            contents, stop = _Fit(config, progress, checkpoint, pool, {}).run(read)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption
     radar_map = RadarMap(contents)
@@ -80,109 +82,97 @@ def fit_rays(
     return radar_map
 
 
-def _fit(
-    read: Callable[[], FitInput],
-    config: FitConfig,
-    progress: bool | None,
-    checkpoint: str | PathLike[str] | None,
-    pool: ThreadPool,
-) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
-    """Return the contents of the map, and the reason for an early end of the training, if any."""
-    clock = _Clock()
-    parts, stop = _trained(read, config, progress, checkpoint, pool, clock)
-    field, contents, learnt = parts.field, parts.contents, parts.intensities
-    # The residuals of a diverged network are arbitrary.
-    if learnt is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
-        scale, range_m = contents["intensity_scale"], contents["sensor"].range_m
-        field.reflectance = closed_form(field, *learnt, scale, config, range_m, pool.num_threads)
-    field.requires_grad_(False)
-    clock.lap("training_s")
-    return MapContents(field=field, config=config, report=parts.report | clock.seconds, **contents), stop
-
-
-class _Clock:
-    """Wall-clock times of the steps of a fit."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last_s = time.perf_counter()
-
-    def lap(self, step: str) -> None:
-        now_s = time.perf_counter()
-        self.seconds[step], self._last_s = now_s - self._last_s, now_s
-
-
 @dataclass(frozen=True)
-class _Parts:
-    """Parts of the map without its closed form."""
+class _Begun:
+    """A map before its training."""
 
     field: Field
-    contents: dict[str, Any]  # of the map, besides its field, configuration and report
+    contents: dict[str, Any]  # of the map, except for field, configuration and report
     report: dict[str, Any]
     intensities: tuple[Rays, Surfels] | None  # for the closed form
 
 
-def _trained(
-    read: Callable[[], FitInput],
-    config: FitConfig,
-    progress: bool | None,
-    checkpoint: str | PathLike[str] | None,
-    pool: ThreadPool,
-    clock: _Clock,
-) -> tuple[_Parts, KeyboardInterrupt | Diverged | None]:
-    """Train the field, if it has to be. The state of the training is freed at the end."""
-    parts, training, saved = _prepared(read, config, checkpoint, pool, clock)
-    stop: KeyboardInterrupt | Diverged | None = None
-    if training is not None:
+@dataclass(frozen=True)
+class _Fit:
+    config: FitConfig
+    progress: bool | None
+    checkpoint: str | PathLike[str] | None
+    pool: ThreadPool
+    seconds: dict[str, float]  # wall-clock time of each step
+    _ends_s: list[float] = dataclasses.field(default_factory=lambda: [time.perf_counter()])
+
+    def _lap(self, step: str) -> None:
+        self._ends_s.append(time.perf_counter())
+        self.seconds[step] = self._ends_s[-1] - self._ends_s[-2]
+
+    def run(self, read: Callable[[], FitInput]) -> tuple[MapContents, _Stop]:
+        """Return the contents of the map, and the reason for an early end of the training, if any."""
+        config = self.config
+        begun, stop = self._train(read)
+        field, contents = begun.field, begun.contents
+        # The residuals of a diverged network are arbitrary.
+        if begun.intensities is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
+            scale, range_m = contents["intensity_scale"], contents["sensor"].range_m
+            of_returns = (*begun.intensities, scale, config, range_m, self.pool.num_threads)
+            field.reflectance = closed_form(field, *of_returns)
+        field.requires_grad_(False)
+        self._lap("training_s")
+        return MapContents(field=field, config=config, report=begun.report | self.seconds, **contents), stop
+
+    def _train(self, read: Callable[[], FitInput]) -> tuple[_Begun, _Stop]:
+        """Train the field, unless it is an average. The state of the training is freed at the end."""
+        begun, training, saved = self._begin(read)
+        if training is None:
+            return begun, None
         if saved is not None:
             saved.resume(training)
+        stop: _Stop = None
         try:
-            training.run(progress, saved)
+            training.run(self.progress, saved)
         except (KeyboardInterrupt, Diverged) as early:
             stop = early
-        parts.report.update(training.report())
-    return parts, stop
+        begun.report.update(training.report())
+        return begun, stop
 
+    def _begin(self, read: Callable[[], FitInput]) -> tuple[_Begun, Training | None, Checkpoint | None]:
+        """Do all before the training, which copies its rays: what the map does not keep is freed at the end."""
+        given, config, num_threads = read(), self.config, self.pool.num_threads
+        check_extent(given.rays, config)
+        check_fit(given.rays, config, given.inside)
+        saved = (
+            None if self.checkpoint is None else Checkpoint(self.checkpoint, given.rays, given.scale, config)
+        )
+        self._lap("prepare_s")
 
-def _prepared(
-    read: Callable[[], FitInput],
-    config: FitConfig,
-    checkpoint: str | PathLike[str] | None,
-    pool: ThreadPool,
-    clock: _Clock,
-) -> tuple[_Parts, Training | None, Checkpoint | None]:
-    """Do all before the training. Most of the memory for it is freed at the end: the training copies its rays."""
-    given, num_threads = read(), pool.num_threads
-    check_extent(given.rays, config)
-    check_fit(given.rays, config, given.inside)
-    saved = None if checkpoint is None else Checkpoint(checkpoint, given.rays, given.scale, config)
-    clock.lap("prepare_s")
+        surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
+        learnt = given.rays if given.inside is None else given.rays.select(given.inside)
+        self._lap("ghosts_s")
 
-    surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
-    learnt = given.rays if given.inside is None else given.rays.select(given.inside)
-    clock.lap("ghosts_s")
+        leaf_keys, returns = occupied_cells(surface, config, num_threads)
+        with_network = config.trains_intensity and learnt.intensities is not None
+        field: Field
+        if surface.means is None:
+            field = NeuralField(leaf_keys, config, with_intensity=with_network, num_threads=num_threads)
+            field.initialise(torch.Generator("cpu").manual_seed(config.seed))
+        else:
+            field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
+        self._lap("occupied_cells_s")
 
-    leaf_keys, returns = occupied_cells(surface, config, num_threads)
-    with_network = config.trains_intensity and learnt.intensities is not None
-    field: Field
-    if surface.means is None:
-        field = NeuralField(leaf_keys, config, with_intensity=with_network, num_threads=num_threads)
-        field.initialise(torch.Generator("cpu").manual_seed(config.seed))
-    else:
-        field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
-    clock.lap("occupied_cells_s")
-
-    sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
-    schedule = Schedule.of(config, with_intensity=with_network, **sizes)
-    report = _report(given, learnt, surface, field, schedule, config)
-    contents = _contents(given, learnt, surface, leaf_keys, returns, config, num_threads)
-    training = None
-    if isinstance(field, NeuralField):
-        scale = given.scale if config.trains_intensity else None
-        training = Training(field, surface.rays, learnt, scale, schedule, config, pool)
-    clock.lap("start_s")
-    closes = learnt.intensities is not None and config.closes_intensity
-    return _Parts(field, contents, report, (learnt, surface.surfels) if closes else None), training, saved
+        sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
+        schedule = Schedule.of(config, with_intensity=with_network, **sizes)
+        closes = learnt.intensities is not None and config.closes_intensity
+        begun = _Begun(
+            field=field,
+            contents=_contents(given, learnt, surface, leaf_keys, returns, config, num_threads),
+            report=_report(given, learnt, surface, field, schedule, config),
+            intensities=(learnt, surface.surfels) if closes else None,
+        )
+        training = None
+        if isinstance(field, NeuralField):
+            scale = given.scale if config.trains_intensity else None
+            training = Training(field, surface.rays, learnt, scale, schedule, config, self.pool)
+        self._lap("start_s")
+        return begun, training, saved
 
 
 def _contents(
