@@ -134,9 +134,7 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
     p, truth = p[known], truth[known]
     fits = len(p) != 0 and not ((p < 0) | (p > 1)).any() and np.isin(truth, (0, 1)).all()
     check(fits, "confidence must be in [0, 1], or NaN but for some, and is_true True or False")
-    count, mean, share = (
-        np.histogram(p, _DECILES, (0, 1), weights=weights)[0] for weights in (None, p, truth)
-    )
+    count, mean, share = (np.histogram(p, _DECILES, (0, 1), weights=of)[0] for of in (None, p, truth))
     mean, share = mean / np.maximum(count, 1), share / np.maximum(count, 1)
     gap = np.abs(mean - share)
     num_true, ranks = int(truth.sum()), float(rankdata(p)[truth == 1].sum())
@@ -166,8 +164,6 @@ def _by_uncertainty(error: Floats, sigma: Floats, bins: int) -> tuple[Floats, Fl
     """Root mean squares (bins,) of uncertainties and errors, in equally filled bins of ascending uncertainty."""
     levels, level, count = np.unique(sigma, return_inverse=True, return_counts=True)
     squared_error = np.bincount(level, error**2) / count
-    by_level = [np.repeat(values, count) for values in (levels**2, squared_error)]
-    predicted, measured = (
-        np.sqrt([part.mean() for part in np.array_split(values, bins)]) for values in by_level
-    )
+    by_level = (np.array_split(np.repeat(values, count), bins) for values in (levels**2, squared_error))
+    predicted, measured = (np.sqrt([part.mean() for part in parts]) for parts in by_level)
     return predicted, measured

@@ -227,9 +227,8 @@ class KNNIntensity:
         step = max(1, _CHUNK // self.candidates)
         for start in range(0, len(points), step):
             part = slice(start, start + step)
-            distance, index = self._tree.query(
-                points[part] - self._origin, k=ranks, workers=resolve_num_threads(0)
-            )
+            near = points[part] - self._origin
+            distance, index = self._tree.query(near, k=ranks, workers=resolve_num_threads(0))
             chord = np.linalg.norm(self._directions[index] - directions[part, None], axis=2)
             angle = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))  # accurate at small angles, unlike arccos
             weight = 1.0 / ((distance + _DISTANCE_M) * (angle + _ANGLE_RAD))

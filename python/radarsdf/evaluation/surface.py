@@ -94,9 +94,8 @@ def surface_metrics(
     kept_sum = 0.0
     for block in _sample_blocks(vertices, faces, corners, samples):
         # The search finds distances strictly below its bound, and a sample exactly at the limit is an inlier.
-        distance, _ = tree.query(
-            block, distance_upper_bound=np.nextafter(_OUTLIER_M, np.inf), workers=workers
-        )
+        limit_m = np.nextafter(_OUTLIER_M, np.inf)
+        distance, _ = tree.query(block, distance_upper_bound=limit_m, workers=workers)
         inliers = distance[np.isfinite(distance)]
         total += len(block)
         kept += len(inliers)
@@ -190,11 +189,9 @@ def _triangles(mesh: trimesh.Trimesh) -> tuple[Floats, Ints]:
         raise TypeError(msg)
     vertices, faces = positions(mesh.vertices, "mesh.vertices"), np.asarray(mesh.faces)
     shaped = faces.dtype.kind in "iu" and faces.shape[1:] == (3,)
-    if faces.size and not (shaped and 0 <= faces.min() <= faces.max() < len(vertices)):
-        msg = (
-            f"mesh.faces must be (F, 3) rows of the {len(vertices)} vertices, not {faces.shape} {faces.dtype}"
-        )
-        raise ValueError(msg)
+    fits = faces.size == 0 or (shaped and 0 <= faces.min() <= faces.max() < len(vertices))
+    rows = f"rows of the {len(vertices)} vertices"
+    check(fits, f"mesh.faces must be (F, 3) {rows}, not {faces.shape} {faces.dtype}")
     return vertices, faces.reshape(-1, 3).astype(np.int64)
 
 
@@ -240,10 +237,9 @@ def _shorten(shortest: Floats, points: Floats, block: Floats, workers: int) -> N
     if len(candidates) == 0:
         return
     tree = cKDTree(block, balanced_tree=False)
-    distance, _ = tree.query(
-        points[candidates], distance_upper_bound=shortest[candidates].max(), workers=workers
-    )
-    shortest[candidates] = np.minimum(shortest[candidates], distance)
+    known = shortest[candidates]
+    distance, _ = tree.query(points[candidates], distance_upper_bound=known.max(), workers=workers)
+    shortest[candidates] = np.minimum(known, distance)
 
 
 def _angles(vertices: Floats, faces: Ints, corners: Floats | None) -> Floats:

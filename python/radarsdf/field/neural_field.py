@@ -64,11 +64,7 @@ class VertexFeatures(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Encode points (N, 3), local frame, m: levels concatenated, (N, 8 · num_levels), or summed for an octree, (N, 8)."""
         found = interpolate(self.features, points, self.table)
-        return (
-            found.view(len(points), found.shape[1] // FEATURE_DIM, FEATURE_DIM).sum(1)
-            if self._summed
-            else found
-        )
+        return found.view(len(points), self.table.num_levels, FEATURE_DIM).sum(1) if self._summed else found
 
 
 class NeuralField(Field):

@@ -129,9 +129,8 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
     of_dense, of_sparse = _ROWS[config.encoding.kind] if config.train else _ROWS_AVERAGED
     rows = round(cells * (of_dense + of_sparse * sparse**6))
     with_network = rays.intensities is not None and config.trains_intensity
-    schedule = Schedule.of(
-        config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=with_network
-    )
+    sizes = {"surface_returns": returns, "returns": returns, "vertices": rows}
+    schedule = Schedule.of(config, with_intensity=with_network, **sizes)
     memory = _ALWAYS + returns * _PER_RETURN + cells * (_PER_CELL if config.train else _PER_CELL_AVERAGED)
     if config.train:
         # Gradients of all rows, unless only touched rows move; with normals two for each thread, and their sum.
@@ -164,9 +163,8 @@ def seconds_of(
     # A forward and a backward pass cost as much as three forward ones, and nine if the loss has normals.
     passes = 9 if config.networks.normals and with_network else 3
     of_field = passes * (iterations * schedule.batch_size + later * schedule.intensity_batch_size / 3)
-    shared = of_field * (
-        _S_PER_INPUT * sdf_widths(config)[0] + _S_PER_MULTIPLICATION * weights_of(sdf_widths(config))
-    )
+    widths = sdf_widths(config)
+    shared = of_field * (_S_PER_INPUT * widths[0] + _S_PER_MULTIPLICATION * weights_of(widths))
     if with_network:
         joint_seen = schedule.joint_iterations * seen_jointly(config, schedule.batch_size)
         seen = joint_seen + later * schedule.intensity_batch_size
@@ -183,18 +181,16 @@ def skipped_parts(
 
     def seconds(network: bool, **changes: Any) -> float:
         changed = config.override(**changes)
-        scheduled = Schedule.of(
-            changed, surface_returns=returns, returns=returns, vertices=rows, with_intensity=network
-        )
+        sizes = {"surface_returns": returns, "returns": returns, "vertices": rows}
+        scheduled = Schedule.of(changed, with_intensity=network, **sizes)
         return seconds_of(changed, scheduled, returns, cells, rows, network)
 
     network = with_intensity and config.trains_intensity
     now_s, surface_s = seconds(network), seconds(False, train=True)
     skipped: list[tuple[str, float | None]] = []
     if not config.train:
-        skipped.append(
-            ("training of the surface: returns are averaged, and not moved onto planes", surface_s - now_s)
-        )
+        what = "training of the surface: returns are averaged, and not moved onto planes"
+        skipped.append((what, surface_s - now_s))
     if not config.returns.free_space:
         skipped.append(("free space, which grids and comparisons need (returns.free_space)", None))
     if not network:

@@ -138,12 +138,8 @@ class CoreGradients(GradientBackend):
 
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
         cells, pool, touched = self._field.cells, self._pool.core_threads, self._touched_by(batch)
-        arguments: dict[str, Any] = {
-            "points": batch.points,
-            "sdf_m": batch.sdf_m,
-            "parts": batch.parts,
-            "pool": pool,
-        }
+        names = ("points", "sdf_m", "parts")
+        arguments: dict[str, Any] = {name: getattr(batch, name) for name in names} | {"pool": pool}
         if losses != "intensity":
             arguments |= {"located": touched.located, "interpolated_grad": touched.gradient}
         if losses != "sdf":

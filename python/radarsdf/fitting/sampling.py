@@ -169,10 +169,8 @@ class RaySampler:
         batch, noise_rad = self._draw((count, count, 0), parts), self._config.training.cross_range_noise_rad
         if noise_rad > 0:
             # Isotropic noise is simpler. Along the beam it is small compared with the width of the band.
-            noise = torch.randn(
-                count, 3, generator=self._generator, dtype=torch.float32, device="cpu"
-            ).numpy()
-            batch.points[:] += noise * (noise_rad * batch.of_ray[:, RAY_RANGE, None])
+            noise = torch.randn(count, 3, generator=self._generator, dtype=torch.float32, device="cpu")
+            batch.points[:] += noise.numpy() * (noise_rad * batch.of_ray[:, RAY_RANGE, None])
         return batch
 
     def batch(self, parts: int = 1) -> Batch:

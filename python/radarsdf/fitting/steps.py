@@ -139,9 +139,9 @@ class _Fit:
         given, config, num_threads = read(), self.config, self.pool.num_threads
         check_extent(given.rays, config)
         check_fit(given.rays, config, given.inside)
-        saved = (
-            None if self.checkpoint is None else Checkpoint(self.checkpoint, given.rays, given.scale, config)
-        )
+        saved, path = None, self.checkpoint
+        if path is not None:
+            saved = Checkpoint(path, given.rays, given.scale, config)
         self._lap("prepare_s")
 
         surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)

@@ -52,8 +52,8 @@ class Evidence:
         information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
         if visibility is not None:
             return cls(information, hits, visibility.at(leaf_keys))
-        counted = count_visibility(leaf_keys, leaf_size_m, *rays.in_c_order(), rays.scans, num_threads)
-        return cls(information, hits, counted)
+        rays_seen = (*rays.in_c_order(), rays.scans)
+        return cls(information, hits, count_visibility(leaf_keys, leaf_size_m, *rays_seen, num_threads))
 
     def columns(self, leaf_keys: Keys, num_threads: int = 0) -> Floats32:
         """Return information, hits, visibility and :func:`usual_information` of each leaf cell, (C, 4)."""
@@ -117,11 +117,8 @@ class VisibilityCounts:
 
     def at(self, leaf_keys: Keys) -> Counts32:
         """Return the counts (C,) of the blocks that contain leaf cells with ascending Morton keys (C,)."""
-        if len(self.keys) == 0:
-            return np.zeros(len(leaf_keys), np.uint32)
-        blocks = leaf_keys >> BLOCK_BITS
-        rows = np.minimum(np.searchsorted(self.keys, blocks), len(self.keys) - 1)
-        return np.where(self.keys[rows] == blocks, self.scans[rows], np.uint32(0))
+        rows = CellBlocks(self.keys).rows(leaf_keys >> BLOCK_BITS)
+        return np.append(self.scans, np.uint32(0))[rows]  # the last entry serves row -1, no block
 
 
 def evidence_sums(

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from radarsdf._core import find_free_space
 from radarsdf.arrays import Bools, Bytes, Ints, Keys
+from radarsdf.checks import check
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
@@ -50,9 +51,8 @@ class FreeSpace:
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
         lower, upper = limit if box_cells is None else box_cells.tolist()
         crossed_m, scans = np.minimum(before_m, known_m), np.ascontiguousarray(rays.scans)
-        return cls(
-            *find_free_space(*rays.in_c_order(), crossed_m, scans, leaf_size_m, lower, upper, num_threads)
-        )
+        box = leaf_size_m, lower, upper
+        return cls(*find_free_space(*rays.in_c_order(), crossed_m, scans, *box, num_threads))
 
     @classmethod
     def none(cls) -> FreeSpace:
@@ -60,13 +60,9 @@ class FreeSpace:
 
     def check(self) -> None:
         """Raise a ValueError if the arrays read from a file are inconsistent."""
-        if (
-            self.keys.ndim != 1
-            or self.planes.shape != (len(self.keys), _PLANES, _WORDS)
-            or not (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
-        ):
-            msg = "the free-space crossings are not planes of 512 cells for ascending keys"
-            raise ValueError(msg)
+        shaped = self.keys.ndim == 1 and self.planes.shape == (len(self.keys), _PLANES, _WORDS)
+        fits = shaped and (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
+        check(fits, "the free-space crossings are not planes of 512 cells for ascending keys")
 
     def dense(self, lower: ArrayLike, shape: tuple[int, int, int]) -> tuple[Bytes, Bools]:
         """Return dense arrays of crossing scans, at most 7, and of whether there are returns, from leaf cell `lower` (3,) on."""
@@ -107,11 +103,5 @@ def unpacked(planes: Keys) -> Bytes:
     return cells[:, _MORTON]
 
 
-def _morton_table() -> Ints:
-    table = np.zeros((BLOCK_CELLS,) * 3, np.int64)
-    cells = lattice_of(_INSIDE) % BLOCK_CELLS
-    table[tuple(cells.T)] = _INSIDE
-    return table
-
-
-_MORTON = _morton_table()
+_PLACES = np.ravel_multi_index(tuple((lattice_of(_INSIDE) % BLOCK_CELLS).T), (BLOCK_CELLS,) * 3)
+_MORTON = np.argsort(_PLACES).reshape((BLOCK_CELLS,) * 3)  # bit of each cell

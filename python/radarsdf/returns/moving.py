@@ -165,10 +165,8 @@ def without_filler(points: Sequence[Array], doppler_mps: Sequence[Array]) -> tup
             contradicting += int((np.abs(expected - filler) > 3 * _SIGMA_MPS).sum())
             asked += int(filled.sum())
     if 2 * contradicting > asked or (asked == 0 and share > _ONLY_FILLER):
-        note = (
-            f"{share:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out"
-        )
-        return others, note
+        equal = f"{share:.0%} of the Doppler values are {filler:g} m/s"
+        return others, f"{equal}: they were not measured, and are left out"
     return speeds, None
 
 
@@ -252,8 +250,6 @@ def checked_doppler(scans: list[Array], doppler_mps: Sequence[ArrayLike]) -> lis
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
     """Return rays of the static returns within the ranges of a fit, without accumulating scans. Intensity outliers are NaN."""
     static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
-    limits: dict[str, Any] = {
-        "min_range_m": config.returns.min_range_m,
-        "max_range_m": config.returns.max_range_m,
-    }
-    return prepare(static.points, scans.poses, static.intensities, **limits)
+    nearest_m, farthest_m = config.returns.min_range_m, config.returns.max_range_m
+    options: dict[str, Any] = {"min_range_m": nearest_m, "max_range_m": farthest_m}
+    return prepare(static.points, scans.poses, static.intensities, **options)

@@ -47,12 +47,11 @@ class Surfels:
         support = neighbour_support(blocks, keys, of_cells, num_threads)
         # Most cells have few returns: surfels for all of them would dominate time and memory.
         cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
-        centres, normals, widest, variances = neighbour_planes(
-            blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
-        )
-        counts = of_cells[:, 0].copy()
-        planes = (cell_of_plane, centres, normals, variances, widest)
-        return cls(cell_size_m, keys, blocks, counts, support, *planes)
+        held = keys[cell_of_plane]
+        planes = neighbour_planes(blocks, held, of_cells, cell_size_m, num_threads)
+        centres, normals, widest, variances = planes
+        cells = (cell_size_m, keys, blocks, of_cells[:, 0].copy(), support, cell_of_plane)
+        return cls(*cells, centres, normals, variances, widest)
 
     def is_flat(self) -> Bools:
         return self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]

@@ -166,9 +166,7 @@ class LeftOut:
             ratio = f"{_MOST_RATIO:g} times the median range of their scan"
             parts.append(f"{self.far} of {self.given} returns (beyond {ratio})")
         kinds = ((self.empty, "without returns"), (self.poses, "whose pose is not a rigid transform"))
-        parts += [
-            f"{len(scans)} scans {what} (the first is scan {scans[0]})" for scans, what in kinds if scans
-        ]
+        parts += [f"{len(of)} scans {what} (the first is scan {of[0]})" for of, what in kinds if of]
         return [f"Left out: {', '.join(parts)}."] if parts else []
 
 

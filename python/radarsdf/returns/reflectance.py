@@ -105,19 +105,17 @@ class Reflectance:
         groups = _Groups.of(points, directions, incidence, leaf_size_m, most)
         times, share = 1.0, 0.0
         if ask is not None:
-            answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(ranges_m))
+            unit_vectors = groups.directions / np.linalg.norm(groups.directions, axis=1, keepdims=True)
+            answers = ask(groups.points, unit_vectors, groups.means(ranges_m))
             unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, ranges_m, incidence, kinds)
         left = unit - response.at(directions, ranges_m, incidence, kinds)
         incidence = groups.means(incidence)
         del plane, kinds  # per-return arrays: frees memory
-        kinds_m, columns = _in_metres(_KINDS, leaf_size_m), (groups.points, groups.directions, incidence)
-        values, options = (
-            (groups.means(left), groups.weights),
-            (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads),
-        )
-        keys, means, explained = fit_cell_means(kinds_m, _TILINGS, *columns, *values, *options)
+        columns = (groups.points, groups.directions, incidence, groups.means(left), groups.weights)
+        options = (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads)
+        keys, means, explained = fit_cell_means(_in_metres(_KINDS, leaf_size_m), _TILINGS, *columns, *options)
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
         coefficients = response.coefficients.copy()
         coefficients[:, 0] += np.median(left - groups.of_returns(explained))
@@ -163,10 +161,6 @@ def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats
     angle: Floats32 = np.arccos(np.minimum(cosine, np.float32(1)))
     angle[plane < 0] = np.nan
     return angle
-
-
-def _unit_vectors(directions: Floats32) -> Floats32:
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)

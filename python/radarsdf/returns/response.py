@@ -187,12 +187,7 @@ def _near(bins: Ints32) -> Bools:
 
 
 def _kernels(widths: tuple[float, float]) -> list[Floats]:
-    """Return the kernels by range and elevation."""
-    steps = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
-    return [_kernel(*of_axis) for of_axis in zip(TABLE_SHAPE, np.divide(widths, steps).tolist(), strict=True)]
-
-
-def _kernel(size: int, deviation_bins: float) -> Floats:
-    """Return Gaussian weights (size, size) by the distance of bins; 1 on the diagonal."""
-    place = np.arange(size) / deviation_bins
-    return np.exp(-0.5 * (place[:, None] - place) ** 2)
+    """Return Gaussian weights of pairs of bins by range and of pairs by elevation; 1 on the diagonals."""
+    bins = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
+    places = [np.arange(n) / (width / bin_) for n, width, bin_ in zip(TABLE_SHAPE, widths, bins, strict=True)]
+    return [np.exp(-0.5 * (place[:, None] - place) ** 2) for place in places]

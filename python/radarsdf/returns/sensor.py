@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Array, Floats
-from radarsdf.checks import check, number, usable_poses
+from radarsdf.checks import check, not_negative, number, usable_poses
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sampling import sample
@@ -58,15 +58,14 @@ class Sensor:
         limits = {"azimuth_rad": math.pi, "elevation_rad": math.pi / 2, "range_m": _MAX_RANGE_M}
         for name, most in limits.items():
             low, high = found = _pair(getattr(self, name), name)
-            if not (0.0 if name == "range_m" else -most) <= low < high <= most:
-                msg = f"{name} must be two ascending numbers up to {most:.4g}, not {low:.6g} and {high:.6g}"
-                raise ValueError(msg)
+            fits = (0.0 if name == "range_m" else -most) <= low < high <= most
+            wanted = f"two ascending numbers up to {most:.4g}"
+            check(fits, f"{name} must be {wanted}, not {low:.6g} and {high:.6g}")
             object.__setattr__(self, name, found)
         fits = 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7
         check(fits, f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}")
-        if any(not 0 <= number(value, "noise") < math.inf for value in dataclasses.astuple(self.noise)):
-            msg = f"noise must be finite and at least 0, not {self.noise}"
-            raise ValueError(msg)
+        for value in dataclasses.astuple(self.noise):
+            not_negative(value, "noise")
         steps = tuple(_pair(step, "thresholds") for step in self.thresholds)
         fits = not any(a >= b for (a, _), (b, _) in itertools.pairwise(steps))
         check(fits, "thresholds must have ascending ranges")
@@ -150,9 +149,8 @@ class Sensor:
         limits: dict[str, Any] = {"min_range_m": min_range_m, "max_range_m": max_range_m}
         rays = prepare(points, poses, intensities, whole=False, **limits)
         check(len(rays), "no return lies within the ranges: a sensor cannot be estimated from its scans")
-        return cls.of_rays(
-            rays.without_outliers(), poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise
-        )
+        noise = SensorNoise(0.0, 0.0, 0.0) if noise is None else noise
+        return cls.of_rays(rays.without_outliers(), poses, noise)
 
     @classmethod
     def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:

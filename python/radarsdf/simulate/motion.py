@@ -171,9 +171,8 @@ def measured_imu(
 
 def _splines(poses: Floats, times_s: Floats) -> tuple[CubicSpline, RotationSpline]:
     """Splines of positions and rotations by time. Both raise a ValueError unless there are two poses, and ascending times."""
-    return CubicSpline(times_s, poses[:, :3, 3]), RotationSpline(
-        times_s, Rotation.from_matrix(poses[:, :3, :3])
-    )
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    return CubicSpline(times_s, poses[:, :3, 3]), RotationSpline(times_s, rotations)
 
 
 def drifted(poses: Floats, sigma_m: float, sigma_rad: float, seed: int = 0, yaw_rad: float = 0.0) -> Floats:

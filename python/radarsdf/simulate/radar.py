@@ -44,7 +44,7 @@ class Origin(IntEnum):
     PHANTOM = 4
 
 
-class Scan(NamedTuple):
+class SimulatedScan(NamedTuple):
     """The N returns of one scan."""
 
     points: Floats32  # (N, 3) sensor frame, m
@@ -133,7 +133,7 @@ class RadarSensor:
         """The lowest intensity."""
         return self.threshold_db if self.floor_db is None else max(self.floor_db, self.threshold_db)
 
-    def scan(self, scene: Scene, T_world_sensor: Floats, seed: int = 0, frame: int = 0) -> Scan:
+    def scan(self, scene: Scene, T_world_sensor: Floats, seed: int = 0, frame: int = 0) -> SimulatedScan:
         """Scan a scene once.
 
         Parameters
@@ -147,7 +147,7 @@ class RadarSensor:
 
         Returns
         -------
-        Scan
+        SimulatedScan
             The N returns: `points` (N, 3) float32, sensor frame, m; `intensities` and `noiseless_intensities` (N,) float32,
             dB; `origin_kind` (N,) int8, codes of `Origin`.
         """
@@ -168,7 +168,7 @@ class RadarSensor:
             for kind, echoes in candidates.items()
         ]
         order = generator(seed, frame, _ORDER).permutation(sum(len(scan.points) for scan in scans))
-        return Scan(*(np.concatenate(columns)[order] for columns in zip(*scans, strict=True)))
+        return SimulatedScan(*(np.concatenate(columns)[order] for columns in zip(*scans, strict=True)))
 
     def echo_power_db(self, scene: Scene, origins: Floats, directions: Floats, hits: Hits) -> Floats:
         """Received power (N,), dB, of surface hits by the radar equation, without speckle or clipping; -inf without a hit.
@@ -262,7 +262,7 @@ class RadarSensor:
         angles = np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
         return _Echoes(np.sqrt(x**2 + y**2 + z**2), angles, power)
 
-    def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> Scan:
+    def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> SimulatedScan:
         """Add sensor noise, apply the detection threshold, quantise and clip the intensities."""
         noise = rng.standard_normal((len(echoes.range_m), 4))
         # Returns that noise lifts above the threshold count as if at it.
@@ -277,11 +277,10 @@ class RadarSensor:
         rows = (power >= self.threshold_db) & (range_m >= self.min_range_m) & (range_m <= self.max_range_m)
         points = range_m[rows, None] * unit_vectors(angles[rows])
         intensities = np.clip(power[rows], self.floor_db, self.saturation_db).astype(np.float32)
-        noiseless = np.clip(
-            np.broadcast_to(echoes.noiseless_db, rows.shape)[rows], self._least_db, self.saturation_db
-        )
+        noiseless = np.broadcast_to(echoes.noiseless_db, rows.shape)[rows]
+        noiseless = np.clip(noiseless, self._least_db, self.saturation_db).astype(np.float32)
         kinds = np.full(len(points), kind, dtype=np.int8)
-        return Scan(points.astype(np.float32), intensities, noiseless.astype(np.float32), kinds)
+        return SimulatedScan(points.astype(np.float32), intensities, noiseless, kinds)
 
 
 def unit_vectors(angles: Floats) -> Floats:

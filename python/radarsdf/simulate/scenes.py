@@ -372,7 +372,5 @@ def _drive(
     return simulate(Scene(site.solids, site.terrain), sensor, poses, name=name, seed=seed)
 
 
-SCENES: dict[str, Callable[..., Simulation]] = {
-    scene.__name__: scene for scene in (hugin, oculii, wall, astyx)
-}
+SCENES: dict[str, Callable[..., Simulation]] = {s.__name__: s for s in (hugin, oculii, wall, astyx)}
 """Simulations by name; each takes `seed` and `frames`."""

@@ -43,7 +43,7 @@ _SENSOR_SCANS = 512  # largest sample of scans for the sensor model
 _SAMPLED_TILES = 4  # tiles that estimate noise and clutter ratio
 
 
-class CheckedScans:
+class ScanStream:
     """Scans that are checked one by one in each pass. Those without a rigid pose are skipped."""
 
     def __init__(self, scans: Iterable[Any]) -> None:
@@ -74,7 +74,7 @@ class CheckedScans:
         self.digest = digest.hexdigest()
 
 
-def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
+def make_plan(scans: ScanStream, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
     """Read all scans once, write the rays of each tile, and return the plan."""
     planner, number = _Planner(folder, config, grid), 0
     for chunk in _chunks(scans, config.returns.accumulate_scans):
