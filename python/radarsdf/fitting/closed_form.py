@@ -40,8 +40,8 @@ def closed_form(
     assert rays.intensities is not None
 
     def network(points: Floats32, directions: Floats32, ranges_m: Floats32) -> Floats32:
-        columns = np.column_stack([points, directions, np.clip(ranges_m, *map(np.float32, range_limits_m))])
-        unit = evaluate(lambda x: field.intensity(x[:, :3], x[:, 3:6], x[:, 6]), torch.from_numpy(columns))
+        columns = torch.from_numpy(np.column_stack([points, directions, np.clip(ranges_m, *range_limits_m)]))
+        unit = evaluate(lambda x: field.intensity(x[:, :3], x[:, 3:6], x[:, 6]), columns)
         return unit.clamp(0, 1).numpy()
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)

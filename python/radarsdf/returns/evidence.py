@@ -78,13 +78,13 @@ class ReturnsOfCells:
         """Sum over all returns in each leaf cell."""
         cells = ReturnCells.of(rays, leaf_size_m, num_threads)
         ones = np.broadcast_to(np.float32(1), len(rays))
-        sums = [
+        weights, information = (
             np.bincount(cells.cell_of_ray, values, len(cells.keys)).astype(np.float32)
             for values in weights_of(ones, rays.ranges_m, noise)
-        ]
+        )
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m, len(cells.keys)) / cells.counts
-        found = cls(cells.keys, *sums, scans, cells.counts)
+        found = cls(cells.keys, weights, information, scans, cells.counts)
         return found.with_uncertain_poses(ranges_m.astype(np.float32), config)
 
     @classmethod

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radarsdf._core import move_onto_planes
-from radarsdf.arrays import AnyFloats, Bools, Floats, Ints, Ints32
+from radarsdf.arrays import Array, Bools, Floats, Ints, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
@@ -56,11 +56,11 @@ class SensorNoise:
         """Standard deviation across the beam: root mean square of azimuth and elevation, rad."""
         return float(np.hypot(self.azimuth_rad, self.elevation_rad) / np.sqrt(2))
 
-    def variances_m2(self, ranges_m: AnyFloats, axes_across: int = 1) -> AnyFloats:
+    def variances_m2(self, ranges_m: Array, axes_across: int = 1) -> Array:
         """Return the sum (N,) of the variances along the beam and on one or both axes across it, at ranges (N,), m²."""
         return self.range_m**2 + axes_across * np.square(self.angle_rad * ranges_m)
 
-    def mean_variances_m2(self, ranges_m: AnyFloats) -> Floats:
+    def mean_variances_m2(self, ranges_m: Array) -> Floats:
         """Return the mean (N,) of the variances along the three axes at ranges (N,), m²."""
         return self.variances_m2(ranges_m.astype(np.float64), axes_across=2) / 3
 

@@ -104,8 +104,8 @@ class ViewStatistics:
         fits = shapes == [(count, 3), (count, 3), (count,), (count,), (count,)]
         check(fits, "the view statistics have arrays of wrong shapes")
         near = (np.abs(self.points) <= limit_m).all() and (self.ranges_m >= 0).all()
-        fits = near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf
-        check(fits, "the view statistics hold numbers out of range")
+        plausible = near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf
+        check(plausible, "the view statistics hold numbers out of range")
 
     def in_world(self, origin: Floats, low: float, high: float) -> ViewStatisticsAt:
         """Convert to the world frame. `origin` (3,): of the local frame, m. `low`, `high`: values of 0 and 1, sensor units."""
