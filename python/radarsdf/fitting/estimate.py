@@ -19,7 +19,7 @@ from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
 from radarsdf.fitting.average import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS, seen_jointly
 from radarsdf.fitting.schedule import Schedule
-from radarsdf.memory import limit_bytes
+from radarsdf.memory import available_bytes
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import resolve_num_threads
@@ -205,7 +205,7 @@ def skipped_parts(
 
 def check_fit(rays: Rays, config: FitConfig, inside: Bools | None = None) -> None:
     """Raise a MemoryError if a fit needs more than `max_memory_bytes`, or than is available."""
-    available = limit_bytes(config.max_memory_bytes)
+    available = config.max_memory_bytes or available_bytes()
     # There are at most as many cells with returns as returns. If this bound fits, cells need not be counted.
     if available is None or _estimate(rays, config, len(rays), len(rays)).peak_memory_bytes <= available:
         return

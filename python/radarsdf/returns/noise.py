@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from radarsdf._core import move_onto_planes
-from radarsdf.arrays import Array, Bools, Floats, Ints, Ints32
+from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
+
+_Ranges = TypeVar("_Ranges", Floats32, Floats)
 
 NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
 """Settings of ``config.returns`` that fix the fields of :class:`SensorNoise`, in their order."""
@@ -56,11 +59,11 @@ class SensorNoise:
         """Standard deviation across the beam: root mean square of azimuth and elevation, rad."""
         return float(np.hypot(self.azimuth_rad, self.elevation_rad) / np.sqrt(2))
 
-    def variances_m2(self, ranges_m: Array, axes_across: int = 1) -> Array:
+    def variances_m2(self, ranges_m: _Ranges, axes_across: int = 1) -> _Ranges:
         """Return the sum (N,) of the variances along the beam and on one or both axes across it, at ranges (N,), m²."""
         return self.range_m**2 + axes_across * np.square(self.angle_rad * ranges_m)
 
-    def mean_variances_m2(self, ranges_m: Array) -> Floats:
+    def mean_variances_m2(self, ranges_m: Floats32) -> Floats:
         """Return the mean (N,) of the variances along the three axes at ranges (N,), m²."""
         return self.variances_m2(ranges_m.astype(np.float64), axes_across=2) / 3
 

@@ -17,8 +17,6 @@ from radarsdf.arrays import Floats, Ints
 
 from .materials import Material
 
-__all__ = ["Box", "CornerReflector", "Hits", "Pole", "Primitive", "Scene", "Terrain"]
-
 _First = tuple[Floats, Floats]
 
 
