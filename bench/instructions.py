@@ -25,7 +25,7 @@ import radarsdf
 import torch
 from radarsdf import FitConfig, _core
 from radarsdf.field.neural_field import NeuralField
-from radarsdf.fitting.average import near_leaf_keys
+from radarsdf.fitting.occupied_cells import near_leaf_keys
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import Training
 from radarsdf.returns.intensities import IntensityScale

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
+
+from radarsdf.arrays import Array, Bools, Floats
 
 # Largest coordinate: squares of it, and products of three, are far from overflow in float64.
 MAX_POSITION_M = 1e12
@@ -34,7 +36,7 @@ def check(holds: object, message: str) -> None:
         raise ValueError(message)
 
 
-def real_array(values: Any, name: str, dtype: Any = np.float64) -> NDArray[Any]:
+def real_array(values: Any, name: str, dtype: Any = np.float64) -> Array:
     """Convert to an array of `dtype` and any shape, without a copy if it is one already.
 
     Raises a TypeError for anything but real numbers, and a ValueError for masked values and integers too large for float64.
@@ -63,16 +65,16 @@ def refuse_masked(values: Any, name: str) -> None:
     check(not masked, f"{name} has masked values: leave them out")
 
 
-def positions(values: ArrayLike, name: str) -> NDArray[np.float64]:
+def positions(values: ArrayLike, name: str) -> Floats:
     """Convert to finite positions (N, 3), m, in C order."""
-    points: NDArray[np.float64] = np.ascontiguousarray(real_array(values, name))
+    points: Floats = np.ascontiguousarray(real_array(values, name))
     check(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
     within = (np.abs(points) <= MAX_POSITION_M).all()
     check(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
     return points
 
 
-def check_box(box: ArrayLike) -> NDArray[np.float64]:
+def check_box(box: ArrayLike) -> Floats:
     """Validate a lower and an upper corner (2, 3), world, m."""
     corners = real_array(box, "box")
     ordered = corners.shape == (2, 3) and (corners[0] < corners[1]).all()
@@ -80,33 +82,33 @@ def check_box(box: ArrayLike) -> NDArray[np.float64]:
     return positions(corners, "box")
 
 
-def check_scan_shapes(scans: Sequence[NDArray[Any]]) -> None:
+def check_scan_shapes(scans: Sequence[Array]) -> None:
     """Refuse an empty sequence of scans, and scans that are not arrays (N, 3)."""
     check(scans, "points holds no scans")
     for i, scan in enumerate(scans):
         check_scan_shape(scan, i)
 
 
-def check_scan_shape(scan: NDArray[Any], number: int) -> None:
+def check_scan_shape(scan: Array, number: int) -> None:
     fits = scan.ndim == 2 and scan.shape[1] == 3
     check(fits, f"scan {number} must have shape (N, 3), not {scan.shape}")
 
 
-def check_values_of_scans(values: Sequence[NDArray[Any]], scans: Sequence[NDArray[Any]], name: str) -> None:
+def check_values_of_scans(values: Sequence[Array], scans: Sequence[Array], name: str) -> None:
     """Refuse values that are not one array (N,) for each scan (N, 3)."""
     check(len(values) == len(scans), f"{name} holds {len(values)} scans, points {len(scans)}")
     for i, (value, scan) in enumerate(zip(values, scans, strict=True)):
         check_values_of_scan(value, scan, name, i)
 
 
-def check_values_of_scan(value: NDArray[Any], scan: NDArray[Any], name: str, number: int) -> None:
+def check_values_of_scan(value: Array, scan: Array, name: str, number: int) -> None:
     fits = value.shape == (len(scan),)
     check(fits, f"{name} of scan {number} must have shape ({len(scan)},), not {value.shape}")
 
 
-def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
+def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> Floats:
     """Convert to an array (F, 4, 4) float64 of any numbers."""
-    T_world_sensor: NDArray[np.float64] = real_array(poses, "poses")
+    T_world_sensor: Floats = real_array(poses, "poses")
     shape = T_world_sensor.shape
     count = (shape or (0,))[0] if num_scans is None else num_scans
     wanted = f"({count}, 4, 4), one T_world_sensor per scan"
@@ -114,15 +116,15 @@ def pose_matrices(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.
     return T_world_sensor
 
 
-def check_pose(pose: Any, name: str) -> NDArray[np.float64]:
+def check_pose(pose: Any, name: str) -> Floats:
     """Convert to a rigid transform (4, 4) float64 T_a_b, m."""
-    matrix: NDArray[np.float64] = real_array(pose, name)
+    matrix: Floats = real_array(pose, name)
     check(matrix.shape == (4, 4), f"{name} must have shape (4, 4), not {matrix.shape}")
     check(are_rigid(matrix[None]).all(), f"{name} is not a rigid transform ({_RIGID})")
     return matrix
 
 
-def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.float64]:
+def check_poses(poses: ArrayLike, num_scans: int | None = None) -> Floats:
     """Convert to rigid transforms (F, 4, 4) float64 T_world_sensor, m, one per scan if the number of scans is given."""
     T_world_sensor = pose_matrices(poses, num_scans)
     for i in np.flatnonzero(~are_rigid(T_world_sensor))[:1]:
@@ -131,9 +133,7 @@ def check_poses(poses: ArrayLike, num_scans: int | None = None) -> NDArray[np.fl
     return T_world_sensor
 
 
-def usable_poses(
-    poses: ArrayLike, num_scans: int | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def usable_poses(poses: ArrayLike, num_scans: int | None = None) -> tuple[Floats, Bools]:
     """:func:`check_poses`, except that a minority of non-rigid poses is interpolated, and False in the mask (F,)."""
     T_world_sensor = pose_matrices(poses, num_scans)
     rigid = are_rigid(T_world_sensor)
@@ -149,12 +149,12 @@ def usable_poses(
     return np.where(rigid[:, None, None], T_world_sensor, filled), rigid
 
 
-def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+def are_rigid(poses: Floats) -> Bools:
     """Mask (F,) of the matrices (F, 4, 4) that are rigid transforms."""
     rotation = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # non-finite matrices are not rigid
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        rigid: NDArray[np.bool_] = (
+        rigid: Bools = (
             (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
             & (rotation_error < _MAX_ROTATION_ERROR)
             & (np.linalg.det(rotation) > 0)
@@ -175,7 +175,7 @@ def one_for_each_scan(values: Any, name: str) -> Iterable[Any]:
     one_by_one = hasattr(values, "__iter__") or hasattr(values, "__getitem__")
     if not one_by_one or getattr(values, "ndim", 1) == 0:
         raise _wrong_type(name, "a list of arrays, one per scan", values)
-    return values  # type: ignore[no-any-return]
+    return values
 
 
 def path_of(value: Any, name: str) -> Path:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from radarsdf.checks import are_rigid, real_array
-
-FloatArray = NDArray[np.float64]
+from radarsdf.arrays import Floats
+from radarsdf.checks import are_rigid, check, real_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,13 +21,13 @@ class Imu:
         If arrays are not finite, their shapes are inconsistent, times do not ascend, or `R_sensor_imu` is not a rotation.
     """
 
-    times_s: FloatArray
+    times_s: Floats
     """(G,) s, ascending, by the clock of the scans."""
-    angular_velocity: FloatArray
+    angular_velocity: Floats
     """(G, 3) rad/s."""
-    specific_force: FloatArray | None = None
+    specific_force: Floats | None = None
     """(G, 3) specific force, m/s²: at rest 9.81 upwards. None: there is no accelerometer."""
-    R_sensor_imu: FloatArray | None = None
+    R_sensor_imu: Floats | None = None
     """(3, 3) rotation from the axes of the IMU to those of the radar. None: unknown."""
 
     def __post_init__(self) -> None:
@@ -39,13 +38,10 @@ class Imu:
             if (values := getattr(self, name)) is None:
                 continue
             array = real_array(values, name)
-            if array.shape != shape or array.size == 0 or not np.isfinite(array).all():
-                msg = f"{name} of an IMU must be finite numbers of shape {shape}, not {array.shape}"
-                raise ValueError(msg)
+            fits = array.shape == shape and array.size != 0 and np.isfinite(array).all()
+            check(fits, f"{name} of an IMU must be finite numbers of shape {shape}, not {array.shape}")
             object.__setattr__(self, name, array)
-        if (np.diff(self.times_s) < 0).any():
-            msg = "times_s of an IMU must ascend"
-            raise ValueError(msg)
+        check(not (np.diff(self.times_s) < 0).any(), "times_s of an IMU must ascend")
         if self.R_sensor_imu is not None:
             object.__setattr__(self, "R_sensor_imu", checked_rotation(self.R_sensor_imu))
 
@@ -54,9 +50,9 @@ class Imu:
         return len(self.times_s)
 
 
-def checked_rotation(R_sensor_imu: ArrayLike) -> FloatArray:
+def checked_rotation(R_sensor_imu: ArrayLike) -> Floats:
     """Convert to a rotation (3, 3); of a rigid transform (4, 4), take its rotation."""
-    matrix: FloatArray = real_array(R_sensor_imu, "R_sensor_imu")
+    matrix: Floats = real_array(R_sensor_imu, "R_sensor_imu")
     whole = np.eye(4)
     whole[:3, :3] = matrix[:3, :3] if matrix.shape in ((3, 3), (4, 4)) else 0.0
     if not are_rigid(whole[None]).all():

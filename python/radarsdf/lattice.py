@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from radarsdf.arrays import Floats, Ints
 
 # Walls and floors often have a coordinate of zero or a round number. On a face between cells, noise would scatter the
 # returns of one wall to both sides. With this shift, no such plane is a face of cells of any size: a third of a block is a
@@ -25,16 +27,15 @@ class WorldLattice(NamedTuple):
         """Edge of a block, m."""
         return self.block_cells * self.cell_m
 
-    def position(self, cells: ArrayLike) -> NDArray[np.float64]:
+    def position(self, cells: ArrayLike) -> Floats:
         """Positions (..., 3), world, m, of the lower corners of leaf cells with indices (..., 3)."""
-        position: NDArray[np.float64] = (np.asarray(cells) + _FIRST_CORNER * self.block_cells) * self.cell_m
-        return position
+        return (np.asarray(cells) + _FIRST_CORNER * self.block_cells) * self.cell_m
 
-    def cells(self, position: ArrayLike) -> NDArray[np.float64]:
+    def cells(self, position: ArrayLike) -> Floats:
         """Inverse of :meth:`position`: indices (..., 3) of leaf cells, with fractions."""
         return np.asarray(position, np.float64) / self.cell_m - _FIRST_CORNER * self.block_cells
 
-    def nearest_block(self, position: ArrayLike) -> NDArray[np.int64]:
+    def nearest_block(self, position: ArrayLike) -> Ints:
         """Indices (..., 3) of the leaf cells at the block corners nearest to positions (..., 3), world, m."""
         blocks = np.round(self.cells(position) / self.block_cells)
         return self.block_cells * blocks.astype(np.int64)

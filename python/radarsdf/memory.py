@@ -30,22 +30,15 @@ def check_views(max_memory_bytes: int | None, *, cells: int = 0, patches: int = 
     `cells`: leaf cells of a map whose surface for views is not yet built; `patches` of that surface; `beams` of one
     view.
     """
-    of_map = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN
-    needed = of_map + beams * _PER_BEAM
-    remedy = "use fewer poses or returns, or fit a part of the scans"
-    _check("these views", needed, max_memory_bytes, remedy)
+    needed = cells * _PER_CELL_TRACED + patches * _PER_PATCH_SEEN + beams * _PER_BEAM
+    _check("these views", needed, max_memory_bytes, "use fewer poses or returns, or fit a part of the scans")
 
 
 def _check(what: str, needed_bytes: float, max_memory_bytes: int | None, remedy: str) -> None:
-    available = limit_bytes(max_memory_bytes)
+    available = available_bytes() if max_memory_bytes is None else max_memory_bytes
     if available is not None and needed_bytes > available:
         msg = f"{what} would take about {needed_bytes / 1e9:.2f} GB, of {available / 1e9:.2f}: {remedy}"
         raise MemoryError(msg)
-
-
-def limit_bytes(max_memory_bytes: int | None) -> int | None:
-    """`max_memory_bytes`, or else the available memory."""
-    return available_bytes() if max_memory_bytes is None else max_memory_bytes
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:

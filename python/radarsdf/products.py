@@ -6,25 +6,22 @@ and so the last bits. LAPACK solves small systems with one thread.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-_Floats = NDArray[np.float64]
+from radarsdf.arrays import Array, Floats
 
 
-def product(a: NDArray[Any], b: NDArray[Any]) -> _Floats:
+def product(a: Array, b: Array) -> Floats:
     """(N, M) product of the matrices a (N, K) and b (K, M), float64."""
     return np.asarray(np.einsum("ik,kj->ij", a, b, dtype=np.float64))
 
 
-def normal_matrix(a: NDArray[Any], b: NDArray[Any]) -> _Floats:
+def normal_matrix(a: Array, b: Array) -> Floats:
     """(K, M) product aᵀ b of a (N, K) and b (N, M), float64."""
     return np.asarray(np.einsum("ni,nj->ij", a, b, dtype=np.float64))
 
 
-def turned(points: NDArray[Any], R: NDArray[Any]) -> _Floats:
+def turned(points: Array, R: Array) -> Floats:
     """(N, 3) points rotated by the matrix R (3, 3), float64: points Rᵀ."""
     # By coordinate, which is as fast as BLAS; by row takes three times as long.
     columns = np.ascontiguousarray(points.T, np.float64)

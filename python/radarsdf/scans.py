@@ -10,9 +10,9 @@ from functools import cache
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from radarsdf.checks import MISSING_POSES, one_for_each_scan
+from radarsdf.arrays import Array, Floats, Ints
+from radarsdf.checks import MISSING_POSES, check, one_for_each_scan
 from radarsdf.imu import Imu
 
 _LOG = logging.getLogger("radarsdf.io")
@@ -20,7 +20,7 @@ _Value = TypeVar("_Value")
 
 _ARRAYS = ("points", "intensities", "doppler_mps", "sigmas")  # one array per scan each
 
-Columns: TypeAlias = dict[str, NDArray[Any]]
+Columns: TypeAlias = dict[str, Array]
 """(N,) each, by name."""
 
 
@@ -28,18 +28,18 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 class Scan:
     """One scan of N returns, with its pose."""
 
-    points: NDArray[Any]
+    points: Array
     """(N, 3) sensor frame, m."""
-    T_world_sensor: NDArray[np.float64]
+    T_world_sensor: Floats
     """(4, 4) m."""
-    intensities: NDArray[Any] | None = None
+    intensities: Array | None = None
     """(N,) sensor units. None if the sensor does not measure them."""
-    doppler_mps: NDArray[Any] | None = None
+    doppler_mps: Array | None = None
     """(N,) radial velocity as output by the sensor, m/s, by most with a negative sign for approaching returns. NaN where it
     was not measured."""
     time_s: float | None = None
     """Time of the scan, s, by the clock of the file."""
-    sigma: NDArray[Any] | None = None
+    sigma: Array | None = None
     """(N, 3) the sensor's own standard deviations of range, azimuth and elevation of each return: m, rad, rad."""
 
     def __len__(self) -> int:
@@ -47,11 +47,10 @@ class Scan:
         return len(self.points)
 
     @property
-    def world_points(self) -> NDArray[np.float64]:
+    def world_points(self) -> Floats:
         """(N, 3) float64, world frame, m."""
         R, t = self.T_world_sensor[:3, :3], self.T_world_sensor[:3, 3]
-        world: NDArray[np.float64] = np.asarray(self.points, np.float64) @ R.T + t
-        return world
+        return np.asarray(self.points, np.float64) @ R.T + t
 
 
 def finite_returns(scan: Scan, notes: Notes) -> Scan:
@@ -131,25 +130,25 @@ class Scans:
 
     def __init__(
         self,
-        points: Sequence[NDArray[Any]],
-        poses: NDArray[np.float64],
-        intensities: Sequence[NDArray[Any]] | None = None,
-        ground_truth: NDArray[Any] | None = None,
+        points: Sequence[Array],
+        poses: Floats,
+        intensities: Sequence[Array] | None = None,
+        ground_truth: Array | None = None,
         *,
-        doppler_mps: Sequence[NDArray[Any]] | None = None,
-        times_s: NDArray[np.float64] | None = None,
-        sigmas: Sequence[NDArray[Any]] | None = None,
+        doppler_mps: Sequence[Array] | None = None,
+        times_s: Floats | None = None,
+        sigmas: Sequence[Array] | None = None,
         imu: Imu | None = None,
     ) -> None:
-        self._arrays: dict[str, list[NDArray[Any]] | None] | None = {
+        self._arrays: dict[str, list[Array] | None] | None = {
             name: None if arrays is None else list(one_for_each_scan(arrays, name))
             for name, arrays in zip(_ARRAYS, (points, intensities, doppler_mps, sigmas), strict=True)
         }
-        self._poses: NDArray[np.float64] | None = poses
+        self._poses: Floats | None = poses
         self._times_s = times_s
         self._source: Callable[[], Iterator[Scan]] | None = None
         self._notes = Notes()
-        self._ground_truth: Callable[[], NDArray[Any] | None] = lambda: ground_truth
+        self._ground_truth: Callable[[], Array | None] = lambda: ground_truth
         self._imu: Callable[[], Imu | None] = lambda: imu
 
     @classmethod
@@ -157,7 +156,7 @@ class Scans:
         cls,
         source: Callable[[], Iterator[Scan]],
         notes: Notes,
-        ground_truth: Callable[[], NDArray[Any] | None] = lambda: None,
+        ground_truth: Callable[[], Array | None] = lambda: None,
         imu: Callable[[], Imu | None] = lambda: None,
     ) -> Scans:
         """Build scans that are read lazily during iteration.
@@ -182,12 +181,12 @@ class Scans:
         return len(self.poses)
 
     @property
-    def points(self) -> list[NDArray[Any]]:
+    def points(self) -> list[Array]:
         """F arrays (N_i, 3), sensor frame, m."""
         return self._loaded()["points"] or []
 
     @property
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> Floats:
         """(F, 4, 4) T_world_sensor, m."""
         self._read_once()
         if self._poses is None:
@@ -195,28 +194,28 @@ class Scans:
         return self._poses
 
     @property
-    def intensities(self) -> list[NDArray[Any]] | None:
+    def intensities(self) -> list[Array] | None:
         """F arrays (N_i,), sensor units. None if the sensor does not measure them."""
         return self._loaded()["intensities"]
 
     @property
-    def doppler_mps(self) -> list[NDArray[Any]] | None:
+    def doppler_mps(self) -> list[Array] | None:
         """F arrays (N_i,), m/s, see `Scan.doppler_mps`; None if not measured."""
         return self._loaded()["doppler_mps"]
 
     @property
-    def sigmas(self) -> list[NDArray[Any]] | None:
+    def sigmas(self) -> list[Array] | None:
         """F arrays (N_i, 3), m, rad, rad, see `Scan.sigma`; None if not available."""
         return self._loaded()["sigmas"]
 
     @property
-    def times_s(self) -> NDArray[np.float64] | None:
+    def times_s(self) -> Floats | None:
         """(F,) times of the scans, s; None if unknown."""
         self._read_once()
         return self._times_s
 
     @property
-    def ground_truth(self) -> NDArray[Any] | None:
+    def ground_truth(self) -> Array | None:
         """(M, 3) lidar points, world frame, m; None if there are none."""
         return self._ground_truth()
 
@@ -230,7 +229,7 @@ class Scans:
         """Sentences on assumptions and, after a complete pass, on omissions."""
         return list(self._notes.lines)
 
-    def select(self, frames: NDArray[np.int64] | Sequence[int]) -> Scans:
+    def select(self, frames: Ints | Sequence[int]) -> Scans:
         """Select scans by index. All scans are read.
 
         Parameters
@@ -253,7 +252,7 @@ class Scans:
         scans._times_s = None if self._times_s is None else self._times_s[frames]
         return scans
 
-    def with_poses(self, poses: NDArray[np.float64], *, other_world: bool = False) -> Scans:
+    def with_poses(self, poses: Floats, *, other_world: bool = False) -> Scans:
         """Replace the poses. All scans are read.
 
         Parameters
@@ -275,7 +274,7 @@ class Scans:
             scans._ground_truth = lambda: None
         return scans
 
-    def with_ground_truth(self, points: Callable[[], NDArray[Any] | None]) -> Scans:
+    def with_ground_truth(self, points: Callable[[], Array | None]) -> Scans:
         """Replace the lidar points (M, 3), world frame, m, by those that `points` returns on first access."""
         scans = copy(self)
         scans._ground_truth = cache(points)
@@ -290,7 +289,7 @@ class Scans:
     def _read(self) -> Iterator[Scan]:
         """Read the files, and keep poses and times of a complete pass."""
         assert self._source is not None
-        poses: list[NDArray[np.float64]] = []
+        poses: list[Floats] = []
         times_s: list[float | None] = []
         self._notes.start_pass()
         for scan in self._source():
@@ -298,9 +297,7 @@ class Scans:
             times_s.append(scan.time_s)
             yield scan
         self._notes.end_pass()
-        if not poses:
-            msg = f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}"
-            raise ValueError(msg)
+        check(poses, f"{self._notes.about}: there is no scan with a return and a pose{self._notes.ending()}")
         self._poses = np.stack(poses)
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
 
@@ -310,7 +307,7 @@ class Scans:
             for _ in self._read():
                 pass
 
-    def _loaded(self) -> dict[str, list[NDArray[Any]] | None]:
+    def _loaded(self) -> dict[str, list[Array] | None]:
         """Arrays of all scans, read from their files at the first call."""
         if self._arrays is None:
             self._arrays = _arrays_of(list(self._read()))
@@ -336,9 +333,7 @@ def filled(points: Any, **given: Any) -> tuple[Any, ...]:
     return arrays, *(getattr(points, name) if values is None else values for name, values in given.items())
 
 
-def chosen(
-    arrays: list[NDArray[Any]] | None, numbers: NDArray[np.int64] | Sequence[int]
-) -> list[NDArray[Any]] | None:
+def chosen(arrays: list[Array] | None, numbers: Ints | Sequence[int]) -> list[Array] | None:
     """Arrays at these `numbers`, (K,), in this order; None for no arrays."""
     return None if arrays is None else [arrays[i] for i in numbers]
 

@@ -5,10 +5,11 @@ import pytest
 import radarsdf
 from radarsdf import FitConfig
 from radarsdf.field.grid_field import GridField
-from radarsdf.fitting import average
-from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.fitting import closed_form
+from radarsdf.fitting.surface_returns import SurfaceReturns
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.weights import Weights
 from scipy.spatial import cKDTree
 
 from ..conftest import ground_and_wall
@@ -45,6 +46,22 @@ def test_contradicting_rays_are_averaged():
     np.testing.assert_allclose(fit(*rays_down([0.0, 0.12, 0.12])).sdf(x), expected, atol=0.02)
 
 
+def test_one_function_weighs_returns(monkeypatch):
+    higher = 300.0 - 0.06  # range of the mean ray between returns at 0 and 0.12 m
+    points, poses = rays_down([0.0, 0.12, 0.12])
+    x = inner_points()
+    before = fit(points, poses)
+
+    def only_near(counts, ranges_m, noise):
+        near = np.where(ranges_m < higher, counts, counts * np.float32(1e-3))
+        return Weights(near, near / noise.variances_m2(ranges_m))
+
+    monkeypatch.setattr("radarsdf.returns.evidence.weights_of", only_near)
+    after = fit(points, poses)
+    assert np.median(after.sdf(x) - before.sdf(x)) < -0.02  # the surface moves up to the nearer returns
+    assert np.nanmedian(after.uncertainty(x)) > np.nanmedian(before.uncertainty(x))
+
+
 def test_smoothing_improves_surfaces_of_low_curvature(monkeypatch):
     rng = np.random.default_rng(2)
     points, poses = rays_down([0.0], spacing_m=0.15)
@@ -69,11 +86,11 @@ def test_of_many_returns_a_sample_is_even_among_scans_and_places(monkeypatch):
     scans = radarsdf.simulate.wall(frames=12, seed=2)
     rays = prepare(scans.points, scans.poses)
     surfels = Surfels.of(rays, 0.2)
-    assert len(average._in_order(rays, surfels, 1)) == len(rays)
-    monkeypatch.setattr(average, "_ENOUGH_RETURNS", 1)
+    assert len(closed_form._in_order(rays, surfels, 1)) == len(rays)
+    monkeypatch.setattr(closed_form, "_ENOUGH_RETURNS", 1)
     planes = np.count_nonzero(surfels.is_flat())
-    monkeypatch.setattr(average, "_ENOUGH_PER_PLANE", len(rays) // (3 * planes))
-    sample = average._in_order(rays, surfels, 1)
+    monkeypatch.setattr(closed_form, "_ENOUGH_PER_PLANE", len(rays) // (3 * planes))
+    sample = closed_form._in_order(rays, surfels, 1)
     assert len(rays) / 5 < len(sample) < len(rays) / 2
     share = len(sample) / len(rays)
     for groups in (lambda r: r.scans, lambda r: (r.points[:, 1] // 4).astype(int) + 100):

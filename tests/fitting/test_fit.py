@@ -159,7 +159,7 @@ def test_ghosts_open_no_cells_but_train_intensities(scene, monkeypatch):
         is_ghost = high[surfels.cells_at(rays.points)]
         return high
 
-    monkeypatch.setattr("radarsdf.fitting.average.find_ghosts", upper_wall)
+    monkeypatch.setattr("radarsdf.fitting.surface_returns.find_ghosts", upper_wall)
     drawn_from = []
     spread = RaySampler.spread
     monkeypatch.setattr(

@@ -8,7 +8,7 @@ import pytest
 import radarsdf
 from radarsdf.io import Scans
 from radarsdf.poses.doppler import SensorVelocities
-from radarsdf.simulate import RadarSensor, Scan, drifted, measured_motion
+from radarsdf.simulate import RadarSensor, SimulatedScan, drifted, measured_motion
 from scipy.spatial.transform import Rotation
 
 
@@ -40,7 +40,10 @@ def first(drive, count, *given, **named):
 
     `drive` is a function of `radarsdf.simulate`. Scans that are not used are not simulated.
     """
-    scan, nothing = RadarSensor.scan, Scan(np.zeros((0, 3), np.float32), *np.zeros((3, 0), np.float32))
+    scan, nothing = (
+        RadarSensor.scan,
+        SimulatedScan(np.zeros((0, 3), np.float32), *np.zeros((3, 0), np.float32)),
+    )
 
     def begun(sensor, scene, T_world_sensor, seed=0, frame=0):
         return scan(sensor, scene, T_world_sensor, seed, frame) if frame < count else nothing

@@ -75,6 +75,7 @@ def returns_of(rays, variances_m2):
     found = sorted(information)
     return ReturnsOfCells(
         keys=np.array(found, np.uint64),
+        weights=np.ones(len(found), np.float32),  # not used by evidence
         information=np.array([information[key] for key in found], np.float32),
         scans=np.array([len(scans_of_cell[key]) for key in found], np.uint32),
         counts=np.ones(len(found)),  # not used by evidence
@@ -141,7 +142,7 @@ def test_a_map_has_the_evidence_of_its_returns(rays, start, drop_ghosts, monkeyp
         assert not set(cells[is_false(rays)]) & set(cells[~is_false(rays)])
         return np.isin(np.arange(len(surfels.keys)), cells[is_false(rays)])
 
-    monkeypatch.setattr("radarsdf.fitting.average.find_ghosts", cells_of_ghosts)
+    monkeypatch.setattr("radarsdf.fitting.surface_returns.find_ghosts", cells_of_ghosts)
     config = STARTS[start].override(
         num_threads=2,
         returns={

@@ -104,7 +104,7 @@ def test_poses_are_rigid_and_smooth(simulation, monkeypatch):
     assert (R[:, 2, 2] > 0.99).all()  # level within some degrees
     height = simulation.poses[:, 2, 3] - simulation.scene.terrain.height(simulation.poses[:, :2, 3])
     assert ((height > 0.9) & (height < 1.7)).all()
-    nothing = sim.Scan(np.zeros((0, 3)), *np.zeros((3, 0)))
+    nothing = sim.SimulatedScan(np.zeros((0, 3)), *np.zeros((3, 0)))
     monkeypatch.setattr(sim.RadarSensor, "scan", lambda *_: nothing)  # the test is of its poses
     usual = {"hugin": 120, "oculii": 120, "wall": 90, "astyx": 20}[simulation.name]
     assert len(sim.SCENES[simulation.name]()) == usual

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import TiledMap
-from radarsdf.fitting.average import SurfaceReturns
+from radarsdf.fitting.surface_returns import SurfaceReturns
 from radarsdf.map import queries
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.tiles.planning import read_rays

@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from radarsdf.config.groups import (
-    MAX_THREADS,
-    EncodingConfig,
-    NetworksConfig,
-    ReturnsConfig,
-    TrainingConfig,
-)
+from radarsdf.config.groups import MAX_THREADS, EncodingConfig, NetworksConfig, ReturnsConfig, TrainingConfig
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import by_name, settings
 

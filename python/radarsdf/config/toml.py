@@ -55,10 +55,8 @@ def to_toml(config: FitConfig) -> str:
 
 def _settings(group: Any) -> list[tuple[str, Any, str]]:
     """Name, value and description of each setting."""
-    fields = group.__pydantic_fields__.items()
-    return [
-        (name, getattr(group, name), " ".join((field.description or "").split())) for name, field in fields
-    ]
+    described = {name: field.description or "" for name, field in group.__pydantic_fields__.items()}
+    return [(name, getattr(group, name), " ".join(text.split())) for name, text in described.items()]
 
 
 def _lines(name: str, value: Any, description: str) -> list[str]:

@@ -12,12 +12,6 @@ from .surface import format_metrics, surface_metrics
 from .trajectory import trajectory_metrics
 
 __all__ = [
-    "KNNIntensity",
-    "confidence_metrics",
-    "format_metrics",
-    "holdout",
-    "intensity_metrics",
-    "surface_metrics",
-    "trajectory_metrics",
-    "uncertainty_metrics",
-]
+    "KNNIntensity", "confidence_metrics", "format_metrics", "holdout", "intensity_metrics",
+    "surface_metrics", "trajectory_metrics", "uncertainty_metrics",
+]  # fmt: skip

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-from radarsdf.checks import real_array
+from radarsdf.arrays import Floats
+from radarsdf.checks import check, real_array
 
 CALIBRATION_PROTOCOL = "radarsdf-calibration-1"  # changes with the meaning of a number
 
-_Floats = NDArray[np.float64]
 _ENCE_BINS = 20
 _DECILES = 10
 _LEAST_M = 1e-12  # keeps ratios of squares from overflowing
@@ -67,14 +67,11 @@ def uncertainty_metrics(error_m: ArrayLike, uncertainty_m: ArrayLike) -> dict[st
     (2.0, 1.0)
     """
     error, sigma = _paired(error_m, "error_m", uncertainty_m, "uncertainty_m")
-    if np.isinf(error).any() or ((sigma < _LEAST_M) | np.isinf(sigma)).any():
-        msg = f"error_m must be finite or NaN, and uncertainty_m at least {_LEAST_M:g} m"
-        raise ValueError(msg)
+    fits = not np.isinf(error).any() and not ((sigma < _LEAST_M) | np.isinf(sigma)).any()
+    check(fits, f"error_m must be finite or NaN, and uncertainty_m at least {_LEAST_M:g} m")
     known = ~(np.isnan(error) | np.isnan(sigma))
     error, sigma = error[known], sigma[known]
-    if len(error) < _ENCE_BINS:
-        msg = f"{len(error)} points are too few for {_ENCE_BINS} bins"
-        raise ValueError(msg)
+    check(len(error) >= _ENCE_BINS, f"{len(error)} points are too few for {_ENCE_BINS} bins")
     z = error / sigma
     predicted, measured = _by_uncertainty(error, sigma, _ENCE_BINS)
     decile_predicted, decile_measured = _by_uncertainty(error, sigma, _DECILES)
@@ -135,12 +132,9 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
     p, truth = _paired(confidence, "confidence", is_true, "is_true")
     known = ~np.isnan(p)
     p, truth = p[known], truth[known]
-    if len(p) == 0 or ((p < 0) | (p > 1)).any() or not np.isin(truth, (0, 1)).all():
-        msg = "confidence must be in [0, 1], or NaN but for some, and is_true True or False"
-        raise ValueError(msg)
-    count, mean, share = (
-        np.histogram(p, _DECILES, (0, 1), weights=weights)[0] for weights in (None, p, truth)
-    )
+    fits = len(p) != 0 and not ((p < 0) | (p > 1)).any() and np.isin(truth, (0, 1)).all()
+    check(fits, "confidence must be in [0, 1], or NaN but for some, and is_true True or False")
+    count, mean, share = (np.histogram(p, _DECILES, (0, 1), weights=of)[0] for of in (None, p, truth))
     mean, share = mean / np.maximum(count, 1), share / np.maximum(count, 1)
     gap = np.abs(mean - share)
     num_true, ranks = int(truth.sum()), float(rankdata(p)[truth == 1].sum())
@@ -158,21 +152,18 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
     }
 
 
-def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[_Floats, _Floats]:
+def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[Floats, Floats]:
     """Convert two arguments to arrays (N,)."""
     first, second = real_array(a, name_a), real_array(b, name_b)
-    if first.ndim != 1 or first.shape != second.shape:
-        msg = f"{name_a} {first.shape} and {name_b} {second.shape} must both be (N,)"
-        raise ValueError(msg)
+    fits = first.ndim == 1 and first.shape == second.shape
+    check(fits, f"{name_a} {first.shape} and {name_b} {second.shape} must both be (N,)")
     return first, second
 
 
-def _by_uncertainty(error: _Floats, sigma: _Floats, bins: int) -> tuple[_Floats, _Floats]:
+def _by_uncertainty(error: Floats, sigma: Floats, bins: int) -> tuple[Floats, Floats]:
     """Root mean squares (bins,) of uncertainties and errors, in equally filled bins of ascending uncertainty."""
     levels, level, count = np.unique(sigma, return_inverse=True, return_counts=True)
     squared_error = np.bincount(level, error**2) / count
-    by_level = [np.repeat(values, count) for values in (levels**2, squared_error)]
-    predicted, measured = (
-        np.sqrt([part.mean() for part in np.array_split(values, bins)]) for values in by_level
-    )
+    by_level = (np.array_split(np.repeat(values, count), bins) for values in (levels**2, squared_error))
+    predicted, measured = (np.sqrt([part.mean() for part in parts]) for parts in by_level)
     return predicted, measured

@@ -6,15 +6,15 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from radarsdf.checks import positions, real_array, whole_number
+from radarsdf.arrays import Floats, Ints
+from radarsdf.checks import check, positions, real_array, whole_number
 from radarsdf.threads import resolve_num_threads
 
 INTENSITY_PROTOCOL = "radarsdf-intensity-1"  # changes with the meaning of a number
 
-_Floats = NDArray[np.float64]
 _CHUNK = 1 << 21  # candidates of all queries processed at once: about 130 MB
 _DISTANCE_M, _ANGLE_RAD = 0.1, 0.1  # noise of the returns: smaller differences hardly change a weight
 _SETTINGS = ((4, 4), (8, 8), (16, 16), (16, 64), (16, 128), (16, 256))  # (k, candidates)
@@ -43,13 +43,10 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
         If the values are not real numbers.
     """
     p, m = real_array(predicted, "predicted"), real_array(measured, "measured")
-    if p.ndim != 1 or p.shape != m.shape or p.size == 0:
-        msg = f"predicted {p.shape} and measured {m.shape} must both be (N,), with at least one return"
-        raise ValueError(msg)
+    fits = p.ndim == 1 and p.shape == m.shape and p.size != 0
+    check(fits, f"predicted {p.shape} and measured {m.shape} must both be (N,), with at least one return")
     error = np.abs(p - m)
-    if not np.isfinite(error).all():
-        msg = "predicted and measured must be finite"
-        raise ValueError(msg)
+    check(np.isfinite(error).all(), "predicted and measured must be finite")
     return {
         "protocol": INTENSITY_PROTOCOL,
         "mae": float(error.mean()),
@@ -58,7 +55,7 @@ def intensity_metrics(predicted: ArrayLike, measured: ArrayLike) -> dict[str, An
     }
 
 
-def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[Ints, Ints]:
     """Split scans into training and held-out ones: in ascending order, scans 0, `every`, 2 · `every`, … are held out.
 
     Parameters
@@ -90,9 +87,8 @@ def holdout(frames: int | Iterable[int], every: int = 10) -> tuple[NDArray[np.in
     else:
         real_array(frames, "frames")
         numbers = np.asarray(frames)
-    if numbers.size and numbers.dtype.kind not in "iu":
-        msg = "frames must be a number of scans or integer frame numbers"
-        raise ValueError(msg)
+    fits = not numbers.size or numbers.dtype.kind in "iu"
+    check(fits, "frames must be a number of scans or integer frame numbers")
     numbers = np.unique(numbers)
     if every < 2 or numbers.size < 2:
         msg = f"cannot hold out every {every}th of {numbers.size} scans: at least one must remain to train on"
@@ -148,15 +144,11 @@ class KNNIntensity:
     ) -> None:
         points, self._directions = _rays(points_world, sensor_positions)
         self._values = real_array(intensities, "intensities")
-        if len(points) == 0:
-            msg = "the baseline needs at least one return"
-            raise ValueError(msg)
-        if self._values.shape != (len(points),) or not np.isfinite(self._values).all():
-            msg = f"intensities must be ({len(points)},) and finite, but have shape {self._values.shape}"
-            raise ValueError(msg)
-        if whole_number(k, "k", 1) > whole_number(candidates, "candidates", 1):
-            msg = f"1 <= k <= candidates is needed, not k={k}, candidates={candidates}"
-            raise ValueError(msg)
+        check(len(points), "the baseline needs at least one return")
+        fits = self._values.shape == (len(points),) and np.isfinite(self._values).all()
+        check(fits, f"intensities must be ({len(points)},) and finite, but have shape {self._values.shape}")
+        ascending = whole_number(k, "k", 1) <= whole_number(candidates, "candidates", 1)
+        check(ascending, f"1 <= k <= candidates is needed, not k={k}, candidates={candidates}")
         self._origin = points.mean(axis=0)
         self._tree = cKDTree(points - self._origin)
         self.candidates = min(candidates, len(points))
@@ -166,11 +158,7 @@ class KNNIntensity:
 
     @classmethod
     def chosen(
-        cls,
-        points_world: ArrayLike,
-        sensor_positions: ArrayLike,
-        intensities: ArrayLike,
-        scans: ArrayLike,
+        cls, points_world: ArrayLike, sensor_positions: ArrayLike, intensities: ArrayLike, scans: ArrayLike
     ) -> KNNIntensity:
         """Build the baseline with the best `candidates` and `k` for these training scans.
 
@@ -197,9 +185,8 @@ class KNNIntensity:
         points, values = positions(points_world, "points"), real_array(intensities, "intensities")
         sensors = np.broadcast_to(real_array(sensor_positions, "sensor positions"), points.shape)
         numbers = np.asarray(scans)
-        if numbers.shape != values.shape or not np.issubdtype(numbers.dtype, np.integer):
-            msg = f"scans must be ({len(values)},) integers, not {numbers.shape} {numbers.dtype}"
-            raise ValueError(msg)
+        fits = numbers.shape == values.shape and np.issubdtype(numbers.dtype, np.integer)
+        check(fits, f"scans must be ({len(values)},) integers, not {numbers.shape} {numbers.dtype}")
         if numbers.min() == numbers.max():
             return cls(points, sensors, values)
         test = np.isin(numbers, holdout(numbers, _EVERY)[1])
@@ -214,7 +201,7 @@ class KNNIntensity:
         k, candidates = min(_SETTINGS, key=error)
         return cls(points, sensors, values, candidates=candidates, k=k)
 
-    def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> _Floats:
+    def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> Floats:
         """Predict the intensity of returns.
 
         Parameters
@@ -240,9 +227,8 @@ class KNNIntensity:
         step = max(1, _CHUNK // self.candidates)
         for start in range(0, len(points), step):
             part = slice(start, start + step)
-            distance, index = self._tree.query(
-                points[part] - self._origin, k=ranks, workers=resolve_num_threads(0)
-            )
+            near = points[part] - self._origin
+            distance, index = self._tree.query(near, k=ranks, workers=resolve_num_threads(0))
             chord = np.linalg.norm(self._directions[index] - directions[part, None], axis=2)
             angle = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))  # accurate at small angles, unlike arccos
             weight = 1.0 / ((distance + _DISTANCE_M) * (angle + _ANGLE_RAD))
@@ -252,16 +238,12 @@ class KNNIntensity:
         return predicted
 
 
-def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[_Floats, _Floats]:
+def _rays(points: ArrayLike, sensors: ArrayLike) -> tuple[Floats, Floats]:
     """Points (N, 3) and the unit vectors (N, 3) from the sensor to each, after checks of both arguments."""
     x = positions(points, "points")
     s = positions(np.atleast_2d(real_array(sensors, "sensor positions")), "sensor positions")
-    if len(s) not in {1, len(x)}:
-        msg = f"sensor positions must be ({len(x)}, 3) or (3,), not {s.shape}"
-        raise ValueError(msg)
+    check(len(s) in {1, len(x)}, f"sensor positions must be ({len(x)}, 3) or (3,), not {s.shape}")
     ray = x - s
     length = np.linalg.norm(ray, axis=1, keepdims=True)
-    if (length == 0).any():
-        msg = "a point lies at its sensor position: it has no viewing direction"
-        raise ValueError(msg)
+    check(not (length == 0).any(), "a point lies at its sensor position: it has no viewing direction")
     return x, ray / length

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
-from radarsdf.checks import check_box, positions, whole_number
+from radarsdf.arrays import Bools, Floats, Ints
+from radarsdf.checks import check, check_box, positions, whole_number
 from radarsdf.threads import resolve_num_threads
 
 if TYPE_CHECKING:
@@ -23,16 +24,10 @@ PROTOCOL = "radarsdf-surface-1"  # changes with the meaning of a number
 _THRESHOLD_M, _OUTLIER_M, _TRUNCATION_M = 0.2, 0.4, 2.0
 _CHUNK = 500_000  # samples at a time, to limit memory; the protocol's random numbers depend on it
 _ANGLE_NOISE_RAD = 1e-7  # rounding of an angle: 1e-9 m of a UTM northing in float64 over an edge of 1 cm
-_Points = NDArray[np.float64]
-_Faces = NDArray[np.int64]
 
 
 def surface_metrics(
-    mesh: trimesh.Trimesh,
-    ground_truth: ArrayLike,
-    *,
-    box: ArrayLike | None = None,
-    samples: int = 10_000_000,
+    mesh: trimesh.Trimesh, ground_truth: ArrayLike, *, box: ArrayLike | None = None, samples: int = 10_000_000
 ) -> dict[str, Any]:
     """Compute the errors of a mesh against ground-truth points by the paper's definitions.
 
@@ -84,9 +79,7 @@ def surface_metrics(
     corners = None if box is None else check_box(box)
     in_the_box = "" if corners is None else " in the box"
     points = _in_box(positions(ground_truth, "ground_truth"), corners)
-    if len(points) == 0:
-        msg = f"there are no ground-truth points{in_the_box}"
-        raise ValueError(msg)
+    check(len(points), f"there are no ground-truth points{in_the_box}")
     vertices, faces = _triangles(mesh)
     # From here on relative to the mean: differences of large coordinates would lose precision.
     origin = points.mean(axis=0)
@@ -101,18 +94,15 @@ def surface_metrics(
     kept_sum = 0.0
     for block in _sample_blocks(vertices, faces, corners, samples):
         # The search finds distances strictly below its bound, and a sample exactly at the limit is an inlier.
-        distance, _ = tree.query(
-            block, distance_upper_bound=np.nextafter(_OUTLIER_M, np.inf), workers=workers
-        )
+        limit_m = np.nextafter(_OUTLIER_M, np.inf)
+        distance, _ = tree.query(block, distance_upper_bound=limit_m, workers=workers)
         inliers = distance[np.isfinite(distance)]
         total += len(block)
         kept += len(inliers)
         kept_sum += float(inliers.sum())
         right += int(np.count_nonzero(inliers < _THRESHOLD_M))
         _shorten(completion, points, block, workers)
-    if total == 0:
-        msg = f"the mesh has no surface{in_the_box}"
-        raise ValueError(msg)
+    check(total, f"the mesh has no surface{in_the_box}")
 
     accuracy_ratio, precision = right / kept if kept else 0.0, right / total
     completion_ratio = float(np.mean(completion < _THRESHOLD_M))
@@ -192,31 +182,27 @@ def _harmonic_mean(a: float, b: float) -> float:
     return 2.0 * a * b / (a + b) if a + b > 0 else 0.0
 
 
-def _triangles(mesh: trimesh.Trimesh) -> tuple[_Points, _Faces]:
+def _triangles(mesh: trimesh.Trimesh) -> tuple[Floats, Ints]:
     """Vertices (V, 3), world, m, and faces (F, 3) of a mesh of any program."""
     if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
         msg = f"mesh must have vertices and faces, not be {mesh!r:.50}"
         raise TypeError(msg)
     vertices, faces = positions(mesh.vertices, "mesh.vertices"), np.asarray(mesh.faces)
     shaped = faces.dtype.kind in "iu" and faces.shape[1:] == (3,)
-    if faces.size and not (shaped and 0 <= faces.min() <= faces.max() < len(vertices)):
-        msg = (
-            f"mesh.faces must be (F, 3) rows of the {len(vertices)} vertices, not {faces.shape} {faces.dtype}"
-        )
-        raise ValueError(msg)
+    fits = faces.size == 0 or (shaped and 0 <= faces.min() <= faces.max() < len(vertices))
+    rows = f"rows of the {len(vertices)} vertices"
+    check(fits, f"mesh.faces must be (F, 3) {rows}, not {faces.shape} {faces.dtype}")
     return vertices, faces.reshape(-1, 3).astype(np.int64)
 
 
-def _in_box(points: _Points, corners: _Points | None) -> _Points:
+def _in_box(points: Floats, corners: Floats | None) -> Floats:
     if corners is None:
         return points
-    inside: NDArray[np.bool_] = ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
+    inside: Bools = ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
     return points[inside]
 
 
-def _sample_blocks(
-    vertices: _Points, faces: _Faces, corners: _Points | None, samples: int
-) -> Iterator[_Points]:
+def _sample_blocks(vertices: Floats, faces: Ints, corners: Floats | None, samples: int) -> Iterator[Floats]:
     """Sample uniformly by area, in blocks of neighbouring triangles, so that searches stay in cache."""
     rng = np.random.default_rng(0)
     if corners is not None and len(faces):
@@ -243,7 +229,7 @@ def _sample_blocks(
             yield block
 
 
-def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -> None:
+def _shorten(shortest: Floats, points: Floats, block: Floats, workers: int) -> None:
     """Update `shortest` (M,), the distances of points to all samples so far, with the samples of `block`."""
     low, high = block.min(axis=0), block.max(axis=0)
     gap = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
@@ -251,13 +237,12 @@ def _shorten(shortest: _Points, points: _Points, block: _Points, workers: int) -
     if len(candidates) == 0:
         return
     tree = cKDTree(block, balanced_tree=False)
-    distance, _ = tree.query(
-        points[candidates], distance_upper_bound=shortest[candidates].max(), workers=workers
-    )
-    shortest[candidates] = np.minimum(shortest[candidates], distance)
+    known = shortest[candidates]
+    distance, _ = tree.query(points[candidates], distance_upper_bound=known.max(), workers=workers)
+    shortest[candidates] = np.minimum(known, distance)
 
 
-def _angles(vertices: _Points, faces: _Faces, corners: _Points | None) -> _Points:
+def _angles(vertices: Floats, faces: Ints, corners: Floats | None) -> Floats:
     """Angles (E,) between the triangles of each edge with two: 0 in a plane, π where one is folded onto the other."""
     from trimesh.graph import face_adjacency  # noqa: PLC0415 - slow to import
 

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checks import check_poses, real_array
-from radarsdf.poses.rigid import Floats, aligned, between, nearest_rotation, placed, steps, turned_by
+from radarsdf.arrays import Floats
+from radarsdf.checks import check, check_poses, real_array
+from radarsdf.poses.rigid import aligned, between, nearest_rotation, placed, steps, turned_by
 
 Alignment = Literal["positions", "poses", "none"]
 
@@ -60,9 +61,8 @@ def trajectory_metrics(
     >>> round(metrics["relative_ratio"], 3), round(metrics["step_m"], 3)
     (0.02, 0.02)
     """
-    if align not in get_args(Alignment):
-        msg = f"align must be one of {', '.join(get_args(Alignment))}, not {align!r:.50}"
-        raise ValueError(msg)
+    fits = align in get_args(Alignment)
+    check(fits, f"align must be one of {', '.join(get_args(Alignment))}, not {align!r:.50}")
     true = check_poses(real_array(true_poses, "true_poses"))
     found = check_poses(poses, len(true))
     at = found
@@ -91,8 +91,7 @@ def _with_positions(poses: Floats, true: Floats) -> Floats:
     from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
     whole = np.eye(4)
     whole[:3, :3] = nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle))
-    found: Floats = np.einsum("ij,fjk->fik", placed(whole, poses, true), poses)
-    return found
+    return np.einsum("ij,fjk->fik", placed(whole, poses, true), poses)
 
 
 def _relative(poses: Floats, true: Floats, distance_m: Floats) -> tuple[float | None, float | None]:
@@ -111,8 +110,7 @@ def _relative(poses: Floats, true: Floats, distance_m: Floats) -> tuple[float | 
 
 
 def _angles(motions: Floats) -> Floats:
-    found: Floats = Rotation.from_matrix(motions[:, :3, :3]).magnitude() if len(motions) else np.zeros(0)
-    return found
+    return Rotation.from_matrix(motions[:, :3, :3]).magnitude() if len(motions) else np.zeros(0)
 
 
 def _rms(values: Floats) -> float:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from radarsdf._core import VertexTable
+from radarsdf.arrays import Floats32
 from radarsdf.field import kernels
 from radarsdf.returns.reflectance import Reflectance
 
@@ -54,7 +53,7 @@ class Field(nn.Module, ABC):
         """Return a mask (N,) of the points (N, 3), local frame, m, in occupied leaf cells."""
         return kernels.locate(points, self.table)[:, 0] >= 0
 
-    def corner_distances_m(self) -> NDArray[np.float32] | None:
+    def corner_distances_m(self) -> Floats32 | None:
         """Return the distances of which :meth:`sdf` is the trilinear interpolation, by row of the table; None if it is not."""
         return None
 

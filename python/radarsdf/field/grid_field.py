@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from radarsdf._core import Encoding, VertexTable
+from radarsdf.arrays import Floats32, Keys
 from radarsdf.field import kernels
 from radarsdf.field.field import Field
 
@@ -20,7 +20,7 @@ class GridField(Field):
     `leaf_keys` (C,): Morton keys of the occupied leaf cells, ascending. The distances are not initialised.
     """
 
-    def __init__(self, leaf_keys: NDArray[np.uint64], leaf_size_m: float, num_threads: int = 0) -> None:
+    def __init__(self, leaf_keys: Keys, leaf_size_m: float, num_threads: int = 0) -> None:
         super().__init__()
         self.table = VertexTable(leaf_keys, leaf_size_m, 1, Encoding.OCTREE, num_threads)
         self.distances_m = nn.Parameter(torch.empty(self.table.num_rows, dtype=torch.float32, device="cpu"))
@@ -47,7 +47,7 @@ class GridField(Field):
         # The closed form is unbounded; intensities beyond the range of the returns were never measured.
         return self._closed_form(points, directions, ranges_m).clamp(0, 1)
 
-    def corner_distances_m(self) -> NDArray[np.float32]:
+    def corner_distances_m(self) -> Floats32:
         return np.asarray(self.distances_m.detach().numpy())
 
     @cached_property

@@ -182,7 +182,7 @@ def interpolate(features: Tensor, points: Tensor, table: VertexTable) -> Tensor:
     (N, 8 · num_levels), finest level first. Zero at levels at which the point is in no occupied cell. Twice
     differentiable by features and points; the gradient by points is the one inside their cell.
     """
-    return _Interpolate.apply(features, points, table)  # type: ignore[no-any-return, no-untyped-call]
+    return _Interpolate.apply(features, points, table)  # type: ignore[no-untyped-call]
 
 
 def encode(features: Tensor, points: Tensor, table: VertexTable) -> tuple[Tensor, Tensor]:
@@ -202,7 +202,7 @@ def locate(points: Tensor, table: VertexTable) -> Tensor:
 
 def fourier(points: Tensor, half_width_m: float, first_frequency: int, num_frequencies: int) -> Tensor:
     """Return sines, then cosines, of 2^k·π·points / half_width_m for k from `first_frequency` on: (N, 6 · num_frequencies)."""
-    return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-any-return, no-untyped-call]
+    return _Fourier.apply(points, half_width_m, first_frequency, num_frequencies)  # type: ignore[no-untyped-call]
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
@@ -224,7 +224,7 @@ def mlp(inputs: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> Te
     # The core processes a few rows at a time through all layers. PyTorch, which processes all rows layer by
     # layer, takes 1.5 times as long. It also makes a dozen calls, each of which acquires the GIL, so two
     # threads would train hardly faster than one.
-    return _MLP.apply(len(layers), *(t for layer in layers for t in layer), *inputs)  # type: ignore[no-any-return, no-untyped-call]
+    return _MLP.apply(len(layers), *(t for layer in layers for t in layer), *inputs)  # type: ignore[no-untyped-call]
 
 
 class _MLP(torch.autograd.Function):

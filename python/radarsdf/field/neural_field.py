@@ -7,13 +7,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from radarsdf._core import FEATURE_DIM, NUM_SPHERICAL_HARMONICS, Encoding, VertexTable
+from radarsdf.arrays import Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.kernels import fourier, interpolate, large_zeros, mlp, spherical_harmonics
@@ -51,12 +50,7 @@ class VertexFeatures(nn.Module):
     """
 
     def __init__(
-        self,
-        leaf_keys: NDArray[np.uint64],
-        leaf_size_m: float,
-        num_levels: int,
-        encoding: Encoding,
-        num_threads: int = 0,
+        self, leaf_keys: Keys, leaf_size_m: float, num_levels: int, encoding: Encoding, num_threads: int = 0
     ) -> None:
         super().__init__()
         self._summed = encoding == Encoding.OCTREE
@@ -70,11 +64,7 @@ class VertexFeatures(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Encode points (N, 3), local frame, m: levels concatenated, (N, 8 · num_levels), or summed for an octree, (N, 8)."""
         found = interpolate(self.features, points, self.table)
-        return (
-            found.view(len(points), found.shape[1] // FEATURE_DIM, FEATURE_DIM).sum(1)
-            if self._summed
-            else found
-        )
+        return found.view(len(points), self.table.num_levels, FEATURE_DIM).sum(1) if self._summed else found
 
 
 class NeuralField(Field):
@@ -84,7 +74,7 @@ class NeuralField(Field):
     """
 
     def __init__(
-        self, leaf_keys: NDArray[np.uint64], config: FitConfig, *, with_intensity: bool, num_threads: int = 0
+        self, leaf_keys: Keys, config: FitConfig, *, with_intensity: bool, num_threads: int = 0
     ) -> None:
         super().__init__()
         encoding = Encoding.TRI_QUADTREE if config.encoding.kind == "tri-quadtree" else Encoding.OCTREE
@@ -118,7 +108,7 @@ class NeuralField(Field):
 
     def logit(self, points: Tensor) -> Tensor:
         """Return signed distances / sigma (N,), positive in free space, at points (N, 3), local frame, m."""
-        return self.sdf_network(self.encode(points))[0]  # type: ignore[no-any-return]
+        return self.sdf_network(self.encode(points))[0]
 
     def sdf(self, points: Tensor) -> Tensor:
         return self.logit(points) * self.sigma_m

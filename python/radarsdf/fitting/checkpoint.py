@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from radarsdf import _core
-from radarsdf.checks import path_of
+from radarsdf.checks import check, path_of
 from radarsdf.config.fit_config import FitConfig, flat_settings, settings_of_results
 from radarsdf.io.files import check_regular_file, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
@@ -79,9 +79,8 @@ class Checkpoint:
                 state = {name: file.array(name).clone() for name in expected}
             for name, value in state.items():
                 wanted = expected[name]
-                if value.shape != wanted.shape or value.dtype != wanted.dtype or not value.isfinite().all():
-                    msg = f"{name} is not {tuple(wanted.shape)} finite numbers, {wanted.dtype}"
-                    raise ValueError(msg)
+                fits = value.shape == wanted.shape and value.dtype == wanted.dtype and value.isfinite().all()
+                check(fits, f"{name} is not {tuple(wanted.shape)} finite numbers, {wanted.dtype}")
             training.restore(state)
         except OSError:
             raise
@@ -107,9 +106,7 @@ class Checkpoint:
             "scans": "is a checkpoint of other scans, poses or intensities",
         }
         for name, what in words.items():
-            if name in differing:
-                msg = f"{self._path} {what}"
-                raise ValueError(msg)
+            check(name not in differing, f"{self._path} {what}")
 
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:

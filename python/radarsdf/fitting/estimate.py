@@ -9,16 +9,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from radarsdf._core import FEATURE_DIM, CellSet
+from radarsdf.arrays import Bools
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import intensity_widths, sdf_widths, weights_of
 from radarsdf.fitting.average import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS, seen_jointly
 from radarsdf.fitting.schedule import Schedule
-from radarsdf.memory import limit_bytes
+from radarsdf.memory import available_bytes
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import resolve_num_threads
@@ -111,7 +112,7 @@ def estimate(
     return estimate_rays(rays, config)
 
 
-def estimate_rays(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> Estimate:
+def estimate_rays(rays: Rays, config: FitConfig, inside: Bools | None = None) -> Estimate:
     """:func:`estimate` for rays of which those `inside`, (N,), are fitted; None for all."""
     threads = resolve_num_threads(config.num_threads)
     points = rays.points if inside is None else rays.points[inside]
@@ -128,9 +129,8 @@ def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) ->
     of_dense, of_sparse = _ROWS[config.encoding.kind] if config.train else _ROWS_AVERAGED
     rows = round(cells * (of_dense + of_sparse * sparse**6))
     with_network = rays.intensities is not None and config.trains_intensity
-    schedule = Schedule.of(
-        config, surface_returns=returns, returns=returns, vertices=rows, with_intensity=with_network
-    )
+    sizes = {"surface_returns": returns, "returns": returns, "vertices": rows}
+    schedule = Schedule.of(config, with_intensity=with_network, **sizes)
     memory = _ALWAYS + returns * _PER_RETURN + cells * (_PER_CELL if config.train else _PER_CELL_AVERAGED)
     if config.train:
         # Gradients of all rows, unless only touched rows move; with normals two for each thread, and their sum.
@@ -163,9 +163,8 @@ def seconds_of(
     # A forward and a backward pass cost as much as three forward ones, and nine if the loss has normals.
     passes = 9 if config.networks.normals and with_network else 3
     of_field = passes * (iterations * schedule.batch_size + later * schedule.intensity_batch_size / 3)
-    shared = of_field * (
-        _S_PER_INPUT * sdf_widths(config)[0] + _S_PER_MULTIPLICATION * weights_of(sdf_widths(config))
-    )
+    widths = sdf_widths(config)
+    shared = of_field * (_S_PER_INPUT * widths[0] + _S_PER_MULTIPLICATION * weights_of(widths))
     if with_network:
         joint_seen = schedule.joint_iterations * seen_jointly(config, schedule.batch_size)
         seen = joint_seen + later * schedule.intensity_batch_size
@@ -182,18 +181,16 @@ def skipped_parts(
 
     def seconds(network: bool, **changes: Any) -> float:
         changed = config.override(**changes)
-        scheduled = Schedule.of(
-            changed, surface_returns=returns, returns=returns, vertices=rows, with_intensity=network
-        )
+        sizes = {"surface_returns": returns, "returns": returns, "vertices": rows}
+        scheduled = Schedule.of(changed, with_intensity=network, **sizes)
         return seconds_of(changed, scheduled, returns, cells, rows, network)
 
     network = with_intensity and config.trains_intensity
     now_s, surface_s = seconds(network), seconds(False, train=True)
     skipped: list[tuple[str, float | None]] = []
     if not config.train:
-        skipped.append(
-            ("training of the surface: returns are averaged, and not moved onto planes", surface_s - now_s)
-        )
+        what = "training of the surface: returns are averaged, and not moved onto planes"
+        skipped.append((what, surface_s - now_s))
     if not config.returns.free_space:
         skipped.append(("free space, which grids and comparisons need (returns.free_space)", None))
     if not network:
@@ -206,9 +203,9 @@ def skipped_parts(
     return skipped
 
 
-def check_fit(rays: Rays, config: FitConfig, inside: NDArray[np.bool_] | None = None) -> None:
+def check_fit(rays: Rays, config: FitConfig, inside: Bools | None = None) -> None:
     """Raise a MemoryError if a fit needs more than `max_memory_bytes`, or than is available."""
-    available = limit_bytes(config.max_memory_bytes)
+    available = config.max_memory_bytes or available_bytes()
     # There are at most as many cells with returns as returns. If this bound fits, cells need not be counted.
     if available is None or _estimate(rays, config, len(rays), len(rays)).peak_memory_bytes <= available:
         return

@@ -94,9 +94,8 @@ def fit(
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
 
     def read() -> FitInput:
-        scans, poses_, intensities_, doppler_mps_ = filled(
-            points, poses=poses, intensities=intensities, doppler_mps=doppler_mps
-        )
+        others = {"poses": poses, "intensities": intensities, "doppler_mps": doppler_mps}
+        scans, poses_, intensities_, doppler_mps_ = filled(points, **others)
         if poses_ is None:
             raise ValueError(MISSING_POSES)
         static = StaticReturns.of(scans, intensities_, doppler_mps_, config.returns)

@@ -15,11 +15,11 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from radarsdf import _core
+from radarsdf.arrays import Array, Ints32
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field import kernels
 from radarsdf.field.neural_field import Geometry, NeuralField, cells_width, fourier_width
@@ -56,9 +56,9 @@ def intensity_loss(predicted: Tensor, label: Tensor) -> Tensor:
 class Touched:
     """Samples of a batch, which touch the features of their cells, and the gradients of their interpolated features."""
 
-    points: NDArray[Any]  # (N, 3) samples, local frame, m
-    located: NDArray[np.int32]  # (N, num_levels) rows of the cells that contain them
-    gradient: NDArray[Any]  # (N, 8 · num_levels) gradient of the interpolated features
+    points: Array  # (N, 3) samples, local frame, m
+    located: Ints32  # (N, num_levels) rows of the cells that contain them
+    gradient: Array  # (N, 8 · num_levels) gradient of the interpolated features
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class CoreGradients(GradientBackend):
             sigma_m=field.sigma_m,
             intensity_in_free_space=config.training.intensity_in_free_space,
         )
-        self._located: NDArray[np.int32] | None = None
+        self._located: Ints32 | None = None
         self._by_sdf = [torch.from_numpy(gradient) for gradient in self._loss.sdf_gradients]
         self._by_intensity = [torch.from_numpy(gradient) for gradient in self._loss.intensity_gradients]
 
@@ -138,12 +138,8 @@ class CoreGradients(GradientBackend):
 
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
         cells, pool, touched = self._field.cells, self._pool.core_threads, self._touched_by(batch)
-        arguments: dict[str, Any] = {
-            "points": batch.points,
-            "sdf_m": batch.sdf_m,
-            "parts": batch.parts,
-            "pool": pool,
-        }
+        names = ("points", "sdf_m", "parts")
+        arguments: dict[str, Any] = {name: getattr(batch, name) for name in names} | {"pool": pool}
         if losses != "intensity":
             arguments |= {"located": touched.located, "interpolated_grad": touched.gradient}
         if losses != "sdf":

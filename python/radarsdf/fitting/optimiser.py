@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from radarsdf import _core
+from radarsdf.checks import check
 from radarsdf.field.kernels import large_zeros, view
 from radarsdf.field.neural_field import VertexFeatures
 from radarsdf.fitting.gradients import Touched
@@ -107,9 +108,7 @@ class Soap(Optimiser):
 
     def restore(self, state: dict[str, Tensor]) -> None:
         count = int(state["step_count"])
-        if count < 0:
-            msg = f"an optimiser cannot have made {count} steps"
-            raise ValueError(msg)
+        check(count >= 0, f"an optimiser cannot have made {count} steps")
         for i, memory in enumerate(self._memories):
             memory.copy_(state[f"memory.{i}"])
         self._adam.restore({k: state[f"adam.{k}"] for k in self._adam.state()})

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from radarsdf._core import (
@@ -19,6 +18,8 @@ from radarsdf._core import (
     random_bytes,
     stable_order,
 )
+from radarsdf.arrays import Bytes, Floats32, Ints, Ints32
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.returns.rays import Rays
 
@@ -77,9 +78,9 @@ class Samples:
 class Batch:
     """Samples in consecutive parts. One thread processes each part."""
 
-    points: NDArray[np.float32]  # (B, 3), see :class:`Samples`
-    sdf_m: NDArray[np.float32]  # (B,)
-    of_ray: NDArray[np.float32]  # (B, 7 or 8)
+    points: Floats32  # (B, 3), see :class:`Samples`
+    sdf_m: Floats32  # (B,)
+    of_ray: Floats32  # (B, 7 or 8)
     parts: list[tuple[int, int]]  # numbers of samples and of leading labelled samples of each part
 
     def split(self) -> list[Samples]:
@@ -133,9 +134,8 @@ class RaySampler:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         following = int(state["next"])
-        if not -1 <= following <= len(self._rays) + self._neighbours:
-            msg = f"a sampler of {len(self._rays)} rays cannot be at ray {following}"
-            raise ValueError(msg)
+        fits = -1 <= following <= len(self._rays) + self._neighbours
+        check(fits, f"a sampler of {len(self._rays)} rays cannot be at ray {following}")
         if following >= 0:
             self._generator.set_state(state["order_from"])
             self._draw_order()
@@ -147,7 +147,7 @@ class RaySampler:
         runs = torch.randperm(count, generator=self._generator, dtype=torch.int32, device="cpu")
         self._runs, self._next = runs.numpy(), 0
 
-    def _take(self, count: int) -> NDArray[np.int64]:
+    def _take(self, count: int) -> Ints:
         """Return the rows of the next `count` rays of the random order, ascending: in Morton order of their returns."""
         # A whole pass takes every ray once, in any order: with few rays, a batch would draw hundreds of permutations.
         passes, count = divmod(count, len(self._rays))
@@ -169,10 +169,8 @@ class RaySampler:
         batch, noise_rad = self._draw((count, count, 0), parts), self._config.training.cross_range_noise_rad
         if noise_rad > 0:
             # Isotropic noise is simpler. Along the beam it is small compared with the width of the band.
-            noise = torch.randn(
-                count, 3, generator=self._generator, dtype=torch.float32, device="cpu"
-            ).numpy()
-            batch.points[:] += noise * (noise_rad * batch.of_ray[:, RAY_RANGE, None])
+            noise = torch.randn(count, 3, generator=self._generator, dtype=torch.float32, device="cpu")
+            batch.points[:] += noise.numpy() * (noise_rad * batch.of_ray[:, RAY_RANGE, None])
         return batch
 
     def batch(self, parts: int = 1) -> Batch:
@@ -189,7 +187,7 @@ class RaySampler:
 
 def _in_morton_order(
     rays: Rays, intensities: Tensor | None, leaf_size_m: float, num_threads: int
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Return :attr:`Samples.of_ray` for all rays, in Morton order of their returns."""
     # A ray is one row of 32 bytes, half a cache line: a batch reads it by one gather.
     order = stable_order(cell_keys(np.ascontiguousarray(rays.points), leaf_size_m, num_threads))
@@ -210,11 +208,11 @@ def share(count: int, part: int, parts: int) -> int:
 class _Layout:
     """Layout of the B samples of a batch, each uniform on a segment of its ray: by part, near samples first."""
 
-    ray: NDArray[np.int32]  # (B,) row of each sample's ray among the rays drawn
+    ray: Ints32  # (B,) row of each sample's ray among the rays drawn
     # (B,) index of its random number: its row with all near samples of the batch first, so that samples do not depend on `parts`
-    number: NDArray[np.int32]
-    kind: NDArray[np.uint8]  # (B,) row of its segment
-    segments: NDArray[np.float32]  # (2, 4) of near and free samples, see the core's ``draw_samples``
+    number: Ints32
+    kind: Bytes  # (B,) row of its segment
+    segments: Floats32  # (2, 4) of near and free samples, see the core's ``draw_samples``
     parts: list[tuple[int, int]]  # see :class:`Batch`
 
     @classmethod
@@ -240,12 +238,11 @@ class _Layout:
         return cls(ray, number, (kinds == 2).astype(np.uint8), segments, sizes_and_labels)
 
 
-def _spread(count: int, of: int) -> NDArray[np.int64]:
+def _spread(count: int, of: int) -> Ints:
     """Return `count` of range(`of`), ascending and evenly spaced, with jitter, since rays are drawn in runs."""
     numbers = np.arange(count)
     jittered = numbers + numbers * _GOLDEN % 1
-    spread: NDArray[np.int64] = np.minimum(jittered * of // max(count, 1), of - 1).astype(np.int64)
-    return spread
+    return np.minimum(jittered * of // max(count, 1), of - 1).astype(np.int64)
 
 
 def draw_seed(generator: torch.Generator) -> int:

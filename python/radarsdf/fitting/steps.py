@@ -9,28 +9,34 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Bools, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
-from radarsdf.fitting.average import SurfaceReturns, average_surface, closed_form, occupied_cells
+from radarsdf.fitting.average import average_surface
 from radarsdf.fitting.checkpoint import Checkpoint
+from radarsdf.fitting.closed_form import closed_form
 from radarsdf.fitting.estimate import check_extent, check_fit, skipped_parts
+from radarsdf.fitting.occupied_cells import occupied_cells
 from radarsdf.fitting.schedule import Schedule
+from radarsdf.fitting.surface_returns import SurfaceReturns
 from radarsdf.fitting.train import Diverged, Interrupted, Training
 from radarsdf.map.contents import Deferred, MapContents
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, ReturnsOfCells, VisibilityCounts
 from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import ScanSums
 from radarsdf.returns.view_statistics import ViewStatistics
 from radarsdf.threads import ThreadPool
+
+_Stop = KeyboardInterrupt | Diverged | None
 
 
 @dataclass(frozen=True)
@@ -42,12 +48,12 @@ class FitInput:
     poses: ArrayLike | None = None  # (F, 4, 4) T_world_sensor of the scans, used to estimate the `sensor`
     moving: int = 0  # number of moving returns left out
     why_none_moving: str | None = None  # see :class:`radarsdf.returns.moving.MovingReturns`
-    inside: NDArray[np.bool_] | None = None
+    inside: Bools | None = None
     """(N,) mask of the returns to fit, in whole leaf cells. The other rays only mark free space. None: all."""
     clutter_ratio: float | None = None  # share of the returns not on a thin surface
     returns_per_cell: float | None = None  # mean number of returns in the cells of surfels
     sensor: Sensor | None = None
-    box_cells: NDArray[np.int64] | None = None
+    box_cells: Ints | None = None
     """(2, 3) box [lower, upper) of free-space crossings to store, leaf cells from the origin. None: no limit."""
     sums: ScanSums | None = None  # sums over the scans of the rays, if updated incrementally
     visibility: VisibilityCounts | None = None  # visibility counts, if updated incrementally
@@ -64,7 +70,7 @@ def fit_rays(
     try:
         # A map created in inference mode could not compute gradients later.
         with torch.inference_mode(mode=False), ThreadPool(config.num_threads) as pool:
-            contents, stop = _fit(read, config, progress, checkpoint, pool)
+            contents, stop = _Fit(config, progress, checkpoint, pool, {}).run(read)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption
     radar_map = RadarMap(contents)
@@ -76,85 +82,109 @@ def fit_rays(
     return radar_map
 
 
-def _fit(
-    read: Callable[[], FitInput],
-    config: FitConfig,
-    progress: bool | None,
-    checkpoint: str | PathLike[str] | None,
-    pool: ThreadPool,
-) -> tuple[MapContents, KeyboardInterrupt | Diverged | None]:
-    """Return the contents of the map, and the reason for an early end of the training, if any."""
-    num_threads, clock = pool.num_threads, [time.perf_counter()]
-    seconds: dict[str, float] = {}
+@dataclass(frozen=True)
+class _Begun:
+    """A map before its training."""
 
-    def lap(step: str) -> None:
-        clock.append(time.perf_counter())
-        seconds[step] = clock[-1] - clock[-2]
-
-    given = read()
-    check_extent(given.rays, config)
-    check_fit(given.rays, config, given.inside)
-    saved = None if checkpoint is None else Checkpoint(checkpoint, given.rays, given.scale, config)
-    lap("prepare_s")
-
-    surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
-    learnt = given.rays if given.inside is None else given.rays.select(given.inside)
-    lap("ghosts_s")
-
-    leaf_keys, returns = occupied_cells(surface, config, num_threads)
-    with_network = config.trains_intensity and learnt.intensities is not None
     field: Field
-    if surface.means is None:
-        field = NeuralField(leaf_keys, config, with_intensity=with_network, num_threads=num_threads)
-        field.initialise(torch.Generator("cpu").manual_seed(config.seed))
-    else:
-        field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
-    lap("occupied_cells_s")
+    contents: dict[str, Any]  # of the map, except for field, configuration and report
+    report: dict[str, Any]
+    intensities: tuple[Rays, Surfels] | None  # for the closed form
 
-    sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
-    schedule = Schedule.of(config, with_intensity=with_network, **sizes)
-    report = _report(given, learnt, surface, field, schedule, config)
-    contents = _contents(given, learnt, surface, leaf_keys, returns, field, report, config, num_threads)
-    lap("start_s")
 
-    scale = given.scale if config.trains_intensity else None
-    closes = learnt.intensities is not None and config.closes_intensity
-    of_intensity = (learnt, surface.surfels) if closes else None
-    surface_rays = surface.rays
-    del given, surface, returns, leaf_keys  # frees most of the memory for the training
-    stop: KeyboardInterrupt | Diverged | None = None
-    if isinstance(field, NeuralField):
-        training = Training(field, surface_rays, learnt, scale, schedule, config, pool)
-        del surface_rays, learnt  # the training has a copy
+@dataclass(frozen=True)
+class _Fit:
+    config: FitConfig
+    progress: bool | None
+    checkpoint: str | PathLike[str] | None
+    pool: ThreadPool
+    seconds: dict[str, float]  # wall-clock time of each step
+    _ends_s: list[float] = dataclasses.field(default_factory=lambda: [time.perf_counter()])
+
+    def _lap(self, step: str) -> None:
+        self._ends_s.append(time.perf_counter())
+        self.seconds[step] = self._ends_s[-1] - self._ends_s[-2]
+
+    def run(self, read: Callable[[], FitInput]) -> tuple[MapContents, _Stop]:
+        """Return the contents of the map, and the reason for an early end of the training, if any."""
+        config = self.config
+        begun, stop = self._train(read)
+        field, contents = begun.field, begun.contents
+        # The residuals of a diverged network are arbitrary.
+        if begun.intensities is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
+            scale, range_m = contents["intensity_scale"], contents["sensor"].range_m
+            of_returns = (*begun.intensities, scale, config, range_m, self.pool.num_threads)
+            field.reflectance = closed_form(field, *of_returns)
+        field.requires_grad_(False)
+        self._lap("training_s")
+        return MapContents(field=field, config=config, report=begun.report | self.seconds, **contents), stop
+
+    def _train(self, read: Callable[[], FitInput]) -> tuple[_Begun, _Stop]:
+        """Train the field, unless it is an average. The state of the training is freed at the end."""
+        begun, training, saved = self._begin(read)
+        if training is None:
+            return begun, None
         if saved is not None:
             saved.resume(training)
+        stop: _Stop = None
         try:
-            training.run(progress, saved)
+            training.run(self.progress, saved)
         except (KeyboardInterrupt, Diverged) as early:
             stop = early
-        report.update(training.report())
-        del training  # frees rays and moments, which the closed form does not need
-        # The residuals of a diverged network are arbitrary.
-    if of_intensity is not None and not (isinstance(stop, Diverged) and config.trains_intensity):
-        field.reflectance = closed_form(contents, *of_intensity, num_threads)
-    field.requires_grad_(False)
-    lap("training_s")
-    report.update(seconds)
-    return contents, stop
+        begun.report.update(training.report())
+        return begun, stop
+
+    def _begin(self, read: Callable[[], FitInput]) -> tuple[_Begun, Training | None, Checkpoint | None]:
+        """Do all before the training, which copies its rays: what the map does not keep is freed at the end."""
+        given, config, num_threads = read(), self.config, self.pool.num_threads
+        check_extent(given.rays, config)
+        check_fit(given.rays, config, given.inside)
+        saved, path = None, self.checkpoint
+        if path is not None:
+            saved = Checkpoint(path, given.rays, given.scale, config)
+        self._lap("prepare_s")
+
+        surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
+        learnt = given.rays if given.inside is None else given.rays.select(given.inside)
+        self._lap("ghosts_s")
+
+        leaf_keys, returns = occupied_cells(surface, config, num_threads)
+        with_network = config.trains_intensity and learnt.intensities is not None
+        field: Field
+        if surface.means is None:
+            field = NeuralField(leaf_keys, config, with_intensity=with_network, num_threads=num_threads)
+            field.initialise(torch.Generator("cpu").manual_seed(config.seed))
+        else:
+            field = average_surface(leaf_keys, surface.means, returns, surface.surfels, config, num_threads)
+        self._lap("occupied_cells_s")
+
+        sizes = {"surface_returns": surface.count, "returns": len(learnt), "vertices": field.table.num_rows}
+        schedule = Schedule.of(config, with_intensity=with_network, **sizes)
+        closes = learnt.intensities is not None and config.closes_intensity
+        begun = _Begun(
+            field=field,
+            contents=_contents(given, learnt, surface, leaf_keys, returns, config, num_threads),
+            report=_report(given, learnt, surface, field, schedule, config),
+            intensities=(learnt, surface.surfels) if closes else None,
+        )
+        training = None
+        if isinstance(field, NeuralField):
+            scale = given.scale if config.trains_intensity else None
+            training = Training(field, surface.rays, learnt, scale, schedule, config, self.pool)
+        self._lap("start_s")
+        return begun, training, saved
 
 
 def _contents(
     given: FitInput,
     learnt: Rays,
     surface: SurfaceReturns,
-    leaf_keys: NDArray[np.uint64],
+    leaf_keys: Keys,
     returns: ReturnsOfCells,
-    field: Field,
-    report: dict[str, Any],
     config: FitConfig,
     num_threads: int,
-) -> MapContents:
-    """Return the contents of the map, with the untrained field."""
+) -> dict[str, Any]:
+    """Return the contents of the map by name, except for field, configuration and report."""
     rays, scale, surfels, leaf_m = given.rays, given.scale, surface.surfels, config.leaf_size_m
     sensor, clutter_ratio, returns_per_cell = given.sensor, given.clutter_ratio, given.returns_per_cell
     if sensor is None:
@@ -163,9 +193,8 @@ def _contents(
     noise, true, box_cells = surface.noise, surface.true, given.box_cells
 
     def free_space() -> FreeSpace:
-        return FreeSpace.of(
-            rays if true is None else rays.select(true), noise, leaf_m, box_cells, num_threads
-        )
+        of_true = rays if true is None else rays.select(true)
+        return FreeSpace.of(of_true, noise, leaf_m, box_cells, num_threads)
 
     def view_statistics() -> ViewStatistics:
         known = learnt.with_intensity
@@ -177,19 +206,16 @@ def _contents(
 
     # Only grids, comparisons and files ask for these, which took a third of a fit. The map keeps the rays until then.
     deferred = config.returns.free_space
-    return MapContents(
-        field=field,
-        origin=rays.origin,
-        intensity_scale=scale,
-        config=config,
-        evidence=Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.visibility),
-        free_space=Deferred(free_space) if deferred else FreeSpace.none,
-        view_statistics=Deferred(view_statistics) if deferred else ViewStatistics.none,
-        clutter_ratio=surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
-        returns_per_cell=surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
-        sensor=sensor,
-        report=report,
-    )
+    return {
+        "origin": rays.origin,
+        "intensity_scale": scale,
+        "evidence": Evidence.of(returns, rays, leaf_keys, leaf_m, num_threads, given.visibility),
+        "free_space": Deferred(free_space) if deferred else FreeSpace.none,
+        "view_statistics": Deferred(view_statistics) if deferred else ViewStatistics.none,
+        "clutter_ratio": surfels.clutter_ratio() if clutter_ratio is None else clutter_ratio,
+        "returns_per_cell": surfels.returns_per_cell() if returns_per_cell is None else returns_per_cell,
+        "sensor": sensor,
+    }
 
 
 def _report(

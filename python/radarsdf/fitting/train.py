@@ -12,11 +12,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from radarsdf.checks import hides_bar
+from radarsdf.arrays import Array
+from radarsdf.checks import check, hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.fitting.checkpoint import Checkpoint
@@ -87,7 +87,7 @@ class LossHistory:
         before_s = max((float(spans[:, 2].max(initial=0.0)) for spans in self._spans.values()), default=0.0)
         self._started_s = time.perf_counter() - before_s
 
-    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: NDArray[Any]) -> None:
+    def add(self, losses: Mapping[str, float], done: Mapping[str, int], sdf_m: Array) -> None:
         """Add the losses of an iteration on samples with labels `sdf_m` (B,), m. `done`: iterations done, it included."""
         now_s = time.perf_counter() - self._started_s
         # The cross-entropy of distances with the wrong sign is below 1 + distance / sigma, and the absolute error of
@@ -231,9 +231,8 @@ class Training:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restore a :meth:`state` of the same fit. Raise a ValueError if it is invalid."""
         done = dict(zip(self.iterations_done, state["done"].tolist(), strict=True))
-        if not all(0 <= done[name] <= self.iterations[name] for name in done):
-            msg = f"{done} iterations of {self.iterations}"
-            raise ValueError(msg)
+        fits = all(0 <= done[name] <= self.iterations[name] for name in done)
+        check(fits, f"{done} iterations of {self.iterations}")
         self.iterations_done.update(done)
         losses = zip(done, state["losses"].tolist(), strict=True)
         self.losses.update({name: loss for name, loss in losses if done[name]})

@@ -15,7 +15,6 @@ from radarsdf.fitting.average import (
     TRUNCATION_CELLS,
     average_at_corners,
     normals_at,
-    returns_of_means,
 )
 from radarsdf.live.regions import (
     NO_KEYS,
@@ -33,7 +32,14 @@ from radarsdf.map import queries
 from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.mesh import Surface, local
-from radarsdf.returns.evidence import BLOCK_BITS, Evidence, VisibilityCounts, bridged, evidence_sums
+from radarsdf.returns.evidence import (
+    BLOCK_BITS,
+    Evidence,
+    ReturnsOfCells,
+    VisibilityCounts,
+    bridged,
+    evidence_sums,
+)
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import (
@@ -231,7 +237,7 @@ class GrowingSurface:
         leaf_keys = leaf_keys[np.isin(leaf_keys >> REGION_BITS, near)]
         here = np.isin(means.keys >> REGION_BITS, near)
         means, normals = means.select(here), normals[here]
-        weighted = returns_of_means(means, noise, config.returns)
+        weighted = ReturnsOfCells.of_means(means, noise, config.returns)
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
         distances_m = average_at_corners(table, means, weighted, normals, config, num_threads)
         own_cells = np.isin(leaf_keys >> REGION_BITS, redone)

@@ -6,13 +6,15 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_visibility
+from radarsdf._core import CellBlocks, block_medians, bridge_cells, count_scans, count_visibility
+from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Keys
 from radarsdf.config.fit_config import LATTICE_BLOCK_CELLS
 from radarsdf.config.groups import ReturnsConfig
+from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
-from radarsdf.returns.sums import merged_keys
+from radarsdf.returns.sums import MeanRays, ReturnCells, merged_keys
+from radarsdf.returns.weights import weights_of
 
 CELLS_OF_SURFACE = 9
 """Approximate number of cells that a plane crosses in a 3 × 3 × 3 neighbourhood."""
@@ -28,19 +30,19 @@ class Evidence:
     `information` and `hits` are sums over a leaf cell and the 26 cells around it.
     """
 
-    information: NDArray[np.float32]  # (C,) 1 / variance of the position estimated from all returns, m⁻²
+    information: Floats32  # (C,) 1 / variance of the position estimated from all returns, m⁻²
     # (C,) number of scans with returns, summed over the cells. Several returns of a scan in a cell count once there, because
     # their errors are correlated.
-    hits: NDArray[np.uint32]
+    hits: Counts32
     # (C,) number of scans with a ray through or into the block of 8 × 8 × 8 leaf cells that contains the cell
-    visibility: NDArray[np.uint32]
+    visibility: Counts32
 
     @classmethod
     def of(
         cls,
         returns: ReturnsOfCells,
         rays: Rays,
-        leaf_keys: NDArray[np.uint64],
+        leaf_keys: Keys,
         leaf_size_m: float,
         num_threads: int = 0,
         visibility: VisibilityCounts | None = None,
@@ -50,10 +52,10 @@ class Evidence:
         information, hits = evidence_sums(returns.select(near), leaf_keys, num_threads)
         if visibility is not None:
             return cls(information, hits, visibility.at(leaf_keys))
-        counted = count_visibility(leaf_keys, leaf_size_m, *rays.in_c_order(), rays.scans, num_threads)
-        return cls(information, hits, counted)
+        rays_seen = (*rays.in_c_order(), rays.scans)
+        return cls(information, hits, count_visibility(leaf_keys, leaf_size_m, *rays_seen, num_threads))
 
-    def columns(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.float32]:
+    def columns(self, leaf_keys: Keys, num_threads: int = 0) -> Floats32:
         """Return information, hits, visibility and :func:`usual_information` of each leaf cell, (C, 4)."""
         usual = usual_information(self.information, leaf_keys, num_threads)
         return np.stack([self.information, self.hits, self.visibility, usual], 1, dtype=np.float32)
@@ -61,17 +63,41 @@ class Evidence:
 
 @dataclass(frozen=True)
 class ReturnsOfCells:
-    """Information, number of scans and number of returns of each leaf cell, in the order of the keys."""
+    """Weights, number of scans and number of returns of each leaf cell, in the order of the keys."""
 
-    keys: NDArray[np.uint64]  # (M,) Morton keys of the leaf cells with returns, ascending
-    information: NDArray[np.float32]  # (M,) 1 / variance of the position estimated from its returns, m⁻²
-    scans: NDArray[np.uint32]  # (M,) number of different scans with returns
-    counts: NDArray[np.float64]  # (M,) number of returns
+    keys: Keys  # (M,) Morton keys of the leaf cells with returns, ascending
+    weights: Floats32  # (M,) sum of the weights of its returns in averages of distances
+    information: Floats32  # (M,) 1 / variance of the position estimated from its returns, m⁻²
+    scans: Counts32  # (M,) number of different scans with returns
+    counts: Floats  # (M,) number of returns
 
-    def select(self, part: NDArray[np.bool_]) -> ReturnsOfCells:
-        return ReturnsOfCells(self.keys[part], self.information[part], self.scans[part], self.counts[part])
+    @classmethod
+    def of_rays(
+        cls, rays: Rays, noise: SensorNoise, leaf_size_m: float, config: ReturnsConfig, num_threads: int
+    ) -> ReturnsOfCells:
+        """Sum over all returns in each leaf cell."""
+        cells = ReturnCells.of(rays, leaf_size_m, num_threads)
+        ones = np.broadcast_to(np.float32(1), len(rays))
+        weights, information = (
+            np.bincount(cells.cell_of_ray, values, len(cells.keys)).astype(np.float32)
+            for values in weights_of(ones, rays.ranges_m, noise)
+        )
+        scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
+        ranges_m = np.bincount(cells.cell_of_ray, rays.ranges_m, len(cells.keys)) / cells.counts
+        found = cls(cells.keys, weights, information, scans, cells.counts)
+        return found.with_uncertain_poses(ranges_m.astype(np.float32), config)
 
-    def with_uncertain_poses(self, ranges_m: NDArray[np.float32], config: ReturnsConfig) -> ReturnsOfCells:
+    @classmethod
+    def of_means(cls, means: MeanRays, noise: SensorNoise, config: ReturnsConfig) -> ReturnsOfCells:
+        """Weigh the mean ray of each leaf cell, whose returns have nearly the same range if seen from the same position."""
+        weights = weights_of(means.counts, means.ranges_m, noise)
+        found = cls(means.keys, *weights, means.scans, means.counts.astype(np.float64))
+        return found.with_uncertain_poses(means.ranges_m, config)
+
+    def select(self, part: Bools) -> ReturnsOfCells:
+        return ReturnsOfCells(*(column[part] for column in vars(self).values()))
+
+    def with_uncertain_poses(self, ranges_m: Floats32, config: ReturnsConfig) -> ReturnsOfCells:
         """Include the pose uncertainty of `config`. `ranges_m` (M,): mean range of the returns in each cell, m."""
         if config.pose_sigma_m == 0 and config.pose_sigma_rad == 0:
             return self
@@ -86,21 +112,18 @@ class ReturnsOfCells:
 class VisibilityCounts:
     """Number of scans whose rays reach each block of 8 × 8 × 8 leaf cells."""
 
-    keys: NDArray[np.uint64]  # (B,) Morton keys of leaf cells without their last nine bits, ascending
-    scans: NDArray[np.uint32]  # (B,) number of scans with a ray through or into each block
+    keys: Keys  # (B,) Morton keys of leaf cells without their last nine bits, ascending
+    scans: Counts32  # (B,) number of scans with a ray through or into each block
 
-    def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint32]:
+    def at(self, leaf_keys: Keys) -> Counts32:
         """Return the counts (C,) of the blocks that contain leaf cells with ascending Morton keys (C,)."""
-        if len(self.keys) == 0:
-            return np.zeros(len(leaf_keys), np.uint32)
-        blocks = leaf_keys >> BLOCK_BITS
-        rows = np.minimum(np.searchsorted(self.keys, blocks), len(self.keys) - 1)
-        return np.where(self.keys[rows] == blocks, self.scans[rows], np.uint32(0))
+        rows = CellBlocks(self.keys).rows(leaf_keys >> BLOCK_BITS)
+        return np.append(self.scans, np.uint32(0))[rows]  # the last entry serves row -1, no block
 
 
 def evidence_sums(
-    returns: ReturnsOfCells, leaf_keys: NDArray[np.uint64], num_threads: int = 0
-) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    returns: ReturnsOfCells, leaf_keys: Keys, num_threads: int = 0
+) -> tuple[Floats32, Counts32]:
     """Compute `information` and `hits` of :class:`Evidence`, (C,) each, for leaf cells with ascending keys (C,)."""
     blocks = CellBlocks(returns.keys)
     columns = np.stack([returns.information, returns.scans], 1).astype(np.float64)
@@ -111,16 +134,14 @@ def evidence_sums(
     return information, hits
 
 
-def usual_information(
-    information: NDArray[np.float32], leaf_keys: NDArray[np.uint64], num_threads: int = 0
-) -> NDArray[np.float32]:
+def usual_information(information: Floats32, leaf_keys: Keys, num_threads: int = 0) -> Floats32:
     """Return the mean `information` (C,) of cells within two to four cells of each, weighted by itself: that of most returns."""
     pairs = merged_keys(leaf_keys)
     begins = np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]
     first, weights = np.flatnonzero(begins), information.astype(np.float64)
     sums = np.add.reduceat(np.stack([weights, weights**2], axis=1), first) if len(first) else np.zeros((0, 2))
     near = CellBlocks(pairs[first]).neighbour_sums(pairs[first], sums, 1.0, num_threads)
-    usual: NDArray[np.float32] = (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32)
+    usual: Floats32 = (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32)
     return usual.take(np.cumsum(begins) - 1)
 
 
@@ -128,9 +149,7 @@ _AT_ONCE = 1 << 20  # leaf cells: float64 sums of all would be the peak of a lar
 _MOST = float(np.iinfo(np.uint16).max)
 
 
-def support_at(
-    leaf_keys: NDArray[np.uint64], keys: NDArray[np.uint64], counts: NDArray[np.float64], num_threads: int = 0
-) -> NDArray[np.float64]:
+def support_at(leaf_keys: Keys, keys: Keys, counts: Floats, num_threads: int = 0) -> Floats:
     """Return the support (C,): returns in each leaf cell and its 26 neighbours, at most 65535. `counts`: at `keys`, (M,)."""
     sums = CellBlocks(keys).neighbour_sums(leaf_keys, np.ascontiguousarray(counts)[:, None], 1.0, num_threads)
     return np.minimum(sums[:, 0], _MOST)
@@ -144,13 +163,7 @@ _MIN_SUPPORT = 0.5
 _MAX_SUPPORT = 9.0
 
 
-def bridged(
-    leaf_keys: NDArray[np.uint64],
-    keys: NDArray[np.uint64],
-    counts: NDArray[np.float64],
-    max_cells: int,
-    num_threads: int = 0,
-) -> NDArray[np.uint64]:
+def bridged(leaf_keys: Keys, keys: Keys, counts: Floats, max_cells: int, num_threads: int = 0) -> Keys:
     """Add gaps of at most `max_cells` between two cells with returns, along 13 directions, to ascending `leaf_keys` (C,).
 
     `counts` (M,): number of returns in the cells with ascending `keys` (M,).

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from radarsdf._core import find_free_space
+from radarsdf.arrays import Bools, Bytes, Ints, Keys
+from radarsdf.checks import check
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
@@ -27,10 +29,10 @@ _INSIDE = np.arange(BLOCK_CELLS**3, dtype=np.uint64)
 class FreeSpace:
     """Free-space crossings of leaf cells, in blocks of 8 × 8 × 8."""
 
-    keys: NDArray[np.uint64]  # (B,) Morton keys of the blocks' leaf cells without the last 9 bits, ascending
+    keys: Keys  # (B,) Morton keys of the blocks' leaf cells without the last 9 bits, ascending
     # (B, 4, 8) bit planes of the 512 leaf cells of a block, in Morton order. Planes 0 to 2: the number of scans with a
     # ray through the cell, at most 7. Plane 3: whether the cell has returns.
-    planes: NDArray[np.uint64]
+    planes: Keys
 
     @classmethod
     def of(
@@ -38,7 +40,7 @@ class FreeSpace:
         rays: Rays,
         noise: SensorNoise,
         leaf_size_m: float,
-        box_cells: NDArray[np.int64] | None = None,
+        box_cells: Ints | None = None,
         num_threads: int = 0,
     ) -> FreeSpace:
         """Compute the crossings of `rays` to true returns in the box [lower, upper), (2, 3) leaf cells; None for no limit."""
@@ -49,9 +51,8 @@ class FreeSpace:
         limit = [[-MAX_CELLS_FROM_ORIGIN] * 3, [MAX_CELLS_FROM_ORIGIN] * 3]
         lower, upper = limit if box_cells is None else box_cells.tolist()
         crossed_m, scans = np.minimum(before_m, known_m), np.ascontiguousarray(rays.scans)
-        return cls(
-            *find_free_space(*rays.in_c_order(), crossed_m, scans, leaf_size_m, lower, upper, num_threads)
-        )
+        box = leaf_size_m, lower, upper
+        return cls(*find_free_space(*rays.in_c_order(), crossed_m, scans, *box, num_threads))
 
     @classmethod
     def none(cls) -> FreeSpace:
@@ -59,17 +60,11 @@ class FreeSpace:
 
     def check(self) -> None:
         """Raise a ValueError if the arrays read from a file are inconsistent."""
-        if (
-            self.keys.ndim != 1
-            or self.planes.shape != (len(self.keys), _PLANES, _WORDS)
-            or not (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
-        ):
-            msg = "the free-space crossings are not planes of 512 cells for ascending keys"
-            raise ValueError(msg)
+        shaped = self.keys.ndim == 1 and self.planes.shape == (len(self.keys), _PLANES, _WORDS)
+        fits = shaped and (np.diff(self.keys.astype(np.int64), prepend=-1) > 0).all()
+        check(fits, "the free-space crossings are not planes of 512 cells for ascending keys")
 
-    def dense(
-        self, lower: ArrayLike, shape: tuple[int, int, int]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    def dense(self, lower: ArrayLike, shape: tuple[int, int, int]) -> tuple[Bytes, Bools]:
         """Return dense arrays of crossing scans, at most 7, and of whether there are returns, from leaf cell `lower` (3,) on."""
         first = np.asarray(lower, np.int64)
         last = first + np.asarray(shape)
@@ -84,7 +79,7 @@ class FreeSpace:
         inside = cells[tuple(slice(o, o + n) for o, n in zip(offset, shape, strict=True))]
         return inside & np.uint8(MOST_SCANS), inside > MOST_SCANS
 
-    def at(self, leaf_keys: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    def at(self, leaf_keys: Keys) -> Bytes:
         """Return the number (N,) of scans that crossed the leaf cells with Morton keys (N,), at most 7."""
         if len(self.keys) == 0:
             return np.zeros(len(leaf_keys), np.uint8)
@@ -95,25 +90,18 @@ class FreeSpace:
         return np.where(self.keys[rows] == blocks, scans, np.uint8(0))
 
 
-def block_numbers(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+def block_numbers(keys: Keys) -> Ints:
     """Return the block coordinates (B, 3) of `keys` (B,): block i begins at leaf cell 8 i."""
-    numbers: NDArray[np.int64] = lattice_of(keys << np.uint64(3 * _LEVELS)) // BLOCK_CELLS
-    return numbers
+    return lattice_of(keys << np.uint64(3 * _LEVELS)) // BLOCK_CELLS
 
 
-def unpacked(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
+def unpacked(planes: Keys) -> Bytes:
     """Unpack bit planes to (B, 8, 8, 8) cells: the number of crossing scans, plus 8 where there are returns."""
     bits = np.unpackbits(planes.astype("<u8").view(np.uint8), axis=-1, bitorder="little")
     weights = np.array([1, 2, 4, 8], np.uint8)[:, None]
-    cells: NDArray[np.uint8] = (bits * weights).sum(axis=1, dtype=np.uint8)
+    cells: Bytes = (bits * weights).sum(axis=1, dtype=np.uint8)
     return cells[:, _MORTON]
 
 
-def _morton_table() -> NDArray[np.int64]:
-    table = np.zeros((BLOCK_CELLS,) * 3, np.int64)
-    cells = lattice_of(_INSIDE) % BLOCK_CELLS
-    table[tuple(cells.T)] = _INSIDE
-    return table
-
-
-_MORTON = _morton_table()
+_PLACES = np.ravel_multi_index(tuple((lattice_of(_INSIDE) % BLOCK_CELLS).T), (BLOCK_CELLS,) * 3)
+_MORTON = np.argsort(_PLACES).reshape((BLOCK_CELLS,) * 3)  # bit of each cell

@@ -8,9 +8,9 @@ the number of returns there nor the rays of other returns reveal that they are f
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import SurfelMap
+from radarsdf.arrays import Bools, Floats, Ints, Ints32
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
@@ -31,19 +31,15 @@ _MIN_SHARE = 0.5
 
 
 def find_ghosts(
-    surfels: Surfels,
-    rays: Rays | MeanRays,
-    cell_of_ray: NDArray[np.int32],
-    noise: SensorNoise,
-    num_threads: int = 0,
-) -> NDArray[np.bool_]:
+    surfels: Surfels, rays: Rays | MeanRays, cell_of_ray: Ints32, noise: SensorNoise, num_threads: int = 0
+) -> Bools:
     """Return a mask (C,) of the cells of `surfels` that hold ghosts.
 
     `rays`: all, or the fewer mean rays of leaf cells; `cell_of_ray` (N,): the cell in which each ends.
     """
     weights = rays.counts if isinstance(rays, MeanRays) else None
 
-    def count(rows: NDArray[np.int32], of: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
+    def count(rows: Ints32, of: Bools, size: int) -> Floats:
         counted = np.bincount(rows[of], None if weights is None else weights[of], size)
         return counted.astype(np.float64)
 
@@ -58,13 +54,13 @@ def find_ghosts(
 
 def first_crossed(
     surfels: Surfels,
-    planes: NDArray[np.int64],
+    planes: Ints,
     rays: Rays | MeanRays,
     noise: SensorNoise,
     num_threads: int = 0,
     *,
     beyond_returns: bool = True,
-) -> NDArray[np.int32]:
+) -> Ints32:
     """Return the index (N,) into `planes` (rows of surfels) of the first that each ray crosses from its front, or -1.
 
     `beyond_returns`: planes extend over the whole cell of the surfel, beyond its returns.
@@ -90,36 +86,32 @@ def first_crossed(
     )
 
 
-def are_opaque(
-    surfels: Surfels, planes: NDArray[np.int64], passed: NDArray[np.float64], num_threads: int = 0
-) -> NDArray[np.bool_]:
+def are_opaque(surfels: Surfels, planes: Ints, passed: Floats, num_threads: int = 0) -> Bools:
     """Return a mask (P,) of `planes` (rows of flat surfels) that stop most rays. `passed` (C,): first crossings by cell."""
     cells = surfels.cell_of_plane[planes]
     support = surfels.support[cells]
     passed_near = surfels.blocks.neighbour_sums(
         surfels.keys[cells], np.ascontiguousarray(passed[:, None]), NEIGHBOUR_WEIGHT, num_threads
     )[:, 0]
-    opaque: NDArray[np.bool_] = support / (support + passed_near) > _MIN_OPACITY
-    return opaque
+    return support / (support + passed_near) > _MIN_OPACITY
 
 
 def are_behind(
     surfels: Surfels,
-    planes: NDArray[np.int64],
-    crosses: NDArray[np.bool_],
+    planes: Ints,
+    crosses: Bools,
     rays: Rays | MeanRays,
     noise: SensorNoise,
     num_threads: int = 0,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return a mask (N,) of rays that end behind `planes` (rows of opaque surfels). `crosses` (N,): rays that cross a flat one."""
     behind, chosen = crosses.copy(), rays.select(np.flatnonzero(crosses))
     behind[crosses] = first_crossed(surfels, planes, chosen, noise, num_threads, beyond_returns=False) >= 0
     return behind
 
 
-def mostly_behind(surfels: Surfels, behind: NDArray[np.float64], num_threads: int = 0) -> NDArray[np.bool_]:
+def mostly_behind(surfels: Surfels, behind: Floats, num_threads: int = 0) -> Bools:
     """Return a mask (C,) of cells in whose neighbourhood most returns lie behind a surface; `behind` (C,) counts them."""
     columns = np.stack([behind, surfels.counts], 1)
     sums = surfels.blocks.neighbour_sums(surfels.keys, columns, 1.0, num_threads)
-    ghosts: NDArray[np.bool_] = sums[:, 0] > _MIN_SHARE * sums[:, 1]
-    return ghosts
+    return sums[:, 0] > _MIN_SHARE * sums[:, 1]

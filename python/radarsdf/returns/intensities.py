@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from radarsdf.checks import real_array
-from radarsdf.returns.sampling import Keys, hashes, sample
+from radarsdf.arrays import Array, Bools, Floats32, Keys
+from radarsdf.checks import check, real_array
+from radarsdf.returns.sampling import hashes, sample
 
 # An intensity is an outlier if it lies beyond a gap and significantly outside the extrapolated tail of the inliers.
 _GAP = 3.0  # ratio of distances from the median across a gap. Tails have gaps, too
@@ -30,15 +30,15 @@ class Plausible:
     high: float
 
     @classmethod
-    def of(cls, intensities: NDArray[Any], keys: Keys | None = None) -> Plausible:
+    def of(cls, intensities: Array, keys: Keys | None = None) -> Plausible:
         known = Intensities()
         known.add(intensities, hashes(np.arange(len(intensities), dtype=np.uint32)) if keys is None else keys)
         return known.plausible()
 
-    def holds(self, intensities: NDArray[Any]) -> NDArray[np.bool_]:
+    def holds(self, intensities: Array) -> Bools:
         return (intensities >= np.float64(self.low)) & (intensities <= np.float64(self.high))
 
-    def kept(self, intensities: NDArray[Any]) -> NDArray[Any]:
+    def kept(self, intensities: Array) -> Array:
         """Return the intensities (N,) with NaN in place of those beyond the limits."""
         return np.where(self.holds(intensities), intensities, intensities.dtype.type(np.nan))
 
@@ -47,12 +47,12 @@ class Intensities:
     """Streaming sample of intensities, with the lowest and the highest, independent of their order."""
 
     def __init__(self) -> None:
-        self._some: NDArray[Any] = np.zeros(0, np.float32)
+        self._some: Array = np.zeros(0, np.float32)
         self._keys: Keys = np.zeros(0, np.uint64)
         self._count = 0
         self.low, self.high = math.inf, -math.inf
 
-    def add(self, intensities: NDArray[Any], keys: Keys) -> None:
+    def add(self, intensities: Array, keys: Keys) -> None:
         """Add intensities (N,), sensor units, NaN where missing, with keys (N,) by :func:`hashes`."""
         none = np.isnan(intensities)
         known, keys = (intensities[~none], keys[~none]) if none.any() else (intensities, keys)
@@ -76,7 +76,7 @@ class Intensities:
         return Plausible(float(median) - limit, float(median) + limit)
 
 
-def _farthest(distances: NDArray[Any], count: int) -> float:
+def _farthest(distances: Array, count: int) -> float:
     """Return the largest inlier distance from the median of `count` intensities, from a sample of distances (M,), ascending."""
     of_all = len(distances)
     distances = distances[distances > 0]  # up to half of the returns may have the same intensity
@@ -93,7 +93,7 @@ def _farthest(distances: NDArray[Any], count: int) -> float:
     return math.inf
 
 
-def _reach(distances: NDArray[Any], share: float) -> float:
+def _reach(distances: Array, share: float) -> float:
     """Extrapolate the distance from the median beyond which a `share` of returns lies, from distances (M,), ascending."""
     # Each quartering of the share extends an exponential tail by the same length, and a heavy tail by growing lengths. A tail
     # lighter than exponential is treated as exponential, because returns are of several kinds.
@@ -116,7 +116,7 @@ class IntensityScale:
     high: float  # highest training intensity, sensor units
 
     @classmethod
-    def of(cls, intensities: NDArray[np.float32] | None) -> IntensityScale | None:
+    def of(cls, intensities: Floats32 | None) -> IntensityScale | None:
         """Build from `intensities` (N,), sensor units, NaN where missing. None without intensities."""
         if intensities is None:
             return None
@@ -126,16 +126,14 @@ class IntensityScale:
     def between(cls, intensity_range: ArrayLike) -> IntensityScale:
         """Build from a range (low, high). Raise a ValueError unless it is finite and ascending."""
         ends = real_array(intensity_range, "intensity_range")
-        if ends.shape != (2,) or not -np.inf < ends[0] < ends[1] < np.inf:
-            msg = "intensity_range must be two finite numbers, the lower one first"
-            raise ValueError(msg)
+        fits = ends.shape == (2,) and -np.inf < ends[0] < ends[1] < np.inf
+        check(fits, "intensity_range must be two finite numbers, the lower one first")
         return cls(*ends.tolist())
 
-    def to_unit(self, intensities: NDArray[np.float32]) -> NDArray[np.float32]:
+    def to_unit(self, intensities: Floats32) -> Floats32:
         """Scale intensities (N,) from sensor units to [0, 1], clipped to the range; NaN stays."""
         unit = (intensities - np.float32(self.low)) / np.float32(self.high - self.low)
-        clipped: NDArray[np.float32] = np.clip(unit, 0, 1).astype(np.float32)
-        return clipped
+        return np.clip(unit, 0, 1).astype(np.float32)
 
     def to_sensor(self, unit: Tensor) -> Tensor:
         """Scale intensities (N,) from [0, 1] to sensor units."""

@@ -12,16 +12,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import check_values_of_scans, one_for_each_scan, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.products import normal_matrix, product
 from radarsdf.returns.rays import Rays, check_scans, prepare
 from radarsdf.scans import Scans
-
-FloatArray = NDArray[np.float64]
 
 MIN_DOPPLER_RETURNS = 10
 """Minimum number of returns of a scan that determine a velocity."""
@@ -44,9 +43,9 @@ _FOLDS = (-1.0, 0.0, 1.0)  # ambiguity intervals by which the three returns of a
 class SensorVelocity:
     """Velocity of the sensor estimated from the Doppler of one scan."""
 
-    velocity_mps: FloatArray  # (3,) in the sensor frame. NaN if the returns do not agree
-    covariance: FloatArray  # (3, 3) m²/s², large in unobserved directions
-    static: NDArray[np.bool_]  # (N,) inliers of the velocity. All False without a velocity
+    velocity_mps: Floats  # (3,) in the sensor frame. NaN if the returns do not agree
+    covariance: Floats  # (3, 3) m²/s², large in unobserved directions
+    static: Bools  # (N,) inliers of the velocity. All False without a velocity
 
     @property
     def found(self) -> bool:
@@ -54,7 +53,7 @@ class SensorVelocity:
 
 
 def sensor_velocity(
-    points: NDArray[Any], doppler_mps: NDArray[Any], *, interval_mps: float | None = None
+    points: Array, doppler_mps: Array, *, interval_mps: float | None = None
 ) -> SensorVelocity:
     """Estimate the velocity of the sensor from a scan (N, 3) with `doppler_mps` (N,), positive away from the sensor.
 
@@ -72,9 +71,9 @@ def sensor_velocity(
     away_columns = np.ascontiguousarray(away.T)
     measured = speeds[rows]
 
-    def residuals(velocities: FloatArray) -> FloatArray:
+    def residuals(velocities: Floats) -> Floats:
         """Return the residuals (K, M) of the measured speeds for velocities (K, 3)."""
-        off: FloatArray = measured - product(velocities, away_columns)
+        off: Floats = measured - product(velocities, away_columns)
         return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
 
     velocity = _most_agreed(away, measured, residuals, interval_mps)
@@ -95,16 +94,13 @@ def sensor_velocity(
     off = residuals(velocity[None])[0]
     static[rows] = np.abs(off) < max(_SIGMA_MPS, 3 * sigma)
     spread = float(np.sum(off[agrees] ** 2)) / max(int(agrees.sum()) - 3, 1)
-    covariance: FloatArray = np.multiply(max(spread, _LEAST_SIGMA_MPS**2), np.linalg.inv(normal))
+    covariance: Floats = np.multiply(max(spread, _LEAST_SIGMA_MPS**2), np.linalg.inv(normal))
     return SensorVelocity(velocity, covariance, static)
 
 
 def _most_agreed(
-    away: FloatArray,
-    measured: FloatArray,
-    residuals: Callable[[FloatArray], FloatArray],
-    interval_mps: float | None,
-) -> FloatArray:
+    away: Floats, measured: Floats, residuals: Callable[[Floats], Floats], interval_mps: float | None
+) -> Floats:
     """Return the velocity (3,) with the most inliers among random draws of three returns (RANSAC)."""
     rng = np.random.default_rng(0)
     drawn = rng.integers(0, len(measured), (_DRAWS, 3))
@@ -116,11 +112,10 @@ def _most_agreed(
     normal = np.einsum("kij,kil->kjl", matrices, matrices) + (_SIGMA_MPS / _ANY_MPS) ** 2 * np.eye(3)
     velocities = np.linalg.solve(normal, np.einsum("kij,ki->kj", matrices, speeds)[:, :, None])[:, :, 0]
     counts = (np.abs(residuals(velocities)) < _SIGMA_MPS).sum(axis=1)
-    best: FloatArray = velocities[int(np.argmax(counts))]
-    return best
+    return velocities[int(np.argmax(counts))]
 
 
-def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
+def folding_interval_mps(doppler_mps: Sequence[Array]) -> float | None:
     """Estimate the width of the ambiguity interval of the speeds, m/s. None if the speeds do not fill one."""
     speeds = np.concatenate([np.asarray(values, np.float64) for values in doppler_mps])
     speeds = speeds[np.isfinite(speeds)]
@@ -138,9 +133,7 @@ def folding_interval_mps(doppler_mps: Sequence[NDArray[Any]]) -> float | None:
 
 
 def sensor_velocities(
-    points: Sequence[NDArray[Any]],
-    doppler_mps: Sequence[NDArray[Any]],
-    others_mps: Sequence[NDArray[Any]] = (),
+    points: Sequence[Array], doppler_mps: Sequence[Array], others_mps: Sequence[Array] = ()
 ) -> list[SensorVelocity]:
     """Estimate the velocity in each of K scans of a sensor. `others_mps`: further speeds to find the ambiguity interval."""
     interval = folding_interval_mps([*others_mps, *doppler_mps]) if points else None
@@ -153,9 +146,7 @@ def sensor_velocities(
     return choices[-1] if agreeing[-1] > 1.2 * agreeing[0] else choices[0]
 
 
-def without_filler(
-    points: Sequence[NDArray[Any]], doppler_mps: Sequence[NDArray[Any]]
-) -> tuple[list[FloatArray], str | None]:
+def without_filler(points: Sequence[Array], doppler_mps: Sequence[Array]) -> tuple[list[Floats], str | None]:
     """Replace the fill value that a driver writes for unmeasured Doppler of K scans by NaN. Also return a note, or None."""
     # Many equal speeds are a fill value if the velocity of the other returns contradicts them, or if there are hardly any
     # others: a stationary sensor with a coarse speed resolution has many equal ones, too.
@@ -174,10 +165,8 @@ def without_filler(
             contradicting += int((np.abs(expected - filler) > 3 * _SIGMA_MPS).sum())
             asked += int(filled.sum())
     if 2 * contradicting > asked or (asked == 0 and share > _ONLY_FILLER):
-        note = (
-            f"{share:.0%} of the Doppler values are {filler:g} m/s: they were not measured, and are left out"
-        )
-        return others, note
+        equal = f"{share:.0%} of the Doppler values are {filler:g} m/s"
+        return others, f"{equal}: they were not measured, and are left out"
     return speeds, None
 
 
@@ -189,7 +178,7 @@ _MAX_MOVING = 0.4  # maximum share of the returns; if more disagree, the Doppler
 class MovingReturns:
     """Moving returns of F scans."""
 
-    masks: list[NDArray[np.bool_]]  # F arrays (N_i,). All False for a scan without a velocity of the sensor
+    masks: list[Bools]  # F arrays (N_i,). All False for a scan without a velocity of the sensor
     why_none: str | None  # why Doppler was not used, in words
 
     @classmethod
@@ -216,7 +205,7 @@ class MovingReturns:
     def count(self) -> int:
         return sum(int(mask.sum()) for mask in self.masks)
 
-    def without(self, arrays: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+    def without(self, arrays: Sequence[ArrayLike]) -> list[Array]:
         return [np.asarray(array)[~mask] for array, mask in zip(arrays, self.masks, strict=True)]
 
 
@@ -248,7 +237,7 @@ class StaticReturns:
         return cls(moving.without(points), values, moving.count, moving.why_none)
 
 
-def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike]) -> list[NDArray[Any]]:
+def checked_doppler(scans: list[Array], doppler_mps: Sequence[ArrayLike]) -> list[Array]:
     """Return F arrays (N_i,). Raise a TypeError or ValueError if they are not numbers or do not match the scans."""
     speeds = [
         real_array(values, f"doppler_mps of scan {i}")
@@ -261,8 +250,6 @@ def checked_doppler(scans: list[NDArray[Any]], doppler_mps: Sequence[ArrayLike])
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
     """Return rays of the static returns within the ranges of a fit, without accumulating scans. Intensity outliers are NaN."""
     static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
-    limits: dict[str, Any] = {
-        "min_range_m": config.returns.min_range_m,
-        "max_range_m": config.returns.max_range_m,
-    }
-    return prepare(static.points, scans.poses, static.intensities, **limits)
+    nearest_m, farthest_m = config.returns.min_range_m, config.returns.max_range_m
+    options: dict[str, Any] = {"min_range_m": nearest_m, "max_range_m": farthest_m}
+    return prepare(static.points, scans.poses, static.intensities, **options)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import move_onto_planes
+from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays
+
+_Ranges = TypeVar("_Ranges", Floats32, Floats)
 
 NOISE_SETTINGS = ("range_noise_m", "azimuth_noise_rad", "elevation_noise_rad")
 """Settings of ``config.returns`` that fix the fields of :class:`SensorNoise`, in their order."""
@@ -44,8 +47,7 @@ class SensorNoise:
     @property
     def variances(self) -> list[float]:
         """Variances along the beam, m², in azimuth and in elevation, rad²."""
-        squares: list[float] = np.square(dataclasses.astuple(self)).tolist()
-        return squares
+        return np.square(dataclasses.astuple(self)).tolist()
 
     @property
     def settings(self) -> dict[str, float]:
@@ -57,17 +59,13 @@ class SensorNoise:
         """Standard deviation across the beam: root mean square of azimuth and elevation, rad."""
         return float(np.hypot(self.azimuth_rad, self.elevation_rad) / np.sqrt(2))
 
-    def variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the sum (N,) of the variances along and across the beam at ranges (N,), m²."""
-        across_m = np.float32(self.angle_rad) * ranges_m
-        variances: NDArray[np.float32] = np.float32(self.range_m**2) + np.square(across_m)
-        return variances
+    def variances_m2(self, ranges_m: _Ranges, axes_across: int = 1) -> _Ranges:
+        """Return the sum (N,) of the variances along the beam and on one or both axes across it, at ranges (N,), m²."""
+        return self.range_m**2 + axes_across * np.square(self.angle_rad * ranges_m)
 
-    def mean_variances_m2(self, ranges_m: NDArray[np.float32]) -> NDArray[np.float64]:
+    def mean_variances_m2(self, ranges_m: Floats32) -> Floats:
         """Return the mean (N,) of the variances along the three axes at ranges (N,), m²."""
-        across_rad2 = self.azimuth_rad**2 + self.elevation_rad**2
-        sums: NDArray[np.float64] = self.range_m**2 + across_rad2 * np.square(ranges_m, dtype=np.float64)
-        return sums / 3
+        return self.variances_m2(ranges_m.astype(np.float64), axes_across=2) / 3
 
 
 def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_threads: int = 0) -> SensorNoise:
@@ -109,16 +107,13 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
     return SensorNoise(*np.sqrt(sigma2).tolist())
 
 
-def variances_across(
-    rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64], noise: SensorNoise
-) -> NDArray[np.float64]:
+def variances_across(rays: Rays, rows: Ints, normals: Floats, noise: SensorNoise) -> Floats:
     """Return the variances (M,) of the returns in `rows` (M,) across planes with `normals` (M, 3), m²."""
     shares = _shares(rays, rows, normals)
-    variances: NDArray[np.float64] = np.einsum("k,kn->n", np.array(noise.variances), shares)
-    return variances
+    return np.einsum("k,kn->n", np.array(noise.variances), shares)
 
 
-def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shares(rays: Rays, rows: Ints, normals: Floats) -> Floats:
     """Return the factors (3, M) of the three noise variances in the variance across planes."""
     ranges2 = np.square(rays.ranges_m.take(rows).astype(np.float64))
     up, normal = rays.up_of_scan.take(rays.scans.take(rows), axis=0).T, normals.T
@@ -133,21 +128,20 @@ def _shares(rays: Rays, rows: NDArray[np.int64], normals: NDArray[np.float64]) -
 # Vectors are columns (3, M): NumPy takes three times as long on rows of three.
 
 
-def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    products: NDArray[np.float64] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return products
+def _dot(a: Floats, b: Floats) -> Floats:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross(a: Floats, b: Floats) -> Floats:
     return np.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
 
 
 def onto_surfels(
     surfels: Surfels,
     rays: Rays,
-    cells: NDArray[np.int32],
+    cells: Ints32,
     noise: SensorNoise,
-    kept: NDArray[np.bool_] | None = None,
+    kept: Bools | None = None,
     num_threads: int = 0,
 ) -> Rays:
     """Move each return towards the surfel of its cell, in row `cells` (N,) of `surfels`, if that is flat.

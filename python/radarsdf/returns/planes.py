@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, cell_keys, principal_axes
+from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32, Keys
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import UPPER, ScanSums, merged_keys
 
@@ -25,15 +25,15 @@ class Surfels:
     """Cells twice as large as leaf cells, with a surfel where the neighbourhood has enough returns."""
 
     cell_size_m: float  # edge of a cell, m
-    keys: NDArray[np.uint64]  # (C,) Morton keys of the cells that hold returns, ascending
+    keys: Keys  # (C,) Morton keys of the cells that hold returns, ascending
     blocks: CellBlocks  # finds the row of a cell from its key
-    counts: NDArray[np.float64]  # (C,) number of returns in each cell
-    support: NDArray[np.float64]  # (C,) weighted number of returns in a cell and its 26 neighbours
-    cell_of_plane: NDArray[np.int64]  # (P,) row of the cell of each surfel, ascending
-    centres: NDArray[np.float64]  # (P, 3) weighted mean of the returns, local, m
-    normals: NDArray[np.float64]  # (P, 3) unit vectors towards the sensors
-    variances: NDArray[np.float64]  # (P, 3) variances of the returns along the principal axes, ascending, m²
-    widest: NDArray[np.float32] | None = None  # (P, 3) axes of the largest variance, unit vectors, in a batch
+    counts: Floats  # (C,) number of returns in each cell
+    support: Floats  # (C,) weighted number of returns in a cell and its 26 neighbours
+    cell_of_plane: Ints  # (P,) row of the cell of each surfel, ascending
+    centres: Floats  # (P, 3) weighted mean of the returns, local, m
+    normals: Floats  # (P, 3) unit vectors towards the sensors
+    variances: Floats  # (P, 3) variances of the returns along the principal axes, ascending, m²
+    widest: Floats32 | None = None  # (P, 3) axes of the largest variance, unit vectors, in a batch
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> Surfels:
@@ -47,16 +47,14 @@ class Surfels:
         support = neighbour_support(blocks, keys, of_cells, num_threads)
         # Most cells have few returns: surfels for all of them would dominate time and memory.
         cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
-        centres, normals, widest, variances = neighbour_planes(
-            blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
-        )
-        counts = of_cells[:, 0].copy()
-        planes = (cell_of_plane, centres, normals, variances, widest)
-        return cls(cell_size_m, keys, blocks, counts, support, *planes)
+        held = keys[cell_of_plane]
+        planes = neighbour_planes(blocks, held, of_cells, cell_size_m, num_threads)
+        centres, normals, widest, variances = planes
+        cells = (cell_size_m, keys, blocks, of_cells[:, 0].copy(), support, cell_of_plane)
+        return cls(*cells, centres, normals, variances, widest)
 
-    def is_flat(self) -> NDArray[np.bool_]:
-        flat: NDArray[np.bool_] = self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]
-        return flat
+    def is_flat(self) -> Bools:
+        return self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]
 
     def clutter_ratio(self) -> float:
         """Return the share of the returns in cells with a surfel whose surfel is not flat. 0 without surfels."""
@@ -70,20 +68,20 @@ class Surfels:
         """Return the mean number of returns per cell, to which false returns are proportional. 0 without cells."""
         return float(self.counts.sum()) / len(self.keys) if len(self.keys) else 0.0
 
-    def cells_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
+    def cells_at(self, points: Floats32, num_threads: int = 0) -> Ints32:
         """Return the row (N,) of the cell of each of the `points` (N, 3), local, m; -1 for a cell without returns."""
         keys = cell_keys(np.ascontiguousarray(points), self.cell_size_m, num_threads)
         return self.blocks.rows(keys, num_threads)
 
-    def cells_of_leaves(self, leaf_keys: NDArray[np.uint64], num_threads: int = 0) -> NDArray[np.int32]:
+    def cells_of_leaves(self, leaf_keys: Keys, num_threads: int = 0) -> Ints32:
         """Return the row (M,) of the cell that contains each leaf cell with Morton keys (M,); -1 without returns."""
         return self.blocks.rows(merged_keys(leaf_keys), num_threads)
 
-    def flat_planes_at(self, points: NDArray[np.float32], num_threads: int = 0) -> NDArray[np.int32]:
+    def flat_planes_at(self, points: Floats32, num_threads: int = 0) -> Ints32:
         """Return the row (N,) of the flat surfel in the cell of each of the `points` (N, 3), local, m; -1 without one."""
         return self.flat_planes_of(self.cells_at(points, num_threads))
 
-    def flat_planes_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    def flat_planes_of(self, cells: Ints32) -> Ints32:
         """Return the row (N,) of the flat surfel of each of the `cells` (N,), -1 for none; -1 without one."""
         flat = np.flatnonzero(self.is_flat())
         planes = np.full(len(self.keys) + 1, -1, np.int32)  # the last entry serves row -1, no cell
@@ -91,22 +89,15 @@ class Surfels:
         return planes[cells]
 
 
-def neighbour_support(
-    blocks: CellBlocks, keys: NDArray[np.uint64], of_cells: NDArray[np.float64], num_threads: int = 0
-) -> NDArray[np.float64]:
+def neighbour_support(blocks: CellBlocks, keys: Keys, of_cells: Floats, num_threads: int = 0) -> Floats:
     """Return the weighted number (K,) of returns in the neighbourhoods of `keys` (K,). `of_cells`: moments by cell of `blocks`."""
     counts = np.ascontiguousarray(of_cells[:, :1])
-    support: NDArray[np.float64] = blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
-    return support
+    return blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
 
 
 def neighbour_planes(
-    blocks: CellBlocks,
-    keys: NDArray[np.uint64],
-    of_cells: NDArray[np.float64],
-    cell_size_m: float,
-    num_threads: int = 0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
+    blocks: CellBlocks, keys: Keys, of_cells: Floats, cell_size_m: float, num_threads: int = 0
+) -> tuple[Floats, Floats, Floats32, Floats]:
     """Return centres, normals, widest axes and variances (K, 3) of the surfels at `keys` (K,); see :func:`neighbour_support`."""
     moments = blocks.neighbour_sums(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
     means = moments[:, 1:10] / moments[:, :1]

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import scan_rays
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints32, Keys
 from radarsdf.checks import (
     MAX_POSITION_M,
+    check,
     check_scan_shape,
     check_scan_shapes,
     check_values_of_scans,
@@ -24,7 +26,7 @@ from radarsdf.checks import (
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
-from radarsdf.returns.sampling import Keys, hashes
+from radarsdf.returns.sampling import hashes
 
 _LOG = logging.getLogger("radarsdf.returns")
 _HASHED_PER_M, _LAST_BITS = 64.0, np.uint64(0xFFFFFF)  # resolution of hashes, and bits beyond it
@@ -43,22 +45,22 @@ class Rays:
     float32 resolves 0.06 mm at 500 m, but only 0.5 m at UTM coordinates, hence the local frame.
     """
 
-    origin: NDArray[np.float64]
+    origin: Floats
     """(3,) origin of the local frame in world coordinates, m: by default the mean sensor position."""
-    points: NDArray[np.float32]  # (N, 3) returns, m
-    directions: NDArray[np.float32]  # (N, 3) unit vectors from the sensor to the return
-    ranges_m: NDArray[np.float32]  # (N,) distance of the return from the sensor
-    intensities: NDArray[np.float32] | None
+    points: Floats32  # (N, 3) returns, m
+    directions: Floats32  # (N, 3) unit vectors from the sensor to the return
+    ranges_m: Floats32  # (N,) distance of the return from the sensor
+    intensities: Floats32 | None
     """(N,) sensor units; NaN where missing or an outlier. None without intensities."""
-    scans: NDArray[np.int32]  # (N,) scan of each return
-    up_of_scan: NDArray[np.float64]  # (F, 3) z axis of the sensor in each scan, local frame
+    scans: Ints32  # (N,) scan of each return
+    up_of_scan: Floats  # (F, 3) z axis of the sensor in each scan, local frame
     num_given: int  # number of returns in the scans, including those out of range
 
     def __len__(self) -> int:
         return len(self.points)
 
     @property
-    def with_intensity(self) -> NDArray[np.bool_]:
+    def with_intensity(self) -> Bools:
         """Mask (N,) of the returns with an intensity that is not an outlier."""
         if self.intensities is None:
             return np.zeros(len(self), np.bool_)
@@ -80,13 +82,13 @@ class Rays:
         kept = Plausible.of(self.intensities, self.hashes()).kept(self.intensities)
         return dataclasses.replace(self, intensities=kept)
 
-    def select(self, part: slice | NDArray[np.bool_] | NDArray[np.integer[Any]]) -> Rays:
+    def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> Rays:
         """Select rays by a slice, a mask (N,) or row indices (M,), in this order."""
         rows = part
         if isinstance(part, np.ndarray) and part.dtype == np.bool_:
             rows = np.flatnonzero(part)
 
-        def chosen(array: NDArray[Any]) -> NDArray[Any]:
+        def chosen(array: Array) -> Array:
             # `take` with row indices needs a third of the time of indexing with them or a mask.
             return array[rows] if isinstance(rows, slice) else array.take(rows, axis=0)
 
@@ -99,17 +101,17 @@ class Rays:
             scans=np.ascontiguousarray(chosen(self.scans)),
         )
 
-    def in_c_order(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    def in_c_order(self) -> tuple[Floats32, Floats32, Floats32]:
         points, directions = np.ascontiguousarray(self.points), np.ascontiguousarray(self.directions)
         return points, directions, np.ascontiguousarray(self.ranges_m)
 
-    def in_world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def in_world(self) -> tuple[Floats, Floats]:
         """Return the returns and their sensor positions, (N, 3) each, float64, world, m."""
         points = self.points.astype(np.float64) + self.origin
         return points, points - self.directions.astype(np.float64) * self.ranges_m[:, None]
 
 
-def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
+def measured(scan: Array) -> Bools:
     """Return a mask (N,) of the rows of a scan (N, 3) that are returns: finite, not at the sensor, not padding."""
     returns = np.ones(len(scan), np.bool_)
     if not (scan.all() and np.abs(scan).max(initial=0.0) <= MAX_POSITION_M):
@@ -128,7 +130,7 @@ def measured(scan: NDArray[Any]) -> NDArray[np.bool_]:
     return returns
 
 
-def too_far(scan: NDArray[Any], returns: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def too_far(scan: Array, returns: Bools) -> Bools:
     """Return a mask (N,) of those `returns` (N,) of a scan (N, 3) that no radar measures with the others, such as 65,535 m.
 
     Their range is more than 100 times the median of the others. Equal ranges count once in it: a sentinel has one.
@@ -141,8 +143,7 @@ def too_far(scan: NDArray[Any], returns: NDArray[np.bool_]) -> NDArray[np.bool_]
         ordered = ordered[np.diff(ordered, prepend=0.0) > _SAME_SQUARE * ordered]
         while ordered[-1] > (most := _MOST_RATIO**2 * ordered[len(ordered) // 2]):
             ordered = ordered[ordered <= most]
-        far: NDArray[np.bool_] = returns & (squares > ordered[-1] * (1 + _SAME_SQUARE))
-        return far
+        return returns & (squares > ordered[-1] * (1 + _SAME_SQUARE))
     return np.zeros(len(scan), np.bool_)
 
 
@@ -165,15 +166,13 @@ class LeftOut:
             ratio = f"{_MOST_RATIO:g} times the median range of their scan"
             parts.append(f"{self.far} of {self.given} returns (beyond {ratio})")
         kinds = ((self.empty, "without returns"), (self.poses, "whose pose is not a rigid transform"))
-        parts += [
-            f"{len(scans)} scans {what} (the first is scan {scans[0]})" for scans, what in kinds if scans
-        ]
+        parts += [f"{len(of)} scans {what} (the first is scan {of[0]})" for of, what in kinds if of]
         return [f"Left out: {', '.join(parts)}."] if parts else []
 
 
 def check_scans(
     points: Iterable[ArrayLike], intensities: Iterable[ArrayLike] | None = None
-) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float32]] | None, LeftOut]:
+) -> tuple[list[Floats], list[Floats32] | None, LeftOut]:
     """Convert scans (N_i, 3) and intensities (N_i,) to arrays. Raise the ValueError of :func:`prepare` if they are invalid.
 
     Rows that are not returns, or too far, become 0 0 0 and non-finite intensities NaN, so that the arrays keep their length.
@@ -204,11 +203,10 @@ def check_scans(
     return scans, [np.where(np.isfinite(v), v, np.float32(np.nan)) for v in values], left_out
 
 
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lengths(vectors: Floats) -> Floats:
     """Return the lengths (N,) of vectors (N, 3), bit-identical to np.linalg.norm in a fifth of the time."""
     x, y, z = vectors.T
-    lengths: NDArray[np.float64] = np.sqrt(x * x + y * y + z * z)
-    return lengths
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def middle_scan(scan: int, scans: int, accumulate_scans: int) -> int:
@@ -217,9 +215,7 @@ def middle_scan(scan: int, scans: int, accumulate_scans: int) -> int:
     return (first + min(first + accumulate_scans, scans) - 1) // 2
 
 
-def within_ranges(
-    scan: NDArray[np.float64], min_range_m: float, max_range_m: float | None
-) -> NDArray[np.bool_]:
+def within_ranges(scan: Floats, min_range_m: float, max_range_m: float | None) -> Bools:
     ranges = _lengths(scan)
     keep = (ranges > 0) & (ranges >= min_range_m)  # a return at the sensor itself has no direction
     return keep if max_range_m is None else keep & (ranges <= max_range_m)
@@ -286,31 +282,27 @@ def prepare(
     )
     rays = rays.without_outliers() if whole else rays
     if rays.intensities is not None and whole:
-        if not rays.with_intensity.any():
-            msg = "no intensity is finite: omit intensities if the sensor does not measure them"
-            raise ValueError(msg)
+        fits = rays.with_intensity.any()
+        check(fits, "no intensity is finite: omit intensities if the sensor does not measure them")
         check_range(float(np.nanmin(rays.intensities)), float(np.nanmax(rays.intensities)))
     return rays
 
 
 def check_range(low: float, high: float) -> None:
     """Raise a ValueError if intensities from `low` to `high`, sensor units, are all equal or too far apart for float32."""
-    if low == high:
-        msg = f"all intensities are {low}: omit them if the sensor does not measure them"
-        raise ValueError(msg)
-    if high - low > float(np.finfo(np.float32).max):
-        msg = f"intensities from {low} to {high} are too far apart for float32"
-        raise ValueError(msg)
+    check(low != high, f"all intensities are {low}: omit them if the sensor does not measure them")
+    fits = high - low <= float(np.finfo(np.float32).max)
+    check(fits, f"intensities from {low} to {high} are too far apart for float32")
 
 
 def rays_from(
-    points: NDArray[Any],
-    sensors: NDArray[np.float64],
+    points: Array,
+    sensors: Floats,
     *,
-    origin: NDArray[np.float64],
-    intensities: NDArray[np.float32] | None,
-    scans: NDArray[np.int32],
-    up_of_scan: NDArray[np.float64],
+    origin: Floats,
+    intensities: Floats32 | None,
+    scans: Ints32,
+    up_of_scan: Floats,
 ) -> Rays:
     """Build rays from `sensors` to `points`, (N, 3) each, local frame, m. The rest as in :class:`Rays`."""
     away = points - sensors

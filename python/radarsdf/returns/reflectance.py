@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, CellMeans, cell_keys, cell_rows, fit_cell_means
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints32, Keys
+from radarsdf.checks import check
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.response import NUM_COEFFICIENTS, NUM_KINDS, TABLE_SHAPE, Response, kinds_of
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
-
-Float32 = NDArray[np.float32]
 
 # Kinds of cells: edge in leaf cells, bin width of the direction's components, bin width of the incidence in rad. Materials
 # differ in how the echo decreases with incidence, so cells by incidence help most on simulated scenes, cells by direction
@@ -42,7 +41,7 @@ _LEAST_MEAN = 0.005  # smallest stored mean, share of the intensity range. A thi
 _NETWORK_TIMES = 0.5
 _CLOSED_TIMES = 0.5
 
-Ask = Callable[[Float32, Float32, Float32], Float32]
+Ask = Callable[[Floats32, Floats32, Floats32], Floats32]
 
 
 @dataclass(frozen=True)
@@ -53,11 +52,11 @@ class Reflectance:
     """
 
     leaf_size_m: float  # edge of a leaf cell, m
-    coefficients: NDArray[np.float64]  # (3, 14), see :class:`~radarsdf.returns.response.Response`
-    table: Float32  # (48, 96) residuals of the first of them by range and elevation
-    plane_keys: NDArray[np.uint64]  # (P,) Morton keys of the surfels' cells with a plane, ascending
-    normals: Float32  # (P, 3) unit normals of these planes, local frame
-    mean_keys: NDArray[np.uint64]  # (M,) keys of the cells with means
+    coefficients: Floats  # (3, 14), see :class:`~radarsdf.returns.response.Response`
+    table: Floats32  # (48, 96) residuals of the first of them by range and elevation
+    plane_keys: Keys  # (P,) Morton keys of the surfels' cells with a plane, ascending
+    normals: Floats32  # (P, 3) unit normals of these planes, local frame
+    mean_keys: Keys  # (M,) keys of the cells with means
     means: NDArray[np.float16]  # (M,) means of the regression's residuals in them
     network_share: float = 0.0  # factor on the intensity network's prediction, to which this is added
 
@@ -78,16 +77,15 @@ class Reflectance:
     def check(self) -> None:
         """Raise a ValueError if keys are not ascending, or shapes do not match."""
         shapes = self.coefficients.shape, self.table.shape, self.normals.shape
-        if shapes != ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3)):
-            msg = "the reflectance has arrays of wrong shapes"
-            raise ValueError(msg)
+        fits = shapes == ((NUM_KINDS, NUM_COEFFICIENTS), TABLE_SHAPE, (len(self.plane_keys), 3))
+        check(fits, "the reflectance has arrays of wrong shapes")
         _ = self._planes, self._cells  # their constructors check the keys
 
     @classmethod
     def of(
         cls,
         rays: Rays,
-        unit: Float32,
+        unit: Floats32,
         surfels: Surfels,
         leaf_size_m: float,
         ask: Ask | None = None,
@@ -107,19 +105,17 @@ class Reflectance:
         groups = _Groups.of(points, directions, incidence, leaf_size_m, most)
         times, share = 1.0, 0.0
         if ask is not None:
-            answers = ask(groups.points, _unit_vectors(groups.directions), groups.means(ranges_m))
+            unit_vectors = groups.directions / np.linalg.norm(groups.directions, axis=1, keepdims=True)
+            answers = ask(groups.points, unit_vectors, groups.means(ranges_m))
             unit = unit - np.float32(_NETWORK_TIMES) * groups.of_returns(answers)
             times, share = _CLOSED_TIMES, 1 - _CLOSED_TIMES * (1 - _NETWORK_TIMES)
         response = Response.of(unit, directions, ranges_m, incidence, kinds)
         left = unit - response.at(directions, ranges_m, incidence, kinds)
         incidence = groups.means(incidence)
         del plane, kinds  # per-return arrays: frees memory
-        kinds_m, columns = _in_metres(_KINDS, leaf_size_m), (groups.points, groups.directions, incidence)
-        values, options = (
-            (groups.means(left), groups.weights),
-            (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads),
-        )
-        keys, means, explained = fit_cell_means(kinds_m, _TILINGS, *columns, *values, *options)
+        columns = (groups.points, groups.directions, incidence, groups.means(left), groups.weights)
+        options = (_SHRINKAGE, _ROUNDS, _LEAST_MEAN, num_threads)
+        keys, means, explained = fit_cell_means(_in_metres(_KINDS, leaf_size_m), _TILINGS, *columns, *options)
         # Cells store means, but the absolute error is to be minimised, so the offset is the median residual.
         coefficients = response.coefficients.copy()
         coefficients[:, 0] += np.median(left - groups.of_returns(explained))
@@ -134,11 +130,13 @@ class Reflectance:
             share,
         )
 
-    def measured(self, directions: Float32, ranges_m: Float32) -> NDArray[np.bool_]:
+    def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
         """See :meth:`~radarsdf.returns.response.Response.measured`."""
         return self._response.measured(directions, ranges_m)
 
-    def at(self, points: Float32, directions: Float32, ranges_m: Float32, num_threads: int = 0) -> Float32:
+    def at(
+        self, points: Floats32, directions: Floats32, ranges_m: Floats32, num_threads: int = 0
+    ) -> Floats32:
         """Predict values (N,) at points (N, 3), local frame, m, along directions (N, 3), unit vectors, from ranges (N,), m."""
         size_m = LEAVES_PER_SURFEL * self.leaf_size_m
         limit_m = MAX_CELLS_FROM_ORIGIN * self.leaf_size_m  # farther points have neither key nor cell
@@ -151,37 +149,32 @@ class Reflectance:
         return found
 
 
-def _in_metres(kinds: NDArray[np.float64], leaf_size_m: float) -> NDArray[np.float64]:
+def _in_metres(kinds: Floats, leaf_size_m: float) -> Floats:
     return np.ascontiguousarray(kinds * [leaf_size_m, 1, 1], np.float64)
 
 
-def _incidence(normals: Float32, plane: NDArray[np.int32], directions: Float32) -> Float32:
+def _incidence(normals: Floats32, plane: Ints32, directions: Floats32) -> Floats32:
     """Return the angles (N,) between the direction and the normal of the plane of each return, rad; NaN for plane -1."""
     if len(normals) == 0:
         return np.full(len(plane), np.nan, np.float32)
     cosine = np.abs(np.einsum("ni,ni->n", normals[plane], directions))
-    angle: Float32 = np.arccos(np.minimum(cosine, np.float32(1)))
+    angle: Floats32 = np.arccos(np.minimum(cosine, np.float32(1)))
     angle[plane < 0] = np.nan
     return angle
-
-
-def _unit_vectors(directions: Float32) -> Float32:
-    unit: Float32 = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return unit
 
 
 @dataclass(frozen=True)
 class _Groups:
     """Returns grouped by place and view. With few returns, each is its own group."""
 
-    rows: NDArray[np.int32] | None  # (N,) row of each return's group. None: one group a return
-    points: Float32  # (G, 3) mean point, local frame, m
-    directions: Float32  # (G, 3) mean direction
-    counts: NDArray[np.float64]  # (G,) number of returns
+    rows: Ints32 | None  # (N,) row of each return's group. None: one group a return
+    points: Floats32  # (G, 3) mean point, local frame, m
+    directions: Floats32  # (G, 3) mean direction
+    counts: Floats  # (G,) number of returns
 
     @classmethod
     def of(
-        cls, points: Float32, directions: Float32, incidence_rad: Float32, leaf_size_m: float, most: int
+        cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, leaf_size_m: float, most: int
     ) -> _Groups:
         if len(points) <= most:
             return cls(None, points, directions, np.ones(len(points)))
@@ -194,17 +187,17 @@ class _Groups:
         return cls(rows, means[0], means[1], counts)
 
     @property
-    def weights(self) -> Float32:
+    def weights(self) -> Floats32:
         return (self.counts / (1 + _CORRELATION * (self.counts - 1))).astype(np.float32)
 
-    def means(self, values: Float32) -> Float32:
+    def means(self, values: Floats32) -> Floats32:
         if self.rows is None:
             return np.ascontiguousarray(values)
         return _divided(np.bincount(self.rows, values, len(self.counts)), self.counts)
 
-    def of_returns(self, values: Float32) -> Float32:
+    def of_returns(self, values: Floats32) -> Floats32:
         return values if self.rows is None else values[self.rows]
 
 
-def _divided(sums: NDArray[Any], counts: NDArray[np.float64]) -> Float32:
+def _divided(sums: Array, counts: Floats) -> Floats32:
     return np.ascontiguousarray((sums.T / counts).T, np.float32)

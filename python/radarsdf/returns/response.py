@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints32
 from radarsdf.products import normal_matrix, product
-
-Float32 = NDArray[np.float32]
 
 # A return lies on no known surface, on a level one or on a steep one. The ground is of another material than walls and
 # its echoes are weak at grazing angles: separate regressions reduce the error of the regression by up to 9 %. A place
@@ -48,17 +47,17 @@ _HALF = -32.0  # after the halving for a network
 class Response:
     """Intensity as a function of range, elevation, incidence and the kind of surface."""
 
-    coefficients: NDArray[np.float64]  # (3, 14) of the regression for each kind of surface
-    table: Float32  # (48, 96) residuals of the first of them by range and elevation, plus `_UNMEASURED` far from returns
+    coefficients: Floats  # (3, 14) of the regression for each kind of surface
+    table: Floats32  # (48, 96) residuals of the first of them by range and elevation, plus `_UNMEASURED` far from returns
 
     @classmethod
     @np.errstate(under="ignore")  # lobes and kernels underflow far from their centre
     def of(
         cls,
-        values: Float32,
-        directions: Float32,
-        ranges_m: Float32,
-        incidence_rad: Float32,
+        values: Floats32,
+        directions: Floats32,
+        ranges_m: Floats32,
+        incidence_rad: Floats32,
         kinds: NDArray[np.int8],
     ) -> Response:
         """Fit the response to `values` (N,) of returns; the other arguments are those of :meth:`at`."""
@@ -80,8 +79,8 @@ class Response:
 
     @np.errstate(under="ignore")
     def at(
-        self, directions: Float32, ranges_m: Float32, incidence_rad: Float32, kinds: NDArray[np.int8]
-    ) -> Float32:
+        self, directions: Floats32, ranges_m: Floats32, incidence_rad: Floats32, kinds: NDArray[np.int8]
+    ) -> Floats32:
         """Predict values (N,) along directions (N, 3) from ranges (N,), m, at incidence angles (N,) on kinds of surface (N,)."""
         of_angles = _of_incidence(_ANGLES_RAD).T.astype(np.float32)
         tables = [_weighted_sum(of_kind[_BASE:], of_angles) for of_kind in self.coefficients]
@@ -101,24 +100,20 @@ class Response:
                 found[own] = values
         return found
 
-    def measured(self, directions: Float32, ranges_m: Float32) -> NDArray[np.bool_]:
+    def measured(self, directions: Floats32, ranges_m: Floats32) -> Bools:
         """Return a mask (N,) of the directions (N, 3) and ranges (N,), m, near which there were returns."""
-        near: NDArray[np.bool_] = (self.table > _HALF / 2).ravel()[
-            _bins(_log_range(ranges_m), directions[:, 2])
-        ]
-        return near
+        return (self.table > _HALF / 2).ravel()[_bins(_log_range(ranges_m), directions[:, 2])]
 
 
-def kinds_of(normals: Float32, plane: NDArray[np.int32]) -> NDArray[np.int8]:
+def kinds_of(normals: Floats32, plane: Ints32) -> NDArray[np.int8]:
     """Return the kind of surface (N,) of each return from the row `plane` (N,) of its normal in `normals` (P, 3); -1: none."""
     # The last entry serves row -1.
     of_plane = np.full(len(normals) + 1, NO_SURFACE, np.int8)
     of_plane[:-1] = np.where(np.abs(normals[:, 2]) > _LEVEL_COSINE, LEVEL, STEEP)
-    kinds: NDArray[np.int8] = of_plane[plane]
-    return kinds
+    return of_plane[plane]
 
 
-def _weighted_sum(weights: NDArray[np.float64], columns: Float32) -> Float32:
+def _weighted_sum(weights: Floats, columns: Floats32) -> Floats32:
     """Sum `columns` (K, N) to (N,). Not a matrix product, whose rounding depends on N and the number of threads."""
     found = np.zeros(columns.shape[1], np.float32)
     with np.errstate(invalid="ignore", over="ignore"):  # the result of a non-finite query is non-finite
@@ -127,25 +122,24 @@ def _weighted_sum(weights: NDArray[np.float64], columns: Float32) -> Float32:
     return found
 
 
-def _of_incidence(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def _of_incidence(angle_rad: Floats) -> Floats:
     """Return columns (N, 9): 1, the cosine, its square and logarithm, and the lobes."""
     cosine = np.maximum(np.cos(angle_rad), _MIN_COSINE)
     lobes = [np.exp(-0.5 * (angle_rad / width) ** 2) for width in _LOBES_RAD]
     return np.stack([np.ones_like(cosine), cosine, cosine**2, np.log10(cosine), *lobes], axis=-1)
 
 
-def _of_ray(directions: Float32, ranges_m: Float32) -> Float32:
+def _of_ray(directions: Floats32, ranges_m: Floats32) -> Floats32:
     """Return columns (N, 5): 1, the logarithm of the range and its square, the sine of the elevation and its square."""
     log_range, up = _log_range(ranges_m), directions[:, 2]
     return np.stack([np.ones_like(up), log_range, log_range**2, up, up**2], axis=1)
 
 
-def _log_range(ranges_m: Float32) -> Float32:
-    log_range: Float32 = np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
-    return log_range
+def _log_range(ranges_m: Floats32) -> Floats32:
+    return np.log10(np.maximum(ranges_m, np.float32(1e-6)) / np.float32(_REFERENCE_RANGE_M))
 
 
-def _bins(log_range: NDArray[np.floating], up: NDArray[np.floating]) -> NDArray[np.int32]:
+def _bins(log_range: AnyFloats, up: AnyFloats) -> Ints32:
     """Return the bin (N,) of the table for each log10(range / 10 m) and sine of the elevation."""
     rows, columns = TABLE_SHAPE
     low, high = np.array(_LOG_RANGES) - np.log10(_REFERENCE_RANGE_M)
@@ -153,17 +147,16 @@ def _bins(log_range: NDArray[np.floating], up: NDArray[np.floating]) -> NDArray[
     column = np.clip((up + 1) * (columns / 2), 0, columns - 1)
     # NaN has no bin: any will do, since the prediction is NaN whatever the table holds.
     row, column = (np.nan_to_num(place).astype(np.int32) for place in (row, column))
-    bins: NDArray[np.int32] = row * np.int32(columns) + column
-    return bins
+    return row * np.int32(columns) + column
 
 
-def _regression(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _regression(design: Floats, values: Floats) -> Floats:
     """Fit coefficients by iteratively reweighted least squares, approximately minimising the absolute error."""
     weights = np.ones(len(values))
     ridge = np.eye(design.shape[1]) * (1e-3 * np.sqrt(len(values)) + 1e-6 * float((design**2).sum()))
     for _ in range(_REWEIGHTINGS):
         weighted = design * weights[:, None]
-        coefficients: NDArray[np.float64] = np.linalg.solve(
+        coefficients: Floats = np.linalg.solve(
             normal_matrix(design, weighted) + ridge, normal_matrix(weighted, values[:, None])[:, 0]
         )
         error = np.abs(values - product(design, coefficients[:, None])[:, 0])
@@ -171,7 +164,7 @@ def _regression(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDA
     return coefficients
 
 
-def _smooth_means(bins: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth_means(bins: Ints32, values: Floats) -> Floats:
     """Return smoothed bin means of `values` (N,): bins with few returns shrink to the mean of a wider kernel."""
     weights, means = np.ones(len(values)), np.zeros(TABLE_SHAPE)
     for _ in range(2):
@@ -186,22 +179,15 @@ def _smooth_means(bins: NDArray[np.int32], values: NDArray[np.float64]) -> NDArr
     return means
 
 
-def _near(bins: NDArray[np.int32]) -> NDArray[np.bool_]:
+def _near(bins: Ints32) -> Bools:
     """Return a mask of the table: entries within a standard deviation of the widest kernels from a return."""
     returns = np.bincount(bins, minlength=TABLE_SHAPE[0] * TABLE_SHAPE[1]).reshape(TABLE_SHAPE)
     by_range, by_elevation = (kernel > np.exp(-0.51) for kernel in _kernels(_KERNELS[0]))
-    near: NDArray[np.bool_] = product(product(by_range, returns), by_elevation) > 0
-    return near
+    return product(product(by_range, returns), by_elevation) > 0
 
 
-def _kernels(widths: tuple[float, float]) -> list[NDArray[np.float64]]:
-    """Return the kernels by range and elevation."""
-    steps = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
-    return [_kernel(*of_axis) for of_axis in zip(TABLE_SHAPE, np.divide(widths, steps).tolist(), strict=True)]
-
-
-def _kernel(size: int, deviation_bins: float) -> NDArray[np.float64]:
-    """Return Gaussian weights (size, size) by the distance of bins; 1 on the diagonal."""
-    place = np.arange(size) / deviation_bins
-    weights: NDArray[np.float64] = np.exp(-0.5 * (place[:, None] - place) ** 2)
-    return weights
+def _kernels(widths: tuple[float, float]) -> list[Floats]:
+    """Return Gaussian weights of pairs of bins by range and of pairs by elevation; 1 on the diagonals."""
+    bins = (_LOG_RANGES[1] - _LOG_RANGES[0]) / TABLE_SHAPE[0], 2 / TABLE_SHAPE[1]
+    places = [np.arange(n) / (width / bin_) for n, width, bin_ in zip(TABLE_SHAPE, widths, bins, strict=True)]
+    return [np.exp(-0.5 * (place[:, None] - place) ** 2) for place in places]

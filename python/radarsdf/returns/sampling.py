@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Keys = NDArray[np.uint64]
+from radarsdf.arrays import Array, Ints, Keys
 
 
-def hashes(*columns: NDArray[Any]) -> Keys:
+def hashes(*columns: Array) -> Keys:
     """Return pseudo-random keys (N,) of rows with values (N,) of four bytes each; equal rows have equal keys."""
     found = np.zeros(len(columns[0]), np.uint64)
     for column in columns:
@@ -20,6 +17,6 @@ def hashes(*columns: NDArray[Any]) -> Keys:
     return found
 
 
-def sample(keys: Keys, most: int) -> NDArray[np.int64]:
+def sample(keys: Keys, most: int) -> Ints:
     """Return the rows of the `most` smallest keys (N,), or of all."""
     return np.arange(len(keys)) if len(keys) <= most else np.argpartition(keys, most)[:most]

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from radarsdf.checks import number, usable_poses
+from radarsdf.arrays import Array, Floats
+from radarsdf.checks import check, not_negative, number, usable_poses
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sampling import sample
@@ -57,20 +58,17 @@ class Sensor:
         limits = {"azimuth_rad": math.pi, "elevation_rad": math.pi / 2, "range_m": _MAX_RANGE_M}
         for name, most in limits.items():
             low, high = found = _pair(getattr(self, name), name)
-            if not (0.0 if name == "range_m" else -most) <= low < high <= most:
-                msg = f"{name} must be two ascending numbers up to {most:.4g}, not {low:.6g} and {high:.6g}"
-                raise ValueError(msg)
+            fits = (0.0 if name == "range_m" else -most) <= low < high <= most
+            wanted = f"two ascending numbers up to {most:.4g}"
+            check(fits, f"{name} must be {wanted}, not {low:.6g} and {high:.6g}")
             object.__setattr__(self, name, found)
-        if not 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7:
-            msg = f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}"
-            raise ValueError(msg)
-        if any(not 0 <= number(value, "noise") < math.inf for value in dataclasses.astuple(self.noise)):
-            msg = f"noise must be finite and at least 0, not {self.noise}"
-            raise ValueError(msg)
+        fits = 0 < number(self.returns_per_scan, "returns_per_scan") <= 1e7
+        check(fits, f"returns_per_scan must be in (0, 10^7], not {self.returns_per_scan}")
+        for value in dataclasses.astuple(self.noise):
+            not_negative(value, "noise")
         steps = tuple(_pair(step, "thresholds") for step in self.thresholds)
-        if any(a >= b for (a, _), (b, _) in itertools.pairwise(steps)):
-            msg = "thresholds must have ascending ranges"
-            raise ValueError(msg)
+        fits = not any(a >= b for (a, _), (b, _) in itertools.pairwise(steps))
+        check(fits, "thresholds must have ascending ranges")
         object.__setattr__(self, "thresholds", steps)
 
     @property
@@ -78,7 +76,7 @@ class Sensor:
         """Width of a beam in azimuth and elevation, rad: the full width at half maximum of the noise."""
         return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
 
-    def threshold(self, ranges_m: NDArray[Any]) -> NDArray[np.float64]:
+    def threshold(self, ranges_m: Array) -> Floats:
         """Interpolate the detection threshold.
 
         Parameters
@@ -94,10 +92,9 @@ class Sensor:
         if not self.thresholds:
             return np.full(len(ranges_m), -np.inf)
         at_m, weakest = np.transpose(self.thresholds)
-        interpolated: NDArray[np.float64] = np.interp(ranges_m, at_m, weakest)
-        return interpolated
+        return np.interp(ranges_m, at_m, weakest)
 
-    def directions(self, azimuth_rad: NDArray[Any], elevation_rad: NDArray[Any]) -> NDArray[np.float64]:
+    def directions(self, azimuth_rad: Array, elevation_rad: Array) -> Floats:
         """Convert azimuths and elevations to unit vectors.
 
         Parameters
@@ -151,12 +148,9 @@ class Sensor:
         poses = np.tile(np.eye(4), (len(points), 1, 1))
         limits: dict[str, Any] = {"min_range_m": min_range_m, "max_range_m": max_range_m}
         rays = prepare(points, poses, intensities, whole=False, **limits)
-        if len(rays) == 0:
-            msg = "no return lies within the ranges: a sensor cannot be estimated from its scans"
-            raise ValueError(msg)
-        return cls.of_rays(
-            rays.without_outliers(), poses, SensorNoise(0.0, 0.0, 0.0) if noise is None else noise
-        )
+        check(len(rays), "no return lies within the ranges: a sensor cannot be estimated from its scans")
+        noise = SensorNoise(0.0, 0.0, 0.0) if noise is None else noise
+        return cls.of_rays(rays.without_outliers(), poses, noise)
 
     @classmethod
     def of_rays(cls, rays: Rays, poses: ArrayLike, noise: SensorNoise) -> Sensor:
@@ -186,13 +180,12 @@ class Sensor:
 
 
 def _pair(values: Any, name: str) -> tuple[float, float]:
-    if not isinstance(values, (tuple, list)) or len(values) != 2:
-        msg = f"{name} must be two numbers, not {values!r:.50}"
-        raise ValueError(msg)
+    fits = isinstance(values, (tuple, list)) and len(values) == 2
+    check(fits, f"{name} must be two numbers, not {values!r:.50}")
     return number(values[0], name), number(values[1], name)
 
 
-def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
+def _limits(values: Floats) -> tuple[float, float]:
     """Return robust lower and upper limits."""
     low, high = np.quantile(values, [_STRAY, 1 - _STRAY])
     if low == high:  # very few returns
@@ -200,9 +193,7 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _thresholds(
-    ranges_m: NDArray[np.float64], intensities: NDArray[np.float64]
-) -> tuple[tuple[float, float], ...]:
+def _thresholds(ranges_m: Floats, intensities: Floats) -> tuple[tuple[float, float], ...]:
     """Return the median range and the robust weakest intensity of range bins with equal counts."""
     order = np.lexsort((intensities, ranges_m))  # equal ranges in an order of their own
     bins = [part for part in np.array_split(order, _RANGE_BINS) if len(part)]

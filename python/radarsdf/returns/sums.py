@@ -6,17 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from radarsdf._core import (
-    CellBlocks,
-    CellSet,
-    cell_keys,
-    count_scans,
-    mean_rays,
-    merge_sums,
-    sum_returns,
-)
+from radarsdf._core import CellBlocks, CellSet, cell_keys, count_scans, mean_rays, merge_sums, sum_returns
+from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.checks import check
 from radarsdf.returns.rays import Rays
 
 MAX_CELLS_FROM_ORIGIN = 1_000_000
@@ -33,7 +26,7 @@ _COMPACTED = (
 )  # steps of the Morton decoding: shift, and mask of the bits kept
 
 
-def lattice_of(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+def lattice_of(keys: Keys) -> Ints:
     """Decode Morton keys (N,) to lattice coordinates (N, 3)."""
     coordinates = np.empty((len(keys), 3), np.int64)
     for axis in range(3):
@@ -44,22 +37,21 @@ def lattice_of(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
     return coordinates
 
 
-def merged_keys(keys: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def merged_keys(keys: Keys) -> Keys:
     """Return the Morton keys (N,) of the parent cells, twice as large, of cells with keys (N,), in the same order."""
     halved = keys >> np.uint64(3)
     # Coordinates of the parents have the offset 2²⁰ too; the shift halved it.
     quarters = halved & _QUARTER
-    merged: NDArray[np.uint64] = (halved ^ _QUARTER) | quarters << np.uint64(3)
-    return merged
+    return (halved ^ _QUARTER) | quarters << np.uint64(3)
 
 
 @dataclass(frozen=True)
 class ReturnCells:
     """Cells with returns."""
 
-    keys: NDArray[np.uint64]  # (C,) Morton keys of the cells, ascending
+    keys: Keys  # (C,) Morton keys of the cells, ascending
     blocks: CellBlocks  # lookup of the row of a cell by its key
-    cell_of_ray: NDArray[np.int32]  # (N,) row of each return's cell
+    cell_of_ray: Ints32  # (N,) row of each return's cell
 
     @classmethod
     def of(cls, rays: Rays, cell_size_m: float, num_threads: int = 0) -> ReturnCells:
@@ -73,7 +65,7 @@ class ReturnCells:
         return cls(keys, blocks, rows)
 
     @cached_property
-    def counts(self) -> NDArray[np.float64]:
+    def counts(self) -> Floats:
         return np.bincount(self.cell_of_ray, minlength=len(self.keys)).astype(np.float64)
 
 
@@ -92,11 +84,11 @@ class ScanSums:
     """
 
     leaf_size_m: float  # edge of a leaf cell, m
-    keys: NDArray[np.uint64]  # (C,) Morton keys of the leaf cells with returns, ascending
+    keys: Keys  # (C,) Morton keys of the leaf cells with returns, ascending
     # (C, 14) sums of 1, x, y, z, xx, xy, xz, yy, yz, zz, the direction (3) of the ray, and its range. Positions are in quanta
     # from the corner of the cell, ranges in quanta, directions times DIRECTION_QUANTA.
-    sums: NDArray[np.int64]
-    scans: NDArray[np.uint32]  # (C,) number of different scans with returns
+    sums: Ints
+    scans: Counts32  # (C,) number of different scans with returns
 
     @classmethod
     def of(cls, rays: Rays, leaf_size_m: float, num_threads: int = 0) -> ScanSums:
@@ -115,9 +107,7 @@ class ScanSums:
         return self._with(other, -1)
 
     def _with(self, other: ScanSums, sign: int) -> ScanSums:
-        if self.leaf_size_m != other.leaf_size_m:
-            msg = "sums over cells of different sizes cannot be added"
-            raise ValueError(msg)
+        check(self.leaf_size_m == other.leaf_size_m, "sums over cells of different sizes cannot be added")
         keys = np.union1d(self.keys, other.keys)
         sums = np.zeros((len(keys), self.sums.shape[1]), np.int64)
         scans = np.zeros(len(keys), np.int64)
@@ -129,10 +119,10 @@ class ScanSums:
         return ScanSums(self.leaf_size_m, keys[kept], sums[kept], scans[kept].astype(np.uint32))
 
     @property
-    def counts(self) -> NDArray[np.float64]:
+    def counts(self) -> Floats:
         return self.sums[:, _COUNT].astype(np.float64)
 
-    def merged_moments(self) -> tuple[NDArray[np.uint64], NDArray[np.float64]]:
+    def merged_moments(self) -> tuple[Keys, Floats]:
         """Return the keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
 
         The sums are those of 1; x, y, z, local, m; xx, xy, xz, yy, yz, zz, m²; and the direction (3).
@@ -144,12 +134,12 @@ class ScanSums:
 class MeanRays:
     """Mean ray of each cell. Measured: averaging them is as good as averaging all rays, two to three times as many."""
 
-    keys: NDArray[np.uint64]  # (M,) Morton keys of the cells, ascending
-    points: NDArray[np.float32]  # (M, 3) mean of the returns in each cell, local, m
-    directions: NDArray[np.float32]  # (M, 3) unit vectors of their mean direction; downwards if it is zero
-    counts: NDArray[np.float32]  # (M,) number of returns in each cell
-    scans: NDArray[np.uint32]  # (M,) number of different scans with returns in each cell
-    ranges_m: NDArray[np.float32]  # (M,) mean range of the returns in each cell, m
+    keys: Keys  # (M,) Morton keys of the cells, ascending
+    points: Floats32  # (M, 3) mean of the returns in each cell, local, m
+    directions: Floats32  # (M, 3) unit vectors of their mean direction; downwards if it is zero
+    counts: Floats32  # (M,) number of returns in each cell
+    scans: Counts32  # (M,) number of different scans with returns in each cell
+    ranges_m: Floats32  # (M,) mean range of the returns in each cell, m
 
     @classmethod
     def of_sums(cls, sums: ScanSums, num_threads: int = 0) -> MeanRays:
@@ -157,11 +147,11 @@ class MeanRays:
         points, directions, ranges_m, counts = means
         return cls(sums.keys, points, directions, counts, sums.scans, ranges_m)
 
-    def select(self, part: NDArray[np.bool_] | NDArray[np.int64]) -> MeanRays:
+    def select(self, part: Bools | Ints) -> MeanRays:
         rows = np.flatnonzero(part) if part.dtype == np.bool_ else part
         return MeanRays(**{name: column.take(rows, axis=0) for name, column in vars(self).items()})
 
-    def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> NDArray[np.uint64]:
+    def leaf_keys(self, leaf_size_m: float, reach_m: float, num_threads: int = 0) -> Keys:
         """Return ascending Morton keys (C,) of the leaf cells that rays cross within `reach_m` of their returns."""
         cells = CellSet(leaf_size_m)
         cells.insert_rays(self.points, self.directions, reach_m, num_threads)

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_rows
+from radarsdf.arrays import AnyFloats, Bools, Floats, Floats32, Ints32
+from radarsdf.checks import check
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
-
-Float32 = NDArray[np.float32]
-Floating = NDArray[np.floating]
 
 PLACE_CELLS = 3
 """Edge of the cells in which returns of similar view share a mean, leaf cells."""
@@ -25,8 +24,8 @@ _MOST = 2**16 - 1  # largest stored count
 
 
 def rows_of_views(
-    points: Floating, directions: Floating, ranges_m: Floating, leaf_size_m: float
-) -> tuple[NDArray[np.int32], int]:
+    points: AnyFloats, directions: AnyFloats, ranges_m: AnyFloats, leaf_size_m: float
+) -> tuple[Ints32, int]:
     """Return the group (N,) by place and view of returns at points (N, 3), m, along directions (N, 3), and their number."""
     # The third bin width of the core applies to any quantity.
     kind = np.array([[PLACE_CELLS * leaf_size_m, _DIRECTION_STEP, _LOG_RANGE_STEP]])
@@ -41,14 +40,14 @@ _COLUMNS = ("points", "directions", "ranges_m", "intensities", "counts")
 class ViewStatisticsAt:
     """View statistics in the world frame."""
 
-    points: NDArray[np.float64]  # (G, 3) mean place, m
-    directions: NDArray[np.float64]  # (G, 3) unit vectors from the sensor
-    ranges_m: NDArray[np.float64]  # (G,) mean range
-    intensities: NDArray[np.float64]  # (G,) mean intensity, sensor units
-    counts: NDArray[np.float64]  # (G,) number of returns
+    points: Floats  # (G, 3) mean place, m
+    directions: Floats  # (G, 3) unit vectors from the sensor
+    ranges_m: Floats  # (G,) mean range
+    intensities: Floats  # (G,) mean intensity, sensor units
+    counts: Floats  # (G,) number of returns
     sigma: float  # standard deviation of single returns from the mean of their group
 
-    def select(self, chosen: NDArray[np.bool_]) -> ViewStatisticsAt:
+    def select(self, chosen: Bools) -> ViewStatisticsAt:
         return dataclasses.replace(self, **{name: getattr(self, name)[chosen] for name in _COLUMNS})
 
     @classmethod
@@ -63,22 +62,21 @@ class ViewStatisticsAt:
 class ViewStatistics:
     """View statistics in the compact form that a map stores: 23 bytes each."""
 
-    points: Float32  # (G, 3) mean place, local frame, m
+    points: Floats32  # (G, 3) mean place, local frame, m
     directions: NDArray[np.int8]  # (G, 3) mean direction from the sensor, a unit vector times 127
     ranges_m: NDArray[np.float16]  # (G,) mean range
-    intensities: Float32  # (G,) mean intensity, scaled to [0, 1]
+    intensities: Floats32  # (G,) mean intensity, scaled to [0, 1]
     counts: NDArray[np.int16]  # (G,) number of returns, at most 65,535, as the bits of an uint16
     sigma: float  # standard deviation of single returns from the mean of their group
 
     @classmethod
-    def of(cls, rays: Rays, unit: Float32, leaf_size_m: float) -> ViewStatistics:
+    def of(cls, rays: Rays, unit: Floats32, leaf_size_m: float) -> ViewStatistics:
         rows, count = rows_of_views(rays.points, rays.directions, rays.ranges_m, leaf_size_m)
         counts = np.bincount(rows, minlength=count)
         of_returns = unit.astype(np.float64)
 
-        def means(column: Floating) -> NDArray[np.float64]:
-            found: NDArray[np.float64] = np.bincount(rows, column, count) / counts
-            return found
+        def means(column: AnyFloats) -> Floats:
+            return np.bincount(rows, column, count) / counts
 
         mean = means(of_returns)
         squares = ((of_returns - mean[rows]) ** 2).sum()
@@ -103,15 +101,13 @@ class ViewStatistics:
         """Raise a ValueError if the arrays read from a file are inconsistent."""
         count, limit_m = len(self.counts), MAX_CELLS_FROM_ORIGIN * leaf_size_m
         shapes = [getattr(self, name).shape for name in _COLUMNS]
-        if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
-            msg = "the view statistics have arrays of wrong shapes"
-            raise ValueError(msg)
+        fits = shapes == [(count, 3), (count, 3), (count,), (count,), (count,)]
+        check(fits, "the view statistics have arrays of wrong shapes")
         near = (np.abs(self.points) <= limit_m).all() and (self.ranges_m >= 0).all()
-        if not (near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf):
-            msg = "the view statistics hold numbers out of range"
-            raise ValueError(msg)
+        plausible = near and (self.counts.view(np.uint16) > 0).all() and 0 <= self.sigma < np.inf
+        check(plausible, "the view statistics hold numbers out of range")
 
-    def in_world(self, origin: NDArray[np.float64], low: float, high: float) -> ViewStatisticsAt:
+    def in_world(self, origin: Floats, low: float, high: float) -> ViewStatisticsAt:
         """Convert to the world frame. `origin` (3,): of the local frame, m. `low`, `high`: values of 0 and 1, sensor units."""
         width = high - low
         return ViewStatisticsAt(

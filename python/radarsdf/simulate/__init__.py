@@ -12,13 +12,13 @@ Examples
 
 from .materials import Material
 from .motion import MeasuredMotion, drifted, measured_imu, measured_motion
-from .radar import Origin, RadarSensor, Scan
+from .radar import Origin, RadarSensor, SimulatedScan
 from .scenes import SCENES, astyx, hugin, oculii, wall
 from .simulation import Simulation, simulate
 from .world import Box, CornerReflector, Hits, Pole, Primitive, Scene, Terrain
 
 __all__ = [
     "SCENES", "Box", "CornerReflector", "Hits", "Material", "MeasuredMotion", "Origin", "Pole",
-    "Primitive", "RadarSensor", "Scan", "Scene", "Simulation", "Terrain", "astyx", "drifted", "hugin",
+    "Primitive", "RadarSensor", "Scene", "SimulatedScan", "Simulation", "Terrain", "astyx", "drifted", "hugin",
     "measured_imu", "measured_motion", "oculii", "simulate", "wall",
 ]  # fmt: skip

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-FloatArray = NDArray[np.float64]
+from radarsdf.arrays import Floats
 
 # A texture is three plane waves (rad/m), none of them along an axis, so that every face of a box shows it.
 _TEXTURE_WAVES = np.array([[1.7, 0.9, 1.3], [-0.8, 2.1, -1.1], [0.5, -1.2, 2.6]])
@@ -37,14 +36,13 @@ class Material:
     # Loss of a wave mirrored by the surface [dB], >= 0; inf: no ghosts.
     mirror_loss_db: Annotated[float, Field(ge=0, allow_inf_nan=True)] = np.inf
 
-    def echo_db(self, points: FloatArray, cos_incidence: FloatArray) -> FloatArray:
+    def echo_db(self, points: Floats, cos_incidence: Floats) -> Floats:
         """Echo (N,), dB, of hits (N, 3), world frame, m, without the loss by range: reflectivity, texture and lobe."""
         texture = np.sin(points @ _TEXTURE_WAVES.T).mean(axis=1)
         cos = np.clip(cos_incidence, 1e-3, 1.0)
         specular = np.exp(-0.5 * (np.arccos(cos) / self.lobe_width_rad) ** 2)
         lobe_db = 10 * np.log10((1 - self.specular) * cos**2 + self.specular * specular + 1e-6)
-        echo: FloatArray = self.reflectivity_db + self.texture_db * texture + lobe_db
-        return echo
+        return self.reflectivity_db + self.texture_db * texture + lobe_db
 
 
 GRASS = Material("grass", -13.0, specular=0.1, lobe_width_rad=0.5, looks=2.0, texture_db=3.0)

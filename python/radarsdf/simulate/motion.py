@@ -5,18 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from radarsdf.arrays import Floats, Floats32
 from radarsdf.checks import check_poses, positive, real_array
 from radarsdf.imu import Imu, checked_rotation
 from radarsdf.poses.rigid import moved, steps
 
 from .radar import generator
 from .simulation import Simulation
-
-FloatArray = NDArray[np.float64]
 
 _MOTION_STREAM, _IMU_STREAM = 2**31 + 1, 2**31 + 2  # no scan has these numbers
 _DOPPLER_SIGMA_MPS = 0.1
@@ -32,11 +31,11 @@ _GRAVITY_MPS2 = np.array([0.0, 0.0, -9.81])
 class MeasuredMotion:
     """Measurements of a radar and a gyroscope during F scans."""
 
-    times_s: FloatArray
+    times_s: Floats
     """(F,) times of the scans, s."""
-    doppler_mps: list[NDArray[np.float32]]
+    doppler_mps: list[Floats32]
     """F arrays (N_i,): radial velocity, m/s, positive away from the sensor."""
-    angular_velocity: FloatArray
+    angular_velocity: Floats
     """(F, 3) rad/s, frame of the sensor, at the times of the scans."""
 
 
@@ -152,7 +151,7 @@ def measured_imu(
     >>> len(imu), imu.angular_velocity.shape, imu.R_sensor_imu is None
     (2001, (2001, 3), True)
     """
-    at_s: FloatArray = real_array(times_s, "times_s")
+    at_s: Floats = real_array(times_s, "times_s")
     positions, turning = _splines(check_poses(poses), at_s)
     R_imu = np.eye(3) if R_sensor_imu is None else checked_rotation(R_sensor_imu)
     count = int(np.floor((at_s[-1] - at_s[0]) * positive(rate_hz, "rate_hz") + 1e-6)) + 1
@@ -170,16 +169,13 @@ def measured_imu(
     return Imu(times, rates, forces + _ACCELEROMETER_BIAS_MPS2 + noise)
 
 
-def _splines(poses: FloatArray, times_s: FloatArray) -> tuple[CubicSpline, RotationSpline]:
+def _splines(poses: Floats, times_s: Floats) -> tuple[CubicSpline, RotationSpline]:
     """Splines of positions and rotations by time. Both raise a ValueError unless there are two poses, and ascending times."""
-    return CubicSpline(times_s, poses[:, :3, 3]), RotationSpline(
-        times_s, Rotation.from_matrix(poses[:, :3, :3])
-    )
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    return CubicSpline(times_s, poses[:, :3, 3]), RotationSpline(times_s, rotations)
 
 
-def drifted(
-    poses: FloatArray, sigma_m: float, sigma_rad: float, seed: int = 0, yaw_rad: float = 0.0
-) -> FloatArray:
+def drifted(poses: Floats, sigma_m: float, sigma_rad: float, seed: int = 0, yaw_rad: float = 0.0) -> Floats:
     """Add errors to the steps between scans, which accumulate along the trajectory.
 
     Parameters

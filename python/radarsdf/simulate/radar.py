@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import gammaincinv
 
-from radarsdf.checks import whole_number
+from radarsdf.arrays import Floats, Floats32, Ints
+from radarsdf.checks import check, whole_number
 from radarsdf.settings import settings
 
 from .world import Hits, Scene
-
-FloatArray = NDArray[np.float64]
 
 # Sums and products of numbers below 1e9 do not overflow.
 _NotNegative = Annotated[float, Field(ge=0, le=1e9)]
@@ -45,27 +44,27 @@ class Origin(IntEnum):
     PHANTOM = 4
 
 
-class Scan(NamedTuple):
+class SimulatedScan(NamedTuple):
     """The N returns of one scan."""
 
-    points: NDArray[np.float32]  # (N, 3) sensor frame, m
-    intensities: NDArray[np.float32]  # (N,) dB
-    noiseless_intensities: NDArray[np.float32]  # (N,) dB, without speckle, noise and steps; NaN: false return
+    points: Floats32  # (N, 3) sensor frame, m
+    intensities: Floats32  # (N,) dB
+    noiseless_intensities: Floats32  # (N,) dB, without speckle, noise and steps; NaN: false return
     origin_kind: NDArray[np.int8]  # (N,) codes of `Origin`
 
 
 class _Rays(NamedTuple):
-    origin: FloatArray  # (3,) world, m
-    directions: FloatArray  # (N, 3) world, unit
-    angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
+    origin: Floats  # (3,) world, m
+    directions: Floats  # (N, 3) world, unit
+    angles: Floats  # (N, 2) azimuth and elevation [rad], sensor frame
     hits: Hits
 
 
 class _Echoes(NamedTuple):  # candidates of returns, before detection
-    range_m: FloatArray  # (N,)
-    angles: FloatArray  # (N, 2) azimuth and elevation [rad], sensor frame
-    power_db: FloatArray  # (N,) with speckle
-    noiseless_db: FloatArray | float = np.nan  # (N,) without speckle; NaN for false returns
+    range_m: Floats  # (N,)
+    angles: Floats  # (N, 2) azimuth and elevation [rad], sensor frame
+    power_db: Floats  # (N,) with speckle
+    noiseless_db: Floats | float = np.nan  # (N,) without speckle; NaN for false returns
 
 
 def generator(seed: int, *key: int) -> np.random.Generator:
@@ -124,19 +123,17 @@ class RadarSensor:
     sidelobe_fov_rad: _Height = 0.52  # full height of the false elevations, uniform in their sine [rad]
 
     def __post_init__(self) -> None:
-        if self.min_range_m >= self.max_range_m:
-            msg = f"min_range_m must be below max_range_m, {self.max_range_m}, not {self.min_range_m}"
-            raise ValueError(msg)
-        if self.saturation_db <= self._least_db:
-            msg = f"saturation_db must be above threshold_db and floor_db, not {self.saturation_db}"
-            raise ValueError(msg)
+        fits = self.min_range_m < self.max_range_m
+        check(fits, f"min_range_m must be below max_range_m, {self.max_range_m}, not {self.min_range_m}")
+        fits = self.saturation_db > self._least_db
+        check(fits, f"saturation_db must be above threshold_db and floor_db, not {self.saturation_db}")
 
     @property
     def _least_db(self) -> float:
         """The lowest intensity."""
         return self.threshold_db if self.floor_db is None else max(self.floor_db, self.threshold_db)
 
-    def scan(self, scene: Scene, T_world_sensor: FloatArray, seed: int = 0, frame: int = 0) -> Scan:
+    def scan(self, scene: Scene, T_world_sensor: Floats, seed: int = 0, frame: int = 0) -> SimulatedScan:
         """Scan a scene once.
 
         Parameters
@@ -150,7 +147,7 @@ class RadarSensor:
 
         Returns
         -------
-        Scan
+        SimulatedScan
             The N returns: `points` (N, 3) float32, sensor frame, m; `intensities` and `noiseless_intensities` (N,) float32,
             dB; `origin_kind` (N,) int8, codes of `Origin`.
         """
@@ -171,11 +168,9 @@ class RadarSensor:
             for kind, echoes in candidates.items()
         ]
         order = generator(seed, frame, _ORDER).permutation(sum(len(scan.points) for scan in scans))
-        return Scan(*(np.concatenate(columns)[order] for columns in zip(*scans, strict=True)))
+        return SimulatedScan(*(np.concatenate(columns)[order] for columns in zip(*scans, strict=True)))
 
-    def echo_power_db(
-        self, scene: Scene, origins: FloatArray, directions: FloatArray, hits: Hits
-    ) -> FloatArray:
+    def echo_power_db(self, scene: Scene, origins: Floats, directions: Floats, hits: Hits) -> Floats:
         """Received power (N,), dB, of surface hits by the radar equation, without speckle or clipping; -inf without a hit.
 
         Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m.
@@ -183,10 +178,9 @@ class RadarSensor:
         hit = hits.primitive >= 0
         range_m = np.where(hit, hits.range_m, 1.0)
         echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
-        power: FloatArray = self.gain_db + echo - self.range_loss_db * np.log10(range_m)
-        return power
+        return self.gain_db + echo - self.range_loss_db * np.log10(range_m)
 
-    def _beam_angles(self, rng: np.random.Generator) -> FloatArray:
+    def _beam_angles(self, rng: np.random.Generator) -> Floats:
         """Azimuth and elevation (beams, 2), rad: a jittered grid, uniform in azimuth and in the sine of elevation."""
         aspect = self.azimuth_fov_rad / self.elevation_fov_rad
         columns = max(1, round(min(self.beams, np.sqrt(self.beams * aspect))))
@@ -235,7 +229,7 @@ class RadarSensor:
         angles[:, 1] = np.arcsin(rng.uniform(-1, 1, size=len(rows)) * np.sin(self.sidelobe_fov_rad / 2))
         return _Echoes(surface.range_m[rows], angles, surface.power_db[rows])
 
-    def _clutter(self, angles: FloatArray, range_m: FloatArray, rng: np.random.Generator) -> _Echoes:
+    def _clutter(self, angles: Floats, range_m: Floats, rng: np.random.Generator) -> _Echoes:
         """Weak false returns near the sensor, and anywhere along a beam in front of its surface."""
         beam = rng.integers(len(angles), size=rng.poisson(self.clutter_per_scan))
         free = np.minimum(range_m[beam], self.max_range_m)
@@ -247,7 +241,7 @@ class RadarSensor:
         rows = (distance >= self.min_range_m) & (distance < 0.95 * free)
         return _Echoes(distance[rows], angles[beam[rows]], power[rows])
 
-    def _phantoms(self, rays: _Rays, R: FloatArray, seed: int, rng: np.random.Generator) -> _Echoes:
+    def _phantoms(self, rays: _Rays, R: Floats, seed: int, rng: np.random.Generator) -> _Echoes:
         """Weak false returns behind surfaces, more behind far ones, whose beams are wider."""
         # Lasting ones have the same places in all scans of a seed: at most one per cell of space.
         lasting = self.phantom_lasting_share
@@ -268,7 +262,7 @@ class RadarSensor:
         angles = np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
         return _Echoes(np.sqrt(x**2 + y**2 + z**2), angles, power)
 
-    def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> Scan:
+    def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> SimulatedScan:
         """Add sensor noise, apply the detection threshold, quantise and clip the intensities."""
         noise = rng.standard_normal((len(echoes.range_m), 4))
         # Returns that noise lifts above the threshold count as if at it.
@@ -283,21 +277,20 @@ class RadarSensor:
         rows = (power >= self.threshold_db) & (range_m >= self.min_range_m) & (range_m <= self.max_range_m)
         points = range_m[rows, None] * unit_vectors(angles[rows])
         intensities = np.clip(power[rows], self.floor_db, self.saturation_db).astype(np.float32)
-        noiseless = np.clip(
-            np.broadcast_to(echoes.noiseless_db, rows.shape)[rows], self._least_db, self.saturation_db
-        )
+        noiseless = np.broadcast_to(echoes.noiseless_db, rows.shape)[rows]
+        noiseless = np.clip(noiseless, self._least_db, self.saturation_db).astype(np.float32)
         kinds = np.full(len(points), kind, dtype=np.int8)
-        return Scan(points.astype(np.float32), intensities, noiseless.astype(np.float32), kinds)
+        return SimulatedScan(points.astype(np.float32), intensities, noiseless, kinds)
 
 
-def unit_vectors(angles: FloatArray) -> FloatArray:
+def unit_vectors(angles: Floats) -> Floats:
     """Unit vectors (N, 3), sensor frame, of azimuths and elevations (N, 2), rad."""
     azimuth, elevation = angles[:, 0], angles[:, 1]
     cos = np.cos(elevation)
     return np.stack([cos * np.cos(azimuth), cos * np.sin(azimuth), np.sin(elevation)], axis=1)
 
 
-def _hash(cells: NDArray[np.int64], key: int) -> FloatArray:
+def _hash(cells: Ints, key: int) -> Floats:
     """Hash rows (N, 3) of integers to numbers in [0, 1), reproducible by key."""
     mixed = np.full(len(cells), key, dtype=np.uint64)
     for column in (*cells.astype(np.uint64).T, np.uint64(0)):
@@ -308,10 +301,9 @@ def _hash(cells: NDArray[np.int64], key: int) -> FloatArray:
     return (mixed >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
-def _speckle_db(looks: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _speckle_db(looks: Floats, rng: np.random.Generator) -> Floats:
     """Fading (N,), dB, for numbers of scatterers (N,)."""
     # Its median is 0, so a fit with the L1 loss, which estimates medians, finds the noiseless intensity.
     power = rng.standard_gamma(looks)
     values, index = np.unique(looks, return_inverse=True)
-    fading: FloatArray = 10 * np.log10(np.maximum(power, 1e-12) / gammaincinv(values, 0.5)[index])
-    return fading
+    return 10 * np.log10(np.maximum(power, 1e-12) / gammaincinv(values, 0.5)[index])

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import whole_number
 
 from . import materials
@@ -17,8 +17,7 @@ from .radar import RadarSensor, generator
 from .simulation import Simulation, simulate
 from .world import Box, CornerReflector, Pole, Primitive, Scene, Terrain
 
-FloatArray = NDArray[np.float64]
-Path = Callable[[FloatArray], FloatArray]
+Path = Callable[[Floats], Floats]
 """Maps curve parameters (N,), 0..1 on the driven part, to positions (N, 2), world frame, m."""
 
 _BURIED_M = 1.0  # solids extend this far into the ground, which leaves no gap on a slope
@@ -43,7 +42,7 @@ class Site:
     def fill(
         self,
         things: Iterable[tuple[str, tuple[int, int], tuple[float, float]]],
-        place: Callable[[float, float], tuple[FloatArray, float]],
+        place: Callable[[float, float], tuple[Floats, float]],
     ) -> None:
         """Add numbers of things, by the names of their methods, at positions and yaws that `place` draws within limits.
 
@@ -53,30 +52,30 @@ class Site:
             for _ in range(int(self.rng.integers(*counts))):
                 any(getattr(self, name)(*place(*limits)) for _ in range(10))
 
-    def beside(self, path: Path, u: float, near: float, far: float) -> tuple[FloatArray, float]:
+    def beside(self, path: Path, u: float, near: float, far: float) -> tuple[Floats, float]:
         """Random place `near` to `far` m to one side of a path at `u`, (2,), and the path's direction there, rad."""
         ahead, here = path(np.array([u + 0.01, u]))
         yaw = float(np.arctan2(*(ahead - here)[::-1]))
         side = self.rng.choice([-1.0, 1.0]) * self.rng.uniform(near, far)
         return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
-    def building(self, xy: FloatArray, yaw: float) -> bool:
+    def building(self, xy: Floats, yaw: float) -> bool:
         """Add a building of concrete or brick, 9 to 16 m long."""
         material = vary(self.rng, materials.CONCRETE if self.rng.random() < 0.5 else materials.BRICK)
         size = self.rng.uniform([9, 6, 5], [16, 9, 9])
         return self._block(xy, yaw + self.rng.normal(0, 0.15), size, material)
 
-    def wall(self, xy: FloatArray, yaw: float) -> bool:
+    def wall(self, xy: Floats, yaw: float) -> bool:
         """Add a free-standing wall, 1.4 to 2.6 m high."""
         size = self.rng.uniform([5, 0.25, 1.4], [12, 0.4, 2.6])
         return self._block(xy, yaw + self.rng.normal(0, 0.15), size, vary(self.rng, materials.CONCRETE))
 
-    def hedge(self, xy: FloatArray, yaw: float) -> bool:
+    def hedge(self, xy: Floats, yaw: float) -> bool:
         """Add a hedge along a road, 1 to 2 m high."""
         size = self.rng.uniform([4, 0.7, 1.0], [14, 1.2, 2.0])
         return self._block(xy, yaw + self.rng.normal(0, 0.05), size, vary(self.rng, materials.TREE))
 
-    def car(self, xy: FloatArray, yaw: float) -> bool:
+    def car(self, xy: Floats, yaw: float) -> bool:
         """Add a car of two boxes: the body, and the cabin on top."""
         metal = vary(self.rng, materials.METAL)
         yaw, size = yaw + self.rng.normal(0, 0.05), self.rng.uniform([3.9, 1.7, 0.8], [4.8, 1.9, 1.0])
@@ -86,7 +85,7 @@ class Site:
         self.add_box(xy, yaw, self._ground(xy) + size[2] - 0.05, cabin, metal)
         return True
 
-    def pole(self, xy: FloatArray, _yaw: float) -> bool:
+    def pole(self, xy: Floats, _yaw: float) -> bool:
         """Add a lamp post of steel or the trunk of a tree."""
         tree = self.rng.random() < 0.4
         radius = self.rng.uniform(0.15, 0.3) if tree else self.rng.uniform(0.06, 0.12)
@@ -94,7 +93,7 @@ class Site:
         material = vary(self.rng, materials.TREE if tree else materials.STEEL_POLE)
         return self.reserve([(*xy, radius)]) and self.add_pole(xy, radius, height, material)
 
-    def tree(self, xy: FloatArray, _yaw: float) -> bool:
+    def tree(self, xy: Floats, _yaw: float) -> bool:
         """Add a tree with a trunk, and a crown that begins 2 to 3 m above the ground."""
         radius, crown = self.rng.uniform(0.15, 0.35), self.rng.uniform([1.2, 2.0], [2.6, 5.0])
         if not self.reserve([(*xy, 0.5 * float(crown[0]))]):
@@ -105,14 +104,14 @@ class Site:
         self.solids.append(Pole(np.array([*xy, bottom]), float(crown[0]), float(crown[1]), wood))
         return True
 
-    def basket(self, xy: FloatArray, facing: float) -> None:
+    def basket(self, xy: Floats, facing: float) -> None:
         """Add a basketball hoop: a post, and a board 0.6 m from it towards x · `facing`, where `facing` is 1 or -1."""
         if self.reserve([(*xy, 0.3)]):
             self.add_pole(xy, 0.1, 3.2, materials.STEEL_POLE)
             at, board = xy + np.array([0.6 * facing, 0.0]), np.array([0.06, 1.8, 1.05])
             self.add_box(at, 0.0, self._ground(xy) + 2.9, board, materials.METAL)
 
-    def _ground(self, xy: FloatArray) -> float:
+    def _ground(self, xy: Floats) -> float:
         return float(self.terrain.height(xy[None])[0])
 
     def reserve(self, circles: list[tuple[float, float, float]]) -> bool:
@@ -124,7 +123,7 @@ class Site:
         self._taken += circles
         return True
 
-    def _block(self, xy: FloatArray, yaw: float, size: FloatArray, material: Material) -> bool:
+    def _block(self, xy: Floats, yaw: float, size: Floats, material: Material) -> bool:
         """Put a box of length, width and height on the ground, unless it would overlap."""
         along = np.array([np.cos(yaw), np.sin(yaw)])
         spots = np.linspace(-0.5, 0.5, max(1, round(size[0] / size[1]))) * max(0.0, size[0] - size[1])
@@ -134,13 +133,11 @@ class Site:
         self.add_box(xy, yaw, bottom, np.array([*size[:2], size[2] + _BURIED_M]), material)
         return True
 
-    def add_box(
-        self, xy: FloatArray, yaw: float, bottom: float, size: FloatArray, material: Material
-    ) -> None:
+    def add_box(self, xy: Floats, yaw: float, bottom: float, size: Floats, material: Material) -> None:
         """Add a box of a size (3,) with its lower face at the height `bottom`, m."""
         self.solids.append(Box(np.array([*xy, bottom + size[2] / 2]), size / 2, yaw, material))
 
-    def add_pole(self, xy: FloatArray, radius_m: float, height_m: float, material: Material) -> bool:
+    def add_pole(self, xy: Floats, radius_m: float, height_m: float, material: Material) -> bool:
         """Add a pole with this height above the ground, and return True."""
         base = np.array([*xy, self._ground(xy) - _BURIED_M])
         self.solids.append(Pole(base, radius_m, height_m + _BURIED_M, material))
@@ -149,13 +146,13 @@ class Site:
 
 def along_path(
     terrain: Terrain,
-    path: Callable[[FloatArray], FloatArray],
+    path: Callable[[Floats], Floats],
     frames: int,
     *,
     height_m: float,
     rng: np.random.Generator,
-    look_at: FloatArray | None = None,
-) -> FloatArray:
+    look_at: Floats | None = None,
+) -> Floats:
     """Poses (frames, 4, 4), T_world_sensor, at equal steps along a path, with slight heave, pitch and roll of a vehicle.
 
     The mean height of the sensor is `height_m`. It faces along the path, or the position `look_at` (2,), world, m.
@@ -260,7 +257,7 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
     length, width = rng.uniform(13, 16), rng.uniform(8, 11)  # half, of the court
     start = rng.uniform(0, 2 * np.pi)
 
-    def path(u: FloatArray) -> FloatArray:
+    def path(u: Floats) -> Floats:
         angle = start + 2 * np.pi * u
         return np.stack([0.6 * length * np.cos(angle), 0.6 * width * np.sin(angle)], axis=1)
 
@@ -268,7 +265,7 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
     for end in (-1.0, 1.0):
         site.basket(np.array([end * (length - 1.0), 0.0]), facing=-end)
 
-    def round_about(near: float, far: float) -> tuple[FloatArray, float]:
+    def round_about(near: float, far: float) -> tuple[Floats, float]:
         angle = rng.uniform(0, 2 * np.pi)
         at = np.array([length * np.cos(angle), width * np.sin(angle)]) * rng.uniform(near, far)
         return at, float(np.arctan2(width * np.cos(angle), -length * np.sin(angle)))
@@ -312,10 +309,9 @@ def wall(seed: int = 0, frames: int | None = None) -> Simulation:
     site.solids.append(CornerReflector(mounted, np.array([1.0, 0.0, 0.0]), edge_m, materials.REFLECTOR))
     radius = 10.0 + rng.uniform(-0.5, 0.5)
 
-    def path(u: FloatArray) -> FloatArray:
+    def path(u: Floats) -> Floats:
         angle, distance = np.deg2rad(160) * (u - 0.5), radius + 0.1 * np.sin(9 * u)
-        xy: FloatArray = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        return xy
+        return distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     return _drive(site, path, (frames, 90), HUGIN_A4, "wall", seed, height_m=1.2, look_at=mounted[:2])
 
@@ -351,7 +347,7 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
 def _lane(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
     """A lane along x that meanders as a sine."""
 
-    def path(u: FloatArray) -> FloatArray:
+    def path(u: Floats) -> Floats:
         x = length_m * u
         return np.stack([x, sway_m * np.sin(2 * np.pi * x / wave_m + phase)], axis=1)
 
@@ -367,7 +363,7 @@ def _drive(
     seed: int,
     *,
     height_m: float,
-    look_at: FloatArray | None = None,
+    look_at: Floats | None = None,
 ) -> Simulation:
     """Scan a site along a path. `frames`: number of scans, and its default."""
     count = frames[1] if frames[0] is None else whole_number(frames[0], "frames", 1)
@@ -376,7 +372,5 @@ def _drive(
     return simulate(Scene(site.solids, site.terrain), sensor, poses, name=name, seed=seed)
 
 
-SCENES: dict[str, Callable[..., Simulation]] = {
-    scene.__name__: scene for scene in (hugin, oculii, wall, astyx)
-}
+SCENES: dict[str, Callable[..., Simulation]] = {s.__name__: s for s in (hugin, oculii, wall, astyx)}
 """Simulations by name; each takes `seed` and `frames`."""

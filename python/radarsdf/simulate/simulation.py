@@ -8,12 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.arrays import Bools, Floats, Floats32
 from radarsdf.checks import check_poses, instance
 
 from .radar import Origin, RadarSensor, generator, unit_vectors
 from .world import Scene
-
-FloatArray = NDArray[np.float64]
 
 _LIDAR_RAYS = 10_000  # rays per pose
 _LIDAR_SIGMA_M = 0.01
@@ -27,11 +26,11 @@ class Lidar:
 
     scene: Scene
     sensor: RadarSensor
-    poses: FloatArray  # (F, 4, 4) T_world_sensor, m
+    poses: Floats  # (F, 4, 4) T_world_sensor, m
     seed: int
 
     @cached_property
-    def points(self) -> FloatArray:
+    def points(self) -> Floats:
         """(M, 3) world, m, computed on first access: ray casting takes as long as the scans."""
         rng, sensor = generator(self.seed, _LIDAR_STREAM), self.sensor
         found = [np.zeros((0, 3))]
@@ -59,12 +58,10 @@ class Simulation:
     There are F scans, with N_i returns in scan i.
     """
 
-    points: list[NDArray[np.float32]]  # F arrays (N_i, 3), sensor frame, m
-    poses: FloatArray  # (F, 4, 4) T_world_sensor, m
-    intensities: list[NDArray[np.float32]]  # F arrays (N_i,), dB
-    noiseless_intensities: list[
-        NDArray[np.float32]
-    ]  # F arrays (N_i,), dB, without speckle and noise; NaN: false return
+    points: list[Floats32]  # F arrays (N_i, 3), sensor frame, m
+    poses: Floats  # (F, 4, 4) T_world_sensor, m
+    intensities: list[Floats32]  # F arrays (N_i,), dB
+    noiseless_intensities: list[Floats32]  # F arrays (N_i,), dB, without speckle and noise; NaN: false return
     origin_kind: list[NDArray[np.int8]]  # F arrays (N_i,), codes of `Origin`
     scene: Scene
     sensor: RadarSensor
@@ -73,7 +70,7 @@ class Simulation:
     lidar: Lidar
 
     @property
-    def ground_truth(self) -> FloatArray:
+    def ground_truth(self) -> Floats:
         """(M, 3) lidar points of the surfaces that the radar can detect, world frame, m.
 
         They have a noise of 1 cm along the ray, and at most one point per cell of 5 cm.
@@ -84,15 +81,14 @@ class Simulation:
         """Number of scans."""
         return len(self.points)
 
-    def world_points(self) -> FloatArray:
+    def world_points(self) -> Floats:
         """All returns, false ones included: (N, 3) float64, world frame, m, in the order of the scans."""
         scans = zip(self.points, self.poses, strict=True)
         return np.concatenate([p.astype(np.float64) @ T[:3, :3].T + T[:3, 3] for p, T in scans])
 
-    def is_surface(self) -> NDArray[np.bool_]:
+    def is_surface(self) -> Bools:
         """Mask of the returns from a surface, (N,) bool, in the order of `world_points`."""
-        surface: NDArray[np.bool_] = np.concatenate(self.origin_kind) == Origin.SURFACE
-        return surface
+        return np.concatenate(self.origin_kind) == Origin.SURFACE
 
     def intensity_noise_floor(self) -> float:
         """Mean absolute difference between measured and noiseless intensities of the surface returns, dB.
@@ -105,7 +101,7 @@ class Simulation:
         return float(error[surface].mean(dtype=np.float64)) if surface.any() else float("nan")
 
 
-def simulate(scene: Scene, sensor: RadarSensor, poses: FloatArray, *, name: str, seed: int = 0) -> Simulation:
+def simulate(scene: Scene, sensor: RadarSensor, poses: Floats, *, name: str, seed: int = 0) -> Simulation:
     """Scan a scene from every pose.
 
     Parameters

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from radarsdf.arrays import Floats, Ints
 
 from .materials import Material
 
-__all__ = ["Box", "CornerReflector", "Hits", "Pole", "Primitive", "Scene", "Terrain"]
-
-FloatArray = NDArray[np.float64]
-_First = tuple[FloatArray, FloatArray]
+_First = tuple[Floats, Floats]
 
 
 class Primitive(ABC):
@@ -27,46 +26,45 @@ class Primitive(ABC):
     material: Material
 
     @abstractmethod
-    def bounding_sphere(self) -> tuple[FloatArray, float]:
+    def bounding_sphere(self) -> tuple[Floats, float]:
         """Centre (3,) and radius of a sphere that contains the part."""
 
     @abstractmethod
-    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+    def intersect(self, origins: Floats, directions: Floats, max_range_m: Floats) -> _First:
         """First hits of (N, 3) rays: ranges (N,), inf beyond `max_range_m` (N,), and unit normals (N, 3)."""
 
     @abstractmethod
-    def signed_distance(self, points: FloatArray) -> FloatArray:
+    def signed_distance(self, points: Floats) -> Floats:
         """Distances (N,) of points (N, 3) to the surface, negative inside."""
 
-    def echo_db(self, points: FloatArray, directions: FloatArray, normals: FloatArray) -> FloatArray:
+    def echo_db(self, points: Floats, directions: Floats, normals: Floats) -> Floats:
         """Echo (N,), dB, of hits (N, 3) seen along unit directions (N, 3), without the loss by range."""
         return self.material.echo_db(points, -np.einsum("ni,ni->n", directions, normals))
 
 
-def _quotient(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+def _quotient(numerator: Floats, denominator: Floats) -> Floats:
     """Divide with a tiny denominator instead of zero, so that a ray parallel to a plane hits it very far away."""
     tiny = np.abs(denominator) < 1e-12
-    result: FloatArray = numerator / np.where(tiny, np.where(denominator < 0, -1e-12, 1e-12), denominator)
-    return result
+    return numerator / np.where(tiny, np.where(denominator < 0, -1e-12, 1e-12), denominator)
 
 
 @dataclass(frozen=True, eq=False)
 class Box(Primitive):
     """A solid box, rotated about the vertical axis only."""
 
-    center: FloatArray  # (3,) world, m
-    half_extents: FloatArray  # (3,) along its own axes, m
+    center: Floats  # (3,) world, m
+    half_extents: Floats  # (3,) along its own axes, m
     yaw_rad: float
     material: Material
 
-    def _rotation(self) -> FloatArray:
+    def _rotation(self) -> Floats:
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
-    def bounding_sphere(self) -> tuple[FloatArray, float]:
+    def bounding_sphere(self) -> tuple[Floats, float]:
         return self.center, float(np.linalg.norm(self.half_extents))
 
-    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+    def intersect(self, origins: Floats, directions: Floats, max_range_m: Floats) -> _First:
         R_world_box = self._rotation()
         origin, direction = (origins - self.center) @ R_world_box, directions @ R_world_box
         corner = np.copysign(self.half_extents, direction)
@@ -78,26 +76,25 @@ class Box(Primitive):
         local[rows, axis] = -np.copysign(1.0, direction[rows, axis])
         return t, local @ R_world_box.T
 
-    def signed_distance(self, points: FloatArray) -> FloatArray:
+    def signed_distance(self, points: Floats) -> Floats:
         q = np.abs((points - self.center) @ self._rotation()) - self.half_extents
-        distance: FloatArray = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
-        return distance
+        return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Pole(Primitive):
     """A solid vertical cylinder."""
 
-    base: FloatArray  # (3,) centre of the lower end, world, m
+    base: Floats  # (3,) centre of the lower end, world, m
     radius_m: float
     height_m: float
     material: Material
 
-    def bounding_sphere(self) -> tuple[FloatArray, float]:
+    def bounding_sphere(self) -> tuple[Floats, float]:
         center = self.base + np.array([0, 0, self.height_m / 2])
         return center, float(np.hypot(self.radius_m, self.height_m / 2))
 
-    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+    def intersect(self, origins: Floats, directions: Floats, max_range_m: Floats) -> _First:
         o, d = origins - self.base, directions
         a = np.maximum(d[:, 0] ** 2 + d[:, 1] ** 2, 1e-24)
         b = o[:, 0] * d[:, 0] + o[:, 1] * d[:, 1]
@@ -118,11 +115,11 @@ class Pole(Primitive):
         normals[cap < side, 2] = -np.sign(d[cap < side, 2])
         return t, normals
 
-    def signed_distance(self, points: FloatArray) -> FloatArray:
+    def signed_distance(self, points: Floats) -> Floats:
         p = points - self.base
         radial = np.hypot(p[:, 0], p[:, 1]) - self.radius_m
         vertical = np.abs(p[:, 2] - self.height_m / 2) - self.height_m / 2
-        outside: FloatArray = np.hypot(np.maximum(radial, 0), np.maximum(vertical, 0))
+        outside: Floats = np.hypot(np.maximum(radial, 0), np.maximum(vertical, 0))
         return outside + np.minimum(np.maximum(radial, vertical), 0)
 
 
@@ -134,27 +131,26 @@ class CornerReflector(Primitive):
     lobe that depends only on the angle to the axis: the three plates together reflect a wave back to its source.
     """
 
-    apex: FloatArray  # (3,) world, m
-    axis: FloatArray  # (3,) unit vector out of the opening, world
+    apex: Floats  # (3,) world, m
+    axis: Floats  # (3,) unit vector out of the opening, world
     edge_m: float  # length of the three edges that meet in the apex
     material: Material  # material of the plates
     retro_db: float = 25.0  # echo on the axis relative to `material.reflectivity_db` [dB]
     retro_width_rad: float = 0.28  # standard deviation of the lobe; 0.28 is the usual 3 dB cone of 38 degrees
 
-    def _edges(self) -> FloatArray:
+    def _edges(self) -> Floats:
         """Unit vectors (3, 3) from the apex along the edges, one per row, at equal angles to the axis."""
         up = np.array([0.0, 0.0, 1.0]) if abs(self.axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
         side = np.cross(up, self.axis)
         side /= np.linalg.norm(side)
         turn = np.arange(3)[:, None] * (2 * np.pi / 3) + np.pi / 2
         ring = np.cos(turn) * side + np.sin(turn) * np.cross(self.axis, side)
-        edges: FloatArray = self.axis / np.sqrt(3) + ring * np.sqrt(2 / 3)
-        return edges
+        return self.axis / np.sqrt(3) + ring * np.sqrt(2 / 3)
 
-    def bounding_sphere(self) -> tuple[FloatArray, float]:
+    def bounding_sphere(self) -> tuple[Floats, float]:
         return self.apex, self.edge_m
 
-    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+    def intersect(self, origins: Floats, directions: Floats, max_range_m: Floats) -> _First:
         edges = self._edges()
         o, d = (origins - self.apex) @ edges.T, directions @ edges.T  # in the frame of the three edges
         best, plate = np.full(len(o), np.inf), np.zeros(len(o), dtype=np.int64)
@@ -168,7 +164,7 @@ class CornerReflector(Primitive):
         facing = -np.sign(d[np.arange(len(d)), plate])
         return best, facing[:, None] * edges[plate]
 
-    def signed_distance(self, points: FloatArray) -> FloatArray:
+    def signed_distance(self, points: Floats) -> Floats:
         p = (points - self.apex) @ self._edges().T
         best = np.full(len(p), np.inf)
         for i in range(3):
@@ -181,22 +177,21 @@ class CornerReflector(Primitive):
             best = np.minimum(best, np.sqrt((u - x) ** 2 + (v - y) ** 2 + p[:, i] ** 2))
         return best
 
-    def echo_db(self, points: FloatArray, directions: FloatArray, normals: FloatArray) -> FloatArray:
+    def echo_db(self, points: Floats, directions: Floats, normals: Floats) -> Floats:
         plates = super().echo_db(points, directions, normals)
         angle = np.arccos(np.clip(-directions @ self.axis, -1, 1))
         lobe_db = 10 * np.log10(np.e) * 0.5 * (angle / self.retro_width_rad) ** 2
         retro = self.material.reflectivity_db + self.retro_db - lobe_db
-        echo: FloatArray = 10 * np.log10(10 ** (plates / 10) + 10 ** (retro / 10))
-        return echo
+        return 10 * np.log10(10 ** (plates / 10) + 10 ** (retro / 10))
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain(Primitive):
     """Height field z(x, y) = level + Σ amplitude · sin(wave · (x, y) + phase), solid below and without an edge."""
 
-    waves: FloatArray  # (K, 2) wave vectors [rad/m]
-    amplitudes: FloatArray  # (K,) [m]
-    phases: FloatArray  # (K,) [rad]
+    waves: Floats  # (K, 2) wave vectors [rad/m]
+    amplitudes: Floats  # (K,) [m]
+    phases: Floats  # (K,) [rad]
     level_m: float
     material: Material
 
@@ -225,25 +220,23 @@ class Terrain(Primitive):
         amplitudes = np.asarray(roughness_m / 2.5**octave, dtype=np.float64)
         return cls(waves, amplitudes, rng.uniform(0, 2 * np.pi, size=10), 0.0, material)
 
-    def height(self, xy: FloatArray) -> FloatArray:
+    def height(self, xy: Floats) -> Floats:
         """Height (N,), m, of the ground at positions (N, 2), world, m."""
-        height: FloatArray = self.level_m + np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes
-        return height
+        return self.level_m + np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes
 
-    def _slope(self, xy: FloatArray) -> FloatArray:
+    def _slope(self, xy: Floats) -> Floats:
         """Gradient (N, 2) of the height."""
-        slope: FloatArray = (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves
-        return slope
+        return (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves
 
-    def _normals(self, xy: FloatArray) -> FloatArray:
+    def _normals(self, xy: Floats) -> Floats:
         normals = np.concatenate([-self._slope(xy), np.ones((len(xy), 1))], axis=1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return normals
 
-    def bounding_sphere(self) -> tuple[FloatArray, float]:
+    def bounding_sphere(self) -> tuple[Floats, float]:
         return np.zeros(3), np.inf
 
-    def intersect(self, origins: FloatArray, directions: FloatArray, max_range_m: FloatArray) -> _First:
+    def intersect(self, origins: Floats, directions: Floats, max_range_m: Floats) -> _First:
         # Rays from above advance until they are below the ground. The steepest possible slope bounds the length of a
         # safe step, but a step is at least 10 cm + 1 % of the range, so a crest of millimetres can be missed.
         steepest = float(np.abs(self.amplitudes) @ np.linalg.norm(self.waves, axis=1))
@@ -283,7 +276,7 @@ class Terrain(Primitive):
         normals[rows] = self._normals((o + x[:, None] * d)[:, :2])
         return result, normals
 
-    def signed_distance(self, points: FloatArray) -> FloatArray:
+    def signed_distance(self, points: Floats) -> Floats:
         # Exact for points nearer to the ground than its radius of curvature, some metres. Farther away, the
         # result is the distance to some point of the ground: possibly too large, never too small.
         foot = points[:, :2].copy()
@@ -301,9 +294,9 @@ class Terrain(Primitive):
 class Hits(NamedTuple):
     """First hits of N rays."""
 
-    range_m: FloatArray  # (N,) inf without a hit
-    normals: FloatArray  # (N, 3) unit vectors, world, towards the ray's origin; zero without a hit
-    primitive: NDArray[np.int64]  # (N,) index into `Scene.parts`, -1 without a hit
+    range_m: Floats  # (N,) inf without a hit
+    normals: Floats  # (N, 3) unit vectors, world, towards the ray's origin; zero without a hit
+    primitive: Ints  # (N,) index into `Scene.parts`, -1 without a hit
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,7 +354,7 @@ class Scene:
             nearest[rows], normals[rows], primitive[rows] = t[hit], n[hit], index
         return Hits(np.where(primitive >= 0, nearest, np.inf), normals, primitive)
 
-    def signed_distance(self, points: ArrayLike) -> FloatArray:
+    def signed_distance(self, points: ArrayLike) -> Floats:
         """Compute signed distances to the union of all parts.
 
         Parameters
@@ -381,7 +374,7 @@ class Scene:
             np.minimum(best, part.signed_distance(p), out=best)
         return best
 
-    def echo_db(self, points: FloatArray, directions: FloatArray, hits: Hits) -> FloatArray:
+    def echo_db(self, points: Floats, directions: Floats, hits: Hits) -> Floats:
         """Echo (N,), dB, without the loss by range, of the hits of rays at points (N, 3); -inf without a hit."""
         echo = np.full(len(points), -np.inf)
         for index in np.unique(hits.primitive[hits.primitive >= 0]):
@@ -389,7 +382,7 @@ class Scene:
             echo[rows] = self.parts[index].echo_db(points[rows], directions[rows], hits.normals[rows])
         return echo
 
-    def material_values(self, hits: Hits, field: str, missing: float) -> FloatArray:
+    def material_values(self, hits: Hits, field: str, missing: float) -> Floats:
         """A numeric field of the material at each hit, (N,) float64; `missing` without a hit."""
         table = np.array([*(getattr(part.material, field) for part in self.parts), missing], dtype=np.float64)
         return table[hits.primitive]

@@ -24,7 +24,7 @@ from radarsdf.io.read import read
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.scans import Scan, Scans
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
-from radarsdf.tiles.planning import SCANS_FILE, CheckedScans, make_plan, read_rays
+from radarsdf.tiles.planning import SCANS_FILE, ScanStream, make_plan, read_rays
 from radarsdf.tiles.tiled_map import TiledMap
 
 _TILE_CELLS = 512  # edge of a tile, leaf cells
@@ -98,7 +98,7 @@ def plan_tiles(
     folder = path_of(out, "out")
     config = FitConfig() if config is None else instance(config, FitConfig, "config")
     grid = _grid(config, tile_size, halo)
-    given = CheckedScans(read(scans) if isinstance(scans, (str, PathLike)) else scans)
+    given = ScanStream(read(scans) if isinstance(scans, (str, PathLike)) else scans)
     if not (folder / PLAN).is_file():
         if folder.is_dir() and not {path.name for path in folder.iterdir()} <= _OURS:
             msg = f"{folder} holds other files: give a new folder"
@@ -117,7 +117,7 @@ def plan_tiles(
     return _known_plan(folder, config, grid, given)
 
 
-def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: CheckedScans) -> Plan:
+def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: ScanStream) -> Plan:
     """The plan in a folder. Raises a ValueError if it is of other scans or settings."""
     plan = Plan.load(folder)
     unknown = [name for name in NOISE_SETTINGS if getattr(config.returns, name) is None]

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from radarsdf._core import cell_keys
 from radarsdf.checks import are_rigid, one_for_each_scan
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.average import SurfaceReturns
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
 from radarsdf.returns.intensities import Intensities, Plausible
 from radarsdf.returns.moving import StaticReturns
-from radarsdf.returns.noise import SensorNoise
+from radarsdf.returns.noise import SensorNoise, sensor_noise
+from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import LeftOut, Rays, check_range, middle_scan, prepare, rays_from
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import lattice_of
@@ -43,7 +43,7 @@ _SENSOR_SCANS = 512  # largest sample of scans for the sensor model
 _SAMPLED_TILES = 4  # tiles that estimate noise and clutter ratio
 
 
-class CheckedScans:
+class ScanStream:
     """Scans that are checked one by one in each pass. Those without a rigid pose are skipped."""
 
     def __init__(self, scans: Iterable[Any]) -> None:
@@ -74,7 +74,7 @@ class CheckedScans:
         self.digest = digest.hexdigest()
 
 
-def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
+def make_plan(scans: ScanStream, folder: Path, config: FitConfig, grid: TileGrid) -> Plan:
     """Read all scans once, write the rays of each tile, and return the plan."""
     planner, number = _Planner(folder, config, grid), 0
     for chunk in _chunks(scans, config.returns.accumulate_scans):
@@ -216,9 +216,8 @@ class _Planner:
             if len(noises) == _SAMPLED_TILES:
                 continue
             with ThreadPool(plan.config.num_threads) as workers:
-                surface = SurfaceReturns.of(rays, plan.config, workers.num_threads)
-            noises.append(surface.noise)
-            surfels = surface.surfels
+                surfels = Surfels.of(rays, plan.config.leaf_size_m, workers.num_threads)
+                noises.append(sensor_noise(surfels, rays, plan.config.returns, workers.num_threads))
             clutter += surfels.clutter_ratio() * len(rays)
             returns += len(rays)
             # Of the cells beyond, the tile has only the returns whose rays cross it.

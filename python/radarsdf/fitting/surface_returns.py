@@ -1,0 +1,103 @@
+"""The returns from which the surface is fitted: without ghosts, and for training moved towards flat surfels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from radarsdf.arrays import Bools, Ints32
+from radarsdf.config.fit_config import FitConfig
+from radarsdf.returns.ghosts import find_ghosts
+from radarsdf.returns.noise import SensorNoise, onto_surfels, sensor_noise
+from radarsdf.returns.planes import Surfels
+from radarsdf.returns.rays import Rays
+from radarsdf.returns.sums import MeanRays, ReturnCells, ScanSums
+
+
+@dataclass(frozen=True)
+class SurfaceReturns:
+    """Returns from which the surface is fitted, with their surfels and noise."""
+
+    rays: Rays  # for training, without ghosts and moved towards the flat surfel of their cell; otherwise all
+    count: int  # number of returns that are no ghosts
+    surfels: Surfels  # of all returns
+    noise: SensorNoise
+    means: MeanRays | None  # mean rays of the leaf cells without ghosts, to average. None for training
+    # (N,) False for ghosts. None if ghosts are not detected, or nothing needs it.
+    true: Bools | None
+
+    @classmethod
+    def of(
+        cls,
+        rays: Rays,
+        config: FitConfig,
+        num_threads: int,
+        inside: Bools | None = None,
+        sums: ScanSums | None = None,
+    ) -> SurfaceReturns:
+        """Clean `rays` by ``config.returns`` and select those `inside`, (N,); None: all. `sums`: of the rays, if known."""
+        needed_later = config.returns.free_space or inside is not None
+        by_return = config.train or (config.returns.drop_ghosts and needed_later)
+        cells = _cells_of(rays, config, sums, by_return, num_threads)
+        noise = sensor_noise(cells.surfels, rays, config.returns, num_threads)
+        clean = _returns_to_train if config.train else _returns_to_average
+        return clean(rays, cells, noise, config, inside, num_threads)
+
+
+class _Cells(NamedTuple):
+    surfels: Surfels
+    means: MeanRays | None  # None for training
+    of_rays: Ints32 | None  # (N,) row of the surfel's cell of each return, if asked for
+
+
+def _cells_of(
+    rays: Rays, config: FitConfig, sums: ScanSums | None, by_return: bool, num_threads: int
+) -> _Cells:
+    """Sum the returns in cells, unless `sums` are known."""
+    leaves = None
+    if sums is None:
+        leaves = ReturnCells.of(rays, config.leaf_size_m, num_threads)
+        sums = ScanSums.of_cells(rays, leaves, config.leaf_size_m, num_threads)
+    surfels, of_rays = Surfels.of_sums(sums, num_threads), None
+    if by_return and leaves is not None:
+        of_rays = surfels.cells_of_leaves(leaves.keys, num_threads)[leaves.cell_of_ray]
+    elif by_return:
+        of_rays = surfels.cells_at(rays.points, num_threads)
+    return _Cells(surfels, None if config.train else MeanRays.of_sums(sums, num_threads), of_rays)
+
+
+def _returns_to_train(
+    rays: Rays, cells: _Cells, noise: SensorNoise, config: FitConfig, inside: Bools | None, num_threads: int
+) -> SurfaceReturns:
+    """Drop ghosts, found by all rays, and move the other returns towards their surfels."""
+    surfels, true, kept = cells.surfels, None, inside
+    assert cells.of_rays is not None
+    if config.returns.drop_ghosts:
+        true = ~find_ghosts(surfels, rays, cells.of_rays, noise, num_threads)[cells.of_rays]
+        kept = true if inside is None else true & inside
+    if config.returns.onto_planes:
+        rays = onto_surfels(surfels, rays, cells.of_rays, noise, kept, num_threads)
+    elif kept is not None:
+        rays = rays.select(kept)
+    return SurfaceReturns(rays, len(rays), surfels, noise, None, true)
+
+
+def _returns_to_average(
+    rays: Rays, cells: _Cells, noise: SensorNoise, config: FitConfig, inside: Bools | None, num_threads: int
+) -> SurfaceReturns:
+    """Drop ghosts, found by the mean rays of leaf cells."""
+    surfels, means, true, count = cells.surfels, cells.means, None, len(rays)
+    assert means is not None
+    if config.returns.drop_ghosts:
+        cell_of_mean = surfels.cells_of_leaves(means.keys, num_threads)
+        of_ghosts = find_ghosts(surfels, means, cell_of_mean, noise, num_threads)
+        means = means.select(~of_ghosts[cell_of_mean])
+        true = None if cells.of_rays is None else ~of_ghosts[cells.of_rays]
+        count = int(surfels.counts[~of_ghosts].sum())
+    if inside is not None:
+        count = int(np.count_nonzero(inside if true is None else true & inside))
+        leaves = ReturnCells.of(rays.select(inside), config.leaf_size_m, num_threads)
+        means = means.select(leaves.blocks.rows(means.keys, num_threads) >= 0)
+    return SurfaceReturns(rays, count, surfels, noise, means, true)
