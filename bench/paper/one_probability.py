@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from radarsdf._core import vertex_areas
 from radarsdf.evaluation import confidence_metrics, surface_metrics
-from radarsdf.map import queries
+from radarsdf.map.confidence import own_surface, probabilities, terms
 from radarsdf.map.contents import MapContents
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Limits, Tally
@@ -58,7 +58,7 @@ class Example:
     voxel_m: float
     surface: Surface
     columns: FloatArray  # (V, K) regressors
-    own: FloatArray  # (V,) factor of the probability, see queries.own_surface
+    own: FloatArray  # (V,) factor of the probability, see radarsdf.map.confidence.own_surface
     reach: FloatArray  # (V,) upper limit of a probability; 0 without returns
     areas_m2: FloatArray  # (V,)
     is_true: NDArray[np.bool_]  # (V,)
@@ -84,9 +84,9 @@ class Example:
             contents,
             VOXEL_M[preset],
             surface,
-            queries.terms(contents, surface.evidence).numpy(),
-            queries.own_surface(surface.evidence).numpy(),
-            queries.probabilities(contents, surface.evidence).reach.numpy(),
+            terms(contents, surface.evidence).numpy(),
+            own_surface(surface.evidence).numpy(),
+            probabilities(contents, surface.evidence).reach,
             vertex_areas(surface.vertices, surface.faces),
             distance_m <= leaf_m,
             np.concatenate([np.array(rows, np.int64) for rows in found]),
@@ -141,7 +141,7 @@ def models(examples: list[Example]) -> tuple[FloatArray, FloatArray]:
 
 
 def confidence(example: Example, numbers: FloatArray) -> FloatArray:
-    """(V,) confidence as by :func:`queries.probabilities`, with these coefficients."""
+    """(V,) confidence as by :func:`radarsdf.map.confidence.probabilities`, with these coefficients."""
     return np.minimum(example.predicted(numbers), example.reach)
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
@@ -109,16 +108,16 @@ class PlacedMap:
     def evidence(self, x: Floats, facing: Floats | None = None) -> PlaceEvidence:
         """Evidence at places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
         own = self.to_own(x)
-        evidence, sigma_m, confidence = self.radar_map.surface_at(torch.from_numpy(np.ascontiguousarray(own)))
+        evidence, sigma_m, confidence = self.radar_map.surface_at(own)
         distance_m, normals = self.radar_map.tangent_planes(own)
         normals = turned(normals, self.T_common_map[:3, :3])
         behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
         return PlaceEvidence(
             distance_m,
             normals,
-            sigma_m.double().numpy(),
-            confidence.double().numpy(),
-            evidence.hits.numpy().astype(np.float64),
+            sigma_m.astype(np.float64),
+            confidence.astype(np.float64),
+            evidence.hits.astype(np.float64),
             self._passes(self.to_own(behind)),
         )
 

@@ -215,9 +215,8 @@ def closed_form(contents: MapContents, rays: Rays, surfels: Surfels, num_threads
     assert rays.intensities is not None
 
     def network(points: Float32, directions: Float32, ranges_m: Float32) -> Float32:
-        sensors = torch.from_numpy(points - directions * ranges_m[:, None])
-        places = torch.from_numpy(points)
-        return scale.to_unit(queries.intensity(contents, places, sensors, extrapolate=True).numpy())
+        sensors = points - directions * ranges_m[:, None]
+        return scale.to_unit(queries.intensity(contents, points, sensors, extrapolate=True))
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
     ask = network if contents.config.trains_intensity else None

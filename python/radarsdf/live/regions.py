@@ -43,6 +43,11 @@ def regions_of(leaf_keys: Keys) -> Keys:
     return np.unique(leaf_keys >> REGION_BITS)
 
 
+def within(leaf_keys: Keys, regions: Keys) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the leaf cells in `regions`."""
+    return np.isin(leaf_keys >> REGION_BITS, regions)
+
+
 def regions_near(regions: Keys, reach: int) -> Keys:
     """Return the ascending keys of these regions, and of those at most `reach` away along each axis."""
     near = shifted(regions << REGION_BITS, REGION_CELLS * steps_near(reach))

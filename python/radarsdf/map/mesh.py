@@ -18,6 +18,7 @@ from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
+from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.threshold import Limits, Tally
@@ -38,7 +39,7 @@ class Surface:
 
     vertices: NDArray[np.float64]  # (V, 3) local frame, m
     faces: NDArray[np.int32]  # (F, 3) rows of the vertices, counter-clockwise seen from free space
-    evidence: queries.EvidenceAt  # at the vertices
+    evidence: EvidenceAt  # at the vertices
     confidence: NDArray[np.float32]  # (V,) see :meth:`Map.confidence`
     uncertainty_m: NDArray[np.float32]  # (V,) see :meth:`Map.uncertainty`
     tally: Tally  # area by confidence
@@ -55,8 +56,8 @@ class Surface:
         """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
         vertices, faces, searched = extract_triangles(contents, voxel_size, box, progress)
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
-        evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
-        return cls.from_triangles(contents, vertices, faces, evidence, searched)
+        points = queries.to_local(contents, vertices + contents.origin)
+        return cls.from_triangles(contents, vertices, faces, evidence(contents, points), searched)
 
     @classmethod
     def from_triangles(
@@ -64,16 +65,16 @@ class Surface:
         scene: WholeMap,
         vertices: NDArray[np.float64],
         faces: NDArray[np.int32],
-        evidence: queries.EvidenceAt,
+        evidence: EvidenceAt,
         cells_searched: int,
     ) -> Surface:
         """Build from triangles and the evidence at their vertices."""
-        found = queries.probabilities(scene, evidence)
-        confidence, uncertainty = found.confidence.float(), queries.uncertainty(scene, evidence).numpy()
-        areas_m2 = vertex_areas(vertices, faces)
-        columns = confidence.double(), found.covering, found.reach, evidence.hits.double()
-        tally = Tally.of(areas_m2, *(column.numpy() for column in columns))
-        return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)
+        found = probabilities(scene, evidence)
+        confidence = found.confidence.astype(np.float32)
+        columns = confidence.astype(np.float64), found.covering, found.reach, evidence.hits
+        tally = Tally.of(vertex_areas(vertices, faces), *columns)
+        sigma_m = uncertainty(scene, evidence)
+        return cls(vertices, faces, evidence, confidence, sigma_m, tally, cells_searched)
 
     def kept(self, limits: Limits) -> NDArray[np.bool_]:
         """Return a mask (F,) of the faces within the limits, without small components."""
@@ -142,10 +143,6 @@ def with_intensities(
     return mesh
 
 
-def local(contents: WholeMap, world: NDArray[np.float64]) -> torch.Tensor:
-    return queries.to_local(contents, torch.from_numpy(world))
-
-
 def within(
     limits: Limits,
     min_confidence: float,
@@ -160,8 +157,7 @@ def within(
 def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
     """Return a mask (F,) of the faces (F, 3) with all vertices in the mask `good` (V,)."""
     first, second, third = faces.T
-    found: NDArray[np.bool_] = good.take(first) & good.take(second) & good.take(third)
-    return found
+    return good.take(first) & good.take(second) & good.take(third)
 
 
 def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
@@ -232,9 +228,8 @@ def sample_lattice(
         voxels = voxels[((centres >= box[0]) & (centres <= box[1])).all(axis=1)]
     if voxel_size < leaf_size_m and not even:
         # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
-        voxels = voxels[
-            _occupied(contents, (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
-        ]
+        centres = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+        voxels = voxels[queries.occupied(contents, centres)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return corners, voxel_corners, distances_m, len(cells)
@@ -255,8 +250,7 @@ def crossed(
     values_m = distances_at(unique, corners, cell_corners)[cell_corners]
     columns = np.ascontiguousarray(values_m.T)  # reductions along rows of eight are slow
     margin_m = _CLEARLY * leaf_size_m
-    found: NDArray[np.int32] = unique[(columns.min(axis=0) <= margin_m) & (columns.max(axis=0) >= -margin_m)]
-    return found
+    return unique[(columns.min(axis=0) <= margin_m) & (columns.max(axis=0) >= -margin_m)]
 
 
 def per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
@@ -268,13 +262,7 @@ def per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
 def subdivided(cells: NDArray[Any], parts: int) -> NDArray[Any]:
     """Subdivide cells (M, 3) into voxels (M · parts³, 3), `parts` along an edge."""
     inside = np.indices((parts,) * 3, cells.dtype).reshape(3, -1).T
-    voxels: NDArray[Any] = cells[:, None] * cells.dtype.type(parts) + inside
-    return voxels.reshape(-1, 3)
-
-
-def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = queries.occupied(contents, torch.from_numpy(points)).numpy()
-    return inside
+    return (cells[:, None] * cells.dtype.type(parts) + inside).reshape(-1, 3)
 
 
 def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config: FitConfig) -> None:
@@ -294,8 +282,11 @@ def _voxels_of(
     # Points across a cell, at most a voxel apart, hit every voxel that overlaps it.
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
     inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    voxels = np.floor((cells[:, None] + inside) * (config.leaf_size_m / voxel_size)).astype(np.int32)
-    return voxels.reshape(-1, 3)
+    return (
+        np.floor((cells[:, None] + inside) * (config.leaf_size_m / voxel_size))
+        .astype(np.int32)
+        .reshape(-1, 3)
+    )
 
 
 def _corner_distances(
@@ -310,7 +301,7 @@ def _corner_distances(
     # A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
     # until it is in an occupied cell, and the distance moved is added to its absolute value.
     points = corners.astype(np.float32) * np.float32(voxel_size)
-    outside = ~_occupied(contents, points)
+    outside = ~queries.occupied(contents, points)
     # Move each corner into its last voxel: NumPy keeps the last assignment of repeated indices.
     owners = np.zeros(len(corners), np.int32)
     owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
@@ -320,10 +311,8 @@ def _corner_distances(
     place, left = corner.copy(), np.arange(len(corner))
     for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
         place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
-        left = left[~_occupied(contents, place[left])]
+        left = left[~queries.occupied(contents, place[left])]
     points[moved] = place
-    values: NDArray[np.float32] = queries.signed_distance(
-        contents, torch.from_numpy(points), description="mesh", progress=progress
-    ).numpy()
+    values = queries.signed_distance(contents, points, description="mesh", progress=progress)
     values[moved] += np.copysign(np.linalg.norm(place - corner, axis=1), values[moved])
     return values

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.checks import number, whole_number
-from radarsdf.map.queries import VOXEL_M
 
 Floats = NDArray[np.float64]
 
+VOXEL_M = 0.1
+"""Default edge of a mesh's voxels, m."""
 _BINS = 1000  # bins of the confidence from 0 to 1
 _SCALARS = 3
 TALLY_NUMBERS = 3 * _BINS + _SCALARS  # length of :meth:`Tally.sums`
@@ -58,8 +59,7 @@ class Limits(NamedTuple):
     ) -> NDArray[np.bool_]:
         """Return a mask (V,) of vertices within the limits at a confidence threshold. NaN exceeds any finite uncertainty."""
         certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= self.max_uncertainty
-        found: NDArray[np.bool_] = certain & (confidence >= threshold)
-        return found
+        return certain & (confidence >= threshold)
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,7 @@ class Tally:
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
         scans = np.round(hits)
 
-        columns = (area_m2, true_m2, covering * area_m2)
-        sums = [np.bincount(bins, values, _BINS) for values in columns]
+        sums = [np.bincount(bins, values, _BINS) for values in (area_m2, true_m2, covering * area_m2)]
         scalars = (np.minimum(existing_m2, area_m2), true_m2[scans == 1], true_m2[scans == 2])
         return cls.of_sums(np.concatenate([*sums, [values.sum() for values in scalars]]))
 

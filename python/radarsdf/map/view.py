@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from radarsdf._core import SurfaceTracer, cell_keys
 from radarsdf.checks import flag, number, whole_number
 from radarsdf.map import queries
+from radarsdf.map.confidence import EvidenceAt, evidence, roughness
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Limits, across_triangles
@@ -101,7 +101,7 @@ class ViewedMap:
     areas_m2: _Floats  # (P,) areas of the patches
     rates: _Floats  # (P,) detection rate: share of the scans reaching a patch that have a return there
     origin: _Floats  # (3,) origin of the local frame, world, m
-    roughness: float  # see :func:`radarsdf.map.queries.roughness`
+    roughness: float  # see :func:`radarsdf.map.confidence.roughness`
     intensity: _Intensity | None
     max_memory_bytes: int | None  # memory limit of views. None: what the system has left
 
@@ -112,16 +112,14 @@ class ViewedMap:
         check_views(config.max_memory_bytes, cells=len(contents.evidence.visibility))
 
         def intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
-            x = torch.from_numpy(points.astype(np.float32))
-            sensors = torch.from_numpy(position.astype(np.float32)).expand(len(x), 3)
-            values: NDArray[np.float32] = queries.intensity(contents, x, sensors).numpy()
-            return values
+            x = points.astype(np.float32)
+            return queries.intensity(contents, x, np.broadcast_to(position.astype(np.float32), x.shape))
 
         return cls.of_surface(
             Surface.of(contents, config.leaf_size_m),
             contents,
             contents.origin,
-            lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
+            lambda points: evidence(contents, points.astype(np.float32)),
             None if contents.intensity_scale is None else intensity,
         )
 
@@ -131,19 +129,19 @@ class ViewedMap:
         surface: Surface,
         scene: WholeMap,
         origin: _Floats,
-        evidence_at: Callable[[_Floats], queries.EvidenceAt],
+        evidence_at: Callable[[_Floats], EvidenceAt],
         intensity: _Intensity | None,
     ) -> ViewedMap:
         """Build with all triangles as patches, and those of the default mesh for tracing. `evidence_at`: of points (N, 3), m."""
         across, twice_m2 = across_triangles(surface.vertices, surface.faces)
         centres = surface.vertices[surface.faces].mean(axis=1)
-        evidence = evidence_at(centres)
-        rates = (evidence.hits.numpy() + _HITS_BEFORE) / (evidence.visibility.numpy() + _VISIBILITY_BEFORE)
+        found = evidence_at(centres)
+        rates = (found.hits + _HITS_BEFORE) / (found.visibility + _VISIBILITY_BEFORE)
         faces = np.ascontiguousarray(surface.faces[surface.kept(Limits.of(scene.config.leaf_size_m))])
         tracer = SurfaceTracer(surface.vertices, faces, resolve_num_threads(0))
         normals = across / np.maximum(twice_m2, 1e-12)[:, None]
         patches = centres, normals, twice_m2 / 2, rates.astype(np.float64)
-        of_scene = queries.roughness(scene), intensity, scene.config.max_memory_bytes
+        of_scene = roughness(scene), intensity, scene.config.max_memory_bytes
         return cls(tracer, *patches, origin, *of_scene)
 
     def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:

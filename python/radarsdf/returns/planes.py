@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +45,8 @@ class Surfels:
         cell_size_m = LEAVES_PER_SURFEL * sums.leaf_size_m
         keys, of_cells = sums.merged_moments()
         blocks = CellBlocks(keys)
-        support = neighbour_support(blocks, keys, of_cells, num_threads)
-        # Most cells have few returns: surfels for all of them would dominate time and memory.
-        cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
-        centres, normals, widest, variances = neighbour_planes(
-            blocks, keys[cell_of_plane], of_cells, cell_size_m, num_threads
-        )
-        counts = of_cells[:, 0].copy()
-        planes = (cell_of_plane, centres, normals, variances, widest)
-        return cls(cell_size_m, keys, blocks, counts, support, *planes)
+        support, *planes = neighbour_planes(blocks, keys, of_cells, cell_size_m, num_threads)
+        return cls(cell_size_m, keys, blocks, of_cells[:, 0].copy(), support, *planes)
 
     def is_flat(self) -> NDArray[np.bool_]:
         flat: NDArray[np.bool_] = self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]
@@ -91,24 +85,22 @@ class Surfels:
         return planes[cells]
 
 
-def neighbour_support(
-    blocks: CellBlocks, keys: NDArray[np.uint64], of_cells: NDArray[np.float64], num_threads: int = 0
-) -> NDArray[np.float64]:
-    """Return the weighted number (K,) of returns in the neighbourhoods of `keys` (K,). `of_cells`: moments by cell of `blocks`."""
-    counts = np.ascontiguousarray(of_cells[:, :1])
-    support: NDArray[np.float64] = blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
-    return support
-
-
 def neighbour_planes(
     blocks: CellBlocks,
     keys: NDArray[np.uint64],
     of_cells: NDArray[np.float64],
     cell_size_m: float,
     num_threads: int = 0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
-    """Return centres, normals, widest axes and variances (K, 3) of the surfels at `keys` (K,); see :func:`neighbour_support`."""
-    moments = blocks.neighbour_sums(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
+) -> tuple[NDArray[Any], ...]:
+    """Fit planes to the neighbourhoods of `keys` (K,). `of_cells`: moments by cell of `blocks`.
+
+    Returns their support (K,), and `cell_of_plane`, `centres`, `normals`, `variances` and `widest` of :class:`Surfels`.
+    """
+    counts = np.ascontiguousarray(of_cells[:, :1])
+    support = blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
+    # Most cells have few returns: surfels for all of them would dominate time and memory.
+    cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
+    moments = blocks.neighbour_sums(keys[cell_of_plane], of_cells, NEIGHBOUR_WEIGHT, num_threads)
     means = moments[:, 1:10] / moments[:, :1]
     centres = means[:, :3].copy()
     covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
@@ -118,5 +110,5 @@ def neighbour_planes(
     normals = axes[:, :, 0]
     normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
     # The lower bound is the resolution of float32 coordinates.
-    widest = axes[:, :, 2].astype(np.float32)
-    return centres, normals, widest, np.maximum(variances, (0.0025 * cell_size_m) ** 2)
+    variances = np.maximum(variances, (0.0025 * cell_size_m) ** 2)
+    return support, cell_of_plane, centres, normals, variances, axes[:, :, 2].astype(np.float32)

@@ -18,6 +18,7 @@ from radarsdf.checks import check_box, hides_bar, path_of, positive
 from radarsdf.io.files import check_outputs
 from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
+from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.mesh import (
     Surface,
@@ -29,7 +30,6 @@ from radarsdf.map.mesh import (
     subdivided,
     within,
 )
-from radarsdf.map.queries import EvidenceAt
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
@@ -138,7 +138,7 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
         spacing=[voxel_m] * 3,
         num_threads=threads,
     )
-    evidence = city.evidence_at(torch.from_numpy(vertices))
+    evidence = city.evidence_at(vertices)
     surface = Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells))
     counts = np.array([found, len(cells)])
     return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
@@ -240,7 +240,7 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     used, faces = renumbered(len(vertices), faces)
 
     def evidence(points: _Floats) -> EvidenceAt:
-        return city.evidence_at(torch.from_numpy(points + origin))
+        return city.evidence_at(points + origin)
 
     def intensity(points: _Floats, sensor_position: _Floats) -> NDArray[np.float32]:
         found = city.intensity(points + origin, sensor_position + origin, extrapolate=True)

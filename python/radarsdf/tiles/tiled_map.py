@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import path_of
-from radarsdf.map import queries
+from radarsdf.map.free_space import CellsInBox, dense_cells
 from radarsdf.map.map import Map
 from radarsdf.map.radar_map import load_file
+from radarsdf.map.threshold import VOXEL_M, Threshold
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
@@ -23,7 +24,6 @@ from radarsdf.tiles.plan import Tile, map_path, report_of
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.threshold import Threshold
     from radarsdf.map.view import ViewedMap
 
 _Floats = NDArray[np.float64]
@@ -61,7 +61,7 @@ class TiledMap(TileBlend):
 
     def mesh(
         self,
-        voxel_size: float = queries.VOXEL_M,
+        voxel_size: float = VOXEL_M,
         *,
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
@@ -96,7 +96,7 @@ class TiledMap(TileBlend):
 
         return mesh_of(self, voxel_size, **wanted)
 
-    def cells_near(self, lower: _Floats, upper: _Floats) -> queries.CellsInBox:
+    def cells_near(self, lower: _Floats, upper: _Floats) -> CellsInBox:
         """Each cell belongs to the tile that contains it; cells of unfinished tiles are unknown."""
         lattice, edge = self.config.lattice, self.plan.tile_cells
         first = np.floor(lattice.cells(lower)).astype(np.int64)
@@ -110,10 +110,10 @@ class TiledMap(TileBlend):
             if (start < stop).all():
                 x, y, z = (stop - start).tolist()
                 here = start - self.plan.origin_cells(planned.tile)
-                found = queries.dense_cells(self.contents_of(planned.tile), here, (x, y, z))
+                found = dense_cells(self.contents_of(planned.tile), here, (x, y, z))
                 place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
                 passed[place], returns[place], observed[place] = found
-        return queries.CellsInBox(lattice.position(first), passed, returns, observed)
+        return CellsInBox(lattice.position(first), passed, returns, observed)
 
     def view_statistics(self) -> ViewStatisticsAt:
         """View statistics of each cell come from its own tile."""
@@ -144,7 +144,7 @@ class TiledMap(TileBlend):
     def export(
         self,
         path: str | PathLike[str],
-        voxel_size: float = queries.VOXEL_M,
+        voxel_size: float = VOXEL_M,
         *,
         progress: bool | None = None,
         **limits: Any,
@@ -175,7 +175,7 @@ class TiledMap(TileBlend):
         return export_mesh(self, path, voxel_size, progress, **limits)
 
     def threshold(
-        self, voxel_size: float = queries.VOXEL_M, *, progress: bool | None = None, **limits: Any
+        self, voxel_size: float = VOXEL_M, *, progress: bool | None = None, **limits: Any
     ) -> Threshold:
         """Expected precision and coverage of a mesh, computed per tile without a mesh of the whole map.
 
