@@ -51,8 +51,7 @@ class Alignment:
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
         """(N,) standard error of the alignment at places (N, 3) along their normals (N, 3), m."""
         rows = _jacobian(x - self.centre, np.nan_to_num(normals))
-        variance: Floats = np.einsum("ni,ij,nj->n", rows, self.covariance, rows)
-        return np.sqrt(np.maximum(variance, 0))
+        return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", rows, self.covariance, rows), 0))
 
 
 def align(before: PlacedMap, after: PlacedMap) -> Alignment:
@@ -68,8 +67,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         """(N,) logarithms of the distances between the surfaces, about equal where the surfaces coincide."""
         near_m, _, distance_m = before.nearest(_transformed(surface.points, pose))
         distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
-        found: Floats = np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
-        return found
+        return np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
 
     found = _constrained_pose(before, surface, np.eye(4))
     searched = _constrained_pose(before, surface, _coarse_pose(before, surface))

@@ -23,7 +23,7 @@ from radarsdf.changes.changes import (
 )  # fmt: skip
 from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.changes.reflectance import Differences
-from radarsdf.checks import check_box
+from radarsdf.checks import check, check_box
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_free_space
@@ -108,9 +108,7 @@ def compare(
     check_free_space(after, "after")
     placed = PlacedMap.of(before), PlacedMap.of(after)
     for name, found in zip(("before", "after"), placed, strict=True):
-        if len(found.faces) == 0:
-            msg = f"{name} has no surface: fit it with more scans of the place"
-            raise ValueError(msg)
+        check(len(found.faces) != 0, f"{name} has no surface: fit it with more scans of the place")
     earlier, later = placed
     alignment = align(earlier, later) if align_frames else Alignment()
     later = replace(later, T_common_map=alignment.T_before_after)

@@ -155,8 +155,7 @@ class Side:
     @property
     def parallel(self) -> NDArray[np.bool_]:
         """(V,) whether the other map's surface is about parallel."""
-        mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
-        return mask
+        return np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
 
     def region_odds(self, free: Floats, distances: Floats) -> Floats:
         """(V,) log odds that a region around each vertex is absent, by log odds (V,) of free space and of distances."""
@@ -224,8 +223,7 @@ class Errors:
             error = student(self.freedom, distance_m, self.scale * sigma_m)
             # Far in the tails, the difference is only rounding.
             inside = np.maximum(error.cdf(reach_m) - error.cdf(lower_m), 1e-12)
-            found: Floats = np.log(inside / (reach_m - lower_m)) - same
-            return found
+            return np.log(inside / (reach_m - lower_m)) - same
 
         free = _free_space_odds(side.own, side.other)
         distances, shifted = np.zeros(len(free)), np.full(len(free), -np.inf)
@@ -243,14 +241,12 @@ def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
     same = betaln(hit + hits, missed + passes) - betaln(hit, missed)
     changed = betaln(0.5 + hits, 0.5 + passes) - betaln(0.5, 0.5)
     fewer = hits < (hits + passes) * hit / (hit + missed)
-    odds: Floats = np.where(fewer, changed - same, np.minimum(changed - same, 0))
-    return odds
+    return np.where(fewer, changed - same, np.minimum(changed - same, 0))
 
 
 def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:
     """(N,) log likelihood ratio of differences (N,): a change of any size within reach against errors alone."""
-    found: Floats = 0.5 * (differences / sigma) ** 2 + np.log(sigma * np.sqrt(2 * np.pi) / (2 * reach))
-    return found
+    return 0.5 * (differences / sigma) ** 2 + np.log(sigma * np.sqrt(2 * np.pi) / (2 * reach))
 
 
 def share_of_changes(log_odds: Floats) -> float:

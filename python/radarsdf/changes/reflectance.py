@@ -33,8 +33,7 @@ class _Means:
         near = cKDTree(x).sparse_distance_matrix(cKDTree(self.points), reach_m, output_type="coo_matrix")
 
         def total(values: Floats) -> Floats:
-            found: Floats = np.bincount(near.row, values[near.col], len(x)).astype(np.float64)
-            return found
+            return np.bincount(near.row, values[near.col], len(x)).astype(np.float64)
 
         weights = 1 / self.variances
         weight = total(weights)

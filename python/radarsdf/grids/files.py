@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.checks import check
 from radarsdf.io.files import check_outputs, write_whole
 
 _PIXELS = np.array([254, 0, 205], np.uint8)  # grey values of map_saver for free, occupied and unknown
@@ -18,9 +19,7 @@ _FREE, _OCCUPIED, _INNER = 1, 2, 3
 
 def check_suffix(path: Path, *suffixes: str) -> None:
     """Raise a ValueError if `path` has another suffix."""
-    if path.suffix not in suffixes:
-        msg = f"{path} must end in {', '.join(suffixes)}"
-        raise ValueError(msg)
+    check(path.suffix in suffixes, f"{path} must end in {', '.join(suffixes)}")
 
 
 def write_map_server(path: Path, state: NDArray[np.int8], origin: NDArray[np.float64], cell_m: float) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from radarsdf.checks import (
     MAX_TIME_S,
+    check,
     check_pose,
     check_values_of_scan,
     instance,
@@ -246,9 +247,7 @@ class LiveMap:
         state = self._state
         with self._owned():
             scan_id = state.next_id if scan_id is None else scan_id
-            if scan_id in state.log:
-                msg = f"the map has a scan {scan_id!r} already: remove or move it"
-                raise ValueError(msg)
+            check(not scan_id in state.log, f"the map has a scan {scan_id!r} already: remove or move it")
             with_intensities = scan.intensities is not None
             if state.with_intensities not in (None, with_intensities):
                 msg = "either all scans have intensities, or none has"
@@ -463,8 +462,6 @@ def _checked_scan(
             static = ~moving if moving.any() else None
     if time_s is not None:
         time_s = number(time_s, "time_s")
-        if not abs(time_s) <= MAX_TIME_S:
-            msg = f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
-            raise ValueError(msg)
+        check(abs(time_s) <= MAX_TIME_S, f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}")
     values_of_scan = None if values is None else values[0].copy()
     return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s), left_out.far

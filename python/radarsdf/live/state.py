@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import QUANTA, GrowingSums, SumsChange
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
 from radarsdf.interrupts import at_once
@@ -212,9 +213,7 @@ class GrowingState:
     def scans(self) -> list[LoggedScan]:
         """Return the scans that are not sealed. Raise a ValueError if there are none."""
         scans = list(self.log.scans())
-        if not scans:
-            msg = "there are no scans to fit: integrate some first"
-            raise ValueError(msg)
+        check(scans, "there are no scans to fit: integrate some first")
         return scans
 
     def fit_input(self) -> Callable[[], FitInput]:
@@ -267,5 +266,4 @@ def _blocks_of_regions(blocks: Keys) -> Keys:
     """Return the ascending keys of all blocks in the regions of these blocks."""
     bits = REGION_BITS - BLOCK_BITS
     regions = np.unique(blocks >> bits)
-    found: Keys = ((regions << bits)[:, None] | np.arange(1 << int(bits), dtype=np.uint64)).reshape(-1)
-    return found
+    return ((regions << bits)[:, None] | np.arange(1 << int(bits), dtype=np.uint64)).reshape(-1)

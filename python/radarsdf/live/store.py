@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from radarsdf._core import GrowingSums
-from radarsdf.checks import MAX_POSITION_M, check_pose, check_values_of_scan, positions
+from radarsdf.checks import MAX_POSITION_M, check, check_pose, check_values_of_scan, positions
 from radarsdf.io.files import check_regular_file, take_lock
 from radarsdf.io.npz import arrays_of, check_archive, check_arrays, write_arrays
 from radarsdf.live.regions import REGION_BITS, Keys
@@ -110,9 +110,7 @@ def _scan_of(
     for name, array in arrays.items():
         if name != "points":
             check_values_of_scan(array, points, name, 0)
-        if array.dtype.kind != _KINDS[name]:
-            msg = f"{name} are {array.dtype}"
-            raise ValueError(msg)
+        check(array.dtype.kind == _KINDS[name], f"{name} are {array.dtype}")
     return LoggedScan(pose, **arrays, time_s=time_s)
 
 

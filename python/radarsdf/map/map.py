@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from radarsdf.checks import MAX_POSITION_M, check_pose, instance, real_array
+from radarsdf.checks import MAX_POSITION_M, check, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, Float32, confidence, uncertainty
@@ -177,9 +177,7 @@ class Map(ABC):
         ValueError
             If the map has no intensities.
         """
-        if not self.has_intensity:
-            msg = "this map was fitted without intensities"
-            raise ValueError(msg)
+        check(self.has_intensity, "this map was fitted without intensities")
         world, answer = _as_positions(x)
         sensors, _ = _as_positions(sensor_positions, rows=len(world))
         query = partial(queries.intensity, extrapolate=extrapolate)
@@ -239,26 +237,24 @@ class Map(ABC):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
-        limits = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
-        limits |= {"min_component_triangles": min_component_triangles}
-        return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
-
-    def _mesh_seen_from(
-        self, viewpoint: ArrayLike | None, voxel_size: float, **wanted: Any
-    ) -> trimesh.Trimesh:
         from radarsdf.map.mesh import with_intensities  # noqa: PLC0415 - trimesh is slow to import
 
-        if viewpoint is None:
-            return self._surface_mesh(voxel_size, **wanted)
         scale = self.intensity_scale
-        if scale is None:
-            msg = "a viewpoint needs a map with intensities; this one was fitted without"
-            raise ValueError(msg)
-        sensor_position = real_array(viewpoint, "viewpoint")
-        if sensor_position.shape != (3,) or not (np.abs(sensor_position) <= MAX_POSITION_M).all():
-            msg = f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m"
-            raise ValueError(msg)
-        mesh = self._surface_mesh(voxel_size, **wanted)
+        if viewpoint is not None:
+            check(scale, "a viewpoint needs a map with intensities; this one was fitted without")
+            sensor_position = real_array(viewpoint, "viewpoint")
+            is_position = sensor_position.shape == (3,) and (np.abs(sensor_position) <= MAX_POSITION_M).all()
+            check(is_position, f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m")
+        mesh = self._surface_mesh(
+            voxel_size,
+            box=box,
+            progress=progress,
+            min_confidence=min_confidence,
+            max_uncertainty=max_uncertainty,
+            min_component_triangles=min_component_triangles,
+        )
+        if viewpoint is None or scale is None:
+            return mesh
         vertices = np.array(mesh.vertices, np.float64)
         return with_intensities(mesh, self.intensity(vertices, sensor_position), scale)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from radarsdf import _core
-from radarsdf.checks import real_array, refuse_masked
+from radarsdf.checks import check, real_array, refuse_masked
 
 
 def marching_cubes(
@@ -91,9 +91,7 @@ def marching_cubes(
     True
     """
     samples = _as_tensor(volume) if isinstance(volume, Tensor) else _as_samples(volume)
-    if samples.ndim != 3:
-        msg = f"volume must have three axes, not {samples.ndim}"
-        raise ValueError(msg)
+    check(samples.ndim == 3, f"volume must have three axes, not {samples.ndim}")
     shape = tuple(samples.shape)
     usable = None if mask is None else _as_mask(mask, shape)
     iso = real_array(level, "level")

@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import vertex_areas
-from radarsdf.checks import MAX_POSITION_M, check_box, positive
+from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
@@ -108,9 +108,7 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """Extract the mesh of one map. `wanted`: the limits of :meth:`Map.mesh`."""
     voxel_size = positive(voxel_size, "voxel_size")
-    if voxel_size > MAX_POSITION_M:
-        msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
-        raise ValueError(msg)
+    check(voxel_size <= MAX_POSITION_M, f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}")
     limits = Limits.of(voxel_size, **wanted)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)

@@ -15,6 +15,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 from typing_extensions import TypedDict
 
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.grid_field import GridField
@@ -61,9 +62,7 @@ def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     """Write a map to one file, atomically. Raise a ValueError if a number is not finite: it could not be loaded."""
     tensors, description = parts_of(contents)
     for name, tensor in tensors.items():
-        if not tensor.isfinite().all():
-            msg = f"{name} of the map contains non-finite numbers: the map is not saved"
-            raise ValueError(msg)
+        check(tensor.isfinite().all(), f"{name} of the map contains non-finite numbers: the map is not saved")
     metadata = {
         "format": FORMAT,
         "format_version": str(FORMAT_VERSION),
@@ -269,5 +268,4 @@ def checked_report(report: Any) -> dict[str, Any]:
     except ValidationError as error:
         msg = f"report.{first_wrong(error)}"
         raise ValueError(msg) from None
-    found: dict[str, Any] = report
-    return found
+    return dict(report)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import number, whole_number
+from radarsdf.checks import check, number, whole_number
 
 Floats = NDArray[np.float64]
 
@@ -45,9 +45,7 @@ class Limits(NamedTuple):
             msg = f"min_confidence must be in [0, 1], not {min_confidence}"
             raise ValueError(msg)
         max_uncertainty = number(math.inf if max_uncertainty is None else max_uncertainty, "max_uncertainty")
-        if max_uncertainty < 0:
-            msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
-            raise ValueError(msg)
+        check(max_uncertainty >= 0, f"max_uncertainty must be at least 0, not {max_uncertainty}")
         if min_component_triangles is None:
             # Fewer in larger voxels, whose triangles have more area.
             min_component_triangles = round(_COMPONENT_TRIANGLES * min(1.0, VOXEL_M / voxel_m))

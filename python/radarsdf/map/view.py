@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import SurfaceTracer, cell_keys
-from radarsdf.checks import flag, number, whole_number
+from radarsdf.checks import check, flag, number, whole_number
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, roughness
 from radarsdf.map.contents import MapContents, WholeMap
@@ -66,8 +66,7 @@ class View:
     @property
     def ranges_m(self) -> _Floats:
         """(N,) distances of the returns from the sensor, m."""
-        lengths: _Floats = np.linalg.norm(self.points.astype(np.float64), axis=1)
-        return lengths
+        return np.linalg.norm(self.points.astype(np.float64), axis=1)
 
     @property
     def world_points(self) -> _Floats:
@@ -156,9 +155,7 @@ def view_from(
 ) -> View:
     """Render a view at a `pose` (4, 4), T_world_sensor, m; see :meth:`Map.render`."""
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
-    if not 0 <= wanted <= 1e8:
-        msg = f"returns must be in [0, 10^8], not {returns}"
-        raise ValueError(msg)
+    check(0 <= wanted <= 1e8, f"returns must be in [0, 10^8], not {returns}")
     azimuth, elevation = _beams(sensor)
     check_views(surface.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation))
     position = pose[:3, 3] - surface.origin
@@ -229,8 +226,7 @@ def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _F
     errors, noise = rng.standard_normal((3, len(points))), sensor.noise
     angles = azimuth + noise.azimuth_rad * errors[1], elevation + noise.elevation_rad * errors[2]
     noisy_m = np.maximum(ranges_m + noise.range_m * errors[0], 0.0)
-    noisy: _Floats = sensor.directions(*angles) * noisy_m[:, None]
-    return noisy
+    return sensor.directions(*angles) * noisy_m[:, None]
 
 
 def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import SurfaceTracer
-from radarsdf.checks import real_array
+from radarsdf.checks import check, real_array
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.figures import new_figure, png_of
@@ -59,9 +59,7 @@ def render(
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int32).reshape(-1, 3)
-    if len(faces) == 0:
-        msg = "the mesh has no triangles to draw"
-        raise ValueError(msg)
+    check(len(faces) != 0, "the mesh has no triangles to draw")
     rgb = np.array(NEUTRAL)[None].repeat(len(vertices), axis=0) if colors is None else np.asarray(colors)
     if rgb.shape not in {(len(vertices), 3), (len(vertices), 4)}:
         msg = f"colors must be ({len(vertices)}, 3) or (…, 4), not {rgb.shape}"
@@ -104,8 +102,7 @@ def render(
         image[part[0] : part[-1] + 1][hit] = color * (0.42 + 0.60 * lambert)[:, None]
     image *= _contours(depth, 2 * _SUPERSAMPLING)[..., None]
     image = image.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3).mean(axis=(1, 3))
-    picture: NDArray[np.uint8] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    return picture
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
 def save_picture(

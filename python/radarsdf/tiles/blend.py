@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from radarsdf.checks import positive
+from radarsdf.checks import check, positive
 from radarsdf.map import queries, storage
 from radarsdf.map.confidence import EvidenceAt, evidence
 from radarsdf.map.contents import MapContents
@@ -54,9 +54,7 @@ class TileBlend(Map):
         self.memory_bytes = positive(memory_bytes, "memory_bytes")
         self._held: OrderedDict[Tile, tuple[MapContents, int]] = OrderedDict()
         self._lock = threading.Lock()
-        if not self.tiles:
-            msg = f"no tile of {self.folder} is done: run radarsdf tiles fit {self.folder}"
-            raise ValueError(msg)
+        check(self.tiles, f"no tile of {self.folder} is done: run radarsdf tiles fit {self.folder}")
 
     @cached_property
     def tiles(self) -> list[TilePlan]:

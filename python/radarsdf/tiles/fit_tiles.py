@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from radarsdf.checks import hides_bar, instance, path_of, positive
+from radarsdf.checks import check, hides_bar, instance, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.extras import require
 from radarsdf.fitting.steps import FitInput, fit_rays
@@ -130,9 +130,7 @@ def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: CheckedS
         for _ in given:
             pass
         different += ["scans"] * (given.digest != plan.input_digest)
-    if different:
-        msg = f"{folder} holds another plan: {', '.join(different)} differ; give a new folder"
-        raise ValueError(msg)
+    check(not different, f"{folder} holds another plan: {', '.join(different)} differ; give a new folder")
     return plan
 
 

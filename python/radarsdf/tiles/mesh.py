@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from radarsdf.checks import check_box, hides_bar, path_of, positive
+from radarsdf.checks import check, check_box, hides_bar, path_of, positive
 from radarsdf.io.files import check_outputs
 from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
@@ -153,8 +153,7 @@ def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
             cells = city.leaf_cells(other, within=tile)
             centres = plan.config.lattice.position(cells + 0.5)
             parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
-    found: NDArray[np.int64] = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
-    return found
+    return sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
 
 
 def _on_borders(city: TileBlend, vertices: _Floats) -> NDArray[np.int64]:
@@ -208,9 +207,7 @@ def export_mesh(
     check_mesh_path(path)
     check_outputs([path])
     mesh = mesh_of(city, voxel_size, progress, **limits)
-    if len(mesh.faces) == 0:
-        msg = f"{city.folder} has no surface here: nothing written"
-        raise ValueError(msg)
+    check(len(mesh.faces) != 0, f"{city.folder} has no surface here: nothing written")
     write_mesh(path, mesh)
     return len(mesh.vertices), len(mesh.faces)
 

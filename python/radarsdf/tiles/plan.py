@@ -80,8 +80,7 @@ class TileGrid:
         # A segment parallel to a slab is inside it: the tiles come from the segment's own bounds.
         enter = np.where(extent == 0, -np.inf, ends.min(axis=0)).max(axis=1)
         leave = np.where(extent == 0, np.inf, ends.max(axis=0)).min(axis=1)
-        meets: NDArray[np.bool_] = np.maximum(enter, 0) <= np.minimum(leave, 1)
-        return meets
+        return np.maximum(enter, 0) <= np.minimum(leave, 1)
 
     def weights(self, tile: Tile, positions: _Floats) -> _Floats:
         """(N,) weights of a tile at positions (N, 3), world, m. The weights of all tiles sum to one.
@@ -93,8 +92,7 @@ class TileGrid:
         for inwards in (beyond_lower, self.tile_m - beyond_lower):
             t = np.clip(inwards / self.halo_m + 0.5, 0.0, 1.0)
             factors *= t * t * (3 - 2 * t)
-        weights: _Floats = factors.prod(axis=1)
-        return weights
+        return factors.prod(axis=1)
 
     def within_half_a_halo(self, tile: Tile, positions: _Floats) -> NDArray[np.int64]:
         """(M,) rows of positions (N, 3), world, m, at which a tile has a weight."""
@@ -104,13 +102,11 @@ class TileGrid:
 
     def _along(self, positions: NDArray[Any]) -> _Floats:
         """(N, 2) offsets of positions (N, 3), world, m, from the corner of tile (0, 0)."""
-        along: _Floats = positions[:, :2] - self.corner_m
-        return along
+        return positions[:, :2] - self.corner_m
 
 
 def _floor(numbers: _Floats) -> NDArray[np.int64]:
-    found: NDArray[np.int64] = np.floor(numbers).astype(np.int64)
-    return found
+    return np.floor(numbers).astype(np.int64)
 
 
 def neighbours(tile: Tile) -> list[Tile]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
-from radarsdf.checks import are_rigid, one_for_each_scan
+from radarsdf.checks import are_rigid, check, one_for_each_scan
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.average import SurfaceReturns
 from radarsdf.fitting.estimate import estimate_rays
@@ -80,9 +80,7 @@ def make_plan(scans: CheckedScans, folder: Path, config: FitConfig, grid: TileGr
     for chunk in _chunks(scans, config.returns.accumulate_scans):
         planner.add(chunk, number)
         number += len(chunk)
-    if number == 0:
-        msg = "there are no scans"
-        raise ValueError(msg)
+    check(number != 0, "there are no scans")
     return planner.plan(scans.digest)
 
 
@@ -171,9 +169,7 @@ class _Planner:
                 continue
             x, y, z = self._origins[tile].tolist()
             tiles.append(TilePlan(tile=tile, returns=int(returns), rays=int(rays), origin_cells=(x, y, z)))
-        if not tiles:
-            msg = "no return of any scan lies within the ranges"
-            raise ValueError(msg)
+        check(tiles, "no return of any scan lies within the ranges")
         axes = np.concatenate(self._axes)
         np.save(self._folder / SCANS_FILE, axes, allow_pickle=False)
         draft = Plan(

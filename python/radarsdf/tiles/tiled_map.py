@@ -9,7 +9,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from radarsdf.checks import path_of
 from radarsdf.map.free_space import CellsInBox, dense_cells
@@ -33,7 +33,9 @@ class TiledMap(TileBlend):
     """A map in tiles, returned by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
 
     It has the methods of :class:`Map`. Where tiles overlap, their fields are averaged with weights that fall smoothly to zero,
-    so neither surface, gradient nor intensity has a seam. Tiles are read on demand.
+    so neither surface, gradient nor intensity has a seam. Tiles are read on demand. The voxels of :meth:`mesh` must divide the edge
+    of a leaf cell, so that triangles of adjacent tiles fit together. They are cached in the folder: another mesh of the same
+    `voxel_size` and `box` is fast.
 
     Parameters
     ----------
@@ -58,38 +60,6 @@ class TiledMap(TileBlend):
 
     def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
         return partial(TiledMap, memory_bytes=self.memory_bytes), (str(self.folder),)
-
-    def mesh(
-        self,
-        voxel_size: float = VOXEL_M,
-        *,
-        box: ArrayLike | None = None,
-        viewpoint: ArrayLike | None = None,
-        progress: bool | None = None,
-        **limits: Any,
-    ) -> trimesh.Trimesh:
-        """Extract the surface as one mesh, without gaps or duplicate triangles between tiles.
-
-        Triangles of the tiles are cached in the folder, so another mesh of the same `voxel_size` and `box` is fast.
-
-        Parameters
-        ----------
-        voxel_size : float
-            Edge of a voxel, m, which must divide the edge of a leaf cell.
-        box, viewpoint, progress, **limits
-            As for :meth:`Map.mesh`.
-
-        Returns
-        -------
-        trimesh.Trimesh
-            World frame, m, with the attributes and metadata of :meth:`Map.mesh`.
-
-        Raises
-        ------
-        ValueError, MemoryError
-            If an argument is out of range, or the mesh exceeds the memory: :meth:`export` writes 3D Tiles one by one.
-        """
-        return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
         from radarsdf.tiles.mesh import mesh_of  # noqa: PLC0415 - trimesh is slow to import

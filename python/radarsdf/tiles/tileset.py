@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from radarsdf.checks import check
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.products import turned
 from radarsdf.tiles.blend import TileBlend
@@ -59,9 +60,7 @@ def write_tileset(
         )
         corners += [vertices.min(axis=0), vertices.max(axis=0)]
         count += len(vertices), len(faces)
-    if not children:
-        msg = "no tile has a triangle, so there is nothing to write"
-        raise ValueError(msg)
+    check(children, "no tile has a triangle, so there is nothing to write")
     error_m = float(np.ptp(corners, axis=0).max()) * _ERROR_OF_EDGE
     root = {
         "boundingVolume": _box(np.array(corners)),
