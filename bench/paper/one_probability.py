@@ -149,7 +149,7 @@ def judged(example: Example, others: list[Example]) -> list[str]:
     """Row of the table: the current mesh, and that of models fitted to the others."""
     of_truth, of_added = models(others)
     surface, p = example.surface, confidence(example, of_truth)
-    hits = surface.evidence.hits.double().numpy()
+    hits = surface.evidence.hits.astype(np.float64)
     tally = Tally.of(example.areas_m2, p, example.predicted(of_added), example.reach, hits)
     learnt_surface = replace(surface, confidence=p.astype(np.float32), tally=tally)
     limits = Limits.of(example.voxel_m)

@@ -5,18 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, qmc
 
 from radarsdf._core import LocalPlanes
-from radarsdf.changes.probability import (
-    PARALLEL,
-    Floats,
-    PlacedMap,
-    odds_of_differences,
-    posterior,
-    share_of_changes,
-)
+from radarsdf.arrays import Floats, Ints
+from radarsdf.changes.probability import PARALLEL, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.map.threshold import across_triangles
 from radarsdf.poses.rigid import moved, rotation_vector, skew
 from radarsdf.poses.verdict import Verdict
@@ -95,7 +88,7 @@ class _Surface:
     points: Floats  # (N, 3) m
     normals: Floats  # (N, 3)
     sigma_m: Floats  # (N,) standard errors, m
-    patches: NDArray[np.int64]  # (N,) index of each point's patch
+    patches: Ints  # (N,) index of each point's patch
     centre: Floats  # (3,) m
     radius_m: float  # root mean square distance of the points from the centre
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.changes.alignment import Alignment, align
 from radarsdf.changes.changes import (
     APPEARED,
@@ -21,9 +22,9 @@ from radarsdf.changes.changes import (
     Changes,
     areas_of,
 )  # fmt: skip
-from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
+from radarsdf.changes.probability import Errors, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.changes.reflectance import Differences
-from radarsdf.checks import check, check_box
+from radarsdf.checks import check, check_box, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_free_space
@@ -95,9 +96,7 @@ def compare(
     An object that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
     Intensities near surface that appeared, disappeared or moved are left out.
     """
-    if not isinstance(before, Map):
-        msg = f"before must be a map, not {type(before).__name__}"
-        raise TypeError(msg)
+    instance(before, Map, "before")  # type: ignore[type-abstract]
     corners = None if box is None else check_box(box)
     check_free_space(before, "before")
     if not isinstance(after, Map):

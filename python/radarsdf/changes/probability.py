@@ -12,17 +12,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 from scipy.special import betaln, expit
 from scipy.stats import t as student
 
+from radarsdf.arrays import Bools, Floats, Ints, Ints32
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import across_triangles
 from radarsdf.products import turned
-
-Floats = NDArray[np.float64]
 
 # Reach of distances around the surface of a field: returns scatter into the next cells.
 _REACH_CELLS = 2.0
@@ -64,7 +62,7 @@ class PlacedMap:
     radar_map: Map
     T_common_map: Floats  # (4, 4) from the map's world to the common frame, m
     vertices: Floats  # (V, 3) of the map's default mesh, in leaf cells; world of the map, m
-    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    faces: Ints32  # (F, 3) rows of vertices
     normals: Floats  # (V, 3) of the mesh, towards free space
     sigma_m: Floats  # (V,) standard errors of the vertices, m
 
@@ -91,7 +89,7 @@ class PlacedMap:
     def _tree(self) -> cKDTree:
         return cKDTree(self.vertices)
 
-    def nearest(self, x: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+    def nearest(self, x: Floats) -> tuple[Floats, Ints, Floats]:
         """Distances to the vertices nearest to places (N, 3), world of the map, their rows, and distances from their planes."""
         near_m, rows = self._tree.query(x)
         away = x - self.vertices[rows]
@@ -141,19 +139,19 @@ class Side:
     """Surface of one map with the evidence of both maps at its vertices."""
 
     vertices: Floats  # (V, 3) common frame, m
-    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    faces: Ints32  # (F, 3) rows of vertices
     own: PlaceEvidence
     other: PlaceEvidence
     sigma_m: Floats  # (V,) standard error of the distance between both surfaces, m
     reach_m: float  # :attr:`PlacedMap.reach_m` of the other map
 
     @property
-    def observed(self) -> NDArray[np.bool_]:
+    def observed(self) -> Bools:
         """(V,) whether the distance is known."""
         return np.isfinite(self.other.distance_m) & np.isfinite(self.sigma_m)
 
     @property
-    def parallel(self) -> NDArray[np.bool_]:
+    def parallel(self) -> Bools:
         """(V,) whether the other map's surface is about parallel."""
         return np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, Encoding, VertexTable
+from radarsdf.arrays import Floats, Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.average import (
     BAND_CELLS,
@@ -19,7 +19,6 @@ from radarsdf.fitting.average import (
 )
 from radarsdf.live.regions import (
     NO_KEYS,
-    Keys,
     RegionTable,
     Rows,
     cubes_near,
@@ -37,12 +36,7 @@ from radarsdf.map.mesh import Surface
 from radarsdf.returns.evidence import BLOCK_BITS, Evidence, VisibilityCounts, bridged, evidence_sums
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.planes import (
-    LEAVES_PER_SURFEL,
-    MIN_SUPPORT,
-    Surfels,
-    neighbour_planes,
-)
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, neighbour_planes
 from radarsdf.returns.sums import MeanRays, ScanSums, lattice_of, merged_keys
 from radarsdf.threads import resolve_num_threads
 
@@ -56,15 +50,20 @@ class GrowingSurface:
     distances take most of the time, and are cached by region. Ghosts and triangles are recomputed for the whole map.
     """
 
-    def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
+    def __init__(self, config: FitConfig, origin: Floats) -> None:
         self._config = config  # quick settings
         self._origin = origin  # (3,) origin of the local frame, world, m
         self.complete = False  # set by the caller after :meth:`update`, so that a partial one is not used
         self._noise: SensorNoise | None = None
-        vector, number = np.full((1, 3), np.nan, np.float32), np.zeros(1, np.float32)
+        vector, number, count = (
+            np.full((1, 3), np.nan, np.float32),
+            np.zeros(1, np.float32),
+            np.zeros(1, np.uint32),
+        )
         # Leaf cells with returns: mean rays and normals.
-        means = {"points": vector, "directions": vector, "counts": number, "ranges_m": number}
-        self._leaves = RegionTable(**means, scans=np.zeros(1, np.uint32), normals=vector)
+        self._leaves = RegionTable(
+            points=vector, directions=vector, counts=number, scans=count, ranges_m=number, normals=vector
+        )
         # Cells of surfels. Planes (centre, normal, variances) are NaN without support.
         no_plane = np.full((1, 9), np.nan)
         self._cells = RegionTable(
@@ -75,10 +74,7 @@ class GrowingSurface:
         self._crossed = RegionTable()  # leaf cells that rays cross near their returns
         # These, and the bridges over gaps between them: distances at the corners, m, whether they change sign, evidence.
         self.distances = RegionTable(
-            values=np.zeros((1, 8), np.float32),
-            crossed=np.zeros(1, bool),
-            information=np.zeros(1, np.float32),
-            hits=np.zeros(1, np.uint32),
+            values=np.zeros((1, 8), np.float32), crossed=np.zeros(1, bool), information=number, hits=count
         )
 
     @property
@@ -226,7 +222,7 @@ class GrowingSurface:
         rows = {"values": values, "crossed": crossed, "information": information, "hits": hits}
         self.distances.put(regions, {"keys": leaf_keys[own]} | rows)
 
-    def _true_means(self, regions: Keys) -> tuple[MeanRays, NDArray[np.float32]]:
+    def _true_means(self, regions: Keys) -> tuple[MeanRays, Floats32]:
         """Return the mean rays of the leaf cells in `regions` that are no ghosts, and their normals (M, 3)."""
         leaves = self._leaves.gather(regions)
         true = np.flatnonzero(~np.isin(merged_keys(leaves["keys"]), self._ghosts))
@@ -235,5 +231,4 @@ class GrowingSurface:
 
 def _means_of(rows: Rows) -> MeanRays:
     """Build the mean rays of leaf cells from their columns."""
-    names = ("keys", "points", "directions", "counts", "scans", "ranges_m")
-    return MeanRays(**{name: rows[name] for name in names})
+    return MeanRays(**{name: rows[name] for name in MeanRays.__dataclass_fields__})

@@ -9,17 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from radarsdf._core import CellBlocks
+from radarsdf.arrays import Floats, Floats32
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.returns.evidence import CELLS_OF_SURFACE
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import ThreadPool, resolve_num_threads, start_vector_library
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _FEW, _VERTICES = 1 << 13, 1 << 17  # places evaluated without a pool of threads; by one thread at a time
 
@@ -50,17 +47,17 @@ _SMOOTH = 0.5  # width of the smooth maximum, standard deviations: excess hits a
 class EvidenceAt(NamedTuple):
     """Evidence of a surface at N points, interpolated between the centres of leaf cells; 0 outside the cells."""
 
-    information: Float32  # (N,) sum of 1 / variance over the returns near each point, m⁻²
-    hits: Float32  # (N,) number of scans with returns near each point
-    visibility: Float32  # (N,) number of scans with rays reaching it
-    usual: Float32  # (N,) information of most returns in the neighbourhood, m⁻²
+    information: Floats32  # (N,) sum of 1 / variance over the returns near each point, m⁻²
+    hits: Floats32  # (N,) number of scans with returns near each point
+    visibility: Floats32  # (N,) number of scans with rays reaching it
+    usual: Floats32  # (N,) information of most returns in the neighbourhood, m⁻²
 
 
-def evidence(contents: MapContents, points: Float32) -> EvidenceAt:
+def evidence(contents: MapContents, points: Floats32) -> EvidenceAt:
     return interpolated(*contents.evidence_of_cells, contents.config.leaf_size_m, points)
 
 
-def interpolated(cells: CellBlocks, columns: Float32, leaf_size_m: float, points: Float32) -> EvidenceAt:
+def interpolated(cells: CellBlocks, columns: Floats32, leaf_size_m: float, points: Floats32) -> EvidenceAt:
     """Interpolate the `columns` (C, 4) of the evidence of leaf cells at points (N, 3), local frame, m."""
     # NaN and points beyond the range of keys are clamped to its limit, where there are no cells.
     limit_m = MAX_CELLS_FROM_ORIGIN * leaf_size_m
@@ -69,7 +66,7 @@ def interpolated(cells: CellBlocks, columns: Float32, leaf_size_m: float, points
     return EvidenceAt(*cells.interpolate(leaf_size_m, columns, near, resolve_num_threads(0)).T)
 
 
-def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Float32:
+def uncertainty(contents: WholeMap, evidence: EvidenceAt) -> Floats32:
     """Return the standard error (N,) of the surface's position, m; NaN where there are no returns."""
     floor_m = floor_cells(contents) * contents.config.leaf_size_m
     known = np.where(evidence.information > 0, evidence.information, np.nan)
@@ -86,7 +83,7 @@ def floor_cells(contents: WholeMap) -> float:
     return _FLOOR_CELLS + _ROUGH_FLOOR_CELLS * math.pow(roughness(contents), 1.5)
 
 
-def confidence(contents: WholeMap, evidence: EvidenceAt) -> Float32:
+def confidence(contents: WholeMap, evidence: EvidenceAt) -> Floats32:
     """Return the probability (N,) that a surface is within a leaf cell's edge; 0 where there are no returns."""
     return probabilities(contents, evidence).confidence.astype(np.float32)
 
@@ -94,9 +91,9 @@ def confidence(contents: WholeMap, evidence: EvidenceAt) -> Float32:
 class Probabilities(NamedTuple):
     """Probabilities of a surface at N points, float64; (nearly) 0 where there are no returns."""
 
-    confidence: Float64  # (N,) see :func:`confidence`
-    covering: Float64  # (N,) true surface newly covered per area, up to a constant factor
-    reach: Float64  # (N,) probability of a position error within a leaf cell's edge, normally distributed
+    confidence: Floats  # (N,) see :func:`confidence`
+    covering: Floats  # (N,) true surface newly covered per area, up to a constant factor
+    reach: Floats  # (N,) probability of a position error within a leaf cell's edge, normally distributed
 
 
 def probabilities(contents: WholeMap, evidence: EvidenceAt) -> Probabilities:

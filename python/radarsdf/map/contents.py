@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from radarsdf._core import CellBlocks
+from radarsdf.arrays import Floats, Floats32
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.returns.evidence import Evidence
@@ -40,7 +38,7 @@ class Deferred(Generic[_Part]):
 class WholeMap:
     """Properties of the whole map on which evidence at a place depends, besides the returns there."""
 
-    origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
+    origin: Floats  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
     clutter_ratio: float  # share of the returns not on a thin surface, in [0, 1]
     returns_per_cell: float  # mean number of returns in the cells of surfels with returns
@@ -59,7 +57,7 @@ class MapContents(WholeMap):
     view_statistics: Callable[[], ViewStatistics] = ViewStatistics.none  # of intensity, or none
 
     @cached_property
-    def evidence_of_cells(self) -> tuple[CellBlocks, NDArray[np.float32]]:
+    def evidence_of_cells(self) -> tuple[CellBlocks, Floats32]:
         """The leaf cells, and (C, 4) see :meth:`radarsdf.returns.evidence.Evidence.columns`. Prepared by the first query."""
         keys = self.field.table.leaf_keys()
         return CellBlocks(keys), self.evidence.columns(keys, resolve_num_threads(0))

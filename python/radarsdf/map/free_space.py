@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Bools, Bytes, Floats, Ints
 from radarsdf.map import queries
 from radarsdf.map.confidence import confidence, evidence
 from radarsdf.map.contents import MapContents
@@ -20,15 +20,15 @@ _ODDS_CELLS = 50_000  # sample of leaf cells that calibrates the weight of free-
 class CellsInBox:
     """Free space and returns in the leaf cells of a box, as dense arrays."""
 
-    corner: NDArray[np.float64]  # (3,) lower corner of the first cell, world, m
-    passed: NDArray[np.uint8]  # number of scans with a ray through the cell, at most 7
-    returns: NDArray[np.bool_]  # whether the cell has returns
-    observed: NDArray[np.bool_]  # whether the cell is a leaf cell of the map
+    corner: Floats  # (3,) lower corner of the first cell, world, m
+    passed: Bytes  # number of scans with a ray through the cell, at most 7
+    returns: Bools  # whether the cell has returns
+    observed: Bools  # whether the cell is a leaf cell of the map
 
 
 def dense_cells(
-    contents: MapContents, lower: NDArray[np.int64], shape: tuple[int, int, int]
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
+    contents: MapContents, lower: Ints, shape: tuple[int, int, int]
+) -> tuple[Bytes, Bools, Bools]:
     """Return `passed`, `returns` and `observed` of the leaf cells from `lower` (3,) on, relative to the map's origin."""
     passed, returns = contents.free_space().dense(lower, shape)
     cells = lattice_of(contents.field.table.leaf_keys()) - lower
@@ -38,7 +38,7 @@ def dense_cells(
     return passed, returns, observed
 
 
-def free_space_odds(contents: MapContents) -> NDArray[np.float64]:
+def free_space_odds(contents: MapContents) -> Floats:
     """Return the odds (8,) that a leaf cell crossed by 0 to 7 or more scans is behind rather than before a surface."""
     # Calibrated on the map's own cells that are clearly on one side of a surface: rays cross solid cells because of noise,
     # and on the way to false returns.

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from radarsdf.arrays import Array, Bools, Floats, Floats32
 from radarsdf.checks import MAX_POSITION_M, check, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
-from radarsdf.map.confidence import EvidenceAt, Float32, confidence, uncertainty
+from radarsdf.map.confidence import EvidenceAt, confidence, uncertainty
 from radarsdf.map.contents import MapContents
 from radarsdf.map.free_space import CellsInBox, free_space_odds
 from radarsdf.map.threshold import VOXEL_M
@@ -30,8 +31,7 @@ if TYPE_CHECKING:
     from radarsdf.map.view import View, ViewedMap
 
 
-_Floats = NDArray[np.float64]
-Query = Callable[..., NDArray[Any]]
+Query = Callable[..., Array]
 
 
 class Map(ABC):
@@ -125,7 +125,7 @@ class Map(ABC):
             and ``pose_sigma_rad`` of the :class:`FitConfig` specify them.
         """
         world, answer = _as_positions(x)
-        return answer(uncertainty(self._contents_of_any, self.evidence_at(world)))
+        return answer(uncertainty(self.contents_of_any, self.evidence_at(world)))
 
     def confidence(self, x: Any) -> Any:
         """Estimate the probability of a surface, from the returns near each position and the scans that reached it.
@@ -148,7 +148,7 @@ class Map(ABC):
         other kinds of scenes, the worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
         """
         world, answer = _as_positions(x)
-        return answer(confidence(self._contents_of_any, self.evidence_at(world)))
+        return answer(confidence(self.contents_of_any, self.evidence_at(world)))
 
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
         """Predict the intensity of the return that a sensor would measure at each position.
@@ -326,22 +326,22 @@ class Map(ABC):
     @property
     def config(self) -> FitConfig:
         """Settings of the fit."""
-        return self._contents_of_any.config
+        return self.contents_of_any.config
 
     @property
     def report(self) -> dict[str, Any]:
         """Counts, losses, sensor noise and times, s, of the fit. `skipped`: parts of the method that it did not run."""
-        return self._contents_of_any.report
+        return self.contents_of_any.report
 
     @property
     def sensor(self) -> Sensor:
         """The radar, estimated from the scans of the fit."""
-        return self._contents_of_any.sensor
+        return self.contents_of_any.sensor
 
     @property
     def intensity_scale(self) -> IntensityScale | None:
         """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
-        return self._contents_of_any.intensity_scale
+        return self.contents_of_any.intensity_scale
 
     @property
     def has_intensity(self) -> bool:
@@ -351,16 +351,16 @@ class Map(ABC):
     @property
     def clutter_ratio(self) -> float:
         """Share of the returns that do not lie on a thin surface, in [0, 1]."""
-        return self._contents_of_any.clutter_ratio
+        return self.contents_of_any.clutter_ratio
 
     @property
     @abstractmethod
-    def origin(self) -> _Floats:
+    def origin(self) -> Floats:
         """Origin of the local frame, (3,) float64, world, m. Queries subtract it in float64."""
 
     @property
     @abstractmethod
-    def extent(self) -> _Floats:
+    def extent(self) -> Floats:
         """Lower and upper corner of the bounding box of all leaf cells, (2, 3) float64, world, m."""
 
     @property
@@ -376,11 +376,11 @@ class Map(ABC):
     # Interface for grids, comparisons and views, and the abstract methods, at positions (N, 3), world, m.
 
     @abstractmethod
-    def cells_near(self, lower: _Floats, upper: _Floats) -> CellsInBox:
+    def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         """Return free space and returns in the leaf cells that overlap the box of two corners (3,), world, m."""
 
     @abstractmethod
-    def evidence_at(self, world: _Floats) -> EvidenceAt:
+    def evidence_at(self, world: Floats) -> EvidenceAt:
         """Return the evidence of a surface at positions (N, 3), world, m."""
 
     @abstractmethod
@@ -389,43 +389,43 @@ class Map(ABC):
 
     @property
     @abstractmethod
-    def _contents_of_any(self) -> MapContents:
+    def contents_of_any(self) -> MapContents:
         """The contents of the map, or of any of its tiles, for properties that all share."""
 
     @cached_property
-    def free_space_odds(self) -> _Floats:
+    def free_space_odds(self) -> Floats:
         """See :func:`radarsdf.map.free_space.free_space_odds`."""
-        return free_space_odds(self._contents_of_any)
+        return free_space_odds(self.contents_of_any)
 
     @abstractmethod
-    def _evaluate(self, query: Query, world: _Floats, *others: _Floats, extrapolate: bool) -> NDArray[Any]:
+    def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
         """Evaluate a query of :mod:`queries` where observed (`extrapolate`: at finite positions) and others finite; else NaN."""
 
     @abstractmethod
-    def _observed(self, world: _Floats) -> NDArray[np.bool_]: ...
+    def _observed(self, world: Floats) -> Bools: ...
 
     @abstractmethod
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     @abstractmethod
-    def _viewed_from(self, position: _Floats, range_m: float) -> ViewedMap:
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
         """Return the data for views from a position (3,) within a range, cached for the next view."""
 
-    def tangent_planes(self, x: _Floats) -> tuple[_Floats, _Floats]:
+    def tangent_planes(self, x: Floats) -> tuple[Floats, Floats]:
         """Linearise the surface at positions (N, 3), world, m: signed distances (N,), m, to planes, and unit normals (N, 3)."""
         sdf, gradient = self.sdf(x, return_gradient=True)
         length = np.linalg.norm(gradient, axis=1)
         # At grazing incidence the field exceeds the distance, and its gradient exceeds 1, by the same factor.
         return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
 
-    def surface_at(self, world: _Floats) -> tuple[EvidenceAt, Float32, Float32]:
+    def surface_at(self, world: Floats) -> tuple[EvidenceAt, Floats32, Floats32]:
         """Return :meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
-        evidence, contents = self.evidence_at(world), self._contents_of_any
+        evidence, contents = self.evidence_at(world), self.contents_of_any
         return evidence, uncertainty(contents, evidence), confidence(contents, evidence)
 
 
-def _as_positions(x: Any, rows: int | None = None) -> tuple[_Floats, Callable[[NDArray[Any]], Any]]:
+def _as_positions(x: Any, rows: int | None = None) -> tuple[Floats, Callable[[Array], Any]]:
     """Convert `x` to positions (N, 3), and return a function that converts results back; (3,) is broadcast to `rows`."""
     is_tensor = isinstance(x, Tensor)
     if is_tensor and (x.device.type != "cpu" or x.layout != torch.strided or x.is_complex()):
@@ -439,7 +439,7 @@ def _as_positions(x: Any, rows: int | None = None) -> tuple[_Floats, Callable[[N
         raise ValueError(msg)
     keep_double = getattr(x, "dtype", None) in (torch.float64, np.dtype(np.float64), None)
 
-    def answer(result: NDArray[Any]) -> Any:
+    def answer(result: Array) -> Any:
         kind = result.dtype if result.dtype == np.bool_ else np.float64 if keep_double else np.float32
         array = np.ascontiguousarray(result, kind)
         return torch.from_numpy(array) if is_tensor else array

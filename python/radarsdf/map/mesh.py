@@ -14,6 +14,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import vertex_areas
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
@@ -37,11 +38,11 @@ _INWARD = 1e-3
 class Surface:
     """All triangles where the field crosses zero, with the evidence of their vertices."""
 
-    vertices: NDArray[np.float64]  # (V, 3) local frame, m
-    faces: NDArray[np.int32]  # (F, 3) rows of the vertices, counter-clockwise seen from free space
+    vertices: Floats  # (V, 3) local frame, m
+    faces: Ints32  # (F, 3) rows of the vertices, counter-clockwise seen from free space
     evidence: EvidenceAt  # at the vertices
-    confidence: NDArray[np.float32]  # (V,) see :meth:`Map.confidence`
-    uncertainty_m: NDArray[np.float32]  # (V,) see :meth:`Map.uncertainty`
+    confidence: Floats32  # (V,) see :meth:`Map.confidence`
+    uncertainty_m: Floats32  # (V,) see :meth:`Map.uncertainty`
     tally: Tally  # area by confidence
     cells_searched: int  # number of leaf cells that may contain surface
 
@@ -50,7 +51,7 @@ class Surface:
         cls,
         contents: MapContents,
         voxel_size: float,
-        box: NDArray[np.float64] | None = None,
+        box: Floats | None = None,
         progress: bool | None = False,
     ) -> Surface:
         """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
@@ -61,22 +62,17 @@ class Surface:
 
     @classmethod
     def from_triangles(
-        cls,
-        scene: WholeMap,
-        vertices: NDArray[np.float64],
-        faces: NDArray[np.int32],
-        evidence: EvidenceAt,
-        cells_searched: int,
+        cls, scene: WholeMap, vertices: Floats, faces: Ints32, evidence: EvidenceAt, cells_searched: int
     ) -> Surface:
         """Build from triangles and the evidence at their vertices."""
         found = probabilities(scene, evidence)
         confidence = found.confidence.astype(np.float32)
-        columns = confidence.astype(np.float64), found.covering, found.reach, evidence.hits
+        columns = confidence.astype(np.float64), found.covering, found.reach, evidence.hits.astype(np.float64)
         tally = Tally.of(vertex_areas(vertices, faces), *columns)
         sigma_m = uncertainty(scene, evidence)
         return cls(vertices, faces, evidence, confidence, sigma_m, tally, cells_searched)
 
-    def kept(self, limits: Limits) -> NDArray[np.bool_]:
+    def kept(self, limits: Limits) -> Bools:
         """Return a mask (F,) of the faces within the limits, without small components."""
         min_confidence = self.tally.threshold(limits.min_confidence).min_confidence
         kept = within(limits, min_confidence, self.faces, self.confidence, self.uncertainty_m)
@@ -86,16 +82,14 @@ class Surface:
             kept[rows] = (sizes >= limits.min_component_triangles).take(labels)
         return kept
 
-    def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
+    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         return self.part(
             origin, self.kept(limits), **counts, **self.tally.threshold(limits.min_confidence).metadata
         )
 
-    def part(
-        self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
-    ) -> trimesh.Trimesh:
+    def part(self, origin: Floats, kept: Bools, **metadata: float) -> trimesh.Trimesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
         used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
         rows = np.flatnonzero(used)
@@ -116,10 +110,10 @@ def extract_mesh(
 
 
 def described_mesh(
-    vertices: NDArray[np.float64],
+    vertices: Floats,
     faces: NDArray[np.integer[Any]],
-    confidence: NDArray[np.float32],
-    uncertainty_m: NDArray[np.float32],
+    confidence: Floats32,
+    uncertainty_m: Floats32,
     **metadata: float,
 ) -> trimesh.Trimesh:
     """Build a mesh of vertices (V, 3), world, m, with vertex attributes and metadata."""
@@ -130,9 +124,7 @@ def described_mesh(
     return mesh
 
 
-def with_intensities(
-    mesh: trimesh.Trimesh, intensities: NDArray[Any], scale: IntensityScale
-) -> trimesh.Trimesh:
+def with_intensities(mesh: trimesh.Trimesh, intensities: Array, scale: IntensityScale) -> trimesh.Trimesh:
     """Add intensities (V,), sensor units, and their colours to the vertices of a mesh."""
     values = intensities.astype(np.float32)
     mesh.vertex_attributes["intensity"] = values
@@ -142,23 +134,19 @@ def with_intensities(
 
 
 def within(
-    limits: Limits,
-    min_confidence: float,
-    faces: NDArray[np.int32],
-    confidence: NDArray[np.float32],
-    uncertainty_m: NDArray[np.float32],
-) -> NDArray[np.bool_]:
+    limits: Limits, min_confidence: float, faces: Ints32, confidence: Floats32, uncertainty_m: Floats32
+) -> Bools:
     """Return a mask (F,) of the faces (F, 3) with all vertices within the limits."""
     return with_all(limits.met(min_confidence, confidence, uncertainty_m), faces)
 
 
-def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+def with_all(good: Bools, faces: Ints32) -> Bools:
     """Return a mask (F,) of the faces (F, 3) with all vertices in the mask `good` (V,)."""
     first, second, third = faces.T
     return good.take(first) & good.take(second) & good.take(third)
 
 
-def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+def renumbered(num_vertices: int, faces: Ints32) -> tuple[Bools, Ints32]:
     """Return a mask (V,) of the vertices that faces use, and the faces (F, 3) renumbered accordingly."""
     used = np.zeros(num_vertices, bool)
     used[faces] = True
@@ -166,7 +154,7 @@ def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.
     return used, renumbered.take(faces)
 
 
-def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int32]:
+def one_for_equal(vertices: Floats, rows: Ints) -> Ints32:
     """Map vertices (V,) to themselves, and those at `rows` (B,) to the first one at the same position."""
     found = np.arange(len(vertices), dtype=np.int32)
     _, first, which = np.unique(vertices[rows], axis=0, return_index=True, return_inverse=True)
@@ -178,8 +166,8 @@ def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDA
 
 
 def extract_triangles(
-    contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
-) -> tuple[NDArray[np.float64], NDArray[np.int32], int]:
+    contents: MapContents, voxel_size: float, box: Floats | None, progress: bool | None
+) -> tuple[Floats, Ints32, int]:
     """Triangulate the surface in voxels. `box` (2, 3), local frame, m, limits their centres.
 
     Returns vertices (V, 3), local frame, m, faces (F, 3), and the number of leaf cells searched.
@@ -206,8 +194,8 @@ def extract_triangles(
 
 
 def sample_lattice(
-    contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], int]:
+    contents: MapContents, voxel_size: float, box: Floats | None, progress: bool | None
+) -> tuple[Ints32, Ints32, Floats32, int]:
     """Return lattice coordinates of the corners (K, 3) of voxels in leaf cells that may contain surface, the rows of each
     voxel (M, 8), signed distances at the corners (K,), m, and the number of these cells."""
     config, leaf_size_m, num_threads = contents.config, contents.config.leaf_size_m, torch.get_num_threads()
@@ -233,7 +221,7 @@ def sample_lattice(
     return corners, voxel_corners, distances_m, len(cells)
 
 
-def _overlap(cells: NDArray[np.int32], leaf_size_m: float, box: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _overlap(cells: Ints32, leaf_size_m: float, box: Floats) -> Bools:
     found = ((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])
     return np.asarray(found.all(axis=1))
 
@@ -241,8 +229,8 @@ def _overlap(cells: NDArray[np.int32], leaf_size_m: float, box: NDArray[np.float
 def crossed(
     cells: NDArray[np.integer[Any]],
     leaf_size_m: float,
-    distances_at: Callable[[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]], NDArray[Any]],
-) -> NDArray[np.int32]:
+    distances_at: Callable[[Ints32, Ints32, Ints32], Array],
+) -> Ints32:
     """Return the leaf cells among (M, 3) with corners, by `distances_at`, not all clearly on one side of the surface."""
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
     values_m = distances_at(unique, corners, cell_corners)[cell_corners]
@@ -257,7 +245,7 @@ def per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
     return parts, math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
 
 
-def subdivided(cells: NDArray[Any], parts: int) -> NDArray[Any]:
+def subdivided(cells: Array, parts: int) -> Array:
     """Subdivide cells (M, 3) into voxels (M · parts³, 3), `parts` along an edge."""
     inside = np.indices((parts,) * 3, cells.dtype).reshape(3, -1).T
     return (cells[:, None] * cells.dtype.type(parts) + inside).reshape(-1, 3)
@@ -270,9 +258,7 @@ def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config:
     check_mesh(cells * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
 
 
-def _voxels_of(
-    cells: NDArray[np.int32], voxel_size: float, parts: int, even: bool, config: FitConfig
-) -> NDArray[np.int32]:
+def _voxels_of(cells: Ints32, voxel_size: float, parts: int, even: bool, config: FitConfig) -> Ints32:
     """Return the voxels (M, 3) that overlap leaf cells, with duplicates. `parts`, `even`: see :func:`per_cell`."""
     _check_voxels(len(cells), voxel_size, parts, even, config)
     if even:
@@ -290,11 +276,11 @@ def _voxels_of(
 def _corner_distances(
     contents: MapContents,
     voxel_size: float,
-    voxels: NDArray[np.int32],
-    corners: NDArray[np.int32],
-    voxel_corners: NDArray[np.int32],
+    voxels: Ints32,
+    corners: Ints32,
+    voxel_corners: Ints32,
     progress: bool | None = False,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Evaluate signed distances (K,), m, at lattice corners (K, 3)."""
     # A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
     # until it is in an occupied cell, and the distance moved is added to its absolute value.

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from radarsdf.arrays import Array, Bools, Floats, Floats32
 from radarsdf.checks import hides_bar
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.returns.response import RANGE_MARGIN
 from radarsdf.threads import ThreadPool, resolve_num_threads, start_vector_library
-
-Float32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 INWARD = 1e-3
 """Shift of points on the border of a map into it, edges of a cell."""
@@ -25,21 +21,21 @@ _CHUNK = 1 << 13  # points per evaluation, so that hidden layers fit the second-
 _MIN_RANGE_M = 1e-6  # lower bound of the norm of a direction, for points at the sensor
 
 
-def to_local(contents: WholeMap, world: NDArray[np.float64]) -> Float32:
+def to_local(contents: WholeMap, world: Floats) -> Floats32:
     """Convert world positions (N, 3), m, to the local frame, float32. The origin is subtracted in float64."""
     with np.errstate(over="ignore"):  # beyond float32 is infinite
         return (world - contents.origin).astype(np.float32, order="C")
 
 
 def signed_distance(
-    contents: MapContents, points: Float32, *, description: str = "", progress: bool | None = False
-) -> Float32:
+    contents: MapContents, points: Floats32, *, description: str = "", progress: bool | None = False
+) -> Floats32:
     if contents.field.corner_distances_m() is not None:
         return plane(contents, points)[:, 0]
     return evaluate(contents.field.sdf, points, description=description, progress=progress)
 
 
-def plane(contents: MapContents, points: Float32) -> Float32:
+def plane(contents: MapContents, points: Floats32) -> Floats32:
     """Evaluate the signed distance and its gradient, (N, 4)."""
     field = contents.field
     if (stored_m := field.corner_distances_m()) is None:
@@ -48,8 +44,8 @@ def plane(contents: MapContents, points: Float32) -> Float32:
 
 
 def intensity(
-    contents: MapContents, points: Float32, sensors: Float32, *, extrapolate: bool = False
-) -> Float32:
+    contents: MapContents, points: Floats32, sensors: Floats32, *, extrapolate: bool = False
+) -> Floats32:
     """Predict intensities (N,), sensor units, of returns from points to sensors (N, 3), local frame, m.
 
     NaN for ranges and elevations unlike those of all returns, unless `extrapolate`.
@@ -74,18 +70,18 @@ def intensity(
     return evaluate(of_chunk, np.concatenate([points, sensors], axis=1))
 
 
-def occupied(contents: MapContents, points: Float32) -> Mask:
+def occupied(contents: MapContents, points: Floats32) -> Bools:
     return evaluate(contents.field.occupied, points)
 
 
 @torch.inference_mode(mode=False)  # gradients, for normals, need ordinary tensors
 def evaluate(
     function: Callable[[Tensor], Tensor],
-    points: Float32,
+    points: Floats32,
     *,
     description: str = "",
     progress: bool | None = False,
-) -> NDArray[Any]:
+) -> Array:
     """Evaluate function(points) without gradients, in chunks, on the number of threads of PyTorch."""
     rows = torch.from_numpy(points)
     if len(rows) <= _CHUNK:
@@ -99,7 +95,7 @@ def evaluate(
         return torch.cat(list(bar)).numpy()
 
 
-def into_cells(contents: MapContents, points: Float32, size_m: float | None = None) -> Mask:
+def into_cells(contents: MapContents, points: Floats32, size_m: float | None = None) -> Bools:
     """Shift points on the border of occupied leaf cells slightly into one, in place; return a mask of those inside.
 
     A point on a face, such as a vertex of a mesh, belongs to the cell above it, which may be empty.
@@ -108,9 +104,7 @@ def into_cells(contents: MapContents, points: Float32, size_m: float | None = No
     return contents.field.table.into_cells(points, step_m, resolve_num_threads(0))
 
 
-def where(
-    known: Mask, query: Callable[..., NDArray[Any]], contents: MapContents, *inputs: Float32
-) -> NDArray[Any]:
+def where(known: Bools, query: Callable[..., Array], contents: MapContents, *inputs: Floats32) -> Array:
     """Evaluate query(contents, *inputs) for the rows in the mask `known` (N,); NaN for the others."""
     if known.all():
         return query(contents, *inputs)

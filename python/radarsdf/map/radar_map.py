@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load, save
 
+from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.field.field import Field
 from radarsdf.map import queries, storage
 from radarsdf.map.confidence import EvidenceAt, evidence
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from radarsdf.map.view import ViewedMap
 
 
-_Floats = NDArray[np.float64]
-
-
 class RadarMap(Map):
     """Fitted map in one file, created by :func:`radarsdf.fit` or :func:`radarsdf.load`. See :class:`Map` for its queries."""
 
@@ -45,19 +42,19 @@ class RadarMap(Map):
         tensors, description = storage.parts_of(self._contents)
         return _from_pickle, (save(tensors), description)  # bytes: the pickle needs no classes of PyTorch
 
-    def _evaluate(self, query: Query, world: _Floats, *others: _Floats, extrapolate: bool) -> NDArray[Any]:
+    def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
         points, *rest = (queries.to_local(self._contents, x) for x in (world, *others))
         inside = queries.into_cells(self._contents, points)
-        known = np.isfinite(points).all(axis=1) if extrapolate else inside
+        known: Any = np.isfinite(points).all(axis=1) if extrapolate else inside
         for x in rest:
             known = known & np.isfinite(x).all(axis=1)
         return queries.where(known, query, self._contents, points, *rest)
 
-    def _observed(self, world: _Floats) -> NDArray[np.bool_]:
+    def _observed(self, world: Floats) -> Bools:
         return queries.into_cells(self._contents, queries.to_local(self._contents, world))
 
     @property
-    def _contents_of_any(self) -> MapContents:
+    def contents_of_any(self) -> MapContents:
         return self._contents
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
@@ -65,7 +62,7 @@ class RadarMap(Map):
 
         return extract_mesh(self._contents, voxel_size, **wanted)
 
-    def cells_near(self, lower: _Floats, upper: _Floats) -> CellsInBox:
+    def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         leaf_m = self.config.leaf_size_m
         first = np.floor((lower - self.origin) / leaf_m).astype(np.int64)
         count = np.floor((upper - self.origin) / leaf_m).astype(np.int64) - first + 1
@@ -73,7 +70,7 @@ class RadarMap(Map):
         cells = dense_cells(self._contents, first, (x, y, z))
         return CellsInBox(self.origin + first * leaf_m, *cells)
 
-    def evidence_at(self, world: _Floats) -> EvidenceAt:
+    def evidence_at(self, world: Floats) -> EvidenceAt:
         return evidence(self._contents, queries.to_local(self._contents, world))
 
     def view_statistics(self) -> ViewStatisticsAt:
@@ -81,7 +78,7 @@ class RadarMap(Map):
         low, high = (0, 1) if scale is None else (scale.low, scale.high)
         return self._contents.view_statistics().in_world(self.origin, low, high)
 
-    def _viewed_from(self, position: _Floats, range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
         return self._viewed
 
     @cached_property
@@ -94,11 +91,11 @@ class RadarMap(Map):
         storage.save_contents(self._contents, path)
 
     @property
-    def origin(self) -> _Floats:
+    def origin(self) -> Floats:
         return self._contents.origin
 
     @property
-    def extent(self) -> _Floats:
+    def extent(self) -> Floats:
         cells = lattice_of(self.field.table.leaf_keys())
         corners = np.stack([cells.min(axis=0), cells.max(axis=0) + 1])
         return corners * self.config.leaf_size_m + self.origin

@@ -8,11 +8,9 @@ from dataclasses import asdict, astuple, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Bools, Floats, Floats32, Ints32
 from radarsdf.checks import check, number, whole_number
-
-Floats = NDArray[np.float64]
 
 VOXEL_M = 0.1
 """Default edge of a mesh's voxels, m."""
@@ -41,9 +39,7 @@ class Limits(NamedTuple):
         """Check the arguments of :meth:`Map.mesh` and fill in defaults."""
         if min_confidence is not None:
             min_confidence = number(min_confidence, "min_confidence")
-        if not 0 <= (min_confidence or 0) <= 1:
-            msg = f"min_confidence must be in [0, 1], not {min_confidence}"
-            raise ValueError(msg)
+        check(0 <= (min_confidence or 0) <= 1, f"min_confidence must be in [0, 1], not {min_confidence}")
         max_uncertainty = number(math.inf if max_uncertainty is None else max_uncertainty, "max_uncertainty")
         check(max_uncertainty >= 0, f"max_uncertainty must be at least 0, not {max_uncertainty}")
         if min_component_triangles is None:
@@ -52,9 +48,7 @@ class Limits(NamedTuple):
         components = whole_number(min_component_triangles, "min_component_triangles", 0)
         return cls(min_confidence, max_uncertainty, components)
 
-    def met(
-        self, threshold: float, confidence: NDArray[np.float32], uncertainty_m: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
+    def met(self, threshold: float, confidence: Floats32, uncertainty_m: Floats32) -> Bools:
         """Return a mask (V,) of vertices within the limits at a confidence threshold. NaN exceeds any finite uncertainty."""
         certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= self.max_uncertainty
         return certain & (confidence >= threshold)
@@ -151,7 +145,7 @@ class Tally:
         return true_m2 / (true_m2 + unseen_m2) * true_m2 / self.existing_m2
 
 
-def across_triangles(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
+def across_triangles(vertices: Floats, faces: Ints32) -> tuple[Floats, Floats]:
     """Return the cross products (F, 3) of the edges of triangles (F, 3), and their lengths (F,), twice the areas, m²."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

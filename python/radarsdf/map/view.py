@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import SurfaceTracer, cell_keys
+from radarsdf.arrays import Floats, Floats32, Ints
 from radarsdf.checks import check, flag, number, whole_number
 from radarsdf.map import queries
 from radarsdf.map.confidence import EvidenceAt, evidence, roughness
@@ -22,8 +22,7 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.scans import Scan, Scans
 from radarsdf.threads import resolve_num_threads
 
-_Floats = NDArray[np.float64]
-_Intensity = Callable[[_Floats, _Floats], NDArray[np.float32]]  # (N,) from points (N, 3) and a sensor (3,), m
+_Intensity = Callable[[Floats, Floats], Floats32]  # (N,) from points (N, 3) and a sensor (3,), m
 
 # The density of returns on the surface is rate^a · cosine^b / range^c, times d if the patch is occluded: (a, b, c, d) in
 # smooth scenes, where returns are spread by angle, and in rough ones, where a radar sees much behind surfaces. Tuned with
@@ -44,19 +43,19 @@ _HITS_BEFORE = 0.5
 class View:
     """Predicted scan at one pose: N returns, and the first surface along each of E · A beams."""
 
-    T_world_sensor: _Floats
+    T_world_sensor: Floats
     """(4, 4) m."""
     sensor: Sensor
     """The radar."""
-    points: NDArray[np.float32]
+    points: Floats32
     """(N, 3) returns, sensor frame, m."""
-    intensities: NDArray[np.float32] | None
+    intensities: Floats32 | None
     """(N,) sensor units, NaN where :meth:`Map.intensity` is. None if the map has no intensities."""
-    azimuth_rad: _Floats
+    azimuth_rad: Floats
     """(A,) azimuths of the beams, ascending, rad."""
-    elevation_rad: _Floats
+    elevation_rad: Floats
     """(E,) elevations of the beams, ascending, rad."""
-    beam_ranges_m: NDArray[np.float32]
+    beam_ranges_m: Floats32
     """(E, A) distance to the first surface along each beam, m. NaN where there is none."""
 
     def __len__(self) -> int:
@@ -64,12 +63,12 @@ class View:
         return len(self.points)
 
     @property
-    def ranges_m(self) -> _Floats:
+    def ranges_m(self) -> Floats:
         """(N,) distances of the returns from the sensor, m."""
         return np.linalg.norm(self.points.astype(np.float64), axis=1)
 
     @property
-    def world_points(self) -> _Floats:
+    def world_points(self) -> Floats:
         """(N, 3) returns, world, m."""
         return Scan(self.points, self.T_world_sensor).world_points
 
@@ -95,11 +94,11 @@ class ViewedMap:
     """Traceable surface of a map, and patches that may have returns, in a local frame. Built once for a map."""
 
     tracer: SurfaceTracer  # tracer of the triangles that the mesh keeps by default
-    centres: _Floats  # (P, 3) centroids of all triangles of the zero level set, the patches, m
-    normals: _Floats  # (P, 3) unit vectors towards free space
-    areas_m2: _Floats  # (P,) areas of the patches
-    rates: _Floats  # (P,) detection rate: share of the scans reaching a patch that have a return there
-    origin: _Floats  # (3,) origin of the local frame, world, m
+    centres: Floats  # (P, 3) centroids of all triangles of the zero level set, the patches, m
+    normals: Floats  # (P, 3) unit vectors towards free space
+    areas_m2: Floats  # (P,) areas of the patches
+    rates: Floats  # (P,) detection rate: share of the scans reaching a patch that have a return there
+    origin: Floats  # (3,) origin of the local frame, world, m
     roughness: float  # see :func:`radarsdf.map.confidence.roughness`
     intensity: _Intensity | None
     max_memory_bytes: int | None  # memory limit of views. None: what the system has left
@@ -110,7 +109,7 @@ class ViewedMap:
         config = contents.config
         check_views(config.max_memory_bytes, cells=len(contents.evidence.visibility))
 
-        def intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
+        def intensity(points: Floats, position: Floats) -> Floats32:
             x = points.astype(np.float32)
             return queries.intensity(contents, x, np.broadcast_to(position.astype(np.float32), x.shape))
 
@@ -127,8 +126,8 @@ class ViewedMap:
         cls,
         surface: Surface,
         scene: WholeMap,
-        origin: _Floats,
-        evidence_at: Callable[[_Floats], EvidenceAt],
+        origin: Floats,
+        evidence_at: Callable[[Floats], EvidenceAt],
         intensity: _Intensity | None,
     ) -> ViewedMap:
         """Build with all triangles as patches, and those of the default mesh for tracing. `evidence_at`: of points (N, 3), m."""
@@ -143,7 +142,7 @@ class ViewedMap:
         of_scene = roughness(scene), intensity, scene.config.max_memory_bytes
         return cls(tracer, *patches, origin, *of_scene)
 
-    def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:
+    def ranges(self, origin: Floats, directions: Floats, max_range_m: float) -> Floats32:
         """Return distances (N,), m, to the first hits of rays from `origin` (3,) in unit `directions` (N, 3); inf: none."""
         rows = np.ascontiguousarray(directions, np.float32)
         found, _ = self.tracer.first_hits(origin.tolist(), rows, max_range_m, False, resolve_num_threads(0))
@@ -151,7 +150,7 @@ class ViewedMap:
 
 
 def view_from(
-    surface: ViewedMap, pose: _Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
+    surface: ViewedMap, pose: Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
 ) -> View:
     """Render a view at a `pose` (4, 4), T_world_sensor, m; see :meth:`Map.render`."""
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
@@ -173,7 +172,7 @@ def view_from(
     return View(pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, first_m)
 
 
-def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
+def _polar(points: Floats) -> tuple[Floats, Floats, Floats]:
     """Convert points (N, 3), sensor frame, m, to ranges, azimuths and elevations (N,)."""
     x, y, z = points.T
     ranges_m = np.sqrt(x * x + y * y + z * z)
@@ -181,9 +180,7 @@ def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
         return ranges_m, np.arctan2(y, x), np.arcsin(z / ranges_m)
 
 
-def _patches(
-    surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, count: int
-) -> NDArray[np.int64]:
+def _patches(surface: ViewedMap, R: Floats, position: Floats, sensor: Sensor, count: int) -> Ints:
     """Return the rows of `count` patches with returns, distributed in proportion to their expected numbers."""
     centres = surface.centres
     seen = np.ones(len(centres), bool)
@@ -207,7 +204,7 @@ def _patches(
     return rows[_spread(expected, count)]
 
 
-def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
+def _spread(expected: Floats, count: int) -> Ints:
     """Return at most `count` distinct rows, distributed in proportion to their `expected` (N,) numbers."""
     count = min(count, int(np.count_nonzero(expected)))
     if count == 0:
@@ -221,7 +218,7 @@ def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
     return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
 
 
-def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
+def _with_noise(points: Floats, sensor: Sensor, rng: np.random.Generator) -> Floats:
     ranges_m, azimuth, elevation = _polar(points)
     errors, noise = rng.standard_normal((3, len(points))), sensor.noise
     angles = azimuth + noise.azimuth_rad * errors[1], elevation + noise.elevation_rad * errors[2]
@@ -229,7 +226,7 @@ def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _F
     return sensor.directions(*angles) * noisy_m[:, None]
 
 
-def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
+def _beams(sensor: Sensor) -> tuple[Floats, Floats]:
     """Return azimuths (A,) and elevations (E,) of beams that overlap by half."""
     steps = [max(width / 2, _MIN_BEAM_RAD) for width in sensor.beam_rad]
     limits = (sensor.azimuth_rad, sensor.elevation_rad)
@@ -243,8 +240,8 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 
 
 def _first_surface(
-    surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, azimuth: _Floats, elevation: _Floats
-) -> NDArray[np.float32]:
+    surface: ViewedMap, R: Floats, position: Floats, sensor: Sensor, azimuth: Floats, elevation: Floats
+) -> Floats32:
     """Return the range (E, A) of the first surface along each beam; NaN where there is none."""
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
 from radarsdf.checks import check, positive
 from radarsdf.map import queries, storage
 from radarsdf.map.confidence import EvidenceAt, evidence
@@ -23,7 +23,6 @@ from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_p
 
 _MEMORY_BYTES = 1 << 30
 _OF_FEATURES = 2.4  # bytes in memory per feature: measured; includes tables of cells and evidence
-_Floats = NDArray[np.float64]
 
 
 class Share(NamedTuple):
@@ -31,18 +30,18 @@ class Share(NamedTuple):
 
     tile: Tile
     contents: MapContents  # the map of the tile
-    rows: NDArray[np.int64]  # (M,) indices of the positions at which the tile has a weight
-    weights: _Floats  # (M,) weights there
-    local: NDArray[np.float32]  # (M, 3) the positions in the frame of the tile, m
+    rows: Ints  # (M,) indices of the positions at which the tile has a weight
+    weights: Floats  # (M,) weights there
+    local: Floats32  # (M, 3) the positions in the frame of the tile, m
 
-    def into_cells(self) -> NDArray[np.bool_]:
+    def into_cells(self) -> Bools:
         """See :func:`radarsdf.map.queries.into_cells`."""
         return queries.into_cells(self.contents, self.local)
 
-    def select(self, chosen: NDArray[np.bool_]) -> Share:
+    def select(self, chosen: Bools) -> Share:
         """Restrict the share to some (M,) of its positions."""
-        columns = (column[chosen] for column in (self.rows, self.weights, self.local))
-        return Share(self.tile, self.contents, *columns)
+        rows, weights, local = self.rows[chosen], self.weights[chosen], self.local[chosen]
+        return self._replace(rows=rows, weights=weights, local=local)
 
 
 class TileBlend(Map):
@@ -81,10 +80,6 @@ class TileBlend(Map):
         """The map of any tile, for what all have in common."""
         return self.contents_of(self.tiles[0].tile)
 
-    @property
-    def _contents_of_any(self) -> MapContents:
-        return self.contents_of_any
-
     def contents_of(self, tile: Tile) -> MapContents:
         """The map of a finished tile, cached in memory."""
         with self._lock:
@@ -97,23 +92,22 @@ class TileBlend(Map):
             self._held.move_to_end(tile)
             return self._held[tile][0]
 
-    def leaf_cells(self, of: Tile, within: Tile) -> NDArray[np.int64]:
+    def leaf_cells(self, of: Tile, within: Tile) -> Ints:
         """(C, 3) leaf cells, by lattice indices, of the map of one finished tile that lie in another one."""
         keys = storage.load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
         cells = lattice_of(keys).astype(np.int64) + self.plan.origin_cells(of)
-        inside: NDArray[np.bool_] = (cells[:, :2] // self.plan.tile_cells == within).all(axis=1)
-        return cells[inside]
+        return cells[(cells[:, :2] // self.plan.tile_cells == within).all(axis=1)]
 
-    def _shares(self, world: _Floats) -> Iterator[Share]:
+    def _shares(self, world: Floats) -> Iterator[Share]:
         """Yield the shares of tiles at positions (N, 3), world, m, in ascending order, which fixes the bits of sums."""
         return (self._share(world, *near) for near in self._near(world))
 
-    def _share(self, world: _Floats, tile: Tile, rows: NDArray[np.int64]) -> Share:
+    def _share(self, world: Floats, tile: Tile, rows: Ints) -> Share:
         contents, x = self.contents_of(tile), world[rows]
         # Weights depend only on the borders between tiles, not on what a tile observed.
         return Share(tile, contents, rows, self.plan.grid.weights(tile, x), queries.to_local(contents, x))
 
-    def _near(self, world: _Floats) -> Iterator[tuple[Tile, NDArray[np.int64]]]:
+    def _near(self, world: Floats) -> Iterator[tuple[Tile, Ints]]:
         """Yield the tiles with a weight at any of the positions (N, 3), world, m, and the rows (M,) of these."""
         grid, places = self.plan.grid, world[np.isfinite(world).all(axis=1), :2]
         if len(places) == 0:
@@ -126,13 +120,13 @@ class TileBlend(Map):
                 yield tile, rows
 
     @cached_property
-    def _reaches(self) -> _Floats:
+    def _reaches(self) -> Floats:
         """(2, T, 2) lower and upper corner of the area in which each tile has a weight, world, m."""
         grid = self.plan.grid
         lower = grid.corner_m + grid.tile_m * np.array([tile.tile for tile in self.tiles])
         return np.stack([lower - grid.halo_m / 2, lower + (grid.tile_m + grid.halo_m / 2)])
 
-    def _known_shares(self, world: _Floats, seen: NDArray[np.bool_]) -> Iterator[Share]:
+    def _known_shares(self, world: Floats, seen: Bools) -> Iterator[Share]:
         """Yield the shares of tiles in whose leaf cells, or on their border, positions (N, 3), world, m, are. Set `seen` (N,)."""
         # Tiles disagree, because ghosts depend on surfaces in front of them. The tile that contains a position decides; for
         # an unfinished one, its neighbours do.
@@ -145,8 +139,8 @@ class TileBlend(Map):
             seen[rows] |= inside & ((owner == number) | (owner < 0))
             yield share.select(inside)
 
-    def _evaluate(self, query: Query, world: _Floats, *others: _Floats, extrapolate: bool) -> NDArray[Any]:
-        def of_tile(share: Share) -> NDArray[Any]:
+    def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
+        def of_tile(share: Share) -> Array:
             rest = [queries.to_local(share.contents, x[share.rows]) for x in others]
             known = np.isfinite(np.concatenate([share.local, *rest], axis=1)).all(axis=1)
             return queries.where(known, query, share.contents, share.local, *rest)
@@ -157,36 +151,36 @@ class TileBlend(Map):
         if extrapolate and not seen.all():
             rest = self._shares(np.where(seen[:, None], np.nan, world))
 
-            def of_moved(share: Share) -> NDArray[Any]:
+            def of_moved(share: Share) -> Array:
                 share.into_cells()
                 return of_tile(share)
 
             found[~seen] = _averages(rest, count, of_moved, columns)[~seen]
         return found if columns > 1 else found[:, 0]
 
-    def _observed(self, world: _Floats) -> NDArray[np.bool_]:
+    def _observed(self, world: Floats) -> Bools:
         seen = np.zeros(len(world), bool)
         for _ in self._known_shares(world, seen):
             pass
         return seen
 
-    def evidence_at(self, world: _Floats) -> EvidenceAt:
+    def evidence_at(self, world: Floats) -> EvidenceAt:
         """All tiles contribute, because evidence ends smoothly at each: a tile that observed no returns lowers it."""
 
-        def of_tile(share: Share) -> NDArray[np.float32]:
+        def of_tile(share: Share) -> Floats32:
             return np.stack(evidence(share.contents, share.local), axis=1)
 
         found = np.nan_to_num(_averages(self._shares(world), len(world), of_tile, columns=4))
         return EvidenceAt(*found.astype(np.float32).T)
 
-    def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
+    def distances_at(self, lattice: Ints, voxel_m: float) -> Floats32:
         """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, indexed from the lattice's first corner.
 
         The bits do not depend on the calling tile. NaN where no tile has an adjacent cell.
         """
         steps = round(self.config.leaf_size_m / voxel_m)
 
-        def of_tile(share: Share) -> NDArray[np.float32]:
+        def of_tile(share: Share) -> Floats32:
             # Computed from integers: the same float32 position for every calling tile.
             origin = self.plan.origin_cells(share.tile) * steps
             points = ((lattice[share.rows] - origin) * voxel_m).astype(np.float32)
@@ -199,8 +193,8 @@ class TileBlend(Map):
 
 
 def _averages(
-    shares: Iterable[Share], count: int, of_tile: Callable[[Share], NDArray[Any]], columns: int = 1
-) -> _Floats:
+    shares: Iterable[Share], count: int, of_tile: Callable[[Share], Array], columns: int = 1
+) -> Floats:
     """(N, columns) weighted averages of the values of tiles, (M, columns) each, at `count` positions. NaN without a share."""
     sums, totals = np.zeros((count, columns)), np.zeros(count)
     for share in shares:

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check, check_box, hides_bar, path_of, positive
-from radarsdf.io.files import check_outputs
+from radarsdf.io.files import check_outputs, reading
 from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
@@ -42,20 +43,19 @@ if TYPE_CHECKING:
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
-_Floats = NDArray[np.float64]
-_Box = NDArray[np.float64] | None  # (2, 3) lower and upper corner, world, m
+_Box = Floats | None  # (2, 3) lower and upper corner, world, m
 
 
 @dataclass(frozen=True)
 class Part:
     """Triangles of one tile."""
 
-    vertices: _Floats  # (V, 3) world, m
-    faces: NDArray[np.int32]  # (F, 3) rows of the vertices
-    confidence: NDArray[np.float32]  # (V,)
-    uncertainty_m: NDArray[np.float32]  # (V,)
-    cells: NDArray[np.int64]  # (2,) numbers of leaf cells, and of those that may contain surface
-    tally: _Floats  # Tally.sums of the whole surface of the tile
+    vertices: Floats  # (V, 3) world, m
+    faces: Ints32  # (F, 3) rows of the vertices
+    confidence: Floats32  # (V,)
+    uncertainty_m: Floats32  # (V,)
+    cells: Ints  # (2,) numbers of leaf cells, and of those that may contain surface
+    tally: Floats  # Tally.sums of the whole surface of the tile
 
 
 _ARRAYS: dict[str, tuple[Any, ...]] = {
@@ -68,24 +68,20 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
 }
 
 
-def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
+def _read(path: Path, *names: str) -> dict[str, Array]:
     """Read arrays of a part, by default all."""
     wanted = {name: _ARRAYS[name] for name in names or _ARRAYS}
-    arrays = arrays_of(path, tuple(wanted))
-    try:
+    with reading(path, "a complete part of a mesh"):
+        arrays = arrays_of(path, tuple(wanted))
         check_arrays(arrays, wanted)
-    except ValueError as error:
-        msg = f"{path} is not a complete part of a mesh: {error}"
-        raise ValueError(msg) from error
     return arrays
 
 
 def voxels_along(leaf_m: float, voxel_size: float) -> int:
     """Number of voxels along a leaf cell. Raises a ValueError unless they divide it, so that those of tiles coincide."""
     steps, even = per_cell(positive(voxel_size, "voxel_size"), leaf_m)
-    if not even:
-        msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as tiles need: use {leaf_m / 2:g} or {leaf_m:g}"
-        raise ValueError(msg)
+    wrong = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as tiles need"
+    check(even, f"{wrong}: use {leaf_m / 2:g} or {leaf_m:g}")
     return steps
 
 
@@ -144,7 +140,7 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
     return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
 
 
-def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
+def _cells_in(city: TileBlend, tile: Tile) -> Ints:
     """(C, 3) leaf cells in a tile, by lattice indices: those of its map, and of others with a weight there."""
     plan = city.plan
     parts = []
@@ -156,13 +152,13 @@ def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
     return sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
 
 
-def _on_borders(city: TileBlend, vertices: _Floats) -> NDArray[np.int64]:
+def _on_borders(city: TileBlend, vertices: Floats) -> Ints:
     """(B,) rows of the vertices (V, 3) on borders of tiles, which the adjacent tile may share."""
     tiles = city.config.lattice.cells(vertices)[:, :2] / city.plan.tile_cells
     return np.flatnonzero((np.abs(tiles - np.round(tiles)) * city.plan.tile_cells < _ON_LATTICE).any(axis=1))
 
 
-def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
+def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[Floats, Ints32]:
     """Merge all parts to vertices (V, 3) and faces (F, 3), without duplicate vertices."""
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0, *[len(part.vertices) for part in parts]], dtype=np.int32)
@@ -170,7 +166,7 @@ def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np
     return vertices, one_for_equal(vertices, _on_borders(city, vertices))[faces]
 
 
-def _allowed(part: Part, min_confidence: float, limits: Limits) -> NDArray[np.bool_]:
+def _allowed(part: Part, min_confidence: float, limits: Limits) -> Bools:
     return within(limits, min_confidence, part.faces, part.confidence, part.uncertainty_m)
 
 
@@ -214,7 +210,7 @@ def export_mesh(
 
 def _separate(
     city: TileBlend, paths: Sequence[Path], limits: Limits, threshold: Threshold
-) -> Iterator[tuple[_Floats, NDArray[np.int32]]]:
+) -> Iterator[tuple[Floats, Ints32]]:
     """Yield vertices (V, 3), world, m, and faces (F, 3) tile by tile. Components that reach a border are kept."""
     for path in paths:
         part = Part(**_read(path))
@@ -236,10 +232,10 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     vertices, faces = _welded(city, [_part_of(city, tile) for tile in tiles])
     used, faces = renumbered(len(vertices), faces)
 
-    def evidence(points: _Floats) -> EvidenceAt:
+    def evidence(points: Floats) -> EvidenceAt:
         return city.evidence_at(points + origin)
 
-    def intensity(points: _Floats, sensor_position: _Floats) -> NDArray[np.float32]:
+    def intensity(points: Floats, sensor_position: Floats) -> Floats32:
         found = city.intensity(points + origin, sensor_position + origin, extrapolate=True)
         return np.asarray(found, np.float32)
 

@@ -9,8 +9,8 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import path_of
 from radarsdf.map.free_space import CellsInBox, dense_cells
 from radarsdf.map.map import Map
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     import trimesh
 
     from radarsdf.map.view import ViewedMap
-
-_Floats = NDArray[np.float64]
 
 
 class TiledMap(TileBlend):
@@ -66,7 +64,7 @@ class TiledMap(TileBlend):
 
         return mesh_of(self, voxel_size, **wanted)
 
-    def cells_near(self, lower: _Floats, upper: _Floats) -> CellsInBox:
+    def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         """Each cell belongs to the tile that contains it; cells of unfinished tiles are unknown."""
         lattice, edge = self.config.lattice, self.plan.tile_cells
         first = np.floor(lattice.cells(lower)).astype(np.int64)
@@ -97,7 +95,7 @@ class TiledMap(TileBlend):
             found.append(view_statistics.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
         return ViewStatisticsAt.together(found)
 
-    def _viewed_from(self, position: _Floats, range_m: float) -> ViewedMap:
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
         from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
 
         tiles = []
@@ -185,7 +183,7 @@ class TiledMap(TileBlend):
         self.plan.save(folder)  # last: without it, the folder is no map
 
     @property
-    def origin(self) -> _Floats:
+    def origin(self) -> Floats:
         """(3,) origin of the middle tile, world, m, for coordinates near zero."""
         return self.config.lattice.position(self.tiles[len(self.tiles) // 2].origin_cells)
 
@@ -216,7 +214,7 @@ class TiledMap(TileBlend):
         return sum(len(self.leaf_cells(tile.tile, tile.tile)) for tile in self.tiles)
 
     @cached_property
-    def extent(self) -> _Floats:
+    def extent(self) -> Floats:
         """(2, 3) lower and upper corner of all leaf cells, world, m."""
         of_tiles = [cells for tile in self.tiles if len(cells := self.leaf_cells(tile.tile, tile.tile))]
         lower = np.min([cells.min(axis=0) for cells in of_tiles], axis=0)
@@ -258,7 +256,7 @@ def lacking(radar_map: Map) -> str:
     return f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
 
 
-def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
+def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, Floats]:
     """Predicted intensities (N,) for rays, sensor units, and these rays: those in no tile are left out."""
     found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)
     known = np.isfinite(found)
