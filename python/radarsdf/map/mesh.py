@@ -40,7 +40,6 @@ class Surface:
 
     vertices: Floats  # (V, 3) local frame, m
     faces: Ints32  # (F, 3) rows of the vertices, counter-clockwise seen from free space
-    evidence: EvidenceAt  # at the vertices
     confidence: Floats32  # (V,) see :meth:`Map.confidence`
     uncertainty_m: Floats32  # (V,) see :meth:`Map.uncertainty`
     tally: Tally  # area by confidence
@@ -70,12 +69,12 @@ class Surface:
         columns = confidence.astype(np.float64), found.covering, found.reach, evidence.hits.astype(np.float64)
         tally = Tally.of(vertex_areas(vertices, faces), *columns)
         sigma_m = uncertainty(scene, evidence)
-        return cls(vertices, faces, evidence, confidence, sigma_m, tally, cells_searched)
+        return cls(vertices, faces, confidence, sigma_m, tally, cells_searched)
 
     def kept(self, limits: Limits) -> Bools:
         """Return a mask (F,) of the faces within the limits, without small components."""
         min_confidence = self.tally.threshold(limits.min_confidence).min_confidence
-        kept = within(limits, min_confidence, self.faces, self.confidence, self.uncertainty_m)
+        kept = with_all(limits.met(min_confidence, self.confidence, self.uncertainty_m), self.faces)
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces.take(rows, axis=0), len(self.vertices))
@@ -93,8 +92,11 @@ class Surface:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
         used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
         rows = np.flatnonzero(used)
-        vertices, confidence = self.vertices.take(rows, axis=0) + origin, self.confidence.take(rows)
-        return described_mesh(vertices, faces, confidence, self.uncertainty_m.take(rows), **metadata)
+        mesh = trimesh.Trimesh(self.vertices.take(rows, axis=0) + origin, faces, process=False)
+        mesh.vertex_attributes["confidence"] = self.confidence.take(rows)
+        mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m.take(rows)
+        mesh.metadata |= metadata
+        return mesh
 
 
 def extract_mesh(
@@ -109,21 +111,6 @@ def extract_mesh(
     return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
 
 
-def described_mesh(
-    vertices: Floats,
-    faces: NDArray[np.integer[Any]],
-    confidence: Floats32,
-    uncertainty_m: Floats32,
-    **metadata: float,
-) -> trimesh.Trimesh:
-    """Build a mesh of vertices (V, 3), world, m, with vertex attributes and metadata."""
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.vertex_attributes["confidence"] = confidence
-    mesh.vertex_attributes["uncertainty_m"] = uncertainty_m
-    mesh.metadata |= metadata
-    return mesh
-
-
 def with_intensities(mesh: trimesh.Trimesh, intensities: Array, scale: IntensityScale) -> trimesh.Trimesh:
     """Add intensities (V,), sensor units, and their colours to the vertices of a mesh."""
     values = intensities.astype(np.float32)
@@ -131,13 +118,6 @@ def with_intensities(mesh: trimesh.Trimesh, intensities: Array, scale: Intensity
     colors = intensity_colors(values, scale.low, scale.high)
     mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
     return mesh
-
-
-def within(
-    limits: Limits, min_confidence: float, faces: Ints32, confidence: Floats32, uncertainty_m: Floats32
-) -> Bools:
-    """Return a mask (F,) of the faces (F, 3) with all vertices within the limits."""
-    return with_all(limits.met(min_confidence, confidence, uncertainty_m), faces)
 
 
 def with_all(good: Bools, faces: Ints32) -> Bools:
@@ -222,8 +202,7 @@ def sample_lattice(
 
 
 def _overlap(cells: Ints32, leaf_size_m: float, box: Floats) -> Bools:
-    found = ((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])
-    return np.asarray(found.all(axis=1))
+    return (((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])).all(axis=1)
 
 
 def crossed(
@@ -266,11 +245,8 @@ def _voxels_of(cells: Ints32, voxel_size: float, parts: int, even: bool, config:
     # Points across a cell, at most a voxel apart, hit every voxel that overlaps it.
     ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
     inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    return (
-        np.floor((cells[:, None] + inside) * (config.leaf_size_m / voxel_size))
-        .astype(np.int32)
-        .reshape(-1, 3)
-    )
+    voxels = np.floor((cells[:, None] + inside) * (config.leaf_size_m / voxel_size))
+    return voxels.astype(np.int32).reshape(-1, 3)
 
 
 def _corner_distances(

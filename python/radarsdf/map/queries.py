@@ -31,7 +31,7 @@ def signed_distance(
     contents: MapContents, points: Floats32, *, description: str = "", progress: bool | None = False
 ) -> Floats32:
     if contents.field.corner_distances_m() is not None:
-        return plane(contents, points)[:, 0]
+        return np.ascontiguousarray(plane(contents, points)[:, 0])
     return evaluate(contents.field.sdf, points, description=description, progress=progress)
 
 

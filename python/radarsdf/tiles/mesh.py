@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
+from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check, check_box, hides_bar, path_of, positive
 from radarsdf.io.files import check_outputs, reading
 from radarsdf.io.meshes import check_mesh_path, write_mesh
@@ -24,14 +23,13 @@ from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_l
 from radarsdf.map.mesh import (
     Surface,
     crossed,
-    described_mesh,
     one_for_equal,
     per_cell,
     renumbered,
     subdivided,
-    within,
+    with_all,
 )
-from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
+from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.tiles.blend import TileBlend
@@ -46,26 +44,14 @@ _BYTES_PER_TRIANGLE = 28  # size in the file of a part
 _Box = Floats | None  # (2, 3) lower and upper corner, world, m
 
 
-@dataclass(frozen=True)
-class Part:
-    """Triangles of one tile."""
-
-    vertices: Floats  # (V, 3) world, m
-    faces: Ints32  # (F, 3) rows of the vertices
-    confidence: Floats32  # (V,)
-    uncertainty_m: Floats32  # (V,)
-    cells: Ints  # (2,) numbers of leaf cells, and of those that may contain surface
-    tally: Floats  # Tally.sums of the whole surface of the tile
-
-
 _ARRAYS: dict[str, tuple[Any, ...]] = {
-    "vertices": (np.float64, None, 3),
+    "vertices": (np.float64, None, 3),  # world, m
     "faces": (np.int32, None, 3),
     "confidence": (np.float32, None),
     "uncertainty_m": (np.float32, None),
-    "cells": (np.int64, 2),
-    "tally": (np.float64, TALLY_NUMBERS),
-}
+    "cells": (np.int64, 2),  # numbers of leaf cells, and of those that may contain surface
+    "tally": (np.float64, TALLY_NUMBERS),  # Tally.sums of the whole surface of the tile
+}  # in the file of a part, the triangles of one tile
 
 
 def _read(path: Path, *names: str) -> dict[str, Array]:
@@ -87,8 +73,8 @@ def voxels_along(leaf_m: float, voxel_size: float) -> int:
 
 def parts_of(
     city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
-) -> tuple[list[Path], Limits, Threshold]:
-    """Mesh all tiles; return the files of the parts, the limits of a mesh (`wanted`), and the sums over the parts."""
+) -> tuple[list[Path], Limits, Tally]:
+    """Mesh all tiles; return the files of the parts, the limits of a mesh (`wanted`), and the tally of all parts."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
     steps = voxels_along(city.config.leaf_size_m, voxel_size)
     corners = None if box is None else check_box(box)
@@ -100,14 +86,17 @@ def parts_of(
         key = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         path = folder_of(city.folder, planned.tile) / f"mesh-{key}.npz"
         if not path.is_file():
-            write_arrays(path, vars(_part_of(city, planned.tile, steps, corners)))
+            surface, leaf_cells = _surface_in(city, planned.tile, steps, corners)
+            arrays = {name: value for name, value in vars(surface).items() if name in _ARRAYS}
+            counts = np.array([leaf_cells, surface.cells_searched])
+            write_arrays(path, arrays | {"cells": counts, "tally": surface.tally.sums()})
         paths.append(path)
     tally = sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS))
-    return paths, limits, Tally.of_sums(tally).threshold(limits.min_confidence)
+    return paths, limits, Tally.of_sums(tally)
 
 
-def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
-    """Triangles near returns in the leaf cells of a tile, with `steps` voxels along a cell's edge."""
+def _surface_in(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> tuple[Surface, int]:
+    """Surface in the leaf cells of a tile, world, m, with `steps` voxels along a cell's edge, and the number of the cells."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
     cells = _cells_in(city, tile)
@@ -116,28 +105,21 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
         cells = cells[((position(cells + 1) >= lower) & (position(cells) <= upper)).all(axis=1)]
     found = len(cells)
     if steps > 1:
-        cells = crossed(
-            cells,
-            config.leaf_size_m,
-            lambda _, corners, __: city.distances_at(corners.astype(np.int64), config.leaf_size_m),
-        ).astype(np.int64)
+
+        def distances_at(_: Ints32, corners: Ints32, __: Ints32) -> Floats32:
+            return city.distances_at(corners.astype(np.int64), config.leaf_size_m)
+
+        cells = crossed(cells, config.leaf_size_m, distances_at).astype(np.int64)
     voxels = subdivided(cells, steps)
     if box is not None:
         centres = position((voxels + 0.5) / steps)
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     _, corners, voxel_corners = sparse_lattice(voxels, num_threads=threads)
-    vertices, faces = extract_cells(
-        corners,
-        city.distances_at(corners.astype(np.int64), voxel_m),
-        voxel_corners,
-        origin=position([0, 0, 0]),
-        spacing=[voxel_m] * 3,
-        num_threads=threads,
-    )
+    distances_m, origin = city.distances_at(corners.astype(np.int64), voxel_m), position([0, 0, 0])
+    options: dict[str, Any] = {"origin": origin, "spacing": [voxel_m] * 3, "num_threads": threads}
+    vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
     evidence = city.evidence_at(vertices)
-    surface = Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells))
-    counts = np.array([found, len(cells)])
-    return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
+    return Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells)), found
 
 
 def _cells_in(city: TileBlend, tile: Tile) -> Ints:
@@ -158,38 +140,25 @@ def _on_borders(city: TileBlend, vertices: Floats) -> Ints:
     return np.flatnonzero((np.abs(tiles - np.round(tiles)) * city.plan.tile_cells < _ON_LATTICE).any(axis=1))
 
 
-def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[Floats, Ints32]:
-    """Merge all parts to vertices (V, 3) and faces (F, 3), without duplicate vertices."""
-    vertices = np.concatenate([part.vertices for part in parts])
-    starts = np.cumsum([0, *[len(part.vertices) for part in parts]], dtype=np.int32)
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
-    return vertices, one_for_equal(vertices, _on_borders(city, vertices))[faces]
+def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]) -> tuple[Floats, Ints32]:
+    """Merge the vertices (V, 3) and faces (F, 3) of all parts, without duplicate vertices."""
+    starts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
+    merged = np.concatenate([part + start for part, start in zip(faces, starts, strict=False)])
+    together = np.concatenate(vertices)
+    return together, one_for_equal(together, _on_borders(city, together))[merged]
 
 
-def _allowed(part: Part, min_confidence: float, limits: Limits) -> Bools:
-    return within(limits, min_confidence, part.faces, part.confidence, part.uncertainty_m)
-
-
-def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
-    """See :meth:`TiledMap.mesh`."""
-    paths, found, threshold = parts_of(city, voxel_size, progress, **limits)
+def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> trimesh.Trimesh:
+    """See :meth:`Map.mesh`."""
+    paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     file_bytes = sum(path.stat().st_size for path in paths)
     check_triangles(file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
-    parts = [Part(**_read(path)) for path in paths]
-    vertices, faces = _welded(city, parts)
-    faces = faces[np.concatenate([_allowed(part, threshold.min_confidence, found) for part in parts])]
-    labels, sizes = mesh_components(faces, len(vertices))
-    used, faces = renumbered(len(vertices), faces[sizes[labels] >= found.min_component_triangles])
-    leaf_cells, cells_searched = np.sum([part.cells for part in parts], axis=0).tolist()
-    return described_mesh(
-        vertices[used],
-        faces,
-        np.concatenate([part.confidence for part in parts])[used],
-        np.concatenate([part.uncertainty_m for part in parts])[used],
-        leaf_cells=leaf_cells,
-        leaf_cells_searched=cells_searched,
-        **threshold.metadata,
-    )
+    parts = [_read(path).values() for path in paths]
+    vertices, faces, confidence, uncertainty_m, cells, _ = zip(*parts, strict=True)
+    leaf_cells, searched = np.sum(cells, axis=0).tolist()
+    of_vertices = np.concatenate(confidence), np.concatenate(uncertainty_m)
+    whole = Surface(*_welded(city, vertices, faces), *of_vertices, tally, searched)
+    return whole.mesh(np.zeros(3), limits, leaf_cells)
 
 
 def export_mesh(
@@ -209,19 +178,20 @@ def export_mesh(
 
 
 def _separate(
-    city: TileBlend, paths: Sequence[Path], limits: Limits, threshold: Threshold
+    city: TileBlend, paths: Sequence[Path], limits: Limits, tally: Tally
 ) -> Iterator[tuple[Floats, Ints32]]:
     """Yield vertices (V, 3), world, m, and faces (F, 3) tile by tile. Components that reach a border are kept."""
+    least = tally.threshold(limits.min_confidence).min_confidence
     for path in paths:
-        part = Part(**_read(path))
-        faces = part.faces[_allowed(part, threshold.min_confidence, limits)]
-        labels, sizes = mesh_components(faces, len(part.vertices))
-        on_border = np.zeros(len(part.vertices), bool)
-        on_border[_on_borders(city, part.vertices)] = True
+        vertices, faces, confidence, uncertainty_m, *_ = _read(path).values()
+        faces = faces[with_all(limits.met(least, confidence, uncertainty_m), faces)]
+        labels, sizes = mesh_components(faces, len(vertices))
+        on_border = np.zeros(len(vertices), bool)
+        on_border[_on_borders(city, vertices)] = True
         large = sizes >= limits.min_component_triangles
         large[labels[on_border[faces].any(axis=1)]] = True
-        used, faces = renumbered(len(part.vertices), faces[large[labels]])
-        yield part.vertices[used], faces
+        used, faces = renumbered(len(vertices), faces[large[labels]])
+        yield vertices[used], faces
 
 
 def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
@@ -229,7 +199,8 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(city.plan.origin_cells(tiles[0]))
-    vertices, faces = _welded(city, [_part_of(city, tile) for tile in tiles])
+    surfaces = [_surface_in(city, tile)[0] for tile in tiles]
+    vertices, faces = _welded(city, [one.vertices for one in surfaces], [one.faces for one in surfaces])
     used, faces = renumbered(len(vertices), faces)
 
     def evidence(points: Floats) -> EvidenceAt:

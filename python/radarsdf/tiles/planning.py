@@ -270,4 +270,5 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
     halo = round(plan.halo_m / plan.config.leaf_size_m)
     lower = np.array(tile.tile) * plan.tile_cells - plan.origin_cells(tile.tile)[:2] - halo
-    return rays, ((cells >= lower) & (cells < lower + plan.tile_cells + 2 * halo)).all(axis=1)
+    inside = (cells >= lower) & (cells < lower + plan.tile_cells + 2 * halo)
+    return rays, np.asarray(inside.all(axis=1))

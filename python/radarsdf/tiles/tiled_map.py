@@ -159,7 +159,8 @@ class TiledMap(TileBlend):
         """
         from radarsdf.tiles.mesh import parts_of  # noqa: PLC0415 - as above
 
-        return parts_of(self, voxel_size, progress, **limits)[2]
+        _, wanted, tally = parts_of(self, voxel_size, progress, **limits)
+        return tally.threshold(wanted.min_confidence)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Copy the plan and the maps of finished tiles to a new folder for :func:`radarsdf.load`.
