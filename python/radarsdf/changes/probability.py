@@ -18,6 +18,7 @@ from scipy.special import betaln, expit
 from scipy.stats import t as student
 
 from radarsdf.arrays import Bools, Floats, Ints, Ints32
+from radarsdf.map.confidence import confidence, uncertainty
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import across_triangles
 from radarsdf.products import turned
@@ -106,15 +107,15 @@ class PlacedMap:
     def evidence(self, x: Floats, facing: Floats | None = None) -> PlaceEvidence:
         """Evidence at places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
         own = self.to_own(x)
-        evidence, sigma_m, confidence = self.radar_map.surface_at(own)
+        evidence, contents = self.radar_map.evidence_at(own), self.radar_map.contents_of_any
         distance_m, normals = self.radar_map.tangent_planes(own)
         normals = turned(normals, self.T_common_map[:3, :3])
         behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
         return PlaceEvidence(
             distance_m,
             normals,
-            sigma_m.astype(np.float64),
-            confidence.astype(np.float64),
+            uncertainty(contents, evidence).astype(np.float64),
+            confidence(contents, evidence).astype(np.float64),
             evidence.hits.astype(np.float64),
             self._passes(self.to_own(behind)),
         )

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from radarsdf.arrays import Array, Bools, Floats, Floats32
+from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import MAX_POSITION_M, check, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
@@ -418,11 +418,6 @@ class Map(ABC):
         length = np.linalg.norm(gradient, axis=1)
         # At grazing incidence the field exceeds the distance, and its gradient exceeds 1, by the same factor.
         return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
-
-    def surface_at(self, world: Floats) -> tuple[EvidenceAt, Floats32, Floats32]:
-        """Return :meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
-        evidence, contents = self.evidence_at(world), self.contents_of_any
-        return evidence, uncertainty(contents, evidence), confidence(contents, evidence)
 
 
 def _as_positions(x: Any, rows: int | None = None) -> tuple[Floats, Callable[[Array], Any]]:

@@ -135,19 +135,10 @@ def mesh_components(faces: Array, num_vertices: int) -> tuple[Ints32, Ints]:
 
 class _MarchingCubes(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        samples: Tensor,
-        mask: Bools | None,
-        spacing: list[float],
-        origin: list[float],
-        level: float,
-        num_threads: int,
-    ) -> tuple[Tensor, Tensor]:
-        found = _core.marching_cubes_dense_with_edges(
-            samples.detach().numpy(), mask, spacing, origin, level, num_threads
-        )
+    def forward(ctx: Any, samples: Tensor, *placement: Any) -> tuple[Tensor, Tensor]:
+        found = _core.marching_cubes_dense_with_edges(samples.detach().numpy(), *placement)
         vertices, faces, edges = map(torch.from_numpy, found)
+        _mask, spacing, _origin, level, num_threads = placement
         ctx.save_for_backward(samples, edges)
         ctx.placement = spacing, level, num_threads
         ctx.mark_non_differentiable(faces)

@@ -34,10 +34,6 @@ class Share(NamedTuple):
     weights: Floats  # (M,) weights there
     local: Floats32  # (M, 3) the positions in the frame of the tile, m
 
-    def into_cells(self) -> Bools:
-        """See :func:`radarsdf.map.queries.into_cells`."""
-        return queries.into_cells(self.contents, self.local)
-
     def select(self, chosen: Bools) -> Share:
         """Restrict the share to some (M,) of its positions."""
         rows, weights, local = self.rows[chosen], self.weights[chosen], self.local[chosen]
@@ -63,17 +59,13 @@ class TileBlend(Map):
     @property
     def missing(self) -> dict[str, str]:
         """Unfinished tiles by name, with the reason of the failure; empty if the fit was not tried or was killed."""
-        return {
-            tile.name: failure_of(self.folder, tile) for tile in self.plan.tiles if not self.has(tile.tile)
-        }
+        undone = (tile for tile in self.plan.tiles if tile.tile not in self.done)
+        return {tile.name: failure_of(self.folder, tile) for tile in undone}
 
     @cached_property
-    def _done(self) -> set[Tile]:
+    def done(self) -> set[Tile]:
+        """Indices of the tiles that are done."""
         return {tile.tile for tile in self.tiles}
-
-    def has(self, tile: Tile) -> bool:
-        """Whether this tile exists and is done."""
-        return tile in self._done
 
     @cached_property
     def contents_of_any(self) -> MapContents:
@@ -135,7 +127,7 @@ class TileBlend(Map):
             owners[rows[(self.plan.grid.tiles_of(world[rows]) == tile).all(axis=1)]] = number
         for number, (tile, rows) in enumerate(near):
             share, owner = self._share(world, tile, rows), owners[rows]
-            inside = share.into_cells()
+            inside = queries.into_cells(share.contents, share.local)
             seen[rows] |= inside & ((owner == number) | (owner < 0))
             yield share.select(inside)
 
@@ -152,7 +144,7 @@ class TileBlend(Map):
             rest = self._shares(np.where(seen[:, None], np.nan, world))
 
             def of_moved(share: Share) -> Array:
-                share.into_cells()
+                queries.into_cells(share.contents, share.local)
                 return of_tile(share)
 
             found[~seen] = _averages(rest, count, of_moved, columns)[~seen]

@@ -81,7 +81,7 @@ def parts_of(
     paths = []
     for planned in tqdm(city.tiles, "mesh", unit="tile", disable=hides_bar(progress)):
         # The file is determined by the settings, the plan and the neighbours.
-        done = [other for other in neighbours(planned.tile) if city.has(other)]
+        done = [other for other in neighbours(planned.tile) if other in city.done]
         text = repr((city.plan.digest, steps, corners, done))
         key = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         path = folder_of(city.folder, planned.tile) / f"mesh-{key}.npz"
@@ -126,11 +126,10 @@ def _cells_in(city: TileBlend, tile: Tile) -> Ints:
     """(C, 3) leaf cells in a tile, by lattice indices: those of its map, and of others with a weight there."""
     plan = city.plan
     parts = []
-    for other in neighbours(tile):
-        if city.has(other):
-            cells = city.leaf_cells(other, within=tile)
-            centres = plan.config.lattice.position(cells + 0.5)
-            parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
+    for other in (other for other in neighbours(tile) if other in city.done):
+        cells = city.leaf_cells(other, within=tile)
+        centres = plan.config.lattice.position(cells + 0.5)
+        parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
     return sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
 
 

@@ -98,13 +98,11 @@ class TiledMap(TileBlend):
     def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
         from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
 
-        tiles = []
-        for planned in self.tiles:
-            lower = self.plan.grid.lower_corner(planned.tile)
-            nearest = np.clip(position[:2], lower, lower + self.plan.tile_m)
-            if np.linalg.norm(nearest - position[:2]) <= range_m:
-                tiles.append(planned.tile)
-        tiles = tiles or [self.tiles[0].tile]  # far from all tiles, any tile shows nothing
+        tiles = [tile.tile for tile in self.tiles]
+        lower = np.array([self.plan.grid.lower_corner(tile) for tile in tiles])
+        away = np.clip(position[:2], lower, lower + self.plan.tile_m) - position[:2]
+        near = np.flatnonzero(np.linalg.norm(away, axis=1) <= range_m)
+        tiles = [tiles[i] for i in near] or tiles[:1]  # far from all tiles, any tile shows nothing
         if self._viewed is None or self._viewed[0] != tiles:
             self._viewed = tiles, viewed_tiles(self, tiles)
         return self._viewed[1]
