@@ -137,7 +137,6 @@ def compare(
 
 
 def _quick_config(config: FitConfig) -> FitConfig:
-    """Settings of a quick map of new scans."""
     names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
     same = {name: getattr(config.returns, name) for name in names}
     return FitConfig.quick(

@@ -71,7 +71,6 @@ class GrowingState:
 
     @property
     def num_bytes(self) -> int:
-        """Memory in total, bytes."""
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
@@ -120,7 +119,6 @@ class GrowingState:
             self.log = self.log.shrunk(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
     def clear_outside(self, centre: Floats, radius_m: float) -> Keys:
-        """See :meth:`LiveMap.clear_outside`."""
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys

@@ -77,7 +77,6 @@ class LoggedScan:
 
     @property
     def static(self) -> LoggedScan:
-        """The scan with static returns only."""
         if self.is_static is None:
             return self
         kept: dict[str, Any] = {name: array[self.is_static] for name, array in self.arrays.items()}
@@ -85,7 +84,6 @@ class LoggedScan:
 
     @property
     def num_bytes(self) -> int:
-        """Memory, bytes."""
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
 
     def at(self, pose: Floats) -> LoggedScan:

@@ -9,14 +9,7 @@ import numpy as np
 from radarsdf._core import CellBlocks, Encoding, VertexTable
 from radarsdf.arrays import Floats, Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.average import (
-    BAND_CELLS,
-    CELLS_SMOOTHED,
-    TRUNCATION_CELLS,
-    average_at_corners,
-    normals_at,
-    returns_of_means,
-)
+from radarsdf.fitting import average
 from radarsdf.live.regions import (
     NO_KEYS,
     RegionTable,
@@ -52,6 +45,7 @@ class GrowingSurface:
 
     def __init__(self, config: FitConfig, origin: Floats) -> None:
         self._config = config  # quick settings
+        self._surfel_m = LEAVES_PER_SURFEL * config.leaf_size_m
         self._origin = origin  # (3,) origin of the local frame, world, m
         self.complete = False  # set by the caller after :meth:`update`, so that a partial one is not used
         self._noise: SensorNoise | None = None
@@ -123,17 +117,10 @@ class GrowingSurface:
 
     def _surfels_of(self, rows: Rows) -> Surfels:
         cell_of_plane = np.flatnonzero(rows["support"] >= MIN_SUPPORT)
-        planes = rows["planes"][cell_of_plane]
+        planes = [part.copy() for part in np.split(rows["planes"][cell_of_plane], 3, axis=1)]
+        keys, counts = rows["keys"], rows["moments"][:, 0].copy()
         return Surfels(
-            cell_size_m=LEAVES_PER_SURFEL * self._config.leaf_size_m,
-            keys=rows["keys"],
-            blocks=CellBlocks(rows["keys"]),
-            counts=rows["moments"][:, 0].copy(),
-            support=rows["support"],
-            cell_of_plane=cell_of_plane,
-            centres=planes[:, :3].copy(),
-            normals=planes[:, 3:6].copy(),
-            variances=planes[:, 6:].copy(),
+            self._surfel_m, keys, CellBlocks(keys), counts, rows["support"], cell_of_plane, *planes
         )
 
     def _put_sums(self, blocks: Keys, sums: ScanSums) -> Keys:
@@ -153,8 +140,8 @@ class GrowingSurface:
         keys, moments, blocks = cells["keys"], cells["moments"], CellBlocks(cells["keys"])
         rows = blocks.rows(near, num_threads)
         rows = rows[rows >= 0]
-        size_m = LEAVES_PER_SURFEL * self._config.leaf_size_m
-        support, fitted, *planes, _ = neighbour_planes(blocks, keys[rows], moments, size_m, num_threads)
+        found = neighbour_planes(blocks, keys[rows], moments, self._surfel_m, num_threads)
+        support, fitted, *planes, _ = found
         cells["support"][rows], cells["planes"][rows] = support, np.nan
         cells["planes"][rows[fitted]] = np.concatenate(planes, axis=1)
         own = np.isin(self._cells.regions_of(keys), regions)
@@ -173,7 +160,7 @@ class GrowingSurface:
         """Compute the normals of the leaf cells in these regions. Return the keys of the changed ones."""
         leaves = self._leaves.gather(regions)
         surfels = self._surfels_of(self._cells.gather(regions))
-        normals = normals_at(_means_of(leaves), surfels, num_threads)
+        normals = average.normals_at(_means_of(leaves), surfels, num_threads)
         differs = (normals != leaves["normals"]).any(axis=1)
         self._leaves.put(regions, leaves | {"normals": normals})
         return leaves["keys"][differs]
@@ -182,10 +169,12 @@ class GrowingSurface:
         """Recompute distances and evidence that depend on changed leaf cells. Return their regions, ascending."""
         # A ray contributes to the cells of its band, and via shared corners to the neighbours of the last one. Added or removed
         # cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
-        reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(max(TRUNCATION_CELLS, BAND_CELLS)) + 1)
+        reached = cubes_near(
+            changed, _BLOCK_CELLS, math.ceil(max(average.TRUNCATION_CELLS, average.BAND_CELLS)) + 1
+        )
         leaf_keys, came_or_went = self._find_leaf_cells(regions_of(reached), num_threads)
         reached = np.union1d(reached, cubes_near(came_or_went, _BLOCK_CELLS, 1))
-        smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED))
+        smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, average.CELLS_SMOOTHED))
         redone = np.intersect1d(smoothed, regions_of(np.union1d(leaf_keys, came_or_went)))
         self._average(redone, leaf_keys, noise, num_threads)
         return redone
@@ -193,7 +182,9 @@ class GrowingSurface:
     def _find_leaf_cells(self, regions: Keys, num_threads: int) -> tuple[Keys, Keys]:
         """Find the leaf cells near `regions`, in which rays changed. Return them, and those that came or went, ascending."""
         rays, _ = self._true_means(regions_near(regions, 1))
-        crossed = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
+        crossed = rays.leaf_keys(
+            self._config.leaf_size_m, self._config.metres(average.BAND_CELLS), num_threads
+        )
         self._crossed.put(regions, {"keys": crossed})
         # Bridges depend on medians over blocks of 32 cells, and on their two ends, which they lack at the border.
         own, around = regions_near(regions, 2), regions_near(regions, 3)
@@ -211,10 +202,10 @@ class GrowingSurface:
             regions_near(regions, 1),
         )  # what influences their corners: smoothing reaches no farther
         means, normals = self._true_means(near)
-        weighted = returns_of_means(means, noise, config.returns)
+        weighted = average.returns_of_means(means, noise, config.returns)
         leaf_keys = leaf_keys[within(leaf_keys, near)]
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_corners(table, means, weighted, normals, config, num_threads)
+        distances_m = average.average_at_corners(table, means, weighted, normals, config, num_threads)
         own = within(leaf_keys, regions)
         values = distances_m[table.leaf_vertices()[1][own]]
         information, hits = evidence_sums(weighted, leaf_keys[own], num_threads)

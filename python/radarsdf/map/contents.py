@@ -15,7 +15,7 @@ from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
-from radarsdf.returns.view_statistics import ViewStatistics
+from radarsdf.returns.view_statistics import ViewStatistics, ViewStatisticsAt
 from radarsdf.threads import resolve_num_threads
 
 _Part = TypeVar("_Part")
@@ -55,6 +55,12 @@ class MapContents(WholeMap):
     report: dict[str, Any]  # counts, losses, sensor noise and times of the fit, s
     free_space: Callable[[], FreeSpace] = FreeSpace.none  # free-space crossings, or none
     view_statistics: Callable[[], ViewStatistics] = ViewStatistics.none  # of intensity, or none
+
+    def views_in_world(self) -> ViewStatisticsAt:
+        """Return the view statistics in the world frame, in sensor units."""
+        scale = self.intensity_scale
+        low, high = (0.0, 1.0) if scale is None else (scale.low, scale.high)
+        return self.view_statistics().in_world(self.origin, low, high)
 
     @cached_property
     def evidence_of_cells(self) -> tuple[CellBlocks, Floats32]:

@@ -188,7 +188,16 @@ def sample_lattice(
         cells = cells[_overlap(cells, leaf_size_m, box)]
     if stored_m is None and voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
-    voxels = _voxels_of(cells, voxel_size, parts, even, config)
+    _check_voxels(len(cells), voxel_size, parts, even, config)
+    if even:
+        voxels = subdivided(cells, parts)
+    else:
+        # Points across a cell, at most a voxel apart, hit every voxel that overlaps it; with duplicates.
+        ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
+        inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
+        voxels = (
+            np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32).reshape(-1, 3)
+        )
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= box[0]) & (centres <= box[1])).all(axis=1)]
@@ -235,18 +244,6 @@ def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config:
         msg = f"voxels of {voxel_size} m are too many for {cells} cells of {config.leaf_size_m} m: use larger ones"
         raise ValueError(msg)
     check_mesh(cells * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
-
-
-def _voxels_of(cells: Ints32, voxel_size: float, parts: int, even: bool, config: FitConfig) -> Ints32:
-    """Return the voxels (M, 3) that overlap leaf cells, with duplicates. `parts`, `even`: see :func:`per_cell`."""
-    _check_voxels(len(cells), voxel_size, parts, even, config)
-    if even:
-        return subdivided(cells, parts)
-    # Points across a cell, at most a voxel apart, hit every voxel that overlaps it.
-    ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
-    inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    voxels = np.floor((cells[:, None] + inside) * (config.leaf_size_m / voxel_size))
-    return voxels.astype(np.int32).reshape(-1, 3)
 
 
 def _corner_distances(

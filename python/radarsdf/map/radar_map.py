@@ -74,9 +74,7 @@ class RadarMap(Map):
         return evidence(self._contents, queries.to_local(self._contents, world))
 
     def view_statistics(self) -> ViewStatisticsAt:
-        scale = self.intensity_scale
-        low, high = (0, 1) if scale is None else (scale.low, scale.high)
-        return self._contents.view_statistics().in_world(self.origin, low, high)
+        return self._contents.views_in_world()
 
     def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
         return self._viewed
@@ -122,11 +120,6 @@ class RadarMap(Map):
     def field(self) -> Field:
         """Signed distance and intensity as a PyTorch module, in the local frame."""
         return self._contents.field
-
-
-def load_file(path: str | PathLike[str]) -> RadarMap:
-    """Load a map from a file. No code in it is executed."""
-    return RadarMap(storage.load_contents(path))
 
 
 @torch.inference_mode(mode=False)

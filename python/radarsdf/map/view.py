@@ -80,13 +80,10 @@ class View:
 
 def scans_of_views(views: Iterable[View]) -> Scans:
     """Convert views to scans, one each."""
-    kept = [(view.points, view.T_world_sensor, view.intensities) for view in views]
-    values = [intensities for _, _, intensities in kept if intensities is not None]
-    return Scans(
-        [points for points, _, _ in kept],
-        np.array([pose for _, pose, _ in kept]).reshape(-1, 4, 4),
-        values if len(values) == len(kept) else None,
-    )
+    kept = list(views)
+    poses = np.array([view.T_world_sensor for view in kept]).reshape(-1, 4, 4)
+    values = [view.intensities for view in kept if view.intensities is not None]
+    return Scans([view.points for view in kept], poses, values if len(values) == len(kept) else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +110,12 @@ class ViewedMap:
             x = points.astype(np.float32)
             return queries.intensity(contents, x, np.broadcast_to(position.astype(np.float32), x.shape))
 
-        return cls.of_surface(
-            Surface.of(contents, config.leaf_size_m),
-            contents,
-            contents.origin,
-            lambda points: evidence(contents, points.astype(np.float32)),
-            None if contents.intensity_scale is None else intensity,
-        )
+        def evidence_at(points: Floats) -> EvidenceAt:
+            return evidence(contents, points.astype(np.float32))
+
+        predicted = None if contents.intensity_scale is None else intensity
+        surface = Surface.of(contents, config.leaf_size_m)
+        return cls.of_surface(surface, contents, contents.origin, evidence_at, predicted)
 
     @classmethod
     def of_surface(

@@ -80,8 +80,8 @@ def fit_tiles(
     ValueError, OSError
         If a scan is invalid, `out` holds other files or another plan, cannot be written, or all tiles failed.
     """
-    threads = None if executor is None else 1
-    plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=threads)
+    of_fit = None if executor is None else 1
+    plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=of_fit)
     return run_fits(out, executor=executor, progress=progress)
 
 

@@ -148,7 +148,6 @@ def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]
 
 
 def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> trimesh.Trimesh:
-    """See :meth:`Map.mesh`."""
     paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     file_bytes = sum(path.stat().st_size for path in paths)
     check_triangles(file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)

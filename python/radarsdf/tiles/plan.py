@@ -84,7 +84,7 @@ class TileGrid:
 
         They rise smoothly within half a halo around each edge. The outer half, where a tile knows less, has no weight.
         """
-        beyond_lower = self._along(positions) - np.array(tile) * self.tile_m
+        beyond_lower = self._along(positions, tile)
         factors = np.ones((len(positions), 2))
         for inwards in (beyond_lower, self.tile_m - beyond_lower):
             t = np.clip(inwards / self.halo_m + 0.5, 0.0, 1.0)
@@ -93,13 +93,12 @@ class TileGrid:
 
     def within_half_a_halo(self, tile: Tile, positions: Floats) -> Ints:
         """(M,) rows of positions (N, 3), world, m, at which a tile has a weight."""
-        from_corner = self._along(positions) - np.array(tile) * self.tile_m
-        half_m = self.halo_m / 2
+        from_corner, half_m = self._along(positions, tile), self.halo_m / 2
         return np.flatnonzero(((from_corner > -half_m) & (from_corner < self.tile_m + half_m)).all(axis=1))
 
-    def _along(self, positions: Array) -> Floats:
-        """(N, 2) offsets of positions (N, 3), world, m, from the corner of tile (0, 0)."""
-        return positions[:, :2] - self.corner_m
+    def _along(self, positions: Array, tile: Tile = (0, 0)) -> Floats:
+        """(N, 2) offsets of positions (N, 3), world, m, from the lower corner of a tile."""
+        return positions[:, :2] - self.corner_m - np.array(tile) * self.tile_m
 
 
 def neighbours(tile: Tile) -> list[Tile]:
@@ -120,7 +119,6 @@ class TilePlan:
 
     @property
     def name(self) -> str:
-        """Name of its files."""
         return f"{self.tile[0]}_{self.tile[1]}"
 
 
@@ -141,17 +139,14 @@ class Plan:
 
     @cached_property
     def grid(self) -> TileGrid:
-        """Grid of the tiles."""
         return TileGrid(self.tile_m, self.halo_m, float(self.config.lattice.position(0)))
 
     @cached_property
     def by_tile(self) -> dict[Tile, TilePlan]:
-        """Tiles by index."""
         return {planned.tile: planned for planned in self.tiles}
 
     @property
     def scale(self) -> IntensityScale | None:
-        """Scale of the intensities."""
         return None if self.intensity_range is None else IntensityScale.between(self.intensity_range)
 
     @property
@@ -185,7 +180,6 @@ class Plan:
         return json.dumps(FORMAT | own, indent=1).encode()
 
     def save(self, folder: Path) -> None:
-        """Write the plan atomically."""
         write_whole(folder / PLAN, self._file_bytes())
 
     def _file_bytes(self) -> bytes:

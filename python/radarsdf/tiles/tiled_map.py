@@ -12,9 +12,10 @@ import numpy as np
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import path_of
+from radarsdf.map import storage
 from radarsdf.map.free_space import CellsInBox, dense_cells
 from radarsdf.map.map import Map
-from radarsdf.map.radar_map import load_file
+from radarsdf.map.radar_map import RadarMap
 from radarsdf.map.threshold import VOXEL_M, Threshold
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
@@ -85,14 +86,11 @@ class TiledMap(TileBlend):
 
     def view_statistics(self) -> ViewStatisticsAt:
         """View statistics of each cell come from its own tile."""
-        scale = self.intensity_scale
-        ends = (0.0, 1.0) if scale is None else (scale.low, scale.high)
         found = []
         for planned in self.tiles:
-            contents = self.contents_of(planned.tile)
-            view_statistics = contents.view_statistics().in_world(contents.origin, *ends)
-            cells = np.floor(self.config.lattice.cells(view_statistics.points)[:, :2])
-            found.append(view_statistics.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
+            of_tile = self.contents_of(planned.tile).views_in_world()
+            cells = np.floor(self.config.lattice.cells(of_tile.points)[:, :2])
+            found.append(of_tile.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
         return ViewStatisticsAt.together(found)
 
     def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
@@ -245,7 +243,7 @@ def load(path: str | PathLike[str]) -> Map:
         If it is no radarsdf map, is damaged, of another version, or cannot be read.
     """
     path = path_of(path, "path")
-    return TiledMap(path) if path.is_dir() else load_file(path)
+    return TiledMap(path) if path.is_dir() else RadarMap(storage.load_contents(path))
 
 
 def lacking(radar_map: Map) -> str:
