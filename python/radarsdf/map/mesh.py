@@ -195,9 +195,8 @@ def sample_lattice(
         # Points across a cell, at most a voxel apart, hit every voxel that overlaps it; with duplicates.
         ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
         inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-        voxels = (
-            np.floor((cells[:, None] + inside) * (leaf_size_m / voxel_size)).astype(np.int32).reshape(-1, 3)
-        )
+        places = (cells[:, None] + inside) * (leaf_size_m / voxel_size)
+        voxels = np.floor(places).astype(np.int32).reshape(-1, 3)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= box[0]) & (centres <= box[1])).all(axis=1)]
