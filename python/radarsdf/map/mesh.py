@@ -202,8 +202,8 @@ def sample_lattice(
         voxels = voxels[((centres >= box[0]) & (centres <= box[1])).all(axis=1)]
     if voxel_size < leaf_size_m and not even:
         # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
-        centres = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
-        voxels = voxels[queries.occupied(contents, centres)]
+        middles = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+        voxels = voxels[queries.occupied(contents, middles)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return corners, voxel_corners, distances_m, len(cells)
