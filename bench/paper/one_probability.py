@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from radarsdf._core import vertex_areas
 from radarsdf.evaluation import confidence_metrics, surface_metrics
-from radarsdf.map import queries
+from radarsdf.map.confidence import EvidenceAt, evidence, own_surface, probabilities, terms
 from radarsdf.map.contents import MapContents
 from radarsdf.map.mesh import Surface
+from radarsdf.map.queries import to_local
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.simulate import SCENES
 from scipy.spatial import cKDTree
@@ -58,7 +59,7 @@ class Example:
     voxel_m: float
     surface: Surface
     columns: FloatArray  # (V, K) regressors
-    own: FloatArray  # (V,) factor of the probability, see queries.own_surface
+    own: FloatArray  # (V,) factor of the probability, see radarsdf.map.confidence.own_surface
     reach: FloatArray  # (V,) upper limit of a probability; 0 without returns
     areas_m2: FloatArray  # (V,)
     is_true: NDArray[np.bool_]  # (V,)
@@ -84,9 +85,9 @@ class Example:
             contents,
             VOXEL_M[preset],
             surface,
-            queries.terms(contents, surface.evidence).numpy(),
-            queries.own_surface(surface.evidence).numpy(),
-            queries.probabilities(contents, surface.evidence).reach.numpy(),
+            terms(contents, evidence_of(contents, surface)).numpy(),
+            own_surface(evidence_of(contents, surface)).numpy(),
+            probabilities(contents, evidence_of(contents, surface)).reach,
             vertex_areas(surface.vertices, surface.faces),
             distance_m <= leaf_m,
             np.concatenate([np.array(rows, np.int64) for rows in found]),
@@ -141,15 +142,20 @@ def models(examples: list[Example]) -> tuple[FloatArray, FloatArray]:
 
 
 def confidence(example: Example, numbers: FloatArray) -> FloatArray:
-    """(V,) confidence as by :func:`queries.probabilities`, with these coefficients."""
+    """(V,) confidence as by :func:`radarsdf.map.confidence.probabilities`, with these coefficients."""
     return np.minimum(example.predicted(numbers), example.reach)
+
+
+def evidence_of(contents: MapContents, surface: Surface) -> EvidenceAt:
+    """Evidence at the vertices of a surface."""
+    return evidence(contents, to_local(contents, surface.vertices + contents.origin))
 
 
 def judged(example: Example, others: list[Example]) -> list[str]:
     """Row of the table: the current mesh, and that of models fitted to the others."""
     of_truth, of_added = models(others)
     surface, p = example.surface, confidence(example, of_truth)
-    hits = surface.evidence.hits.double().numpy()
+    hits = evidence_of(example.contents, surface).hits.astype(np.float64)
     tally = Tally.of(example.areas_m2, p, example.predicted(of_added), example.reach, hits)
     learnt_surface = replace(surface, confidence=p.astype(np.float32), tally=tally)
     limits = Limits.of(example.voxel_m)

@@ -245,11 +245,11 @@ def test_a_full_disk_leaves_the_map_unchanged(tmp_path, monkeypatch):
     live = map_of(range(6), max_bytes=needed - 60_000, folder=tmp_path / "scans")
     before, ids, poses = state(live), live.scan_ids, [live.pose(i) for i in range(6)]
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("radarsdf.live.store._write", full)
+        patched.setattr("radarsdf.live.store._save", full)
         for _ in range(3):
             with pytest.raises(OSError, match="No space"):
                 live.integrate(SCENE.points[6], SCENE.poses[6], SCENE.intensities[6])

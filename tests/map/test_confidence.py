@@ -9,11 +9,10 @@ import pickle
 import numpy as np
 import pytest
 import radarsdf
-import torch
 from radarsdf import FitConfig
 from radarsdf._core import cell_keys
-from radarsdf.map import queries
-from radarsdf.map.queries import EvidenceAt, _floor_m
+from radarsdf.map import confidence as confidences
+from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.radar_map import RadarMap
 from radarsdf.returns.evidence import Evidence, usual_information
 from radarsdf.returns.noise import SensorNoise
@@ -40,16 +39,16 @@ def confidence(radar_map, information, hits, visibility, clutter_ratio=0.1, retu
     contents = dataclasses.replace(
         radar_map._contents, clutter_ratio=clutter_ratio, returns_per_cell=returns_per_cell
     )
-    found = queries.confidence(contents, at(information, hits, visibility))
-    assert found.dtype == torch.float32
-    return found.numpy()
+    found = confidences.confidence(contents, at(information, hits, visibility))
+    assert found.dtype == np.float32
+    return found
 
 
 def at(information, hits, visibility, usual=0.0):
     """Evidence at places. `usual`: information nearby, by default less than at the places."""
     given = (information, hits, visibility, usual)
     columns = np.broadcast_arrays(*(np.asarray(a, np.float32) for a in given))
-    return EvidenceAt(*(torch.from_numpy(np.atleast_1d(column).copy()) for column in columns))
+    return EvidenceAt(*map(np.atleast_1d, columns))
 
 
 @pytest.mark.parametrize("clutter_ratio", [0.0, 1.0])
@@ -104,8 +103,8 @@ def test_few_of_many_returns_nearby_are_no_surface(radar_map):
     """Noise spreads returns beyond an edge: of a hundredth of the density there, hundreds of scans are no evidence."""
     information, hits = np.full(4, 1e4), [400.0, 400, 400, 1]
     usual = 1e4 * np.array([1, 5, 100, 100])
-    found = queries.confidence(radar_map._contents, at(information, hits, 400.0, usual)).numpy()
-    alone = queries.confidence(radar_map._contents, at(information, hits, 400.0)).numpy()
+    found = confidences.confidence(radar_map._contents, at(information, hits, 400.0, usual))
+    alone = confidences.confidence(radar_map._contents, at(information, hits, 400.0))
     shares = np.array([1, 0.2, 0.01, 0.01]) * (1 + 4 / np.sqrt(hits))
     np.testing.assert_allclose(found / alone, 1 / (1 + (0.25 / shares) ** 3), rtol=1e-5)
     assert found[2] < 0.01
@@ -141,7 +140,7 @@ def test_places_have_the_evidence_of_their_cells(radar_map):
     """In the middle of a cell, its neighbours have no weight."""
     contents, evidence = radar_map._contents, radar_map.evidence
     centres = (radar_map.field.table.leaf_cells() + 0.5) * radar_map.config.leaf_size_m
-    found = queries.evidence(contents, torch.from_numpy(centres.astype(np.float32)))
+    found = confidences.evidence(contents, centres.astype(np.float32))
     columns = *dataclasses.astuple(evidence), contents.evidence_of_cells[1][:, 3]
     for column, expected in zip(found, columns, strict=True):
         assert expected.max() > 0
@@ -150,7 +149,7 @@ def test_places_have_the_evidence_of_their_cells(radar_map):
     assert 0.5 < known.mean() < 1
     np.testing.assert_allclose(
         radar_map.confidence(centres + radar_map.origin)[known],
-        queries.confidence(contents, at(*columns)).numpy()[known],
+        confidences.confidence(contents, at(*columns))[known],
         atol=1e-3,
     )
 
@@ -172,7 +171,7 @@ CONFIG = FitConfig.quick().override(
 
 def floor_m(radar_map):
     """Error that repetition does not reduce, m."""
-    return _floor_m(radar_map._contents)
+    return confidences.floor_cells(radar_map._contents) * LEAF_M
 
 
 def two_walls(scans=4, returns=400):

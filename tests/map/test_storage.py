@@ -111,7 +111,7 @@ def test_files_of_other_programs_and_versions(saved, tmp_path):
     path = tmp_path / "other.safetensors"
     for foreign in (None, {"format": "pt"}, {"format": "radarsdf.mesh", "format_version": "1"}):
         save_file({"weight": torch.zeros(3)}, path, foreign)
-        with pytest.raises(ValueError, match="is not a radarsdf map"):
+        with pytest.raises(ValueError, match="is not a complete radarsdf map"):
             radarsdf.load(path)
     for version in ("12", "", "1.5", "one"):
         write(path, tensors, metadata | {"format_version": version})

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
+from radarsdf.map.confidence import evidence
 from radarsdf.map.mesh import Surface
+from radarsdf.map.queries import to_local
 from radarsdf.map.threshold import Limits, Tally, Threshold
 
 WALL_X_M = 10.1
@@ -108,9 +110,11 @@ def test_sums_of_parts_equal_those_of_the_whole(of_many):
     surface = Surface.of(of_many._contents, 0.2)
     middle = surface.vertices[surface.faces].mean(axis=1)[:, 1] > 0
 
+    scene = of_many._contents
+    found = evidence(scene, to_local(scene, surface.vertices + scene.origin))
+
     def of(faces):
-        scene = of_many._contents
-        return Surface.from_triangles(scene, surface.vertices, faces, surface.evidence, 0).tally
+        return Surface.from_triangles(scene, surface.vertices, faces, found, 0).tally
 
     parts = [of(surface.faces[middle]), of(surface.faces[~middle])]
     assert min(part.existing_m2 for part in parts) > 3

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.mesh import Surface
@@ -29,7 +28,7 @@ def in_one_go(city, steps, min_triangles):
     vertices, faces = extract_cells(
         corners, values, voxels, origin=city.config.lattice.position([0, 0, 0]), spacing=[voxel_m] * 3
     )
-    evidence = city.evidence_at(torch.from_numpy(vertices))
+    evidence = city.evidence_at(vertices)
     surface = Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, 0)
     good = surface.confidence >= surface.tally.threshold().min_confidence
     faces = faces[good[faces].all(axis=1)]

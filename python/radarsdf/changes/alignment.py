@@ -5,18 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, qmc
 
 from radarsdf._core import LocalPlanes
-from radarsdf.changes.probability import (
-    PARALLEL,
-    Floats,
-    PlacedMap,
-    odds_of_differences,
-    posterior,
-    share_of_changes,
-)
+from radarsdf.arrays import Floats, Ints
+from radarsdf.changes.probability import PARALLEL, PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.map.threshold import across_triangles
 from radarsdf.poses.rigid import moved, rotation_vector, skew
 from radarsdf.poses.verdict import Verdict
@@ -51,8 +44,7 @@ class Alignment:
     def sigma_m(self, x: Floats, normals: Floats) -> Floats:
         """(N,) standard error of the alignment at places (N, 3) along their normals (N, 3), m."""
         rows = _jacobian(x - self.centre, np.nan_to_num(normals))
-        variance: Floats = np.einsum("ni,ij,nj->n", rows, self.covariance, rows)
-        return np.sqrt(np.maximum(variance, 0))
+        return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", rows, self.covariance, rows), 0))
 
 
 def align(before: PlacedMap, after: PlacedMap) -> Alignment:
@@ -68,8 +60,7 @@ def align(before: PlacedMap, after: PlacedMap) -> Alignment:
         """(N,) logarithms of the distances between the surfaces, about equal where the surfaces coincide."""
         near_m, _, distance_m = before.nearest(_transformed(surface.points, pose))
         distance_m = np.where(near_m <= before.reach_m, distance_m, near_m)
-        found: Floats = np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
-        return found
+        return np.log(np.hypot(distance_m, _COINCIDENT_CELLS * before.leaf_m))
 
     found = _constrained_pose(before, surface, np.eye(4))
     searched = _constrained_pose(before, surface, _coarse_pose(before, surface))
@@ -97,7 +88,7 @@ class _Surface:
     points: Floats  # (N, 3) m
     normals: Floats  # (N, 3)
     sigma_m: Floats  # (N,) standard errors, m
-    patches: NDArray[np.int64]  # (N,) index of each point's patch
+    patches: Ints  # (N,) index of each point's patch
     centre: Floats  # (3,) m
     radius_m: float  # root mean square distance of the points from the centre
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
 from radarsdf.checks import path_of
 from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.threshold import across_triangles
@@ -16,7 +17,6 @@ from radarsdf.map.threshold import across_triangles
 if TYPE_CHECKING:
     import trimesh
 
-Floats = NDArray[np.float64]
 
 UNSEEN, SAME, GONE, APPEARED, MOVED, REFLECTANCE_CHANGED = -1, 0, 1, 2, 3, 4
 NAMES = {
@@ -36,16 +36,16 @@ class ChangedSurface:
 
     vertices: Floats
     """(V, 3) world of the earlier map, m."""
-    faces: NDArray[np.int32]
+    faces: Ints32
     """(F, 3) rows of vertices; triangles face free space."""
     kind: NDArray[np.int8]
     """(V,) -1 unseen, 0 same, 1 gone, 2 appeared, 3 moved, 4 changed reflectance. Unseen: not observed by the other map.
     Changed reflectance, on the later surface only: the surface did not move."""
-    probability: NDArray[np.float32]
+    probability: Floats32
     """(V,) probability of that change; of the likeliest change where it is the same or unseen."""
-    moved_m: NDArray[np.float32]
+    moved_m: Floats32
     """(V,) displacement along the normal towards free space, m. NaN for other kinds."""
-    intensity_change: NDArray[np.float32]
+    intensity_change: Floats32
     """(V,) later minus earlier intensity from views common to both drives, sensor units, without the offset common to all
     places. NaN without such views."""
 
@@ -193,12 +193,12 @@ def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
     }
 
 
-def colors_of(kinds: NDArray[np.int8]) -> NDArray[np.uint8]:
+def colors_of(kinds: NDArray[np.int8]) -> Bytes:
     """Colours (V, 3), sRGB, of kinds (V,)."""
     table = np.array([COLORS[kind] for kind in sorted(COLORS)], np.uint8)
     return table[np.asarray(kinds, np.int64) - min(COLORS)]
 
 
-def _mean(values: NDArray[np.float32]) -> float | None:
+def _mean(values: Floats32) -> float | None:
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else None

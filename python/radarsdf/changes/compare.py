@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.changes.alignment import Alignment, align
 from radarsdf.changes.changes import (
     APPEARED,
@@ -21,9 +22,9 @@ from radarsdf.changes.changes import (
     Changes,
     areas_of,
 )  # fmt: skip
-from radarsdf.changes.probability import Errors, Floats, PlacedMap, Side, posterior, share_of_changes
+from radarsdf.changes.probability import Errors, PlacedMap, Side, posterior, share_of_changes
 from radarsdf.changes.reflectance import Differences
-from radarsdf.checks import check_box
+from radarsdf.checks import check, check_box, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.grids.occupancy import check_free_space
@@ -95,9 +96,7 @@ def compare(
     An object that stood on the ground is "moved" where its top was about parallel to the ground and within two leaf cells of it.
     Intensities near surface that appeared, disappeared or moved are left out.
     """
-    if not isinstance(before, Map):
-        msg = f"before must be a map, not {type(before).__name__}"
-        raise TypeError(msg)
+    instance(before, Map, "before")  # type: ignore[type-abstract]
     corners = None if box is None else check_box(box)
     check_free_space(before, "before")
     if not isinstance(after, Map):
@@ -108,9 +107,7 @@ def compare(
     check_free_space(after, "after")
     placed = PlacedMap.of(before), PlacedMap.of(after)
     for name, found in zip(("before", "after"), placed, strict=True):
-        if len(found.faces) == 0:
-            msg = f"{name} has no surface: fit it with more scans of the place"
-            raise ValueError(msg)
+        check(len(found.faces) != 0, f"{name} has no surface: fit it with more scans of the place")
     earlier, later = placed
     alignment = align(earlier, later) if align_frames else Alignment()
     later = replace(later, T_common_map=alignment.T_before_after)
@@ -140,7 +137,6 @@ def compare(
 
 
 def _quick_config(config: FitConfig) -> FitConfig:
-    """Settings of a quick map of new scans."""
     names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
     same = {name: getattr(config.returns, name) for name in names}
     return FitConfig.quick(

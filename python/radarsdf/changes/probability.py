@@ -12,18 +12,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 from scipy.special import betaln, expit
 from scipy.stats import t as student
 
+from radarsdf.arrays import Bools, Floats, Ints, Ints32
+from radarsdf.map.confidence import confidence, uncertainty
 from radarsdf.map.map import Map
 from radarsdf.map.threshold import across_triangles
 from radarsdf.products import turned
-
-Floats = NDArray[np.float64]
 
 # Reach of distances around the surface of a field: returns scatter into the next cells.
 _REACH_CELLS = 2.0
@@ -65,7 +63,7 @@ class PlacedMap:
     radar_map: Map
     T_common_map: Floats  # (4, 4) from the map's world to the common frame, m
     vertices: Floats  # (V, 3) of the map's default mesh, in leaf cells; world of the map, m
-    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    faces: Ints32  # (F, 3) rows of vertices
     normals: Floats  # (V, 3) of the mesh, towards free space
     sigma_m: Floats  # (V,) standard errors of the vertices, m
 
@@ -92,7 +90,7 @@ class PlacedMap:
     def _tree(self) -> cKDTree:
         return cKDTree(self.vertices)
 
-    def nearest(self, x: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
+    def nearest(self, x: Floats) -> tuple[Floats, Ints, Floats]:
         """Distances to the vertices nearest to places (N, 3), world of the map, their rows, and distances from their planes."""
         near_m, rows = self._tree.query(x)
         away = x - self.vertices[rows]
@@ -109,16 +107,16 @@ class PlacedMap:
     def evidence(self, x: Floats, facing: Floats | None = None) -> PlaceEvidence:
         """Evidence at places (N, 3) on a surface. `facing` (N, 3): its normals; default: those of the map."""
         own = self.to_own(x)
-        evidence, sigma_m, confidence = self.radar_map.surface_at(torch.from_numpy(np.ascontiguousarray(own)))
+        evidence, contents = self.radar_map.evidence_at(own), self.radar_map.contents_of_any
         distance_m, normals = self.radar_map.tangent_planes(own)
         normals = turned(normals, self.T_common_map[:3, :3])
         behind = x - _BEHIND_CELLS * self.leaf_m * np.nan_to_num(normals if facing is None else facing)
         return PlaceEvidence(
             distance_m,
             normals,
-            sigma_m.double().numpy(),
-            confidence.double().numpy(),
-            evidence.hits.numpy().astype(np.float64),
+            uncertainty(contents, evidence).astype(np.float64),
+            confidence(contents, evidence).astype(np.float64),
+            evidence.hits.astype(np.float64),
             self._passes(self.to_own(behind)),
         )
 
@@ -142,22 +140,21 @@ class Side:
     """Surface of one map with the evidence of both maps at its vertices."""
 
     vertices: Floats  # (V, 3) common frame, m
-    faces: NDArray[np.int32]  # (F, 3) rows of vertices
+    faces: Ints32  # (F, 3) rows of vertices
     own: PlaceEvidence
     other: PlaceEvidence
     sigma_m: Floats  # (V,) standard error of the distance between both surfaces, m
     reach_m: float  # :attr:`PlacedMap.reach_m` of the other map
 
     @property
-    def observed(self) -> NDArray[np.bool_]:
+    def observed(self) -> Bools:
         """(V,) whether the distance is known."""
         return np.isfinite(self.other.distance_m) & np.isfinite(self.sigma_m)
 
     @property
-    def parallel(self) -> NDArray[np.bool_]:
+    def parallel(self) -> Bools:
         """(V,) whether the other map's surface is about parallel."""
-        mask: NDArray[np.bool_] = np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
-        return mask
+        return np.einsum("ni,ni->n", self.own.normals, self.other.normals) >= PARALLEL
 
     def region_odds(self, free: Floats, distances: Floats) -> Floats:
         """(V,) log odds that a region around each vertex is absent, by log odds (V,) of free space and of distances."""
@@ -225,8 +222,7 @@ class Errors:
             error = student(self.freedom, distance_m, self.scale * sigma_m)
             # Far in the tails, the difference is only rounding.
             inside = np.maximum(error.cdf(reach_m) - error.cdf(lower_m), 1e-12)
-            found: Floats = np.log(inside / (reach_m - lower_m)) - same
-            return found
+            return np.log(inside / (reach_m - lower_m)) - same
 
         free = _free_space_odds(side.own, side.other)
         distances, shifted = np.zeros(len(free)), np.full(len(free), -np.inf)
@@ -244,14 +240,12 @@ def _free_space_odds(own: PlaceEvidence, other: PlaceEvidence) -> Floats:
     same = betaln(hit + hits, missed + passes) - betaln(hit, missed)
     changed = betaln(0.5 + hits, 0.5 + passes) - betaln(0.5, 0.5)
     fewer = hits < (hits + passes) * hit / (hit + missed)
-    odds: Floats = np.where(fewer, changed - same, np.minimum(changed - same, 0))
-    return odds
+    return np.where(fewer, changed - same, np.minimum(changed - same, 0))
 
 
 def odds_of_differences(differences: Floats, sigma: Floats, reach: float) -> Floats:
     """(N,) log likelihood ratio of differences (N,): a change of any size within reach against errors alone."""
-    found: Floats = 0.5 * (differences / sigma) ** 2 + np.log(sigma * np.sqrt(2 * np.pi) / (2 * reach))
-    return found
+    return 0.5 * (differences / sigma) ** 2 + np.log(sigma * np.sqrt(2 * np.pi) / (2 * reach))
 
 
 def share_of_changes(log_odds: Floats) -> float:

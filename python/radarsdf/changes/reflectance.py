@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from radarsdf.changes.probability import Floats, PlacedMap, odds_of_differences, posterior, share_of_changes
+from radarsdf.arrays import Bools, Floats
+from radarsdf.changes.probability import PlacedMap, odds_of_differences, posterior, share_of_changes
 from radarsdf.products import turned
 from radarsdf.returns.view_statistics import PLACE_CELLS, rows_of_views
 
@@ -24,7 +24,7 @@ class _Means:
     values: Floats  # (K,) sensor units
     variances: Floats  # (K,) from the number of returns per mean
 
-    def select(self, chosen: NDArray[np.bool_]) -> _Means:
+    def select(self, chosen: Bools) -> _Means:
         """Return the chosen ones (K,)."""
         return _Means(self.points[chosen], self.values[chosen], self.variances[chosen])
 
@@ -33,8 +33,7 @@ class _Means:
         near = cKDTree(x).sparse_distance_matrix(cKDTree(self.points), reach_m, output_type="coo_matrix")
 
         def total(values: Floats) -> Floats:
-            found: Floats = np.bincount(near.row, values[near.col], len(x)).astype(np.float64)
-            return found
+            return np.bincount(near.row, values[near.col], len(x)).astype(np.float64)
 
         weights = 1 / self.variances
         weight = total(weights)
@@ -65,9 +64,7 @@ class Differences:
         days = [p.radar_map.view_statistics() for p in (before, after)]
         days = [
             replace(
-                day,
-                points=p.to_common(day.points),
-                directions=turned(day.directions, p.T_common_map[:3, :3]),
+                day, points=p.to_common(day.points), directions=turned(day.directions, p.T_common_map[:3, :3])
             )
             for p, day in zip((before, after), days, strict=True)
         ]
@@ -109,7 +106,7 @@ class Differences:
         width = max(scale.high - scale.low for scale in scales if scale is not None)
         return cls(between, within, offset, PLACE_CELLS * leaf_m, width)
 
-    def probability(self, x: Floats, same: NDArray[np.bool_], changed: Floats) -> tuple[Floats, Floats]:
+    def probability(self, x: Floats, same: Bools, changed: Floats) -> tuple[Floats, Floats]:
         """(V,) difference near places (V, 3), and probability that only the reflectance changed, for places that are `same` (V,).
 
         Views near places (C, 3) that `changed` otherwise are ignored. If views of one place scatter more than their numbers

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from radarsdf._core import cell_keys, stable_order
 from radarsdf.arrays import Floats32
@@ -40,9 +39,9 @@ def closed_form(
     assert rays.intensities is not None
 
     def network(points: Floats32, directions: Floats32, ranges_m: Floats32) -> Floats32:
-        columns = torch.from_numpy(np.column_stack([points, directions, np.clip(ranges_m, *range_limits_m)]))
+        columns = np.column_stack([points, directions, np.clip(ranges_m, *range_limits_m)])
         unit = evaluate(lambda x: field.intensity(x[:, :3], x[:, 3:6], x[:, 6]), columns)
-        return unit.clamp(0, 1).numpy()
+        return unit.clip(0, 1)
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
     ask = network if config.trains_intensity else None

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats, Ints
+from radarsdf.checks import check
 from radarsdf.io.files import check_outputs, write_whole
 
 _PIXELS = np.array([254, 0, 205], np.uint8)  # grey values of map_saver for free, occupied and unknown
@@ -18,12 +20,10 @@ _FREE, _OCCUPIED, _INNER = 1, 2, 3
 
 def check_suffix(path: Path, *suffixes: str) -> None:
     """Raise a ValueError if `path` has another suffix."""
-    if path.suffix not in suffixes:
-        msg = f"{path} must end in {', '.join(suffixes)}"
-        raise ValueError(msg)
+    check(path.suffix in suffixes, f"{path} must end in {', '.join(suffixes)}")
 
 
-def write_map_server(path: Path, state: NDArray[np.int8], origin: NDArray[np.float64], cell_m: float) -> None:
+def write_map_server(path: Path, state: NDArray[np.int8], origin: Floats, cell_m: float) -> None:
     """Write states (X, Y) from `origin` (2,), m, as ``NAME.yaml``, which is `path`, and ``NAME.pgm``."""
     check_suffix(path, ".yaml")
     image = path.with_suffix(".pgm")
@@ -40,20 +40,20 @@ def write_map_server(path: Path, state: NDArray[np.int8], origin: NDArray[np.flo
     write_whole(path, text.encode())
 
 
-def write_octomap(path: Path, state: NDArray[np.int8], origin: NDArray[np.float64], voxel_m: float) -> None:
+def write_octomap(path: Path, state: NDArray[np.int8], origin: Floats, voxel_m: float) -> None:
     """Write states (X, Y, Z) from `origin` (3,), m, a multiple of the voxel, as OctoMap's binary octree."""
     start = np.round(origin / voxel_m)
-    if np.abs(origin / voxel_m - start).max() > _MOST_OFF:
-        msg = (
-            f"the grid's origin, {origin}, must be a multiple of its voxels of {voxel_m:g} m, as OctoMap's are: "
-            f"the nearest is {start * voxel_m}"
-        )
-        raise ValueError(msg)
+    wrong = (
+        f"the grid's origin, {origin}, must be a multiple of its voxels of {voxel_m:g} m, as OctoMap's are"
+    )
+    even = np.abs(origin / voxel_m - start).max() <= _MOST_OFF
+    check(even, f"{wrong}: the nearest is {start * voxel_m}")
     known = state >= 0
     keys = np.argwhere(known) + start.astype(np.int64) + _HALF
-    if len(keys) and not ((keys >= 0).all() and (keys < 2 * _HALF).all()):
-        msg = f"the grid is more than {_HALF} voxels from the world's origin, where OctoMap's octree ends"
-        raise ValueError(msg)
+    inside = ((keys >= 0) & (keys < 2 * _HALF)).all()
+    check(
+        inside, f"the grid is more than {_HALF} voxels from the world's origin, the end of OctoMap's octree"
+    )
     size, data = _octree(keys, np.where(state[known] == 1, _OCCUPIED, _FREE))
     header = (
         "# Octomap OcTree binary file\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
@@ -62,7 +62,7 @@ def write_octomap(path: Path, state: NDArray[np.int8], origin: NDArray[np.float6
     write_whole(path, header.encode() + data)
 
 
-def _octree(keys: NDArray[np.int64], codes: NDArray[np.int64]) -> tuple[int, bytes]:
+def _octree(keys: Ints, codes: Ints) -> tuple[int, bytes]:
     """Encode voxels (N, 3) with codes (N,): number of nodes, and two bytes for each inner node in depth-first order."""
     # The two bytes are the codes of its eight children, x varying fastest; 0: unknown.
     numbers = np.zeros(len(keys), np.int64)  # Morton codes

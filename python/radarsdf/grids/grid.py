@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from radarsdf.checks import number, path_of, real_array
+from radarsdf.arrays import Bools, Floats, Floats32
+from radarsdf.checks import check, number, path_of, real_array
 from radarsdf.grids.files import check_suffix, write_map_server, write_octomap
 from radarsdf.io.npz import write_arrays
 from radarsdf.settings import settings
@@ -27,10 +28,10 @@ _Metres = Annotated[float, Field(gt=0, le=100)]
 class DistanceField:
     """Euclidean distances from the centre of each voxel of a grid."""
 
-    occupied_m: NDArray[np.float32]
+    occupied_m: Floats32
     """(X, Y, Z) distance to the centre of the nearest occupied voxel, m; in occupied voxels the negative distance to the
     nearest other one. Unknown voxels do not count: infinite if nothing is occupied."""
-    not_free_m: NDArray[np.float32]
+    not_free_m: Floats32
     """(X, Y, Z) distance to the centre of the nearest voxel that is not free or outside the grid, m; 0 if not free."""
     error_m: float
     """Half a diagonal of a voxel plus the position error of the surface, m. Not an upper bound: false returns and missing
@@ -53,13 +54,13 @@ class Wheels:
 class Costmap:
     """Ground and costs by column of a grid. NaN, and a cost of -1, where the ground is unknown."""
 
-    height_m: NDArray[np.float32]
+    height_m: Floats32
     """(X, Y) height of the ground, world, m: the lowest surface that faces upwards."""
-    slope_rad: NDArray[np.float32]
+    slope_rad: Floats32
     """(X, Y) slope of the plane fitted to the heights of a column and its eight neighbours, rad."""
-    step_m: NDArray[np.float32]
+    step_m: Floats32
     """(X, Y) largest residual of these heights, m."""
-    clearance_m: NDArray[np.float32]
+    clearance_m: Floats32
     """(X, Y) distance from the ground to the first occupied voxel above it, m. Infinite where there is none."""
     cost: NDArray[np.int8]
     """(X, Y) 0 to 99, the larger ratio of slope and step to the limits of the vehicle; 100 where a limit is exceeded or the
@@ -70,7 +71,7 @@ class Costmap:
 class FlatGrid:
     """Two-dimensional grid of occupied, free and unknown columns."""
 
-    origin: NDArray[np.float64]
+    origin: Floats
     """(2,) lower corner of column (0, 0), world, m."""
     cell_size: float
     """Edge of a column, m."""
@@ -102,15 +103,15 @@ class Grid:
     Voxel (i, j, k) spans ``origin + [i, j, k] * voxel_size`` to ``origin + [i + 1, j + 1, k + 1] * voxel_size``.
     """
 
-    origin: NDArray[np.float64]
+    origin: Floats
     """(3,) lower corner of voxel (0, 0, 0), world, m: a multiple of the voxel along each axis."""
     voxel_size: float
     """Edge of a voxel, m."""
     state: NDArray[np.int8]
     """(X, Y, Z) -1: unknown, 0: free, 1: occupied."""
-    probability: NDArray[np.float32]
+    probability: Floats32
     """(X, Y, Z) probability of a surface in the voxel. NaN without rays and returns there."""
-    distance_m: NDArray[np.float32]
+    distance_m: Floats32
     """(X, Y, Z) signed distance of the map at the centre of the voxel, m, positive in free space. NaN where it was not
     observed."""
     position_error_m: float
@@ -123,27 +124,27 @@ class Grid:
         return x, y, z
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Bools:
         """(X, Y, Z) whether rays crossed the voxel and nothing is in it."""
         return np.equal(self.state, FREE)
 
     @property
-    def occupied(self) -> NDArray[np.bool_]:
+    def occupied(self) -> Bools:
         """(X, Y, Z) whether the voxel probably contains a surface."""
         return np.equal(self.state, OCCUPIED)
 
     @property
-    def unknown(self) -> NDArray[np.bool_]:
+    def unknown(self) -> Bools:
         """(X, Y, Z) whether the voxel is neither free nor occupied."""
         return np.equal(self.state, UNKNOWN)
 
-    def centres(self, which: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    def centres(self, which: Bools | None = None) -> Floats:
         """Compute the centres of voxels.
 
         Parameters
         ----------
         which : (X, Y, Z) ndarray of bool, optional
-            Mask of the voxels, such as :attr:`free`. Default: all.
+            Bools of the voxels, such as :attr:`free`. Default: all.
 
         Returns
         -------
@@ -172,9 +173,8 @@ class Grid:
             If `x` is not (N, 3).
         """
         positions = real_array(x, "positions")
-        if positions.ndim != 2 or positions.shape[1] != 3:
-            msg = f"positions must have shape (N, 3), not {positions.shape}"
-            raise ValueError(msg)
+        rows = positions.ndim == 2 and positions.shape[1] == 3
+        check(rows, f"positions must have shape (N, 3), not {positions.shape}")
         voxels = np.nan_to_num(np.floor((positions - self.origin) / self.voxel_size), nan=-1)
         inside = ((voxels >= 0) & (voxels < self.shape)).all(axis=1)
         found = np.full(len(positions), UNKNOWN, np.int8)
@@ -191,11 +191,10 @@ class Grid:
         """
         from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
-        def to_nearest(others: NDArray[np.bool_], beyond: bool) -> NDArray[np.float32]:
+        def to_nearest(others: Bools, beyond: bool) -> Floats32:
             """Return distances to the nearest voxel outside the mask `others`. `beyond`: the outside of the grid counts."""
             mask = np.pad(others, 1, constant_values=not beyond)
-            found: NDArray[np.float64] = distance_transform_edt(mask, self.voxel_size)
-            return found[1:-1, 1:-1, 1:-1].astype(np.float32)
+            return distance_transform_edt(mask, self.voxel_size)[1:-1, 1:-1, 1:-1].astype(np.float32)
 
         occupied = self.occupied
         occupied_m = np.full(self.shape, np.inf, np.float32)
@@ -252,14 +251,12 @@ class Grid:
         """
         from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
-        if number(lower_m, "lower_m") >= number(upper_m, "upper_m"):
-            msg = f"upper_m must be above lower_m, {lower_m}, not {upper_m}"
-            raise ValueError(msg)
+        ascending = number(lower_m, "lower_m") < number(upper_m, "upper_m")
+        check(ascending, f"upper_m must be above lower_m, {lower_m}, not {upper_m}")
         height, _ = self._ground()
         top_m = float(self.origin[2] + self.shape[2] * self.voxel_size)
-        if not np.isfinite(height).any():
-            msg = "no column of the grid shows ground: choose a box that reaches from below it to above it"
-            raise ValueError(msg)
+        ground = np.isfinite(height).any()
+        check(ground, "no column of the grid shows ground: choose a box from below it to above it")
         nearest = distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True)
         base = height[tuple(nearest)]
         above, half = self._z() - base[..., None], self.voxel_size / 2
@@ -295,11 +292,11 @@ class Grid:
         else:
             write_octomap(target, self.state, self.origin, self.voxel_size)
 
-    def _z(self) -> NDArray[np.float64]:
+    def _z(self) -> Floats:
         """Return the heights (Z,) of the voxels' centres, world, m."""
         return np.asarray(self.origin[2] + (np.arange(self.shape[2]) + 0.5) * self.voxel_size)
 
-    def _ground(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _ground(self) -> tuple[Floats32, Floats32]:
         """Return the heights (X, Y) of the ground, world, m, and the clearance above it, m. NaN in columns without ground."""
         # The ground of a column is the lowest surface on which the signed distance increases upwards. Its height is the zero
         # crossing of the distance, interpolated between the voxels above and below.
@@ -310,13 +307,13 @@ class Grid:
         with np.errstate(invalid="ignore"):
             up = (lower <= 0) & (upper > 0) & (occupied[..., :-1] | occupied[..., 1:])
             share = np.divide(lower, lower - upper, out=np.zeros_like(lower), where=up)
-        found: NDArray[np.bool_] = np.asarray(up.any(axis=2))
+        found = np.asarray(up.any(axis=2))
         first = up.argmax(axis=2)
         share = np.take_along_axis(share, first[..., None], 2)[..., 0]
         height = np.where(found, z[first] + share * self.voxel_size, np.nan).astype(np.float32)
         # Exclude the voxels of the ground itself, one or two.
         above = np.arange(len(z)) > np.asarray(first + 2)[..., None]
-        hanging: NDArray[np.bool_] = self.occupied & above & found[..., None]
+        hanging = self.occupied & above & found[..., None]
         room = np.where(hanging.any(axis=2), z[hanging.argmax(axis=2)] - self.voxel_size / 2 - height, np.inf)
         return height, np.where(found, room, np.nan).astype(np.float32)
 
@@ -329,7 +326,7 @@ def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | Distance
     write_arrays(target, of_grid | vars(found), compressed=True)
 
 
-def _planes(height: NDArray[np.float32], size: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _planes(height: Floats32, size: float) -> tuple[Floats32, Floats32]:
     """Fit a plane to each column and its eight neighbours: slope and largest residual. NaN with fewer than three heights."""
     padded = np.pad(height.astype(np.float64), 1, constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*height.shape, 9)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
 from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from radarsdf.map.map import Map
@@ -86,7 +86,7 @@ def check_free_space(radar_map: Map, name: str) -> None:
         raise ValueError(msg)
 
 
-def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: tuple[int, ...]) -> Grid:
+def _fine_grid(radar_map: Map, lower: Floats, size: float, shape: tuple[int, ...]) -> Grid:
     """Compute the grid from a lower corner (3,), world, m, in voxels at most as large as leaf cells."""
     from scipy.ndimage import binary_erosion  # noqa: PLC0415 - slow to import
 
@@ -135,12 +135,8 @@ def _fine_grid(radar_map: Map, lower: NDArray[np.float64], size: float, shape: t
 
 
 def _touched(
-    voxels: NDArray[np.int64],
-    planes: tuple[NDArray[Any], ...],
-    shape: tuple[int, ...],
-    size: float,
-    step: int,
-) -> NDArray[np.float32]:
+    voxels: Ints, planes: tuple[Array, ...], shape: tuple[int, ...], size: float, step: int
+) -> Floats32:
     """Return the largest probability, by voxel, that the surface of one of the `voxels` (N, 3), `step` away, extends into it."""
     # `planes`: distances (N,), normals (N, 3), standard errors (N,) and probabilities of a surface (N,).
     found = np.zeros(shape, np.float32)
@@ -158,7 +154,7 @@ def _touched(
     return found
 
 
-def _crossed(distance_m: NDArray[np.float32], reach_m: float) -> NDArray[np.bool_]:
+def _crossed(distance_m: Floats32, reach_m: float) -> Bools:
     """Return a mask of voxels next to a sign change of the distance, if the surface is in reach or nearer than to the neighbour."""
     # A distance near zero without a sign change may be the end of the observed field.
     padded = np.pad(distance_m, 1, constant_values=np.nan)

@@ -11,10 +11,12 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Floats, Keys
 from radarsdf.checks import (
     MAX_TIME_S,
+    check,
     check_pose,
     check_values_of_scan,
     instance,
@@ -29,7 +31,6 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.fitting.fit import fit
 from radarsdf.fitting.steps import fit_rays
-from radarsdf.live.regions import Keys
 from radarsdf.live.state import GrowingState
 from radarsdf.live.store import LoggedScan, ScanId, compact, load_state, locked_folder
 from radarsdf.live.tracking import Follower
@@ -48,9 +49,9 @@ class Integrated:
 
     scan_id: ScanId
     """Identifier to move or remove the scan."""
-    pose: NDArray[np.float64]
+    pose: Floats
     """(4, 4) T_world_sensor, m."""
-    blocks: NDArray[np.uint64]
+    blocks: Keys
     """(B,) ascending keys of the changed blocks of 8 × 8 × 8 leaf cells."""
     moving: int
     """Number of moving returns, which are left out."""
@@ -120,9 +121,8 @@ class LiveMap:
         folder: str | PathLike[str] | None = None,
     ) -> None:
         config = FitConfig() if config is None else instance(config, FitConfig, "config")
-        if config.returns.accumulate_scans != 1:
-            msg = "returns.accumulate_scans must be 1: a live map integrates single scans"
-            raise ValueError(msg)
+        single = config.returns.accumulate_scans == 1
+        check(single, "returns.accumulate_scans must be 1: a live map integrates single scans")
         corner = None if origin is None else positions([np.asarray(origin)], "origin")[0]
         most = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
         place = None if folder is None else path_of(folder, "folder")
@@ -151,7 +151,7 @@ class LiveMap:
         return self._state.config
 
     @property
-    def origin(self) -> NDArray[np.float64] | None:
+    def origin(self) -> Floats | None:
         """(3,) origin of the local frame, world, m. None before the first scan."""
         return self._state.origin
 
@@ -180,7 +180,7 @@ class LiveMap:
             raise RuntimeError(msg)
         return self._lock
 
-    def pose(self, scan_id: ScanId) -> NDArray[np.float64]:
+    def pose(self, scan_id: ScanId) -> Floats:
         """Return the pose of a scan, (4, 4) float64.
 
         Raises
@@ -240,32 +240,26 @@ class LiveMap:
         scan, far = _checked_scan(points, intensities, doppler_mps, time_s, self.config.returns)
         given = None if pose is None else check_pose(pose, "pose").copy()
         instance(scan_id, Hashable, "scan_id")  # type: ignore[type-abstract]
-        if given is None and scan.time_s is None:
-            msg = "a scan needs a pose, or a time"
-            raise ValueError(msg)
+        check(given is not None or scan.time_s is not None, "a scan needs a pose, or a time")
         state = self._state
         with self._owned():
             scan_id = state.next_id if scan_id is None else scan_id
-            if scan_id in state.log:
-                msg = f"the map has a scan {scan_id!r} already: remove or move it"
-                raise ValueError(msg)
+            check(not scan_id in state.log, f"the map has a scan {scan_id!r} already: remove or move it")
             with_intensities = scan.intensities is not None
-            if state.with_intensities not in (None, with_intensities):
-                msg = "either all scans have intensities, or none has"
-                raise ValueError(msg)
+            alike = state.with_intensities in (None, with_intensities)
+            check(alike, "either all scans have intensities, or none has")
             steps = [] if given is not None else self._follower.seek(state.track, state.log, scan_id, scan)
             come = {step.scan_id: step.logged.at(step.found.pose) for step in steps}
             if given is not None:
                 come[scan_id] = scan.at(given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
-            origin = state.origin
-            if origin is None:
-                lattice = self.config.lattice
-                origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
+            lattice, origin = self.config.lattice, state.origin
             blocks = state.exchange(
                 come,
                 again,
-                origin=origin,
+                origin=lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
+                if origin is None
+                else origin,
                 with_intensities=with_intensities,
                 next_id=max(state.next_id, scan_id + 1) if isinstance(scan_id, int) else state.next_id,
                 track=self._follower.track(steps) if steps else state.track.placed(scan_id, scan),
@@ -307,10 +301,8 @@ class LiveMap:
         with self._owned():
             moved = {}
             for scan_id, given in poses.items():
-                pose, scan = (
-                    check_pose(given, f"the pose of scan {scan_id!r:.50}"),
-                    self._state.log.get(scan_id),
-                )
+                pose = check_pose(given, f"the pose of scan {scan_id!r:.50}")
+                scan = self._state.log.get(scan_id)
                 if (pose != scan.pose).any():
                     moved[scan_id] = scan.at(pose.copy())
             return self._state.exchange(moved, moved)
@@ -427,9 +419,8 @@ class LiveMap:
             If scans were sealed, or there are none.
         """
         with self._owned(changes=False):
-            if sealed := self.sealed_scans:
-                msg = f"{sealed} scans were sealed by max_bytes or clear_outside, and cannot be fitted: give the map a folder to keep scans in"
-                raise ValueError(msg)
+            sealed = f"{self.sealed_scans} scans were sealed by max_bytes or clear_outside"
+            check(not self.sealed_scans, f"{sealed}: give the map a folder to keep scans in")
             scans, origin = self._state.scans(), self._state.origin
         intensities = [scan.intensities for scan in scans if scan.intensities is not None]
         speeds = [scan.doppler_mps for scan in scans if scan.doppler_mps is not None]
@@ -463,8 +454,6 @@ def _checked_scan(
             static = ~moving if moving.any() else None
     if time_s is not None:
         time_s = number(time_s, "time_s")
-        if not abs(time_s) <= MAX_TIME_S:
-            msg = f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}"
-            raise ValueError(msg)
+        check(abs(time_s) <= MAX_TIME_S, f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}")
     values_of_scan = None if values is None else values[0].copy()
     return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s), left_out.far

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
+from radarsdf.arrays import Array, Bools, Ints, Keys
 from radarsdf.returns.sums import lattice_of
 
-Keys = NDArray[np.uint64]
-Rows = dict[str, NDArray[Any]]
+Rows = dict[str, Array]
 
 REGION_CELLS = 64  # leaf cells along the edge of a region
 REGION_BITS = np.uint64(18)  # bits of a leaf cell's Morton key below those of its region
@@ -21,12 +19,12 @@ NO_KEYS = np.zeros(0, np.uint64)
 _FARTHEST = 1_000_000  # farthest cell along each axis that has a key
 
 
-def steps_near(reach: int) -> NDArray[np.int64]:
+def steps_near(reach: int) -> Ints:
     """Return all offsets ((2 reach + 1)³, 3) of at most `reach` along each axis."""
     return np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)), np.int64)
 
 
-def shifted(keys: Keys, steps: NDArray[np.int64]) -> Keys:
+def shifted(keys: Keys, steps: Ints) -> Keys:
     """Return the unique ascending keys of cells at offsets `steps` (S, 3) from `keys` (N,)."""
     return np.unique(_keys_at((lattice_of(keys)[:, None] + steps).reshape(-1, 3)))
 
@@ -43,18 +41,23 @@ def regions_of(leaf_keys: Keys) -> Keys:
     return np.unique(leaf_keys >> REGION_BITS)
 
 
+def within(leaf_keys: Keys, regions: Keys) -> Bools:
+    """Return a mask (N,) of the leaf cells in `regions`."""
+    return np.isin(leaf_keys >> REGION_BITS, regions)
+
+
 def regions_near(regions: Keys, reach: int) -> Keys:
     """Return the ascending keys of these regions, and of those at most `reach` away along each axis."""
     near = shifted(regions << REGION_BITS, REGION_CELLS * steps_near(reach))
     return np.unique(near >> REGION_BITS)
 
 
-def region_places(regions: Keys) -> NDArray[np.int64]:
+def region_places(regions: Keys) -> Ints:
     """Return the lattice positions (R, 3) of regions: i spans [i, i + 1) times their edge."""
     return lattice_of(regions << REGION_BITS) // REGION_CELLS
 
 
-def _keys_at(cells: NDArray[np.int64]) -> Keys:
+def _keys_at(cells: Ints) -> Keys:
     """Return the keys (N,) of cells (N, 3)."""
     # The centre of a cell of 1 m is exact in float64.
     return cell_keys(np.clip(cells, -_FARTHEST, _FARTHEST - 1) + 0.5, 1.0, 1)
@@ -63,7 +66,7 @@ def _keys_at(cells: NDArray[np.int64]) -> Keys:
 class RegionTable:
     """Table by ascending Morton keys of cells, partitioned into regions. `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2."""
 
-    def __init__(self, leaves_per_cell: int = 1, **columns: NDArray[Any]) -> None:
+    def __init__(self, leaves_per_cell: int = 1, **columns: Array) -> None:
         """Create an empty table. `columns`: default row of each column."""
         self._merged = leaves_per_cell.bit_length() - 1
         self._new: Rows = {"keys": np.zeros(1, np.uint64), **columns}

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import QUANTA, GrowingSums, SumsChange
+from radarsdf.arrays import Array, Floats, Keys
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.steps import FitInput
 from radarsdf.interrupts import at_once
-from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, Keys, region_places, regions_of
+from radarsdf.live.regions import NO_KEYS, REGION_BITS, REGION_CELLS, region_places, regions_of
 from radarsdf.live.store import Described, LoggedScan, RegionStore, ScanId, ScanLog, save_state
 from radarsdf.live.surface import GrowingSurface
 from radarsdf.live.tracking import Track
@@ -42,11 +43,7 @@ class GrowingState:
     """
 
     def __init__(
-        self,
-        config: FitConfig,
-        origin: NDArray[np.float64] | None,
-        max_bytes: int | None,
-        folder: Path | None,
+        self, config: FitConfig, origin: Floats | None, max_bytes: int | None, folder: Path | None
     ) -> None:
         self.config = config
         self.quick = FitConfig.quick(  # with the same cells, returns, bridges, seed and limits
@@ -74,7 +71,6 @@ class GrowingState:
 
     @property
     def num_bytes(self) -> int:
-        """Memory in total, bytes."""
         surface = 0 if self._surface is None else self._surface.num_bytes
         return self.sums.num_bytes + self.log.num_bytes + surface
 
@@ -110,7 +106,7 @@ class GrowingState:
         """Change the sums and set attributes at once. Return the changed blocks: `blocks`, or those that `change` returns."""
         surface, self._surface = self._surface, None  # an interruption after the change discards it
         result, _ = at_once(change, partial(vars(self).update, new))
-        changed: Keys = result[0] if blocks is None else blocks
+        changed = result[0] if blocks is None else blocks
         self._changed.update(changed.tolist())
         self._surface = surface
         return changed
@@ -122,8 +118,7 @@ class GrowingState:
                 self._settle_noise()
             self.log = self.log.shrunk(max(0, self.max_bytes - (self.num_bytes - self.log.num_bytes)))
 
-    def clear_outside(self, centre: NDArray[np.float64], radius_m: float) -> Keys:
-        """See :meth:`LiveMap.clear_outside`."""
+    def clear_outside(self, centre: Floats, radius_m: float) -> Keys:
         keys = self.sums.block_keys()
         if self.origin is None:
             return keys
@@ -133,7 +128,7 @@ class GrowingState:
             nearest = np.clip(centre, lower, lower + REGION_CELLS * self.config.leaf_size_m)
             return self._put_away(regions[np.square(nearest - centre).sum(axis=1) > radius_m**2])
         middles = (lattice_of(keys << BLOCK_BITS) + 4) * self.config.leaf_size_m + self.origin
-        gone: Keys = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
+        gone = keys[np.square(middles - centre).sum(axis=1) > radius_m**2]
         log = self.log.sealed_beyond(centre, radius_m)
         return self._commit(partial(self.sums.erase, gone), gone, log=log)
 
@@ -170,36 +165,38 @@ class GrowingState:
         else:
             surface = self._surface
             blocks = np.array(sorted(self._changed), np.uint64)
-        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(_blocks_of_regions(blocks)))
+        bits = REGION_BITS - BLOCK_BITS
+        in_region = np.arange(1 << int(bits), dtype=np.uint64)
+        near = (
+            (np.unique(blocks >> bits) << bits)[:, None] | in_region
+        ).ravel()  # all blocks of their regions
+        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(near))
         surface.complete = False
         self._changed.clear()
         return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the state to a file. Raise a ValueError for scan ids that are neither integers nor strings."""
-        keys, ids, sealed = self.sums.block_keys(), self.log.ids, self.log.sealed
-        if not all(type(scan_id) in (int, str) for scan_id in (*ids, *sealed)):
-            msg = "a map can be saved only if the ids of its scans are whole numbers or strings"
-            raise ValueError(msg)
+        ids: list[Any] = [*self.log.ids, *self.log.sealed]
+        savable = all(type(scan_id) in (int, str) for scan_id in ids)
+        check(savable, "a map can be saved only if the ids of its scans are whole numbers or strings")
         scans = list(self.log.scans())
-        described: dict[str, Any] = {
-            "config": self.config.to_dict(),
-            "origin": None if self.origin is None else self.origin.tolist(),
-            "noise": list(dataclasses.astuple(self.noise)),
-            "noise_of": self._noise_of,
-            "next_id": self.next_id,
-            "with_intensities": self.with_intensities,
-            "max_bytes": self.max_bytes,
-            "sealed": list(sealed),
-            "ids": ids,
-            "poses": [scan.pose.tolist() for scan in scans],
-            "times_s": [scan.time_s for scan in scans],
-        }
-        save_state(
-            path, Described(**described), scans, (*self.sums.sums_of(keys), *self.sums.visibility_of(keys))
+        described = Described(
+            config=self.config.to_dict(),
+            origin=None if self.origin is None else self.origin.tolist(),
+            noise=list(dataclasses.astuple(self.noise)),
+            noise_of=self._noise_of,
+            next_id=self.next_id,
+            with_intensities=self.with_intensities,
+            max_bytes=self.max_bytes,
+            sealed=ids[len(scans) :],
+            ids=ids[: len(scans)],
+            poses=[scan.pose.tolist() for scan in scans],
+            times_s=[scan.time_s for scan in scans],
         )
+        save_state(path, described, scans, self.sums)
 
-    def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[NDArray[Any]]) -> None:
+    def restore(self, described: Described, scans: list[LoggedScan], sums: Sequence[Array]) -> None:
         """Restore a saved state into a new one."""
         self.sums.insert(*sums)
         self.noise, self._noise_of = SensorNoise(*described.noise), described.noise_of
@@ -212,9 +209,7 @@ class GrowingState:
     def scans(self) -> list[LoggedScan]:
         """Return the scans that are not sealed. Raise a ValueError if there are none."""
         scans = list(self.log.scans())
-        if not scans:
-            msg = "there are no scans to fit: integrate some first"
-            raise ValueError(msg)
+        check(scans, "there are no scans to fit: integrate some first")
         return scans
 
     def fit_input(self) -> Callable[[], FitInput]:
@@ -250,7 +245,7 @@ class GrowingState:
             vars(self).update(noise=noise, _noise_of=scans)
 
 
-def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.float64] | None) -> Rays:
+def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: Floats | None) -> Rays:
     """Return the rays of the static returns. Those of a scan depend on the scan, its pose and the settings alone."""
     static = [scan.static for scan in scans]
     return prepare(
@@ -261,11 +256,3 @@ def _rays_of(scans: Sequence[LoggedScan], config: FitConfig, origin: NDArray[np.
         whole=False,
         **config.preparation,
     )
-
-
-def _blocks_of_regions(blocks: Keys) -> Keys:
-    """Return the ascending keys of all blocks in the regions of these blocks."""
-    bits = REGION_BITS - BLOCK_BITS
-    regions = np.unique(blocks >> bits)
-    found: Keys = ((regions << bits)[:, None] | np.arange(1 << int(bits), dtype=np.uint64)).reshape(-1)
-    return found

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import CellBlocks, Encoding, VertexTable
+from radarsdf.arrays import Floats, Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.average import (
     BAND_CELLS,
@@ -18,8 +18,6 @@ from radarsdf.fitting.average import (
 )
 from radarsdf.live.regions import (
     NO_KEYS,
-    REGION_BITS,
-    Keys,
     RegionTable,
     Rows,
     cubes_near,
@@ -27,11 +25,13 @@ from radarsdf.live.regions import (
     regions_of,
     shifted,
     steps_near,
+    within,
 )
 from radarsdf.map import queries
+from radarsdf.map.confidence import interpolated
 from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
-from radarsdf.map.mesh import Surface, local
+from radarsdf.map.mesh import Surface
 from radarsdf.returns.evidence import (
     BLOCK_BITS,
     Evidence,
@@ -42,13 +42,7 @@ from radarsdf.returns.evidence import (
 )
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.planes import (
-    LEAVES_PER_SURFEL,
-    MIN_SUPPORT,
-    Surfels,
-    neighbour_planes,
-    neighbour_support,
-)
+from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, neighbour_planes
 from radarsdf.returns.sums import MeanRays, ScanSums, lattice_of, merged_keys
 from radarsdf.threads import resolve_num_threads
 
@@ -62,37 +56,32 @@ class GrowingSurface:
     distances take most of the time, and are cached by region. Ghosts and triangles are recomputed for the whole map.
     """
 
-    def __init__(self, config: FitConfig, origin: NDArray[np.float64]) -> None:
+    def __init__(self, config: FitConfig, origin: Floats) -> None:
         self._config = config  # quick settings
+        self._surfel_m = LEAVES_PER_SURFEL * config.leaf_size_m
         self._origin = origin  # (3,) origin of the local frame, world, m
         self.complete = False  # set by the caller after :meth:`update`, so that a partial one is not used
         self._noise: SensorNoise | None = None
-        vector, number = np.full((1, 3), np.nan, np.float32), np.zeros(1, np.float32)
+        vector, number, count = (
+            np.full((1, 3), np.nan, np.float32),
+            np.zeros(1, np.float32),
+            np.zeros(1, np.uint32),
+        )
         # Leaf cells with returns: mean rays and normals.
         self._leaves = RegionTable(
-            points=vector,
-            directions=vector,
-            counts=number,
-            scans=np.zeros(1, np.uint32),
-            ranges_m=number,
-            normals=vector,
+            points=vector, directions=vector, counts=number, scans=count, ranges_m=number, normals=vector
         )
         # Cells of surfels. Planes (centre, normal, variances) are NaN without support.
+        no_plane = np.full((1, 9), np.nan)
         self._cells = RegionTable(
-            LEAVES_PER_SURFEL,
-            moments=np.zeros((1, 13)),
-            support=np.zeros(1),
-            planes=np.full((1, 9), np.nan),
+            LEAVES_PER_SURFEL, moments=np.zeros((1, 13)), support=np.zeros(1), planes=no_plane
         )
         self._surfels = self._surfels_of(self._cells.gather())  # surfels of all cells
         self._ghosts = NO_KEYS  # ascending keys of the surfel cells with ghosts
         self._crossed = RegionTable()  # leaf cells that rays cross near their returns
         # These, and the bridges over gaps between them: distances at the corners, m, whether they change sign, evidence.
         self.distances = RegionTable(
-            values=np.zeros((1, 8), np.float32),
-            crossed=np.zeros(1, bool),
-            information=np.zeros(1, np.float32),
-            hits=np.zeros(1, np.uint32),
+            values=np.zeros((1, 8), np.float32), crossed=np.zeros(1, bool), information=number, hits=count
         )
 
     @property
@@ -134,24 +123,17 @@ class GrowingSurface:
         )
         evidence = Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
-        points = local(scene, vertices + self._origin)
+        points = queries.to_local(scene, vertices + self._origin)
         columns = evidence.columns(rows["keys"], resolve_num_threads(0))
-        at = queries.interpolated(CellBlocks(rows["keys"]), columns, leaf_m, points)
+        at = interpolated(CellBlocks(rows["keys"]), columns, leaf_m, points)
         return scene, Surface.from_triangles(scene, vertices, faces, at, len(rows["keys"]))
 
     def _surfels_of(self, rows: Rows) -> Surfels:
         cell_of_plane = np.flatnonzero(rows["support"] >= MIN_SUPPORT)
-        planes = rows["planes"][cell_of_plane]
+        planes = [part.copy() for part in np.split(rows["planes"][cell_of_plane], 3, axis=1)]
+        keys, counts = rows["keys"], rows["moments"][:, 0].copy()
         return Surfels(
-            cell_size_m=LEAVES_PER_SURFEL * self._config.leaf_size_m,
-            keys=rows["keys"],
-            blocks=CellBlocks(rows["keys"]),
-            counts=rows["moments"][:, 0].copy(),
-            support=rows["support"],
-            cell_of_plane=cell_of_plane,
-            centres=planes[:, :3].copy(),
-            normals=planes[:, 3:6].copy(),
-            variances=planes[:, 6:].copy(),
+            self._surfel_m, keys, CellBlocks(keys), counts, rows["support"], cell_of_plane, *planes
         )
 
     def _put_sums(self, blocks: Keys, sums: ScanSums) -> Keys:
@@ -161,8 +143,7 @@ class GrowingSurface:
         self._leaves.put(regions, self._leaves.carried(regions, sums.keys) | vars(MeanRays.of_sums(sums)))
         keys, moments = sums.merged_moments()
         self._cells.put(regions, self._cells.carried(regions, keys) | {"moments": moments})
-        found: Keys = either[np.isin(either >> BLOCK_BITS, blocks)]
-        return found
+        return either[np.isin(either >> BLOCK_BITS, blocks)]
 
     def _fit_planes(self, changed: Keys, num_threads: int) -> Keys:
         """Fit planes in the neighbourhood of changed cells. Return the ascending keys of their regions."""
@@ -172,13 +153,10 @@ class GrowingSurface:
         keys, moments, blocks = cells["keys"], cells["moments"], CellBlocks(cells["keys"])
         rows = blocks.rows(near, num_threads)
         rows = rows[rows >= 0]
-        cells["support"][rows] = neighbour_support(blocks, keys[rows], moments, num_threads)
-        cells["planes"][rows] = np.nan
-        rows = rows[cells["support"][rows] >= MIN_SUPPORT]
-        centres, normals, _, variances = neighbour_planes(
-            blocks, keys[rows], moments, LEAVES_PER_SURFEL * self._config.leaf_size_m, num_threads
-        )
-        cells["planes"][rows] = np.concatenate([centres, normals, variances], axis=1)
+        found = neighbour_planes(blocks, keys[rows], moments, self._surfel_m, num_threads)
+        support, fitted, *planes, _ = found
+        cells["support"][rows], cells["planes"][rows] = support, np.nan
+        cells["planes"][rows[fitted]] = np.concatenate(planes, axis=1)
         own = np.isin(self._cells.regions_of(keys), regions)
         self._cells.put(regions, {name: column[own] for name, column in cells.items()})
         return regions
@@ -189,10 +167,7 @@ class GrowingSurface:
         cells = self._surfels.cells_of_leaves(leaves["keys"], num_threads)
         found = find_ghosts(self._surfels, _means_of(leaves), cells, noise, num_threads)
         before, self._ghosts = self._ghosts, self._surfels.keys[found]
-        differs: Keys = leaves["keys"][
-            np.isin(merged_keys(leaves["keys"]), np.setxor1d(before, self._ghosts))
-        ]
-        return differs
+        return leaves["keys"][np.isin(merged_keys(leaves["keys"]), np.setxor1d(before, self._ghosts))]
 
     def _find_normals(self, regions: Keys, num_threads: int) -> Keys:
         """Compute the normals of the leaf cells in these regions. Return the keys of the changed ones."""
@@ -201,60 +176,57 @@ class GrowingSurface:
         normals = normals_at(_means_of(leaves), surfels, num_threads)
         differs = (normals != leaves["normals"]).any(axis=1)
         self._leaves.put(regions, leaves | {"normals": normals})
-        found: Keys = leaves["keys"][differs]
-        return found
+        return leaves["keys"][differs]
 
     def _derive_distances(self, changed: Keys, noise: SensorNoise, num_threads: int) -> Keys:
         """Recompute distances and evidence that depend on changed leaf cells. Return their regions, ascending."""
         # A ray contributes to the cells of its band, and via shared corners to the neighbours of the last one. Added or removed
         # cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
-        config = self._config
         reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(max(TRUNCATION_CELLS, BAND_CELLS)) + 1)
-        centre = regions_of(reached)
-        # Bridges depend on medians over blocks of 32 cells, and on their two ends.
-        own, around = regions_near(centre, 2), regions_near(centre, 3)
-        leaves = self._leaves.gather(around)
-        is_true = ~np.isin(merged_keys(leaves["keys"]), self._ghosts)
-        means, normals = _means_of(leaves).select(is_true), leaves["normals"][is_true]
-        before = self.distances.gather(around)["keys"]
-        rays = means.select(np.isin(means.keys >> REGION_BITS, regions_near(centre, 1)))
-        keys = rays.leaf_keys(config.leaf_size_m, config.metres(BAND_CELLS), num_threads)
-        self._crossed.put(centre, {"keys": keys})
-        crossed = self._crossed.gather(around)["keys"]
-        counts = means.counts.astype(np.float64)
-        found = bridged(crossed, means.keys, counts, config.encoding.bridge_cells, num_threads)
-        # At the border of the gathered regions, bridges lack an end.
-        leaf_keys = np.concatenate(
-            [found[np.isin(found >> REGION_BITS, own)], before[~np.isin(before >> REGION_BITS, own)]]
-        )
-        leaf_keys.sort()
-        came_or_went = np.setxor1d(leaf_keys, before, assume_unique=True)
+        leaf_keys, came_or_went = self._find_leaf_cells(regions_of(reached), num_threads)
         reached = np.union1d(reached, cubes_near(came_or_went, _BLOCK_CELLS, 1))
-        there = regions_of(np.union1d(leaf_keys, before))
-        redone = np.intersect1d(regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED)), there)
-        # All cells that influence their corners: smoothing reaches no farther.
-        near = regions_near(redone, 1)
-        leaf_keys = leaf_keys[np.isin(leaf_keys >> REGION_BITS, near)]
-        here = np.isin(means.keys >> REGION_BITS, near)
-        means, normals = means.select(here), normals[here]
+        smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED))
+        redone = np.intersect1d(smoothed, regions_of(np.union1d(leaf_keys, came_or_went)))
+        self._average(redone, leaf_keys, noise, num_threads)
+        return redone
+
+    def _find_leaf_cells(self, regions: Keys, num_threads: int) -> tuple[Keys, Keys]:
+        """Find the leaf cells near `regions`, in which rays changed. Return them, and those that came or went, ascending."""
+        rays, _ = self._true_means(regions_near(regions, 1))
+        crossed = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
+        self._crossed.put(regions, {"keys": crossed})
+        # Bridges depend on medians over blocks of 32 cells, and on their two ends, which they lack at the border.
+        own, around = regions_near(regions, 2), regions_near(regions, 3)
+        ends, _ = self._true_means(around)
+        counts, most = ends.counts.astype(np.float64), self._config.encoding.bridge_cells
+        found = bridged(self._crossed.gather(around)["keys"], ends.keys, counts, most, num_threads)
+        before = self.distances.gather(around)["keys"]
+        leaf_keys = np.union1d(found[within(found, own)], before[~within(before, own)])
+        return leaf_keys, np.setxor1d(leaf_keys, before, assume_unique=True)
+
+    def _average(self, regions: Keys, leaf_keys: Keys, noise: SensorNoise, num_threads: int) -> None:
+        """Recompute distances and evidence of the leaf cells in `regions`."""
+        config = self._config
+        near = regions_near(regions, 1)  # what influences their corners: smoothing reaches no farther
+        means, normals = self._true_means(near)
         weighted = ReturnsOfCells.of_means(means, noise, config.returns)
+        leaf_keys = leaf_keys[within(leaf_keys, near)]
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
         distances_m = average_at_corners(table, means, weighted, normals, config, num_threads)
-        own_cells = np.isin(leaf_keys >> REGION_BITS, redone)
-        values = distances_m[table.leaf_vertices()[1][own_cells]]
-        information, hits = evidence_sums(weighted, leaf_keys[own_cells], num_threads)
-        rows = {
-            "keys": leaf_keys[own_cells],
-            "values": values,
-            "crossed": (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0),
-            "information": information,
-            "hits": hits,
-        }
-        self.distances.put(redone, rows)
-        return redone
+        own = within(leaf_keys, regions)
+        values = distances_m[table.leaf_vertices()[1][own]]
+        information, hits = evidence_sums(weighted, leaf_keys[own], num_threads)
+        crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
+        rows = {"values": values, "crossed": crossed, "information": information, "hits": hits}
+        self.distances.put(regions, {"keys": leaf_keys[own]} | rows)
+
+    def _true_means(self, regions: Keys) -> tuple[MeanRays, Floats32]:
+        """Return the mean rays of the leaf cells in `regions` that are no ghosts, and their normals (M, 3)."""
+        leaves = self._leaves.gather(regions)
+        true = np.flatnonzero(~np.isin(merged_keys(leaves["keys"]), self._ghosts))
+        return _means_of(leaves).select(true), leaves["normals"].take(true, axis=0)
 
 
 def _means_of(rows: Rows) -> MeanRays:
     """Build the mean rays of leaf cells from their columns."""
-    names = ("keys", "points", "directions", "counts", "scans", "ranges_m")
-    return MeanRays(**{name: rows[name] for name in names})
+    return MeanRays(**{name: rows[name] for name in MeanRays.__dataclass_fields__})

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from radarsdf.checks import real_array
+from radarsdf.arrays import Bytes
+from radarsdf.checks import check, real_array
 
 # From indigo through magenta and orange to yellow. Lightness increases from 0.32 to 0.93 in OKLab, in equal steps.
 _ANCHORS = np.array([
@@ -15,14 +16,13 @@ _ANCHORS = np.array([
 NEUTRAL = (190, 196, 204)  # light grey, for surfaces without a value
 
 
-def intensity_colors(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
+def intensity_colors(values: ArrayLike, low: float, high: float) -> Bytes:
     """Map values (N,) to RGBA colours (N, 4) uint8, from dark indigo at `low` to bright yellow at `high`; NaN is grey.
 
     Values outside the limits are clipped; if the limits are equal, all values get the middle colour.
     """
-    if not (np.isfinite([low, high]).all() and low <= high):
-        msg = f"limits must be finite and ascending, not {low} and {high}"
-        raise ValueError(msg)
+    ascending = np.isfinite([low, high]).all() and low <= high
+    check(ascending, f"limits must be finite and ascending, not {low} and {high}")
     v = real_array(values, "values")
     where = np.clip((v - low) / (high - low), 0.0, 1.0) if high > low else np.where(np.isnan(v), np.nan, 0.5)
     known = ~np.isnan(where)

@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from radarsdf._core import CellBlocks
+from radarsdf.arrays import Floats, Floats32
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.free_space import FreeSpace
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
-from radarsdf.returns.view_statistics import ViewStatistics
+from radarsdf.returns.view_statistics import ViewStatistics, ViewStatisticsAt
 from radarsdf.threads import resolve_num_threads
 
 _Part = TypeVar("_Part")
@@ -40,7 +38,7 @@ class Deferred(Generic[_Part]):
 class WholeMap:
     """Properties of the whole map on which evidence at a place depends, besides the returns there."""
 
-    origin: NDArray[np.float64]  # (3,) origin of the local frame in world coordinates, m
+    origin: Floats  # (3,) origin of the local frame in world coordinates, m
     config: FitConfig
     clutter_ratio: float  # share of the returns not on a thin surface, in [0, 1]
     returns_per_cell: float  # mean number of returns in the cells of surfels with returns
@@ -58,8 +56,14 @@ class MapContents(WholeMap):
     free_space: Callable[[], FreeSpace] = FreeSpace.none  # free-space crossings, or none
     view_statistics: Callable[[], ViewStatistics] = ViewStatistics.none  # of intensity, or none
 
+    def views_in_world(self) -> ViewStatisticsAt:
+        """Return the view statistics in the world frame, in sensor units."""
+        scale = self.intensity_scale
+        low, high = (0.0, 1.0) if scale is None else (scale.low, scale.high)
+        return self.view_statistics().in_world(self.origin, low, high)
+
     @cached_property
-    def evidence_of_cells(self) -> tuple[CellBlocks, NDArray[np.float32]]:
+    def evidence_of_cells(self) -> tuple[CellBlocks, Floats32]:
         """The leaf cells, and (C, 4) see :meth:`radarsdf.returns.evidence.Evidence.columns`. Prepared by the first query."""
         keys = self.field.table.leaf_keys()
         return CellBlocks(keys), self.evidence.columns(keys, resolve_num_threads(0))

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from radarsdf.checks import MAX_POSITION_M, check_pose, instance, real_array
+from radarsdf.arrays import Array, Bools, Floats
+from radarsdf.checks import MAX_POSITION_M, check, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
+from radarsdf.map.confidence import EvidenceAt, confidence, uncertainty
 from radarsdf.map.contents import MapContents
+from radarsdf.map.free_space import CellsInBox, free_space_odds
+from radarsdf.map.threshold import VOXEL_M
 from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.view_statistics import ViewStatisticsAt
@@ -25,6 +29,9 @@ if TYPE_CHECKING:
     import trimesh
 
     from radarsdf.map.view import View, ViewedMap
+
+
+Query = Callable[..., Array]
 
 
 class Map(ABC):
@@ -61,9 +68,9 @@ class Map(ABC):
         """
         world, answer = _as_positions(x)
         if return_gradient:
-            found = self._plane(world, extrapolate)
-            return answer(found[:, 0].contiguous()), answer(found[:, 1:].contiguous())
-        return answer(self._sdf(world, extrapolate))
+            planes = self._evaluate(queries.plane, world, extrapolate=extrapolate)
+            return answer(planes[:, 0]), answer(planes[:, 1:])
+        return answer(self._evaluate(queries.signed_distance, world, extrapolate=extrapolate))
 
     def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
         """Compute the gradient of the signed distance.
@@ -82,7 +89,7 @@ class Map(ABC):
             normal incidence, and larger at grazing incidence. NaN where :meth:`sdf` is.
         """
         world, answer = _as_positions(x)
-        return answer(self._plane(world, extrapolate)[:, 1:].contiguous())
+        return answer(self._evaluate(queries.plane, world, extrapolate=extrapolate)[:, 1:])
 
     def observed(self, x: Any) -> Any:
         """Test whether positions lie in or on the border of a leaf cell, near returns or in a small gap between them.
@@ -118,7 +125,7 @@ class Map(ABC):
             and ``pose_sigma_rad`` of the :class:`FitConfig` specify them.
         """
         world, answer = _as_positions(x)
-        return answer(queries.uncertainty(self._contents_of_any, self.evidence_at(world)))
+        return answer(uncertainty(self.contents_of_any, self.evidence_at(world)))
 
     def confidence(self, x: Any) -> Any:
         """Estimate the probability of a surface, from the returns near each position and the scans that reached it.
@@ -141,7 +148,7 @@ class Map(ABC):
         other kinds of scenes, the worst tenth is mostly within 0.1 to 0.3 of the share of true surface.
         """
         world, answer = _as_positions(x)
-        return answer(queries.confidence(self._contents_of_any, self.evidence_at(world)))
+        return answer(confidence(self.contents_of_any, self.evidence_at(world)))
 
     def intensity(self, x: Any, sensor_positions: Any, *, extrapolate: bool = False) -> Any:
         """Predict the intensity of the return that a sensor would measure at each position.
@@ -170,16 +177,15 @@ class Map(ABC):
         ValueError
             If the map has no intensities.
         """
-        if not self.has_intensity:
-            msg = "this map was fitted without intensities"
-            raise ValueError(msg)
+        check(self.has_intensity, "this map was fitted without intensities")
         world, answer = _as_positions(x)
         sensors, _ = _as_positions(sensor_positions, rows=len(world))
-        return answer(self._intensity(world, sensors, extrapolate))
+        query = partial(queries.intensity, extrapolate=extrapolate)
+        return answer(self._evaluate(query, world, sensors, extrapolate=extrapolate))
 
     def mesh(
         self,
-        voxel_size: float = queries.VOXEL_M,
+        voxel_size: float = VOXEL_M,
         *,
         box: ArrayLike | None = None,
         viewpoint: ArrayLike | None = None,
@@ -231,26 +237,24 @@ class Map(ABC):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
-        limits = {"min_confidence": min_confidence, "max_uncertainty": max_uncertainty}
-        limits |= {"min_component_triangles": min_component_triangles}
-        return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
-
-    def _mesh_seen_from(
-        self, viewpoint: ArrayLike | None, voxel_size: float, **wanted: Any
-    ) -> trimesh.Trimesh:
         from radarsdf.map.mesh import with_intensities  # noqa: PLC0415 - trimesh is slow to import
 
-        if viewpoint is None:
-            return self._surface_mesh(voxel_size, **wanted)
         scale = self.intensity_scale
-        if scale is None:
-            msg = "a viewpoint needs a map with intensities; this one was fitted without"
-            raise ValueError(msg)
-        sensor_position = real_array(viewpoint, "viewpoint")
-        if sensor_position.shape != (3,) or not (np.abs(sensor_position) <= MAX_POSITION_M).all():
-            msg = f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m"
-            raise ValueError(msg)
-        mesh = self._surface_mesh(voxel_size, **wanted)
+        if viewpoint is not None:
+            check(scale, "a viewpoint needs a map with intensities; this one was fitted without")
+            sensor_position = real_array(viewpoint, "viewpoint")
+            is_position = sensor_position.shape == (3,) and (np.abs(sensor_position) <= MAX_POSITION_M).all()
+            check(is_position, f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m")
+        mesh = self._surface_mesh(
+            voxel_size,
+            box=box,
+            progress=progress,
+            min_confidence=min_confidence,
+            max_uncertainty=max_uncertainty,
+            min_component_triangles=min_component_triangles,
+        )
+        if viewpoint is None or scale is None:
+            return mesh
         vertices = np.array(mesh.vertices, np.float64)
         return with_intensities(mesh, self.intensity(vertices, sensor_position), scale)
 
@@ -322,22 +326,22 @@ class Map(ABC):
     @property
     def config(self) -> FitConfig:
         """Settings of the fit."""
-        return self._contents_of_any.config
+        return self.contents_of_any.config
 
     @property
     def report(self) -> dict[str, Any]:
         """Counts, losses, sensor noise and times, s, of the fit. `skipped`: parts of the method that it did not run."""
-        return self._contents_of_any.report
+        return self.contents_of_any.report
 
     @property
     def sensor(self) -> Sensor:
         """The radar, estimated from the scans of the fit."""
-        return self._contents_of_any.sensor
+        return self.contents_of_any.sensor
 
     @property
     def intensity_scale(self) -> IntensityScale | None:
         """Range of the training intensities, sensor units. None: the map was fitted without intensities."""
-        return self._contents_of_any.intensity_scale
+        return self.contents_of_any.intensity_scale
 
     @property
     def has_intensity(self) -> bool:
@@ -347,16 +351,16 @@ class Map(ABC):
     @property
     def clutter_ratio(self) -> float:
         """Share of the returns that do not lie on a thin surface, in [0, 1]."""
-        return self._contents_of_any.clutter_ratio
+        return self.contents_of_any.clutter_ratio
 
     @property
     @abstractmethod
-    def origin(self) -> NDArray[np.float64]:
+    def origin(self) -> Floats:
         """Origin of the local frame, (3,) float64, world, m. Queries subtract it in float64."""
 
     @property
     @abstractmethod
-    def extent(self) -> NDArray[np.float64]:
+    def extent(self) -> Floats:
         """Lower and upper corner of the bounding box of all leaf cells, (2, 3) float64, world, m."""
 
     @property
@@ -372,11 +376,11 @@ class Map(ABC):
     # Interface for grids, comparisons and views, and the abstract methods, at positions (N, 3), world, m.
 
     @abstractmethod
-    def cells_near(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
+    def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         """Return free space and returns in the leaf cells that overlap the box of two corners (3,), world, m."""
 
     @abstractmethod
-    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+    def evidence_at(self, world: Floats) -> EvidenceAt:
         """Return the evidence of a surface at positions (N, 3), world, m."""
 
     @abstractmethod
@@ -385,68 +389,54 @@ class Map(ABC):
 
     @property
     @abstractmethod
-    def _contents_of_any(self) -> MapContents:
+    def contents_of_any(self) -> MapContents:
         """The contents of the map, or of any of its tiles, for properties that all share."""
 
     @cached_property
-    def free_space_odds(self) -> NDArray[np.float64]:
-        """See :func:`radarsdf.map.queries.free_space_odds`."""
-        return queries.free_space_odds(self._contents_of_any)
+    def free_space_odds(self) -> Floats:
+        """See :func:`radarsdf.map.free_space.free_space_odds`."""
+        return free_space_odds(self.contents_of_any)
 
     @abstractmethod
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor: ...
+    def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
+        """Evaluate a query of :mod:`queries` where observed (`extrapolate`: at finite positions) and others finite; else NaN."""
 
     @abstractmethod
-    def _plane(self, world: Tensor, extrapolate: bool) -> Tensor:
-        """Return the signed distance and its gradient, (N, 4)."""
-
-    @abstractmethod
-    def _observed(self, world: Tensor) -> Tensor: ...
-
-    @abstractmethod
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor: ...
+    def _observed(self, world: Floats) -> Bools: ...
 
     @abstractmethod
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
         """:meth:`Map.mesh` without intensities. `wanted`: its arguments except the viewpoint."""
 
     @abstractmethod
-    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
         """Return the data for views from a position (3,) within a range, cached for the next view."""
 
-    def tangent_planes(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def tangent_planes(self, x: Floats) -> tuple[Floats, Floats]:
         """Linearise the surface at positions (N, 3), world, m: signed distances (N,), m, to planes, and unit normals (N, 3)."""
         sdf, gradient = self.sdf(x, return_gradient=True)
         length = np.linalg.norm(gradient, axis=1)
         # At grazing incidence the field exceeds the distance, and its gradient exceeds 1, by the same factor.
         return sdf / np.maximum(length, 1), gradient / length[:, None].clip(1e-9)
 
-    def surface_at(self, world: Tensor) -> tuple[queries.EvidenceAt, Tensor, Tensor]:
-        """Return :meth:`evidence_at`, :meth:`Map.uncertainty` and :meth:`Map.confidence` at positions (N, 3), world, m."""
-        evidence, contents = self.evidence_at(world), self._contents_of_any
-        return evidence, queries.uncertainty(contents, evidence), queries.confidence(contents, evidence)
 
-
-def _as_positions(x: Any, rows: int | None = None) -> tuple[Tensor, Callable[[Tensor], Any]]:
-    """Convert `x` to a tensor (N, 3), and return a function that converts results back; (3,) is broadcast to `rows`."""
+def _as_positions(x: Any, rows: int | None = None) -> tuple[Floats, Callable[[Array], Any]]:
+    """Convert `x` to positions (N, 3), and return a function that converts results back; (3,) is broadcast to `rows`."""
     is_tensor = isinstance(x, Tensor)
-    if is_tensor:
-        if x.device.type != "cpu" or x.layout != torch.strided or x.is_complex():
-            msg = f"positions must be real numbers in a dense tensor on the CPU, not {x.dtype} {x.layout} on {x.device}"
-            raise TypeError(msg)
-        world = x.detach()
-    else:  # copy read-only arrays, because PyTorch warns of them
-        world = torch.from_numpy(np.require(real_array(x, "positions"), requirements=["C", "W"]))
+    if is_tensor and (x.device.type != "cpu" or x.layout != torch.strided or x.is_complex()):
+        msg = f"positions must be real numbers in a dense tensor on the CPU, not {x.dtype} {x.layout} on {x.device}"
+        raise TypeError(msg)
+    world = x.detach().double().numpy() if is_tensor else real_array(x, "positions")
     if rows is not None and world.shape == (3,):
-        world = world.expand(rows, 3)
+        world = np.broadcast_to(world, (rows, 3))
     if world.ndim != 2 or world.shape[1] != 3 or (rows is not None and len(world) != rows):
-        msg = f"positions must have shape (N, 3), not {tuple(world.shape)}"
+        msg = f"positions must have shape (N, 3), not {world.shape}"
         raise ValueError(msg)
     keep_double = getattr(x, "dtype", None) in (torch.float64, np.dtype(np.float64), None)
 
-    def answer(result: Tensor) -> Any:
-        if result.dtype != torch.bool:
-            result = result.double() if keep_double else result.float()
-        return result if is_tensor else result.numpy()
+    def answer(result: Array) -> Any:
+        kind = result.dtype if result.dtype == np.bool_ else np.float64 if keep_double else np.float32
+        array = np.ascontiguousarray(result, kind)
+        return torch.from_numpy(array) if is_tensor else array
 
     return world, answer

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from radarsdf import _core
-from radarsdf.checks import real_array, refuse_masked
+from radarsdf.arrays import Array, Bools, Floats, Ints, Ints32
+from radarsdf.checks import check, real_array, refuse_masked
 
 
 def marching_cubes(
@@ -91,15 +92,11 @@ def marching_cubes(
     True
     """
     samples = _as_tensor(volume) if isinstance(volume, Tensor) else _as_samples(volume)
-    if samples.ndim != 3:
-        msg = f"volume must have three axes, not {samples.ndim}"
-        raise ValueError(msg)
+    check(samples.ndim == 3, f"volume must have three axes, not {samples.ndim}")
     shape = tuple(samples.shape)
     usable = None if mask is None else _as_mask(mask, shape)
     iso = real_array(level, "level")
-    if iso.shape != () or not np.isfinite(iso):
-        msg = f"level must be a finite number, not {level!r:.50}"
-        raise ValueError(msg)
+    check(iso.shape == () and np.isfinite(iso), f"level must be a finite number, not {level!r:.50}")
     rest = usable, *_as_placement(spacing, origin, shape), float(iso), num_threads
     if not isinstance(samples, Tensor):
         return _core.marching_cubes_dense(samples, *rest)
@@ -111,48 +108,37 @@ def marching_cubes(
 
 
 def extract_cells(
-    corners: NDArray[Any],
-    values: NDArray[Any],
-    cells: NDArray[Any],
+    corners: Array,
+    values: Array,
+    cells: Array,
     level: float = 0.0,
     *,
     spacing: Sequence[float] = (1.0, 1.0, 1.0),
-    origin: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
+    origin: Sequence[float] | Floats = (0.0, 0.0, 0.0),
     num_threads: int = 0,
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+) -> tuple[Floats, Ints32]:
     """Triangulate values (K,) at lattice coordinates (K, 3), in cells (M, 8) of :func:`sparse_lattice`."""
     corners, cells = (np.ascontiguousarray(a, np.int32) for a in (corners, cells))
     placement = list(spacing), list(origin), level
     return _core.marching_cubes_sparse(corners, values, cells, *placement, num_threads)
 
 
-def sparse_lattice(
-    cells: NDArray[Any], *, num_threads: int = 0
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+def sparse_lattice(cells: Array, *, num_threads: int = 0) -> tuple[Ints32, Ints32, Ints32]:
     """Return the sorted unique cells (M', 3) of lower corners (M, 3), their sorted corners (K, 3), and rows of these (M', 8)."""
     return _core.sparse_lattice(np.ascontiguousarray(cells, np.int32), num_threads)
 
 
-def mesh_components(faces: NDArray[Any], num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def mesh_components(faces: Array, num_vertices: int) -> tuple[Ints32, Ints]:
     """Label connected components of faces (F, 3): labels (F,), in order of their first faces, and sizes (C,)."""
     return _core.mesh_components(np.ascontiguousarray(faces, np.int32), num_vertices)
 
 
 class _MarchingCubes(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        samples: Tensor,
-        mask: NDArray[np.bool_] | None,
-        spacing: list[float],
-        origin: list[float],
-        level: float,
-        num_threads: int,
-    ) -> tuple[Tensor, Tensor]:
-        found = _core.marching_cubes_dense_with_edges(
-            samples.detach().numpy(), mask, spacing, origin, level, num_threads
-        )
+    def forward(ctx: Any, samples: Tensor, *placement: Any) -> tuple[Tensor, Tensor]:
+        found = _core.marching_cubes_dense_with_edges(samples.detach().numpy(), *placement)
         vertices, faces, edges = map(torch.from_numpy, found)
+        _mask, spacing, _origin, level, num_threads = placement
         ctx.save_for_backward(samples, edges)
         ctx.placement = spacing, level, num_threads
         ctx.mark_non_differentiable(faces)
@@ -183,7 +169,7 @@ def _as_tensor(volume: Tensor) -> Tensor:
     return volume.to(torch.float32 if small and kind != torch.float64 else torch.float64).contiguous()
 
 
-def _as_samples(volume: ArrayLike) -> NDArray[Any]:
+def _as_samples(volume: ArrayLike) -> Array:
     """Convert `volume` to C order, as float32 if that represents every value of the type, else float64."""
     refuse_masked(volume, "volume")
     array = np.asarray(volume)
@@ -192,7 +178,7 @@ def _as_samples(volume: ArrayLike) -> NDArray[Any]:
     return np.ascontiguousarray(real_array(array, "volume"))
 
 
-def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _as_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Bools:
     refuse_masked(mask, "mask")
     array = np.asarray(mask)
     if array.dtype != np.bool_ or array.shape != shape:
@@ -207,11 +193,9 @@ def _as_placement(
 ) -> tuple[list[float], list[float]]:
     step, start = real_array(spacing, "spacing"), real_array(origin, "origin")
     for name, values, fits in (("spacing", step, step > 0), ("origin", start, start < np.inf)):
-        if values.shape != (3,) or not (fits & np.isfinite(values)).all():
-            msg = f"{name} must be three finite numbers, positive for spacing, not {values}"
-            raise ValueError(msg)
+        three = values.shape == (3,) and (fits & np.isfinite(values)).all()
+        check(three, f"{name} must be three finite numbers, positive for spacing, not {values}")
     with np.errstate(over="ignore"):
-        if not np.isfinite(np.abs(start) + step * extent).all():
-            msg = f"the lattice with spacing {spacing!r} ends beyond float64"
-            raise ValueError(msg)
+        within = np.isfinite(np.abs(start) + step * extent).all()
+    check(within, f"the lattice with spacing {spacing!r} ends beyond float64")
     return step.tolist(), start.tolist()

@@ -14,10 +14,12 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from radarsdf._core import vertex_areas
-from radarsdf.checks import MAX_POSITION_M, check_box, positive
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
+from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
 from radarsdf.map.colors import intensity_colors
+from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.threshold import Limits, Tally
@@ -36,11 +38,10 @@ _INWARD = 1e-3
 class Surface:
     """All triangles where the field crosses zero, with the evidence of their vertices."""
 
-    vertices: NDArray[np.float64]  # (V, 3) local frame, m
-    faces: NDArray[np.int32]  # (F, 3) rows of the vertices, counter-clockwise seen from free space
-    evidence: queries.EvidenceAt  # at the vertices
-    confidence: NDArray[np.float32]  # (V,) see :meth:`Map.confidence`
-    uncertainty_m: NDArray[np.float32]  # (V,) see :meth:`Map.uncertainty`
+    vertices: Floats  # (V, 3) local frame, m
+    faces: Ints32  # (F, 3) rows of the vertices, counter-clockwise seen from free space
+    confidence: Floats32  # (V,) see :meth:`Map.confidence`
+    uncertainty_m: Floats32  # (V,) see :meth:`Map.uncertainty`
     tally: Tally  # area by confidence
     cells_searched: int  # number of leaf cells that may contain surface
 
@@ -49,57 +50,53 @@ class Surface:
         cls,
         contents: MapContents,
         voxel_size: float,
-        box: NDArray[np.float64] | None = None,
+        box: Floats | None = None,
         progress: bool | None = False,
     ) -> Surface:
         """Extract the surface in voxels of this edge, m, of the whole map or in a `box` (2, 3), local frame, m."""
         vertices, faces, searched = extract_triangles(contents, voxel_size, box, progress)
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
-        evidence = queries.evidence(contents, local(contents, vertices + contents.origin))
-        return cls.from_triangles(contents, vertices, faces, evidence, searched)
+        points = queries.to_local(contents, vertices + contents.origin)
+        return cls.from_triangles(contents, vertices, faces, evidence(contents, points), searched)
 
     @classmethod
     def from_triangles(
-        cls,
-        scene: WholeMap,
-        vertices: NDArray[np.float64],
-        faces: NDArray[np.int32],
-        evidence: queries.EvidenceAt,
-        cells_searched: int,
+        cls, scene: WholeMap, vertices: Floats, faces: Ints32, evidence: EvidenceAt, cells_searched: int
     ) -> Surface:
         """Build from triangles and the evidence at their vertices."""
-        found = queries.probabilities(scene, evidence)
-        confidence, uncertainty = found.confidence.float(), queries.uncertainty(scene, evidence).numpy()
-        areas_m2 = vertex_areas(vertices, faces)
-        columns = confidence.double(), found.covering, found.reach, evidence.hits.double()
-        tally = Tally.of(areas_m2, *(column.numpy() for column in columns))
-        return cls(vertices, faces, evidence, confidence.numpy(), uncertainty, tally, cells_searched)
+        found = probabilities(scene, evidence)
+        confidence = found.confidence.astype(np.float32)
+        columns = confidence.astype(np.float64), found.covering, found.reach, evidence.hits.astype(np.float64)
+        tally = Tally.of(vertex_areas(vertices, faces), *columns)
+        sigma_m = uncertainty(scene, evidence)
+        return cls(vertices, faces, confidence, sigma_m, tally, cells_searched)
 
-    def kept(self, limits: Limits) -> NDArray[np.bool_]:
+    def kept(self, limits: Limits) -> Bools:
         """Return a mask (F,) of the faces within the limits, without small components."""
         min_confidence = self.tally.threshold(limits.min_confidence).min_confidence
-        kept = within(limits, min_confidence, self.faces, self.confidence, self.uncertainty_m)
+        kept = with_all(limits.met(min_confidence, self.confidence, self.uncertainty_m), self.faces)
         rows = np.flatnonzero(kept)
         if len(rows):
             labels, sizes = mesh_components(self.faces.take(rows, axis=0), len(self.vertices))
             kept[rows] = (sizes >= limits.min_component_triangles).take(labels)
         return kept
 
-    def mesh(self, origin: NDArray[np.float64], limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
+    def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         return self.part(
             origin, self.kept(limits), **counts, **self.tally.threshold(limits.min_confidence).metadata
         )
 
-    def part(
-        self, origin: NDArray[np.float64], kept: NDArray[np.bool_], **metadata: float
-    ) -> trimesh.Trimesh:
+    def part(self, origin: Floats, kept: Bools, **metadata: float) -> trimesh.Trimesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
         used, faces = renumbered(len(self.vertices), self.faces.take(np.flatnonzero(kept), axis=0))
         rows = np.flatnonzero(used)
-        vertices, confidence = self.vertices.take(rows, axis=0) + origin, self.confidence.take(rows)
-        return described_mesh(vertices, faces, confidence, self.uncertainty_m.take(rows), **metadata)
+        mesh = trimesh.Trimesh(self.vertices.take(rows, axis=0) + origin, faces, process=False)
+        mesh.vertex_attributes["confidence"] = self.confidence.take(rows)
+        mesh.vertex_attributes["uncertainty_m"] = self.uncertainty_m.take(rows)
+        mesh.metadata |= metadata
+        return mesh
 
 
 def extract_mesh(
@@ -107,33 +104,14 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """Extract the mesh of one map. `wanted`: the limits of :meth:`Map.mesh`."""
     voxel_size = positive(voxel_size, "voxel_size")
-    if voxel_size > MAX_POSITION_M:
-        msg = f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}"
-        raise ValueError(msg)
+    check(voxel_size <= MAX_POSITION_M, f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}")
     limits = Limits.of(voxel_size, **wanted)
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)
     return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
 
 
-def described_mesh(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.integer[Any]],
-    confidence: NDArray[np.float32],
-    uncertainty_m: NDArray[np.float32],
-    **metadata: float,
-) -> trimesh.Trimesh:
-    """Build a mesh of vertices (V, 3), world, m, with vertex attributes and metadata."""
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.vertex_attributes["confidence"] = confidence
-    mesh.vertex_attributes["uncertainty_m"] = uncertainty_m
-    mesh.metadata |= metadata
-    return mesh
-
-
-def with_intensities(
-    mesh: trimesh.Trimesh, intensities: NDArray[Any], scale: IntensityScale
-) -> trimesh.Trimesh:
+def with_intensities(mesh: trimesh.Trimesh, intensities: Array, scale: IntensityScale) -> trimesh.Trimesh:
     """Add intensities (V,), sensor units, and their colours to the vertices of a mesh."""
     values = intensities.astype(np.float32)
     mesh.vertex_attributes["intensity"] = values
@@ -142,29 +120,13 @@ def with_intensities(
     return mesh
 
 
-def local(contents: WholeMap, world: NDArray[np.float64]) -> torch.Tensor:
-    return queries.to_local(contents, torch.from_numpy(world))
-
-
-def within(
-    limits: Limits,
-    min_confidence: float,
-    faces: NDArray[np.int32],
-    confidence: NDArray[np.float32],
-    uncertainty_m: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """Return a mask (F,) of the faces (F, 3) with all vertices within the limits."""
-    return with_all(limits.met(min_confidence, confidence, uncertainty_m), faces)
-
-
-def with_all(good: NDArray[np.bool_], faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+def with_all(good: Bools, faces: Ints32) -> Bools:
     """Return a mask (F,) of the faces (F, 3) with all vertices in the mask `good` (V,)."""
     first, second, third = faces.T
-    found: NDArray[np.bool_] = good.take(first) & good.take(second) & good.take(third)
-    return found
+    return good.take(first) & good.take(second) & good.take(third)
 
 
-def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.bool_], NDArray[np.int32]]:
+def renumbered(num_vertices: int, faces: Ints32) -> tuple[Bools, Ints32]:
     """Return a mask (V,) of the vertices that faces use, and the faces (F, 3) renumbered accordingly."""
     used = np.zeros(num_vertices, bool)
     used[faces] = True
@@ -172,7 +134,7 @@ def renumbered(num_vertices: int, faces: NDArray[np.int32]) -> tuple[NDArray[np.
     return used, renumbered.take(faces)
 
 
-def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int32]:
+def one_for_equal(vertices: Floats, rows: Ints) -> Ints32:
     """Map vertices (V,) to themselves, and those at `rows` (B,) to the first one at the same position."""
     found = np.arange(len(vertices), dtype=np.int32)
     _, first, which = np.unique(vertices[rows], axis=0, return_index=True, return_inverse=True)
@@ -184,8 +146,8 @@ def one_for_equal(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDA
 
 
 def extract_triangles(
-    contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
-) -> tuple[NDArray[np.float64], NDArray[np.int32], int]:
+    contents: MapContents, voxel_size: float, box: Floats | None, progress: bool | None
+) -> tuple[Floats, Ints32, int]:
     """Triangulate the surface in voxels. `box` (2, 3), local frame, m, limits their centres.
 
     Returns vertices (V, 3), local frame, m, faces (F, 3), and the number of leaf cells searched.
@@ -212,8 +174,8 @@ def extract_triangles(
 
 
 def sample_lattice(
-    contents: MapContents, voxel_size: float, box: NDArray[np.float64] | None, progress: bool | None
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], int]:
+    contents: MapContents, voxel_size: float, box: Floats | None, progress: bool | None
+) -> tuple[Ints32, Ints32, Floats32, int]:
     """Return lattice coordinates of the corners (K, 3) of voxels in leaf cells that may contain surface, the rows of each
     voxel (M, 8), signed distances at the corners (K,), m, and the number of these cells."""
     config, leaf_size_m, num_threads = contents.config, contents.config.leaf_size_m, torch.get_num_threads()
@@ -226,37 +188,42 @@ def sample_lattice(
         cells = cells[_overlap(cells, leaf_size_m, box)]
     if stored_m is None and voxel_size < leaf_size_m and contents.field.smooth_in_cells:
         cells = crossed(cells, leaf_size_m, partial(_corner_distances, contents, leaf_size_m))
-    voxels = _voxels_of(cells, voxel_size, parts, even, config)
+    _check_voxels(len(cells), voxel_size, parts, even, config)
+    if even:
+        voxels = subdivided(cells, parts)
+    else:
+        # Points across a cell, at most a voxel apart, hit every voxel that overlaps it; with duplicates.
+        ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
+        inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
+        places = (cells[:, None] + inside) * (leaf_size_m / voxel_size)
+        voxels = np.floor(places).astype(np.int32).reshape(-1, 3)
     if box is not None:
         centres = (voxels + 0.5) * voxel_size
         voxels = voxels[((centres >= box[0]) & (centres <= box[1])).all(axis=1)]
     if voxel_size < leaf_size_m and not even:
         # Only voxels with their centre in an occupied cell: others would extrapolate the surface beyond the map.
-        voxels = voxels[
-            _occupied(contents, (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size))
-        ]
+        middles = (voxels.astype(np.float32) + np.float32(0.5)) * np.float32(voxel_size)
+        voxels = voxels[queries.occupied(contents, middles)]
     voxels, corners, voxel_corners = sparse_lattice(voxels, num_threads=num_threads)
     distances_m = _corner_distances(contents, voxel_size, voxels, corners, voxel_corners, progress)
     return corners, voxel_corners, distances_m, len(cells)
 
 
-def _overlap(cells: NDArray[np.int32], leaf_size_m: float, box: NDArray[np.float64]) -> NDArray[np.bool_]:
-    found = ((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])
-    return np.asarray(found.all(axis=1))
+def _overlap(cells: Ints32, leaf_size_m: float, box: Floats) -> Bools:
+    return (((cells + 1) * leaf_size_m >= box[0]) & (cells * leaf_size_m <= box[1])).all(axis=1)
 
 
 def crossed(
     cells: NDArray[np.integer[Any]],
     leaf_size_m: float,
-    distances_at: Callable[[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]], NDArray[Any]],
-) -> NDArray[np.int32]:
+    distances_at: Callable[[Ints32, Ints32, Ints32], Array],
+) -> Ints32:
     """Return the leaf cells among (M, 3) with corners, by `distances_at`, not all clearly on one side of the surface."""
     unique, corners, cell_corners = sparse_lattice(cells, num_threads=torch.get_num_threads())
     values_m = distances_at(unique, corners, cell_corners)[cell_corners]
     columns = np.ascontiguousarray(values_m.T)  # reductions along rows of eight are slow
     margin_m = _CLEARLY * leaf_size_m
-    found: NDArray[np.int32] = unique[(columns.min(axis=0) <= margin_m) & (columns.max(axis=0) >= -margin_m)]
-    return found
+    return unique[(columns.min(axis=0) <= margin_m) & (columns.max(axis=0) >= -margin_m)]
 
 
 def per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
@@ -265,16 +232,10 @@ def per_cell(voxel_size: float, leaf_size_m: float) -> tuple[int, bool]:
     return parts, math.isclose(parts * voxel_size, leaf_size_m, rel_tol=1e-9)
 
 
-def subdivided(cells: NDArray[Any], parts: int) -> NDArray[Any]:
+def subdivided(cells: Array, parts: int) -> Array:
     """Subdivide cells (M, 3) into voxels (M · parts³, 3), `parts` along an edge."""
     inside = np.indices((parts,) * 3, cells.dtype).reshape(3, -1).T
-    voxels: NDArray[Any] = cells[:, None] * cells.dtype.type(parts) + inside
-    return voxels.reshape(-1, 3)
-
-
-def _occupied(contents: MapContents, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = queries.occupied(contents, torch.from_numpy(points)).numpy()
-    return inside
+    return (cells[:, None] * cells.dtype.type(parts) + inside).reshape(-1, 3)
 
 
 def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config: FitConfig) -> None:
@@ -284,33 +245,19 @@ def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config:
     check_mesh(cells * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
 
 
-def _voxels_of(
-    cells: NDArray[np.int32], voxel_size: float, parts: int, even: bool, config: FitConfig
-) -> NDArray[np.int32]:
-    """Return the voxels (M, 3) that overlap leaf cells, with duplicates. `parts`, `even`: see :func:`per_cell`."""
-    _check_voxels(len(cells), voxel_size, parts, even, config)
-    if even:
-        return subdivided(cells, parts)
-    # Points across a cell, at most a voxel apart, hit every voxel that overlaps it.
-    ends = np.clip(np.arange(parts + 1) / parts, 1e-6, 1 - 1e-6)
-    inside = np.stack(np.meshgrid(*[ends] * 3, indexing="ij"), -1).reshape(1, -1, 3)
-    voxels = np.floor((cells[:, None] + inside) * (config.leaf_size_m / voxel_size)).astype(np.int32)
-    return voxels.reshape(-1, 3)
-
-
 def _corner_distances(
     contents: MapContents,
     voxel_size: float,
-    voxels: NDArray[np.int32],
-    corners: NDArray[np.int32],
-    voxel_corners: NDArray[np.int32],
+    voxels: Ints32,
+    corners: Ints32,
+    voxel_corners: Ints32,
     progress: bool | None = False,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Evaluate signed distances (K,), m, at lattice corners (K, 3)."""
     # A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
     # until it is in an occupied cell, and the distance moved is added to its absolute value.
     points = corners.astype(np.float32) * np.float32(voxel_size)
-    outside = ~_occupied(contents, points)
+    outside = ~queries.occupied(contents, points)
     # Move each corner into its last voxel: NumPy keeps the last assignment of repeated indices.
     owners = np.zeros(len(corners), np.int32)
     owners[voxel_corners.reshape(-1)] = np.repeat(np.arange(len(voxels), dtype=np.int32), 8)
@@ -320,10 +267,8 @@ def _corner_distances(
     place, left = corner.copy(), np.arange(len(corner))
     for share in (_INWARD, 0.25, 0.5, 0.75, 1.0):
         place[left] = corner[left] + np.float32(share) * (centres[left] - corner[left])
-        left = left[~_occupied(contents, place[left])]
+        left = left[~queries.occupied(contents, place[left])]
     points[moved] = place
-    values: NDArray[np.float32] = queries.signed_distance(
-        contents, torch.from_numpy(points), description="mesh", progress=progress
-    ).numpy()
+    values = queries.signed_distance(contents, points, description="mesh", progress=progress)
     values[moved] += np.copysign(np.linalg.norm(place - corner, axis=1), values[moved])
     return values

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load, save
-from torch import Tensor
 
+from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.field.field import Field
 from radarsdf.map import queries, storage
+from radarsdf.map.confidence import EvidenceAt, evidence
 from radarsdf.map.contents import MapContents
-from radarsdf.map.map import Map
+from radarsdf.map.free_space import CellsInBox, dense_cells
+from radarsdf.map.map import Map, Query
 from radarsdf.returns.evidence import Evidence
 from radarsdf.returns.sums import lattice_of
 from radarsdf.returns.view_statistics import ViewStatisticsAt
@@ -41,49 +42,41 @@ class RadarMap(Map):
         tensors, description = storage.parts_of(self._contents)
         return _from_pickle, (save(tensors), description)  # bytes: the pickle needs no classes of PyTorch
 
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._where_observed(queries.signed_distance, world, extrapolate=extrapolate)
+    def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
+        points, *rest = (queries.to_local(self._contents, x) for x in (world, *others))
+        inside = queries.into_cells(self._contents, points)
+        known: Any = np.isfinite(points).all(axis=1) if extrapolate else inside
+        for x in rest:
+            known = known & np.isfinite(x).all(axis=1)
+        return queries.where(known, query, self._contents, points, *rest)
 
-    def _plane(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._where_observed(queries.plane, world, extrapolate=extrapolate)
-
-    def _observed(self, world: Tensor) -> Tensor:
-        return queries.into_cells(self._contents, queries.to_local(self._contents, world))[1]
-
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        predicted = partial(queries.intensity, extrapolate=extrapolate)
-        return self._where_observed(predicted, world, sensors, extrapolate=extrapolate)
+    def _observed(self, world: Floats) -> Bools:
+        return queries.into_cells(self._contents, queries.to_local(self._contents, world))
 
     @property
-    def _contents_of_any(self) -> MapContents:
+    def contents_of_any(self) -> MapContents:
         return self._contents
-
-    def _where_observed(self, query: Callable[..., Tensor], *positions: Tensor, extrapolate: bool) -> Tensor:
-        local = (queries.to_local(self._contents, world) for world in positions)
-        return queries.where_observed(self._contents, query, *local, extrapolate=extrapolate)
 
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
         from radarsdf.map.mesh import extract_mesh  # noqa: PLC0415 - trimesh is slow to import
 
         return extract_mesh(self._contents, voxel_size, **wanted)
 
-    def cells_near(self, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> queries.CellsInBox:
+    def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         leaf_m = self.config.leaf_size_m
         first = np.floor((lower - self.origin) / leaf_m).astype(np.int64)
         count = np.floor((upper - self.origin) / leaf_m).astype(np.int64) - first + 1
         x, y, z = count.tolist()
-        cells = queries.dense_cells(self._contents, first, (x, y, z))
-        return queries.CellsInBox(self.origin + first * leaf_m, *cells)
+        cells = dense_cells(self._contents, first, (x, y, z))
+        return CellsInBox(self.origin + first * leaf_m, *cells)
 
-    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
-        return queries.evidence(self._contents, queries.to_local(self._contents, world))
+    def evidence_at(self, world: Floats) -> EvidenceAt:
+        return evidence(self._contents, queries.to_local(self._contents, world))
 
     def view_statistics(self) -> ViewStatisticsAt:
-        scale = self.intensity_scale
-        low, high = (0, 1) if scale is None else (scale.low, scale.high)
-        return self._contents.view_statistics().in_world(self.origin, low, high)
+        return self._contents.views_in_world()
 
-    def _viewed_from(self, position: NDArray[np.float64], range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:  # noqa: ARG002 - the whole map
         return self._viewed
 
     @cached_property
@@ -96,11 +89,11 @@ class RadarMap(Map):
         storage.save_contents(self._contents, path)
 
     @property
-    def origin(self) -> NDArray[np.float64]:
+    def origin(self) -> Floats:
         return self._contents.origin
 
     @property
-    def extent(self) -> NDArray[np.float64]:
+    def extent(self) -> Floats:
         cells = lattice_of(self.field.table.leaf_keys())
         corners = np.stack([cells.min(axis=0), cells.max(axis=0) + 1])
         return corners * self.config.leaf_size_m + self.origin
@@ -127,11 +120,6 @@ class RadarMap(Map):
     def field(self) -> Field:
         """Signed distance and intensity as a PyTorch module, in the local frame."""
         return self._contents.field
-
-
-def load_file(path: str | PathLike[str]) -> RadarMap:
-    """Load a map from a file. No code in it is executed."""
-    return RadarMap(storage.load_contents(path))
 
 
 @torch.inference_mode(mode=False)

@@ -9,17 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 from typing_extensions import TypedDict
 
+from radarsdf.arrays import Array, Keys
+from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.grid_field import GridField
 from radarsdf.field.neural_field import NeuralField
-from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes
 from radarsdf.map.contents import MapContents
 from radarsdf.returns.evidence import Evidence
@@ -40,77 +41,46 @@ _EVIDENCE = {"information": torch.float32, "hits": torch.uint32, "visibility": t
 _PARTS = {
     "free_space": {"keys": (torch.int64, 1), "planes": (torch.int64, 3)},
     "view_statistics": {
-        "points": (torch.float32, 2),
-        "directions": (torch.int8, 2),
-        "ranges_m": (torch.float16, 1),
-        "intensities": (torch.float32, 1),
-        "counts": (torch.int16, 1),
+        "points": (torch.float32, 2), "directions": (torch.int8, 2), "ranges_m": (torch.float16, 1),
+        "intensities": (torch.float32, 1), "counts": (torch.int16, 1),
     },
     "reflectance": {
-        "coefficients": (torch.float64, 2),
-        "table": (torch.float32, 2),
-        "plane_keys": (torch.int64, 1),
-        "normals": (torch.float32, 2),
-        "mean_keys": (torch.int64, 1),
-        "means": (torch.float16, 1),
+        "coefficients": (torch.float64, 2), "table": (torch.float32, 2), "plane_keys": (torch.int64, 1),
+        "normals": (torch.float32, 2), "mean_keys": (torch.int64, 1), "means": (torch.float16, 1),
     },
-}
+}  # fmt: skip
 
 
 def save_contents(contents: MapContents, path: str | PathLike[str]) -> None:
     """Write a map to one file, atomically. Raise a ValueError if a number is not finite: it could not be loaded."""
     tensors, description = parts_of(contents)
     for name, tensor in tensors.items():
-        if not tensor.isfinite().all():
-            msg = f"{name} of the map contains non-finite numbers: the map is not saved"
-            raise ValueError(msg)
-    metadata = {
-        "format": FORMAT,
-        "format_version": str(FORMAT_VERSION),
-        "units": _UNITS,
-        "description": json.dumps(description),
-    }
-    write_whole(path, tensor_bytes(tensors, metadata))
+        check(tensor.isfinite().all(), f"{name} of the map contains non-finite numbers: the map is not saved")
+    metadata = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "units": _UNITS}
+    write_whole(path, tensor_bytes(tensors, metadata | {"description": json.dumps(description)}))
 
 
 @torch.inference_mode(mode=False)  # or the map could not compute gradients
 def load_contents(path: str | PathLike[str]) -> MapContents:
     """Read the file of a map. Raise a ValueError if it is damaged, of another program or of another version."""
     check_regular_file(path)
-    foreign = None
-    try:
-        with open_tensors(path) as file:
-            metadata = file.metadata
-            version = metadata.get("format_version", "")
-            if metadata.get("format") != FORMAT:
-                foreign = f"{path} is not a radarsdf map"
-            elif version != str(FORMAT_VERSION):
-                foreign = f"{path} has format version {version!r}; this radarsdf reads version {FORMAT_VERSION}: fit it again"
-            else:
-                file.check_metadata()
-                # Copy: the tensors are views of the file, which may be changed or removed.
-                tensors = {name: file.array(name).clone() for name in file.names}
-                return contents_of(tensors, json.loads(metadata["description"]))
-    except OSError:
-        raise
-    except SafetensorError as error:
-        raise _damaged(path) from error
-    except Exception as error:  # damaged files raise exceptions of many kinds
-        msg = f"{path} is not a complete radarsdf map: {error}"
-        raise ValueError(msg) from error
-    raise ValueError(foreign)
+    with reading(path, "a complete radarsdf map", Exception), open_tensors(path) as file:
+        check(file.metadata.get("format") == FORMAT, "it has another format")
+        version, known = file.metadata.get("format_version", ""), str(FORMAT_VERSION)
+        check(version == known, f"it has format version {version!r}, this radarsdf {known}: fit it again")
+        file.check_metadata()
+        # Copy: the tensors are views of the file, which may be changed or removed.
+        tensors = {name: file.array(name).clone() for name in file.names}
+        return contents_of(tensors, json.loads(file.metadata["description"]))
 
 
-def load_leaf_keys(path: str | PathLike[str]) -> NDArray[np.uint64]:
+def load_leaf_keys(path: str | PathLike[str]) -> Keys:
     """Read the ascending Morton keys (C,) of the leaf cells of a map, and nothing else of its file."""
-    try:
-        with open_tensors(path, "np") as file:
-            keys: NDArray[Any] = file.array("leaf_keys")
-    except (SafetensorError, ValueError) as error:
-        raise _damaged(path) from error
-    if keys.dtype != np.int64 or keys.ndim != 1 or not (np.diff(keys, prepend=-1) > 0).all():
-        raise _damaged(path)
-    return keys.astype(np.uint64)
+    with reading(path, "a complete radarsdf map", SafetensorError), open_tensors(path, "np") as file:
+        keys: Array = file.array("leaf_keys")
+        ascending = keys.dtype == np.int64 and keys.ndim == 1 and (np.diff(keys, prepend=-1) > 0).all()
+        check(ascending, "keys of leaf cells are not ascending")
+        return keys.astype(np.uint64)
 
 
 def file_bytes(contents: MapContents) -> int:
@@ -127,13 +97,9 @@ def parts_of(contents: MapContents) -> tuple[dict[str, Tensor], dict[str, Any]]:
     tensors["origin"] = torch.from_numpy(contents.origin)
     tensors["leaf_keys"] = torch.from_numpy(field.table.leaf_keys().astype(np.int64))
     tensors |= {name: torch.from_numpy(getattr(contents.evidence, name)) for name in _EVIDENCE}
-    parts = {
-        "free_space": contents.free_space(),
-        "view_statistics": contents.view_statistics(),
-        "reflectance": reflectance,
-    }
-    for part, owner in parts.items():
-        for name in _PARTS[part] if owner is not None else ():
+    for part, columns in _PARTS.items():
+        owner = reflectance if part == "reflectance" else getattr(contents, part)()
+        for name in columns if owner is not None else ():
             array = getattr(owner, name)
             stored = array.view(np.int64) if array.dtype == np.uint64 else array
             tensors[f"{part}.{name}"] = torch.from_numpy(stored)
@@ -156,7 +122,7 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     origin = _taken(tensors, "origin", torch.float64, (3,))
     keys = _taken(tensors, "leaf_keys", torch.int64, (None,))
     evidence = {name: _taken(tensors, name, dtype, keys.shape) for name, dtype in _EVIDENCE.items()}
-    _check((evidence["information"] >= 0).all(), "information is negative")
+    check((evidence["information"] >= 0).all(), "information is negative")
     free_space = FreeSpace(**_arrays_of("free_space", tensors))
     free_space.check()
     view_statistics = ViewStatistics(
@@ -174,7 +140,7 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     # A map with intensities needs a network or a closed form to predict them; one without has neither.
     trained = scale is not None and config.trains_intensity
     answered = trained or reflectance is not None
-    _check(answered == (scale is not None), "a predictor of intensities is missing or superfluous")
+    check(answered == (scale is not None), "a predictor of intensities is missing or superfluous")
     field = _field_of(tensors, keys.astype(np.uint64), config, trained)
     field.reflectance = reflectance
     return MapContents(
@@ -192,9 +158,7 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     )
 
 
-def _field_of(
-    tensors: dict[str, Tensor], keys: NDArray[np.uint64], config: FitConfig, with_intensity: bool
-) -> Field:
+def _field_of(tensors: dict[str, Tensor], keys: Keys, config: FitConfig, with_intensity: bool) -> Field:
     """Build the field with these leaf cells from the remaining tensors."""
     # On the meta device, for shapes alone: a damaged description could request networks of any size.
     with torch.device("meta"):
@@ -204,7 +168,7 @@ def _field_of(
             field = GridField(keys, config.leaf_size_m)
     for name, tensor in tensors.items():
         finite = tensor.dtype == torch.float32 and tensor.isfinite().all()
-        _check(finite, f"{name} is not finite float32 numbers")
+        check(finite, f"{name} is not finite float32 numbers")
     state = {name.removeprefix("field."): tensor for name, tensor in tensors.items()}
     field.load_state_dict(state, assign=True)  # raises a RuntimeError for wrong names or shapes
     field.requires_grad_(False)
@@ -219,30 +183,19 @@ def _arrays_of(part: str, tensors: dict[str, Tensor]) -> dict[str, Any]:
     return arrays
 
 
-def _taken(
-    tensors: dict[str, Tensor], name: str, dtype: torch.dtype, shape: tuple[int | None, ...]
-) -> NDArray[Any]:
+def _taken(tensors: dict[str, Tensor], name: str, dtype: torch.dtype, shape: tuple[int | None, ...]) -> Array:
     """Pop a tensor of finite numbers of this type and shape; None stands for any length."""
     tensor = tensors.pop(name)
     fits = tensor.dtype == dtype and tensor.ndim == len(shape) and bool(tensor.isfinite().all())
     fits &= all(wanted in (None, length) for wanted, length in zip(shape, tensor.shape, strict=False))
-    _check(fits, f"{name} is not {shape} finite numbers, {dtype}")
+    check(fits, f"{name} is not {shape} finite numbers, {dtype}")
     return tensor.numpy().copy()
 
 
 def _in_range(name: str, value: Any, highest: float) -> float:
     found = float(value)
-    _check(0 <= found <= highest and found < math.inf, f"{name} must be in [0, {highest:g}], not {value}")
+    check(0 <= found <= highest and found < math.inf, f"{name} must be in [0, {highest:g}], not {value}")
     return found
-
-
-def _check(fits: Any, text: str) -> None:
-    if not fits:
-        raise ValueError(text)
-
-
-def _damaged(path: str | PathLike[str]) -> ValueError:
-    return ValueError(f"{path} is not a complete radarsdf map: truncated, damaged, or of another format")
 
 
 class _Report(TypedDict, total=False):
@@ -269,5 +222,4 @@ def checked_report(report: Any) -> dict[str, Any]:
     except ValidationError as error:
         msg = f"report.{first_wrong(error)}"
         raise ValueError(msg) from None
-    found: dict[str, Any] = report
-    return found
+    return dict(report)

@@ -8,13 +8,12 @@ from dataclasses import asdict, astuple, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from radarsdf.checks import number, whole_number
-from radarsdf.map.queries import VOXEL_M
+from radarsdf.arrays import Bools, Floats, Floats32, Ints32
+from radarsdf.checks import check, number, whole_number
 
-Floats = NDArray[np.float64]
-
+VOXEL_M = 0.1
+"""Default edge of a mesh's voxels, m."""
 _BINS = 1000  # bins of the confidence from 0 to 1
 _SCALARS = 3
 TALLY_NUMBERS = 3 * _BINS + _SCALARS  # length of :meth:`Tally.sums`
@@ -40,26 +39,19 @@ class Limits(NamedTuple):
         """Check the arguments of :meth:`Map.mesh` and fill in defaults."""
         if min_confidence is not None:
             min_confidence = number(min_confidence, "min_confidence")
-        if not 0 <= (min_confidence or 0) <= 1:
-            msg = f"min_confidence must be in [0, 1], not {min_confidence}"
-            raise ValueError(msg)
+        check(0 <= (min_confidence or 0) <= 1, f"min_confidence must be in [0, 1], not {min_confidence}")
         max_uncertainty = number(math.inf if max_uncertainty is None else max_uncertainty, "max_uncertainty")
-        if max_uncertainty < 0:
-            msg = f"max_uncertainty must be at least 0, not {max_uncertainty}"
-            raise ValueError(msg)
+        check(max_uncertainty >= 0, f"max_uncertainty must be at least 0, not {max_uncertainty}")
         if min_component_triangles is None:
             # Fewer in larger voxels, whose triangles have more area.
             min_component_triangles = round(_COMPONENT_TRIANGLES * min(1.0, VOXEL_M / voxel_m))
         components = whole_number(min_component_triangles, "min_component_triangles", 0)
         return cls(min_confidence, max_uncertainty, components)
 
-    def met(
-        self, threshold: float, confidence: NDArray[np.float32], uncertainty_m: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
+    def met(self, threshold: float, confidence: Floats32, uncertainty_m: Floats32) -> Bools:
         """Return a mask (V,) of vertices within the limits at a confidence threshold. NaN exceeds any finite uncertainty."""
         certain = np.nan_to_num(uncertainty_m, nan=np.inf) <= self.max_uncertainty
-        found: NDArray[np.bool_] = certain & (confidence >= threshold)
-        return found
+        return certain & (confidence >= threshold)
 
 
 @dataclass(frozen=True)
@@ -109,8 +101,7 @@ class Tally:
         existing_m2 = np.divide(true_m2, reach, out=np.zeros_like(true_m2), where=true_m2 > 0)
         scans = np.round(hits)
 
-        columns = (area_m2, true_m2, covering * area_m2)
-        sums = [np.bincount(bins, values, _BINS) for values in columns]
+        sums = [np.bincount(bins, values, _BINS) for values in (area_m2, true_m2, covering * area_m2)]
         scalars = (np.minimum(existing_m2, area_m2), true_m2[scans == 1], true_m2[scans == 2])
         return cls.of_sums(np.concatenate([*sums, [values.sum() for values in scalars]]))
 
@@ -154,7 +145,7 @@ class Tally:
         return true_m2 / (true_m2 + unseen_m2) * true_m2 / self.existing_m2
 
 
-def across_triangles(vertices: Floats, faces: NDArray[np.int32]) -> tuple[Floats, Floats]:
+def across_triangles(vertices: Floats, faces: Ints32) -> tuple[Floats, Floats]:
     """Return the cross products (F, 3) of the edges of triangles (F, 3), and their lengths (F,), twice the areas, m²."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

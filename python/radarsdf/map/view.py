@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from radarsdf._core import SurfaceTracer, cell_keys
-from radarsdf.checks import flag, number, whole_number
+from radarsdf.arrays import Floats, Floats32, Ints
+from radarsdf.checks import check, flag, number, whole_number
 from radarsdf.map import queries
+from radarsdf.map.confidence import EvidenceAt, evidence, roughness
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.mesh import Surface
 from radarsdf.map.threshold import Limits, across_triangles
@@ -22,8 +22,7 @@ from radarsdf.returns.sensor import Sensor
 from radarsdf.scans import Scan, Scans
 from radarsdf.threads import resolve_num_threads
 
-_Floats = NDArray[np.float64]
-_Intensity = Callable[[_Floats, _Floats], NDArray[np.float32]]  # (N,) from points (N, 3) and a sensor (3,), m
+_Intensity = Callable[[Floats, Floats], Floats32]  # (N,) from points (N, 3) and a sensor (3,), m
 
 # The density of returns on the surface is rate^a · cosine^b / range^c, times d if the patch is occluded: (a, b, c, d) in
 # smooth scenes, where returns are spread by angle, and in rough ones, where a radar sees much behind surfaces. Tuned with
@@ -44,19 +43,19 @@ _HITS_BEFORE = 0.5
 class View:
     """Predicted scan at one pose: N returns, and the first surface along each of E · A beams."""
 
-    T_world_sensor: _Floats
+    T_world_sensor: Floats
     """(4, 4) m."""
     sensor: Sensor
     """The radar."""
-    points: NDArray[np.float32]
+    points: Floats32
     """(N, 3) returns, sensor frame, m."""
-    intensities: NDArray[np.float32] | None
+    intensities: Floats32 | None
     """(N,) sensor units, NaN where :meth:`Map.intensity` is. None if the map has no intensities."""
-    azimuth_rad: _Floats
+    azimuth_rad: Floats
     """(A,) azimuths of the beams, ascending, rad."""
-    elevation_rad: _Floats
+    elevation_rad: Floats
     """(E,) elevations of the beams, ascending, rad."""
-    beam_ranges_m: NDArray[np.float32]
+    beam_ranges_m: Floats32
     """(E, A) distance to the first surface along each beam, m. NaN where there is none."""
 
     def __len__(self) -> int:
@@ -64,13 +63,12 @@ class View:
         return len(self.points)
 
     @property
-    def ranges_m(self) -> _Floats:
+    def ranges_m(self) -> Floats:
         """(N,) distances of the returns from the sensor, m."""
-        lengths: _Floats = np.linalg.norm(self.points.astype(np.float64), axis=1)
-        return lengths
+        return np.linalg.norm(self.points.astype(np.float64), axis=1)
 
     @property
-    def world_points(self) -> _Floats:
+    def world_points(self) -> Floats:
         """(N, 3) returns, world, m."""
         return Scan(self.points, self.T_world_sensor).world_points
 
@@ -82,13 +80,10 @@ class View:
 
 def scans_of_views(views: Iterable[View]) -> Scans:
     """Convert views to scans, one each."""
-    kept = [(view.points, view.T_world_sensor, view.intensities) for view in views]
-    values = [intensities for _, _, intensities in kept if intensities is not None]
-    return Scans(
-        [points for points, _, _ in kept],
-        np.array([pose for _, pose, _ in kept]).reshape(-1, 4, 4),
-        values if len(values) == len(kept) else None,
-    )
+    kept = list(views)
+    poses = np.array([view.T_world_sensor for view in kept]).reshape(-1, 4, 4)
+    values = [view.intensities for view in kept if view.intensities is not None]
+    return Scans([view.points for view in kept], poses, values if len(values) == len(kept) else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +91,12 @@ class ViewedMap:
     """Traceable surface of a map, and patches that may have returns, in a local frame. Built once for a map."""
 
     tracer: SurfaceTracer  # tracer of the triangles that the mesh keeps by default
-    centres: _Floats  # (P, 3) centroids of all triangles of the zero level set, the patches, m
-    normals: _Floats  # (P, 3) unit vectors towards free space
-    areas_m2: _Floats  # (P,) areas of the patches
-    rates: _Floats  # (P,) detection rate: share of the scans reaching a patch that have a return there
-    origin: _Floats  # (3,) origin of the local frame, world, m
-    roughness: float  # see :func:`radarsdf.map.queries.roughness`
+    centres: Floats  # (P, 3) centroids of all triangles of the zero level set, the patches, m
+    normals: Floats  # (P, 3) unit vectors towards free space
+    areas_m2: Floats  # (P,) areas of the patches
+    rates: Floats  # (P,) detection rate: share of the scans reaching a patch that have a return there
+    origin: Floats  # (3,) origin of the local frame, world, m
+    roughness: float  # see :func:`radarsdf.map.confidence.roughness`
     intensity: _Intensity | None
     max_memory_bytes: int | None  # memory limit of views. None: what the system has left
 
@@ -111,42 +106,39 @@ class ViewedMap:
         config = contents.config
         check_views(config.max_memory_bytes, cells=len(contents.evidence.visibility))
 
-        def intensity(points: _Floats, position: _Floats) -> NDArray[np.float32]:
-            x = torch.from_numpy(points.astype(np.float32))
-            sensors = torch.from_numpy(position.astype(np.float32)).expand(len(x), 3)
-            values: NDArray[np.float32] = queries.intensity(contents, x, sensors).numpy()
-            return values
+        def intensity(points: Floats, position: Floats) -> Floats32:
+            x = points.astype(np.float32)
+            return queries.intensity(contents, x, np.broadcast_to(position.astype(np.float32), x.shape))
 
-        return cls.of_surface(
-            Surface.of(contents, config.leaf_size_m),
-            contents,
-            contents.origin,
-            lambda points: queries.evidence(contents, torch.from_numpy(points.astype(np.float32))),
-            None if contents.intensity_scale is None else intensity,
-        )
+        def evidence_at(points: Floats) -> EvidenceAt:
+            return evidence(contents, points.astype(np.float32))
+
+        predicted = None if contents.intensity_scale is None else intensity
+        surface = Surface.of(contents, config.leaf_size_m)
+        return cls.of_surface(surface, contents, contents.origin, evidence_at, predicted)
 
     @classmethod
     def of_surface(
         cls,
         surface: Surface,
         scene: WholeMap,
-        origin: _Floats,
-        evidence_at: Callable[[_Floats], queries.EvidenceAt],
+        origin: Floats,
+        evidence_at: Callable[[Floats], EvidenceAt],
         intensity: _Intensity | None,
     ) -> ViewedMap:
         """Build with all triangles as patches, and those of the default mesh for tracing. `evidence_at`: of points (N, 3), m."""
         across, twice_m2 = across_triangles(surface.vertices, surface.faces)
         centres = surface.vertices[surface.faces].mean(axis=1)
-        evidence = evidence_at(centres)
-        rates = (evidence.hits.numpy() + _HITS_BEFORE) / (evidence.visibility.numpy() + _VISIBILITY_BEFORE)
+        found = evidence_at(centres)
+        rates = (found.hits + _HITS_BEFORE) / (found.visibility + _VISIBILITY_BEFORE)
         faces = np.ascontiguousarray(surface.faces[surface.kept(Limits.of(scene.config.leaf_size_m))])
         tracer = SurfaceTracer(surface.vertices, faces, resolve_num_threads(0))
         normals = across / np.maximum(twice_m2, 1e-12)[:, None]
         patches = centres, normals, twice_m2 / 2, rates.astype(np.float64)
-        of_scene = queries.roughness(scene), intensity, scene.config.max_memory_bytes
+        of_scene = roughness(scene), intensity, scene.config.max_memory_bytes
         return cls(tracer, *patches, origin, *of_scene)
 
-    def ranges(self, origin: _Floats, directions: _Floats, max_range_m: float) -> NDArray[np.float32]:
+    def ranges(self, origin: Floats, directions: Floats, max_range_m: float) -> Floats32:
         """Return distances (N,), m, to the first hits of rays from `origin` (3,) in unit `directions` (N, 3); inf: none."""
         rows = np.ascontiguousarray(directions, np.float32)
         found, _ = self.tracer.first_hits(origin.tolist(), rows, max_range_m, False, resolve_num_threads(0))
@@ -154,13 +146,11 @@ class ViewedMap:
 
 
 def view_from(
-    surface: ViewedMap, pose: _Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
+    surface: ViewedMap, pose: Floats, sensor: Sensor, returns: float | None, *, noise: bool, seed: Any
 ) -> View:
     """Render a view at a `pose` (4, 4), T_world_sensor, m; see :meth:`Map.render`."""
     wanted = number(sensor.returns_per_scan if returns is None else returns, "returns")
-    if not 0 <= wanted <= 1e8:
-        msg = f"returns must be in [0, 10^8], not {returns}"
-        raise ValueError(msg)
+    check(0 <= wanted <= 1e8, f"returns must be in [0, 10^8], not {returns}")
     azimuth, elevation = _beams(sensor)
     check_views(surface.max_memory_bytes, patches=len(surface.centres), beams=len(azimuth) * len(elevation))
     position = pose[:3, 3] - surface.origin
@@ -178,7 +168,7 @@ def view_from(
     return View(pose, sensor, points.astype(np.float32), intensities, azimuth, elevation, first_m)
 
 
-def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
+def _polar(points: Floats) -> tuple[Floats, Floats, Floats]:
     """Convert points (N, 3), sensor frame, m, to ranges, azimuths and elevations (N,)."""
     x, y, z = points.T
     ranges_m = np.sqrt(x * x + y * y + z * z)
@@ -186,9 +176,7 @@ def _polar(points: _Floats) -> tuple[_Floats, _Floats, _Floats]:
         return ranges_m, np.arctan2(y, x), np.arcsin(z / ranges_m)
 
 
-def _patches(
-    surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, count: int
-) -> NDArray[np.int64]:
+def _patches(surface: ViewedMap, R: Floats, position: Floats, sensor: Sensor, count: int) -> Ints:
     """Return the rows of `count` patches with returns, distributed in proportion to their expected numbers."""
     centres = surface.centres
     seen = np.ones(len(centres), bool)
@@ -212,7 +200,7 @@ def _patches(
     return rows[_spread(expected, count)]
 
 
-def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
+def _spread(expected: Floats, count: int) -> Ints:
     """Return at most `count` distinct rows, distributed in proportion to their `expected` (N,) numbers."""
     count = min(count, int(np.count_nonzero(expected)))
     if count == 0:
@@ -226,16 +214,15 @@ def _spread(expected: _Floats, count: int) -> NDArray[np.int64]:
     return np.flatnonzero(np.diff(up_to, prepend=0.0) > 0)
 
 
-def _with_noise(points: _Floats, sensor: Sensor, rng: np.random.Generator) -> _Floats:
+def _with_noise(points: Floats, sensor: Sensor, rng: np.random.Generator) -> Floats:
     ranges_m, azimuth, elevation = _polar(points)
     errors, noise = rng.standard_normal((3, len(points))), sensor.noise
     angles = azimuth + noise.azimuth_rad * errors[1], elevation + noise.elevation_rad * errors[2]
     noisy_m = np.maximum(ranges_m + noise.range_m * errors[0], 0.0)
-    noisy: _Floats = sensor.directions(*angles) * noisy_m[:, None]
-    return noisy
+    return sensor.directions(*angles) * noisy_m[:, None]
 
 
-def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
+def _beams(sensor: Sensor) -> tuple[Floats, Floats]:
     """Return azimuths (A,) and elevations (E,) of beams that overlap by half."""
     steps = [max(width / 2, _MIN_BEAM_RAD) for width in sensor.beam_rad]
     limits = (sensor.azimuth_rad, sensor.elevation_rad)
@@ -249,8 +236,8 @@ def _beams(sensor: Sensor) -> tuple[_Floats, _Floats]:
 
 
 def _first_surface(
-    surface: ViewedMap, R: _Floats, position: _Floats, sensor: Sensor, azimuth: _Floats, elevation: _Floats
-) -> NDArray[np.float32]:
+    surface: ViewedMap, R: Floats, position: Floats, sensor: Sensor, azimuth: Floats, elevation: Floats
+) -> Floats32:
     """Return the range (E, A) of the first surface along each beam; NaN where there is none."""
     grid = np.meshgrid(elevation, azimuth, indexing="ij")
     directions = turned(sensor.directions(grid[1].ravel(), grid[0].ravel()), R)

@@ -8,8 +8,8 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Floats
 from radarsdf.extras import require
 from radarsdf.grids.grid import Grid
 from radarsdf.io.files import write_whole
@@ -39,7 +39,7 @@ def png_of(figure: Any, **options: Any) -> bytes:
 
 
 def save_view_picture(
-    path: str | PathLike[str], views: Sequence[View], measured: Sequence[NDArray[Any] | None] = ()
+    path: str | PathLike[str], views: Sequence[View], measured: Sequence[Array | None] = ()
 ) -> None:
     """Save a PNG picture of views, one row each.
 
@@ -86,9 +86,7 @@ def save_view_picture(
     write_whole(path, png_of(figure, dpi=100))
 
 
-def _draw_returns(
-    axes: Any, view: View, points: NDArray[Any], values: NDArray[Any] | None, limits: Any, title: str
-) -> Any:
+def _draw_returns(axes: Any, view: View, points: Array, values: Array | None, limits: Any, title: str) -> Any:
     azimuth_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 0]))
     range_m = np.linalg.norm(points, axis=1)
     colors = {"color": "tab:blue"} if values is None else {"c": values, "vmin": limits[0], "vmax": limits[1]}
@@ -106,7 +104,7 @@ def save_grid_picture(path: str | PathLike[str], grid: Grid, lower_m: float, upp
     size_in = (12.0, float(np.clip(12.0 * y / x, 4.0, 14.0)))
     figure = new_figure(figsize=size_in, dpi=110, facecolor="white", layout="constrained")
 
-    def draw(axes: Any, values: NDArray[Any], title: str, **options: Any) -> None:
+    def draw(axes: Any, values: Array, title: str, **options: Any) -> None:
         shown = values.T.astype(np.float32)
         image = axes.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **options)
         axes.set_facecolor(_UNKNOWN)
@@ -131,9 +129,7 @@ def save_grid_picture(path: str | PathLike[str], grid: Grid, lower_m: float, upp
 
 
 def save_trajectory_picture(
-    path: str | PathLike[str],
-    points: Sequence[NDArray[Any]],
-    trajectories: Mapping[str, NDArray[np.float64]],
+    path: str | PathLike[str], points: Sequence[Array], trajectories: Mapping[str, Floats]
 ) -> None:
     """Save a PNG picture of trajectories from above, with the returns.
 

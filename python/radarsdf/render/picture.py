@@ -6,10 +6,11 @@ from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from radarsdf._core import SurfaceTracer
-from radarsdf.checks import real_array
+from radarsdf.arrays import Bytes, Floats, Floats32, Ints32
+from radarsdf.checks import check, real_array
 from radarsdf.io.files import write_whole
 from radarsdf.map.colors import NEUTRAL, intensity_colors
 from radarsdf.render.figures import new_figure, png_of
@@ -18,7 +19,6 @@ from radarsdf.threads import resolve_num_threads
 if TYPE_CHECKING:
     import trimesh
 
-_Floats = NDArray[np.float64]
 
 _PIXELS_AT_ONCE = 1 << 20  # limit of memory
 _CREASE = np.cos(np.deg2rad(40.0))  # edges with a larger angle are drawn sharp, others are shaded smoothly
@@ -32,7 +32,7 @@ def render(
     width: int = 1600,
     height: int = 1000,
     viewpoint: ArrayLike | None = None,
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """Render a mesh on white, lit from behind the viewer, upper left.
 
     Parameters
@@ -59,13 +59,10 @@ def render(
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int32).reshape(-1, 3)
-    if len(faces) == 0:
-        msg = "the mesh has no triangles to draw"
-        raise ValueError(msg)
+    check(len(faces) != 0, "the mesh has no triangles to draw")
     rgb = np.array(NEUTRAL)[None].repeat(len(vertices), axis=0) if colors is None else np.asarray(colors)
-    if rgb.shape not in {(len(vertices), 3), (len(vertices), 4)}:
-        msg = f"colors must be ({len(vertices)}, 3) or (…, 4), not {rgb.shape}"
-        raise ValueError(msg)
+    fits = rgb.shape in {(len(vertices), 3), (len(vertices), 4)}
+    check(fits, f"colors must be ({len(vertices)}, 3) or (…, 4), not {rgb.shape}")
     origin = vertices.mean(axis=0)
     vertices = vertices - origin
     eye, axes = _camera(vertices[np.unique(faces)], viewpoint, origin)
@@ -104,8 +101,7 @@ def render(
         image[part[0] : part[-1] + 1][hit] = color * (0.42 + 0.60 * lambert)[:, None]
     image *= _contours(depth, 2 * _SUPERSAMPLING)[..., None]
     image = image.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3).mean(axis=(1, 3))
-    picture: NDArray[np.uint8] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    return picture
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
 def save_picture(
@@ -154,9 +150,8 @@ def save_picture(
         from matplotlib.colors import ListedColormap, Normalize  # noqa: PLC0415
 
         values = real_array(scalar, "scalar")
-        if values.shape != (len(mesh.vertices),):
-            msg = f"scalar must be ({len(mesh.vertices)},), one value per vertex, not {values.shape}"
-            raise ValueError(msg)
+        fits = values.shape == (len(mesh.vertices),)
+        check(fits, f"scalar must be ({len(mesh.vertices)},), one value per vertex, not {values.shape}")
         known = values[np.isfinite(values)]
         lower, upper = map(float, np.percentile(known, [2, 98]) if known.size else (0.0, 1.0))
         colors = intensity_colors(values, lower, upper)
@@ -172,7 +167,7 @@ def save_picture(
     write_whole(path, png_of(figure, dpi=dpi))
 
 
-def eye_around(points: _Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) -> _Floats:
+def eye_around(points: Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) -> Floats:
     """Position (3,) from which all points (N, 3), m, with z up, are visible, `rise_deg` above the horizon.
 
     It faces the southern one of their two longer sides, rotated by `turn_deg`, anticlockwise as seen from above.
@@ -187,19 +182,17 @@ def eye_around(points: _Floats, turn_deg: float = 25.0, rise_deg: float = 36.0) 
     return np.asarray(center + 2.6 * radius * np.array([*(np.cos(rise) * flat), np.sin(rise)]))
 
 
-def middle_of(points: _Floats) -> tuple[_Floats, float]:
+def middle_of(points: Floats) -> tuple[Floats, float]:
     """Centre (3,) of the bounding box of points (N, 3), and half its diagonal, ignoring a few stray points."""
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     return 0.5 * (low + high), max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
-def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tuple[_Floats, _Floats]:
+def _camera(points: Floats, viewpoint: ArrayLike | None, origin: Floats) -> tuple[Floats, Floats]:
     """Position (3,) of the eye relative to `origin`, and its axes (3, 3): right, up, forward."""
     center, radius = middle_of(points)
     eye = eye_around(points) + origin if viewpoint is None else real_array(viewpoint, "viewpoint")
-    if eye.shape != (3,) or not np.isfinite(eye).all():
-        msg = "viewpoint must be (3,) and finite"
-        raise ValueError(msg)
+    check(eye.shape == (3,) and np.isfinite(eye).all(), "viewpoint must be (3,) and finite")
     eye = eye - origin
     forward = center - eye
     if np.linalg.norm(forward) < 1e-9 * radius:
@@ -212,7 +205,7 @@ def _camera(points: _Floats, viewpoint: ArrayLike | None, origin: _Floats) -> tu
     return eye, np.stack([right, np.cross(right, forward), forward])
 
 
-def _zoom(seen: _Floats, rows: int, columns: int) -> tuple[_Floats, float] | None:
+def _zoom(seen: Floats, rows: int, columns: int) -> tuple[Floats, float] | None:
     """Middle (2,) of the picture, and pixels per unit, both at depth 1, for points (N, 3) along the axes of the eye."""
     # None if all of them are more than 56° off its axis. The zoom ignores such points.
     screen = np.stack([seen[:, 0], -seen[:, 1]]) / seen[:, 2]
@@ -226,7 +219,7 @@ def _zoom(seen: _Floats, rows: int, columns: int) -> tuple[_Floats, float] | Non
     return 0.5 * (low + high), focal
 
 
-def _barycentric(points: _Floats, corners: _Floats) -> _Floats:
+def _barycentric(points: Floats, corners: Floats) -> Floats:
     """Weights (N, 3) of the corners (N, 3, 3) of triangles at points (N, 3) on them."""
     a, b, c = (corners[:, i] - points for i in range(3))
     across = np.cross(b - a, c - a)
@@ -236,7 +229,7 @@ def _barycentric(points: _Floats, corners: _Floats) -> _Floats:
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
-def _corner_normals(vertices: _Floats, faces: NDArray[np.int32]) -> _Floats:
+def _corner_normals(vertices: Floats, faces: Ints32) -> Floats:
     """Normals (F, 3, 3) at the corners of triangles: the vertex normal on smooth surfaces, else the face normal."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     own = np.cross(b - a, c - a)
@@ -249,7 +242,7 @@ def _corner_normals(vertices: _Floats, faces: NDArray[np.int32]) -> _Floats:
     return np.where(smooth[..., None], shared[faces], own[:, None])
 
 
-def _contours(depth: _Floats, step: int) -> NDArray[np.float32]:
+def _contours(depth: Floats, step: int) -> Floats32:
     """Brightness factors (rows, columns) of eye-dome lighting: pixels with nearer ones `step` pixels away are darker."""
     far = np.log(depth).astype(np.float32)
     padded = np.pad(far, step, constant_values=np.inf)

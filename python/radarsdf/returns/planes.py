@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radarsdf._core import CellBlocks, cell_keys, principal_axes
-from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32, Keys
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32, Keys
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import UPPER, ScanSums, merged_keys
 
@@ -44,14 +44,8 @@ class Surfels:
         cell_size_m = LEAVES_PER_SURFEL * sums.leaf_size_m
         keys, of_cells = sums.merged_moments()
         blocks = CellBlocks(keys)
-        support = neighbour_support(blocks, keys, of_cells, num_threads)
-        # Most cells have few returns: surfels for all of them would dominate time and memory.
-        cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
-        held = keys[cell_of_plane]
-        planes = neighbour_planes(blocks, held, of_cells, cell_size_m, num_threads)
-        centres, normals, widest, variances = planes
-        cells = (cell_size_m, keys, blocks, of_cells[:, 0].copy(), support, cell_of_plane)
-        return cls(*cells, centres, normals, variances, widest)
+        support, *planes = neighbour_planes(blocks, keys, of_cells, cell_size_m, num_threads)
+        return cls(cell_size_m, keys, blocks, of_cells[:, 0].copy(), support, *planes)
 
     def is_flat(self) -> Bools:
         return self.variances[:, 0] < MAX_FLATNESS * self.variances[:, 1]
@@ -89,17 +83,22 @@ class Surfels:
         return planes[cells]
 
 
-def neighbour_support(blocks: CellBlocks, keys: Keys, of_cells: Floats, num_threads: int = 0) -> Floats:
-    """Return the weighted number (K,) of returns in the neighbourhoods of `keys` (K,). `of_cells`: moments by cell of `blocks`."""
-    counts = np.ascontiguousarray(of_cells[:, :1])
-    return blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
-
-
 def neighbour_planes(
-    blocks: CellBlocks, keys: Keys, of_cells: Floats, cell_size_m: float, num_threads: int = 0
-) -> tuple[Floats, Floats, Floats32, Floats]:
-    """Return centres, normals, widest axes and variances (K, 3) of the surfels at `keys` (K,); see :func:`neighbour_support`."""
-    moments = blocks.neighbour_sums(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
+    blocks: CellBlocks,
+    keys: Keys,
+    of_cells: Floats,
+    cell_size_m: float,
+    num_threads: int = 0,
+) -> tuple[Array, ...]:
+    """Fit planes to the neighbourhoods of `keys` (K,). `of_cells`: moments by cell of `blocks`.
+
+    Returns their support (K,), and `cell_of_plane`, `centres`, `normals`, `variances` and `widest` of :class:`Surfels`.
+    """
+    counts = np.ascontiguousarray(of_cells[:, :1])
+    support = blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
+    # Most cells have few returns: surfels for all of them would dominate time and memory.
+    cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
+    moments = blocks.neighbour_sums(keys[cell_of_plane], of_cells, NEIGHBOUR_WEIGHT, num_threads)
     means = moments[:, 1:10] / moments[:, :1]
     centres = means[:, :3].copy()
     covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
@@ -109,5 +108,5 @@ def neighbour_planes(
     normals = axes[:, :, 0]
     normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
     # The lower bound is the resolution of float32 coordinates.
-    widest = axes[:, :, 2].astype(np.float32)
-    return centres, normals, widest, np.maximum(variances, (0.0025 * cell_size_m) ** 2)
+    variances = np.maximum(variances, (0.0025 * cell_size_m) ** 2)
+    return support, cell_of_plane, centres, normals, variances, axes[:, :, 2].astype(np.float32)

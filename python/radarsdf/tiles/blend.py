@@ -5,26 +5,24 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
-from functools import cached_property, partial
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from radarsdf.checks import positive
+from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
+from radarsdf.checks import check, positive
 from radarsdf.map import queries, storage
+from radarsdf.map.confidence import EvidenceAt, evidence
 from radarsdf.map.contents import MapContents
-from radarsdf.map.map import Map
+from radarsdf.map.map import Map, Query
 from radarsdf.returns.sums import lattice_of
-from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path, neighbours
+from radarsdf.tiles.plan import Plan, Tile, TilePlan, failure_of, is_done, map_path
 
 _MEMORY_BYTES = 1 << 30
 _OF_FEATURES = 2.4  # bytes in memory per feature: measured; includes tables of cells and evidence
-_Floats = NDArray[np.float64]
 
 
 class Share(NamedTuple):
@@ -32,14 +30,14 @@ class Share(NamedTuple):
 
     tile: Tile
     contents: MapContents  # the map of the tile
-    rows: NDArray[np.int64]  # (M,) indices of the positions at which the tile has a weight
-    weights: _Floats  # (M,) weights there
-    local: Tensor  # (M, 3) the positions in the frame of the tile, m
+    rows: Ints  # (M,) indices of the positions at which the tile has a weight
+    weights: Floats  # (M,) weights there
+    local: Floats32  # (M, 3) the positions in the frame of the tile, m
 
-    def at(self, points: Tensor, chosen: NDArray[np.bool_]) -> Share:
-        """Restrict the share to some (M,) of its positions; `points` (M, 3) are their local coordinates."""
-        local = points[torch.from_numpy(chosen)]
-        return self._replace(rows=self.rows[chosen], weights=self.weights[chosen], local=local)
+    def select(self, chosen: Bools) -> Share:
+        """Restrict the share to some (M,) of its positions."""
+        rows, weights, local = self.rows[chosen], self.weights[chosen], self.local[chosen]
+        return self._replace(rows=rows, weights=weights, local=local)
 
 
 class TileBlend(Map):
@@ -51,9 +49,7 @@ class TileBlend(Map):
         self.memory_bytes = positive(memory_bytes, "memory_bytes")
         self._held: OrderedDict[Tile, tuple[MapContents, int]] = OrderedDict()
         self._lock = threading.Lock()
-        if not self.tiles:
-            msg = f"no tile of {self.folder} is done: run radarsdf tiles fit {self.folder}"
-            raise ValueError(msg)
+        check(self.tiles, f"no tile of {self.folder} is done: run radarsdf tiles fit {self.folder}")
 
     @cached_property
     def tiles(self) -> list[TilePlan]:
@@ -63,26 +59,18 @@ class TileBlend(Map):
     @property
     def missing(self) -> dict[str, str]:
         """Unfinished tiles by name, with the reason of the failure; empty if the fit was not tried or was killed."""
-        return {
-            tile.name: failure_of(self.folder, tile) for tile in self.plan.tiles if not self.has(tile.tile)
-        }
+        undone = (tile for tile in self.plan.tiles if tile.tile not in self.done)
+        return {tile.name: failure_of(self.folder, tile) for tile in undone}
 
     @cached_property
-    def _done(self) -> set[Tile]:
+    def done(self) -> set[Tile]:
+        """Indices of the tiles that are done."""
         return {tile.tile for tile in self.tiles}
-
-    def has(self, tile: Tile) -> bool:
-        """Whether this tile exists and is done."""
-        return tile in self._done
 
     @cached_property
     def contents_of_any(self) -> MapContents:
         """The map of any tile, for what all have in common."""
         return self.contents_of(self.tiles[0].tile)
-
-    @property
-    def _contents_of_any(self) -> MapContents:
-        return self.contents_of_any
 
     def contents_of(self, tile: Tile) -> MapContents:
         """The map of a finished tile, cached in memory."""
@@ -96,125 +84,115 @@ class TileBlend(Map):
             self._held.move_to_end(tile)
             return self._held[tile][0]
 
-    def leaf_cells(self, of: Tile, within: Tile) -> NDArray[np.int64]:
+    def leaf_cells(self, of: Tile, within: Tile) -> Ints:
         """(C, 3) leaf cells, by lattice indices, of the map of one finished tile that lie in another one."""
         keys = storage.load_leaf_keys(map_path(self.folder, self.plan.by_tile[of]))
         cells = lattice_of(keys).astype(np.int64) + self.plan.origin_cells(of)
-        inside: NDArray[np.bool_] = (cells[:, :2] // self.plan.tile_cells == within).all(axis=1)
-        return cells[inside]
+        return cells[(cells[:, :2] // self.plan.tile_cells == within).all(axis=1)]
 
-    def _shares(self, world: _Floats) -> Iterator[Share]:
+    def _shares(self, world: Floats) -> Iterator[Share]:
         """Yield the shares of tiles at positions (N, 3), world, m, in ascending order, which fixes the bits of sums."""
+        return (self._share(world, *near) for near in self._near(world))
+
+    def _share(self, world: Floats, tile: Tile, rows: Ints) -> Share:
+        contents, x = self.contents_of(tile), world[rows]
         # Weights depend only on the borders between tiles, not on what a tile observed.
-        grid = self.plan.grid
-        places = world[np.isfinite(world).all(axis=1), :2]
+        return Share(tile, contents, rows, self.plan.grid.weights(tile, x), queries.to_local(contents, x))
+
+    def _near(self, world: Floats) -> Iterator[tuple[Tile, Ints]]:
+        """Yield the tiles with a weight at any of the positions (N, 3), world, m, and the rows (M,) of these."""
+        grid, places = self.plan.grid, world[np.isfinite(world).all(axis=1), :2]
         if len(places) == 0:
             return
-        reach_m = np.array([-grid.halo_m / 2, grid.tile_m + grid.halo_m / 2])
-        for planned in self.tiles:
-            first, last = grid.lower_corner(planned.tile) + reach_m[:, None]
-            if (first > places.max(axis=0)).any() or (last < places.min(axis=0)).any():
-                continue
-            rows = grid.within_half_a_halo(planned.tile, world)
-            if len(rows):
-                contents = self.contents_of(planned.tile)
-                local = queries.to_local(contents, torch.from_numpy(world[rows]))
-                yield Share(planned.tile, contents, rows, grid.weights(planned.tile, world[rows]), local)
+        first, last = self._reaches
+        near = ((first <= places.max(axis=0)) & (last >= places.min(axis=0))).all(axis=1)
+        for i in np.flatnonzero(near).tolist():
+            tile = self.tiles[i].tile
+            if len(rows := grid.within_half_a_halo(tile, world)):
+                yield tile, rows
 
-    def _known_shares(self, world: _Floats, seen: NDArray[np.bool_]) -> Iterator[Share]:
+    @cached_property
+    def _reaches(self) -> Floats:
+        """(2, T, 2) lower and upper corner of the area in which each tile has a weight, world, m."""
+        grid = self.plan.grid
+        lower = grid.corner_m + grid.tile_m * np.array([tile.tile for tile in self.tiles])
+        return np.stack([lower - grid.halo_m / 2, lower + (grid.tile_m + grid.halo_m / 2)])
+
+    def _known_shares(self, world: Floats, seen: Bools) -> Iterator[Share]:
         """Yield the shares of tiles in whose leaf cells, or on their border, positions (N, 3), world, m, are. Set `seen` (N,)."""
         # Tiles disagree, because ghosts depend on surfaces in front of them. The tile that contains a position decides; for
         # an unfinished one, its neighbours do.
-        for share in self._shares(world):
-            points, inside = queries.into_cells(share.contents, share.local)
-            owners = self.plan.grid.tiles_of(world[share.rows])
-            for tile in neighbours(share.tile):
-                if tile == share.tile or not self.has(tile):
-                    seen[share.rows] |= inside.numpy() & (owners == tile).all(axis=1)
-            yield share.at(points, inside.numpy())
+        near, owners = list(self._near(world)), np.full(len(world), -1)
+        for number, (tile, rows) in enumerate(near):
+            owners[rows[(self.plan.grid.tiles_of(world[rows]) == tile).all(axis=1)]] = number
+        for number, (tile, rows) in enumerate(near):
+            share, owner = self._share(world, tile, rows), owners[rows]
+            inside = queries.into_cells(share.contents, share.local)
+            seen[rows] |= inside & ((owner == number) | (owner < 0))
+            yield share.select(inside)
 
-    def _average(
-        self, world: Tensor, extrapolate: bool, of_tile: Callable[[Share], Tensor], columns: int = 1
-    ) -> Tensor:
-        positions = _contiguous(world)
-        count, seen = len(positions), np.zeros(len(positions), bool)
-        found = _averages(self._known_shares(positions, seen), count, of_tile, columns)
+    def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
+        def of_tile(share: Share) -> Array:
+            rest = [queries.to_local(share.contents, x[share.rows]) for x in others]
+            known = np.isfinite(np.concatenate([share.local, *rest], axis=1)).all(axis=1)
+            return queries.where(known, query, share.contents, share.local, *rest)
+
+        count, seen, columns = len(world), np.zeros(len(world), bool), 4 if query is queries.plane else 1
+        found = _averages(self._known_shares(world, seen), count, of_tile, columns)
         found[~seen] = np.nan
         if extrapolate and not seen.all():
-            rest = self._shares(np.where(seen[:, None], np.nan, positions))
-            moved = (s._replace(local=queries.into_cells(s.contents, s.local)[0]) for s in rest)
-            found[~seen] = _averages(moved, count, of_tile, columns)[~seen]
-        return torch.from_numpy(found)
+            rest = self._shares(np.where(seen[:, None], np.nan, world))
 
-    def _sdf(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._average(world, extrapolate, _distance)[:, 0]
+            def of_moved(share: Share) -> Array:
+                queries.into_cells(share.contents, share.local)
+                return of_tile(share)
 
-    def _plane(self, world: Tensor, extrapolate: bool) -> Tensor:
-        return self._average(
-            world, extrapolate, lambda share: queries.plane(share.contents, share.local), columns=4
-        )
+            found[~seen] = _averages(rest, count, of_moved, columns)[~seen]
+        return found if columns > 1 else found[:, 0]
 
-    def _observed(self, world: Tensor) -> Tensor:
+    def _observed(self, world: Floats) -> Bools:
         seen = np.zeros(len(world), bool)
-        for _ in self._known_shares(_contiguous(world), seen):
+        for _ in self._known_shares(world, seen):
             pass
-        return torch.from_numpy(seen)
+        return seen
 
-    def _intensity(self, world: Tensor, sensors: Tensor, extrapolate: bool) -> Tensor:
-        def of_tile(share: Share) -> Tensor:
-            there = queries.to_local(share.contents, sensors[torch.from_numpy(share.rows)])
-            predicted = partial(queries.intensity, share.contents, extrapolate=extrapolate)
-            return queries.where(there.isfinite().all(dim=1), share.local, there, function=predicted)
-
-        return self._average(world, extrapolate, of_tile)[:, 0]
-
-    def evidence_at(self, world: Tensor) -> queries.EvidenceAt:
+    def evidence_at(self, world: Floats) -> EvidenceAt:
         """All tiles contribute, because evidence ends smoothly at each: a tile that observed no returns lowers it."""
-        positions = _contiguous(world)
 
-        def of_tile(share: Share) -> Tensor:
-            return torch.stack(list(queries.evidence(share.contents, share.local)), 1)
+        def of_tile(share: Share) -> Floats32:
+            return np.stack(evidence(share.contents, share.local), axis=1)
 
-        found = np.nan_to_num(_averages(self._shares(positions), len(positions), of_tile, columns=4))
-        return queries.EvidenceAt(*torch.from_numpy(found).float().unbind(1))
+        found = np.nan_to_num(_averages(self._shares(world), len(world), of_tile, columns=4))
+        return EvidenceAt(*found.astype(np.float32).T)
 
-    def distances_at(self, lattice: NDArray[np.int64], voxel_m: float) -> NDArray[np.float32]:
+    def distances_at(self, lattice: Ints, voxel_m: float) -> Floats32:
         """(K,) signed distances at corners (K, 3) of voxels that divide leaf cells, indexed from the lattice's first corner.
 
         The bits do not depend on the calling tile. NaN where no tile has an adjacent cell.
         """
         steps = round(self.config.leaf_size_m / voxel_m)
 
-        def touching() -> Iterator[Share]:
-            for share in self._shares(self.config.lattice.position(lattice / steps)):
-                # Computed from integers: the same float32 position for every calling tile.
-                origin = self.plan.origin_cells(share.tile) * steps
-                points = torch.from_numpy(((lattice[share.rows] - origin) * voxel_m).astype(np.float32))
-                # A corner on the border of the map may be in an outer cell, which has no features.
-                points, inside = queries.into_cells(share.contents, points, voxel_m)
-                yield share.at(points, inside.numpy())
+        def of_tile(share: Share) -> Floats32:
+            # Computed from integers: the same float32 position for every calling tile.
+            origin = self.plan.origin_cells(share.tile) * steps
+            points = ((lattice[share.rows] - origin) * voxel_m).astype(np.float32)
+            # A corner on the border of the map may be in an outer cell, which has no features.
+            inside = queries.into_cells(share.contents, points, voxel_m)
+            return queries.where(inside, queries.signed_distance, share.contents, points)
 
-        return _averages(touching(), len(lattice), _distance)[:, 0].astype(np.float32)
+        shares = self._shares(self.config.lattice.position(lattice / steps))
+        return _averages(shares, len(lattice), of_tile)[:, 0].astype(np.float32)
 
 
 def _averages(
-    shares: Iterable[Share], count: int, of_tile: Callable[[Share], Tensor], columns: int = 1
-) -> _Floats:
+    shares: Iterable[Share], count: int, of_tile: Callable[[Share], Array], columns: int = 1
+) -> Floats:
     """(N, columns) weighted averages of the values of tiles, (M, columns) each, at `count` positions. NaN without a share."""
     sums, totals = np.zeros((count, columns)), np.zeros(count)
     for share in shares:
-        values = of_tile(share).numpy().astype(np.float64).reshape(-1, columns)
+        values = of_tile(share).astype(np.float64).reshape(-1, columns)
         known = ~np.isnan(values[:, 0])  # a tile may lack a view that its neighbour has
         sums[share.rows[known]] += share.weights[known, None] * values[known]
         totals[share.rows[known]] += share.weights[known]
     with np.errstate(invalid="ignore", divide="ignore"):
-        found: _Floats = sums / totals[:, None]
-    return found
-
-
-def _distance(share: Share) -> Tensor:
-    return queries.signed_distance(share.contents, share.local)
-
-
-def _contiguous(world: Tensor) -> _Floats:
-    return np.ascontiguousarray(world.double().numpy())
+        return sums / totals[:, None]

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from radarsdf.checks import hides_bar, instance, path_of, positive
+from radarsdf.checks import check, hides_bar, instance, path_of, positive
 from radarsdf.config.fit_config import FitConfig, settings_of_results
 from radarsdf.extras import require
 from radarsdf.fitting.steps import FitInput, fit_rays
@@ -80,8 +80,8 @@ def fit_tiles(
     ValueError, OSError
         If a scan is invalid, `out` holds other files or another plan, cannot be written, or all tiles failed.
     """
-    threads = None if executor is None else 1
-    plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=threads)
+    of_fit = None if executor is None else 1
+    plan_tiles(scans, out, tile_size=tile_size, halo=halo, config=config, threads=of_fit)
     return run_fits(out, executor=executor, progress=progress)
 
 
@@ -100,10 +100,9 @@ def plan_tiles(
     grid = _grid(config, tile_size, halo)
     given = ScanStream(read(scans) if isinstance(scans, (str, PathLike)) else scans)
     if not (folder / PLAN).is_file():
-        if folder.is_dir() and not {path.name for path in folder.iterdir()} <= _OURS:
-            msg = f"{folder} holds other files: give a new folder"
-            raise ValueError(msg)
         folder.mkdir(exist_ok=True)
+        ours = {path.name for path in folder.iterdir()} <= _OURS
+        check(ours, f"{folder} holds other files: give a new folder")
         lock = take_lock(folder / _LOCK, "planned")
         try:
             if not (folder / PLAN).is_file():  # another process may have just written it
@@ -130,9 +129,7 @@ def _known_plan(folder: Path, config: FitConfig, grid: TileGrid, given: ScanStre
         for _ in given:
             pass
         different += ["scans"] * (given.digest != plan.input_digest)
-    if different:
-        msg = f"{folder} holds another plan: {', '.join(different)} differ; give a new folder"
-        raise ValueError(msg)
+    check(not different, f"{folder} holds another plan: {', '.join(different)} differ; give a new folder")
     return plan
 
 
@@ -147,9 +144,8 @@ def run_fits(
     root = path_of(folder, "folder")
     plan = Plan.load(root)
     wanted = {tile.name for tile in plan.tiles} if names is None else set(names)
-    if unknown := wanted - {tile.name for tile in plan.tiles}:
-        msg = f"{folder} has no tile {min(unknown)}"
-        raise ValueError(msg)
+    unknown = sorted(wanted - {tile.name for tile in plan.tiles})
+    check(not unknown, f"{folder} has no tiles {', '.join(unknown)}")
     todo = [tile for tile in plan.tiles if tile.name in wanted and not is_done(root, plan, tile)]
     failed = run_tasks(fit_tile, [(str(root), tile.name) for tile in todo], executor, progress=progress)
     for i, tile in enumerate(todo):
@@ -158,9 +154,7 @@ def run_fits(
                 write_whole(failure_path(root, tile), failed[i].encode())
             else:
                 failure_path(root, tile).unlink(missing_ok=True)
-    if failed and len(failed) == len(plan.tiles):
-        msg = f"all {len(failed)} tiles failed, the first: {failed[0]}"
-        raise ValueError(msg)
+    check(len(failed) < len(plan.tiles), f"all {len(failed)} tiles failed, the first: {failed.get(0)}")
     return TiledMap(root)
 
 
@@ -197,9 +191,8 @@ def _grid(config: FitConfig, tile_size: float | None, halo: float | None) -> Til
         return lattice.block_m * max(1, round(wanted / lattice.block_m))
 
     tile_m, halo_m = blocks(tile_size, _TILE_CELLS, "tile_size"), blocks(halo, _HALO_CELLS, "halo")
-    if halo_m > tile_m:
-        msg = f"the halo, {halo_m:g} m, is larger than the tile, {tile_m:g} m: use larger tiles"
-        raise ValueError(msg)
+    fits = halo_m <= tile_m
+    check(fits, f"the halo, {halo_m:g} m, is larger than the tile, {tile_m:g} m: use larger tiles")
     return TileGrid(tile_m, halo_m, corner_m=float(lattice.position(0)))
 
 

@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from radarsdf.checks import check_box, hides_bar, path_of, positive
-from radarsdf.io.files import check_outputs
+from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
+from radarsdf.checks import check, check_box, hides_bar, path_of, positive
+from radarsdf.io.files import check_outputs, reading
 from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
+from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.mesh import (
     Surface,
     crossed,
-    described_mesh,
     one_for_equal,
     per_cell,
     renumbered,
     subdivided,
-    within,
+    with_all,
 )
-from radarsdf.map.queries import EvidenceAt
-from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally, Threshold
+from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views
 from radarsdf.tiles.blend import TileBlend
@@ -42,76 +41,62 @@ if TYPE_CHECKING:
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
-_Floats = NDArray[np.float64]
-_Box = NDArray[np.float64] | None  # (2, 3) lower and upper corner, world, m
-
-
-@dataclass(frozen=True)
-class Part:
-    """Triangles of one tile."""
-
-    vertices: _Floats  # (V, 3) world, m
-    faces: NDArray[np.int32]  # (F, 3) rows of the vertices
-    confidence: NDArray[np.float32]  # (V,)
-    uncertainty_m: NDArray[np.float32]  # (V,)
-    cells: NDArray[np.int64]  # (2,) numbers of leaf cells, and of those that may contain surface
-    tally: _Floats  # Tally.sums of the whole surface of the tile
+_Box = Floats | None  # (2, 3) lower and upper corner, world, m
 
 
 _ARRAYS: dict[str, tuple[Any, ...]] = {
-    "vertices": (np.float64, None, 3),
+    "vertices": (np.float64, None, 3),  # world, m
     "faces": (np.int32, None, 3),
     "confidence": (np.float32, None),
     "uncertainty_m": (np.float32, None),
-    "cells": (np.int64, 2),
-    "tally": (np.float64, TALLY_NUMBERS),
-}
+    "cells": (np.int64, 2),  # numbers of leaf cells, and of those that may contain surface
+    "tally": (np.float64, TALLY_NUMBERS),  # Tally.sums of the whole surface of the tile
+}  # in the file of a part, the triangles of one tile
 
 
-def _read(path: Path, *names: str) -> dict[str, NDArray[Any]]:
+def _read(path: Path, *names: str) -> dict[str, Array]:
     """Read arrays of a part, by default all."""
     wanted = {name: _ARRAYS[name] for name in names or _ARRAYS}
-    arrays = arrays_of(path, tuple(wanted))
-    try:
+    with reading(path, "a complete part of a mesh"):
+        arrays = arrays_of(path, tuple(wanted))
         check_arrays(arrays, wanted)
-    except ValueError as error:
-        msg = f"{path} is not a complete part of a mesh: {error}"
-        raise ValueError(msg) from error
     return arrays
 
 
 def voxels_along(leaf_m: float, voxel_size: float) -> int:
     """Number of voxels along a leaf cell. Raises a ValueError unless they divide it, so that those of tiles coincide."""
     steps, even = per_cell(positive(voxel_size, "voxel_size"), leaf_m)
-    if not even:
-        msg = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as tiles need: use {leaf_m / 2:g} or {leaf_m:g}"
-        raise ValueError(msg)
+    wrong = f"voxels of {voxel_size:g} m do not divide leaf cells of {leaf_m:g} m, as tiles need"
+    check(even, f"{wrong}: use {leaf_m / 2:g} or {leaf_m:g}")
     return steps
 
 
 def parts_of(
     city: TileBlend, voxel_size: float, progress: bool | None, *, box: ArrayLike | None = None, **wanted: Any
-) -> tuple[list[Path], Limits, Threshold]:
-    """Mesh all tiles; return the files of the parts, the limits of a mesh (`wanted`), and the sums over the parts."""
+) -> tuple[list[Path], Limits, Tally]:
+    """Mesh all tiles; return the files of the parts, the limits of a mesh (`wanted`), and the tally of all parts."""
     limits = Limits.of(positive(voxel_size, "voxel_size"), **wanted)
     steps = voxels_along(city.config.leaf_size_m, voxel_size)
     corners = None if box is None else check_box(box)
     paths = []
     for planned in tqdm(city.tiles, "mesh", unit="tile", disable=hides_bar(progress)):
         # The file is determined by the settings, the plan and the neighbours.
-        done = [other for other in neighbours(planned.tile) if city.has(other)]
+        done = [other for other in neighbours(planned.tile) if other in city.done]
         text = repr((city.plan.digest, steps, corners, done))
         key = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         path = folder_of(city.folder, planned.tile) / f"mesh-{key}.npz"
         if not path.is_file():
-            write_arrays(path, vars(_part_of(city, planned.tile, steps, corners)))
+            surface, leaf_cells = _surface_in(city, planned.tile, steps, corners)
+            arrays = {name: value for name, value in vars(surface).items() if name in _ARRAYS}
+            counts = np.array([leaf_cells, surface.cells_searched])
+            write_arrays(path, arrays | {"cells": counts, "tally": surface.tally.sums()})
         paths.append(path)
     tally = sum((_read(path, "tally")["tally"] for path in paths), np.zeros(TALLY_NUMBERS))
-    return paths, limits, Tally.of_sums(tally).threshold(limits.min_confidence)
+    return paths, limits, Tally.of_sums(tally)
 
 
-def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> Part:
-    """Triangles near returns in the leaf cells of a tile, with `steps` voxels along a cell's edge."""
+def _surface_in(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> tuple[Surface, int]:
+    """Surface in the leaf cells of a tile, world, m, with `steps` voxels along a cell's edge, and the number of the cells."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
     cells = _cells_in(city, tile)
@@ -120,81 +105,58 @@ def _part_of(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> P
         cells = cells[((position(cells + 1) >= lower) & (position(cells) <= upper)).all(axis=1)]
     found = len(cells)
     if steps > 1:
-        cells = crossed(
-            cells,
-            config.leaf_size_m,
-            lambda _, corners, __: city.distances_at(corners.astype(np.int64), config.leaf_size_m),
-        ).astype(np.int64)
+
+        def distances_at(_: Ints32, corners: Ints32, __: Ints32) -> Floats32:
+            return city.distances_at(corners.astype(np.int64), config.leaf_size_m)
+
+        cells = crossed(cells, config.leaf_size_m, distances_at).astype(np.int64)
     voxels = subdivided(cells, steps)
     if box is not None:
         centres = position((voxels + 0.5) / steps)
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     _, corners, voxel_corners = sparse_lattice(voxels, num_threads=threads)
-    vertices, faces = extract_cells(
-        corners,
-        city.distances_at(corners.astype(np.int64), voxel_m),
-        voxel_corners,
-        origin=position([0, 0, 0]),
-        spacing=[voxel_m] * 3,
-        num_threads=threads,
-    )
-    evidence = city.evidence_at(torch.from_numpy(vertices))
-    surface = Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells))
-    counts = np.array([found, len(cells)])
-    return Part(vertices, faces, surface.confidence, surface.uncertainty_m, counts, surface.tally.sums())
+    distances_m, origin = city.distances_at(corners.astype(np.int64), voxel_m), position([0, 0, 0])
+    options: dict[str, Any] = {"origin": origin, "spacing": [voxel_m] * 3, "num_threads": threads}
+    vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
+    evidence = city.evidence_at(vertices)
+    return Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells)), found
 
 
-def _cells_in(city: TileBlend, tile: Tile) -> NDArray[np.int64]:
+def _cells_in(city: TileBlend, tile: Tile) -> Ints:
     """(C, 3) leaf cells in a tile, by lattice indices: those of its map, and of others with a weight there."""
     plan = city.plan
     parts = []
-    for other in neighbours(tile):
-        if city.has(other):
-            cells = city.leaf_cells(other, within=tile)
-            centres = plan.config.lattice.position(cells + 0.5)
-            parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
-    found: NDArray[np.int64] = sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
-    return found
+    for other in (other for other in neighbours(tile) if other in city.done):
+        cells = city.leaf_cells(other, within=tile)
+        centres = plan.config.lattice.position(cells + 0.5)
+        parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
+    return sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
 
 
-def _on_borders(city: TileBlend, vertices: _Floats) -> NDArray[np.int64]:
+def _on_borders(city: TileBlend, vertices: Floats) -> Ints:
     """(B,) rows of the vertices (V, 3) on borders of tiles, which the adjacent tile may share."""
     tiles = city.config.lattice.cells(vertices)[:, :2] / city.plan.tile_cells
     return np.flatnonzero((np.abs(tiles - np.round(tiles)) * city.plan.tile_cells < _ON_LATTICE).any(axis=1))
 
 
-def _welded(city: TileBlend, parts: Sequence[Part]) -> tuple[_Floats, NDArray[np.int32]]:
-    """Merge all parts to vertices (V, 3) and faces (F, 3), without duplicate vertices."""
-    vertices = np.concatenate([part.vertices for part in parts])
-    starts = np.cumsum([0, *[len(part.vertices) for part in parts]], dtype=np.int32)
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
-    return vertices, one_for_equal(vertices, _on_borders(city, vertices))[faces]
+def _welded(city: TileBlend, vertices: Sequence[Floats], faces: Sequence[Ints32]) -> tuple[Floats, Ints32]:
+    """Merge the vertices (V, 3) and faces (F, 3) of all parts, without duplicate vertices."""
+    starts = np.cumsum([0, *map(len, vertices)], dtype=np.int32)
+    merged = np.concatenate([part + start for part, start in zip(faces, starts, strict=False)])
+    together = np.concatenate(vertices)
+    return together, one_for_equal(together, _on_borders(city, together))[merged]
 
 
-def _allowed(part: Part, min_confidence: float, limits: Limits) -> NDArray[np.bool_]:
-    return within(limits, min_confidence, part.faces, part.confidence, part.uncertainty_m)
-
-
-def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **limits: Any) -> trimesh.Trimesh:
-    """See :meth:`TiledMap.mesh`."""
-    paths, found, threshold = parts_of(city, voxel_size, progress, **limits)
+def mesh_of(city: TileBlend, voxel_size: float, progress: bool | None, **wanted: Any) -> trimesh.Trimesh:
+    paths, limits, tally = parts_of(city, voxel_size, progress, **wanted)
     file_bytes = sum(path.stat().st_size for path in paths)
     check_triangles(file_bytes // _BYTES_PER_TRIANGLE, city.config.max_memory_bytes)
-    parts = [Part(**_read(path)) for path in paths]
-    vertices, faces = _welded(city, parts)
-    faces = faces[np.concatenate([_allowed(part, threshold.min_confidence, found) for part in parts])]
-    labels, sizes = mesh_components(faces, len(vertices))
-    used, faces = renumbered(len(vertices), faces[sizes[labels] >= found.min_component_triangles])
-    leaf_cells, cells_searched = np.sum([part.cells for part in parts], axis=0).tolist()
-    return described_mesh(
-        vertices[used],
-        faces,
-        np.concatenate([part.confidence for part in parts])[used],
-        np.concatenate([part.uncertainty_m for part in parts])[used],
-        leaf_cells=leaf_cells,
-        leaf_cells_searched=cells_searched,
-        **threshold.metadata,
-    )
+    parts = [_read(path).values() for path in paths]
+    vertices, faces, confidence, uncertainty_m, cells, _ = zip(*parts, strict=True)
+    leaf_cells, searched = np.sum(cells, axis=0).tolist()
+    of_vertices = np.concatenate(confidence), np.concatenate(uncertainty_m)
+    whole = Surface(*_welded(city, vertices, faces), *of_vertices, tally, searched)
+    return whole.mesh(np.zeros(3), limits, leaf_cells)
 
 
 def export_mesh(
@@ -208,27 +170,26 @@ def export_mesh(
     check_mesh_path(path)
     check_outputs([path])
     mesh = mesh_of(city, voxel_size, progress, **limits)
-    if len(mesh.faces) == 0:
-        msg = f"{city.folder} has no surface here: nothing written"
-        raise ValueError(msg)
+    check(len(mesh.faces) != 0, f"{city.folder} has no surface here: nothing written")
     write_mesh(path, mesh)
     return len(mesh.vertices), len(mesh.faces)
 
 
 def _separate(
-    city: TileBlend, paths: Sequence[Path], limits: Limits, threshold: Threshold
-) -> Iterator[tuple[_Floats, NDArray[np.int32]]]:
+    city: TileBlend, paths: Sequence[Path], limits: Limits, tally: Tally
+) -> Iterator[tuple[Floats, Ints32]]:
     """Yield vertices (V, 3), world, m, and faces (F, 3) tile by tile. Components that reach a border are kept."""
+    least = tally.threshold(limits.min_confidence).min_confidence
     for path in paths:
-        part = Part(**_read(path))
-        faces = part.faces[_allowed(part, threshold.min_confidence, limits)]
-        labels, sizes = mesh_components(faces, len(part.vertices))
-        on_border = np.zeros(len(part.vertices), bool)
-        on_border[_on_borders(city, part.vertices)] = True
+        vertices, faces, confidence, uncertainty_m, *_ = _read(path).values()
+        faces = faces[with_all(limits.met(least, confidence, uncertainty_m), faces)]
+        labels, sizes = mesh_components(faces, len(vertices))
+        on_border = np.zeros(len(vertices), bool)
+        on_border[_on_borders(city, vertices)] = True
         large = sizes >= limits.min_component_triangles
         large[labels[on_border[faces].any(axis=1)]] = True
-        used, faces = renumbered(len(part.vertices), faces[large[labels]])
-        yield part.vertices[used], faces
+        used, faces = renumbered(len(vertices), faces[large[labels]])
+        yield vertices[used], faces
 
 
 def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
@@ -236,13 +197,14 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
     cells = sum(len(city.contents_of(tile).evidence.visibility) for tile in tiles)
     check_views(city.config.max_memory_bytes, cells=cells)
     origin = city.config.lattice.position(city.plan.origin_cells(tiles[0]))
-    vertices, faces = _welded(city, [_part_of(city, tile) for tile in tiles])
+    surfaces = [_surface_in(city, tile)[0] for tile in tiles]
+    vertices, faces = _welded(city, [one.vertices for one in surfaces], [one.faces for one in surfaces])
     used, faces = renumbered(len(vertices), faces)
 
-    def evidence(points: _Floats) -> EvidenceAt:
-        return city.evidence_at(torch.from_numpy(points + origin))
+    def evidence(points: Floats) -> EvidenceAt:
+        return city.evidence_at(points + origin)
 
-    def intensity(points: _Floats, sensor_position: _Floats) -> NDArray[np.float32]:
+    def intensity(points: Floats, sensor_position: Floats) -> Floats32:
         found = city.intensity(points + origin, sensor_position + origin, extrapolate=True)
         return np.asarray(found, np.float32)
 

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from safetensors import SafetensorError
 
+from radarsdf.arrays import Array, Bools, Floats, Ints
 from radarsdf.checks import MAX_POSITION_M, check
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.io.files import check_regular_file, write_whole
+from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.map.storage import checked_report
 from radarsdf.returns.intensities import IntensityScale
@@ -34,7 +34,6 @@ PLAN, TILES = "plan.json", "tiles"
 Tile = tuple[int, int]
 """Index of a tile along x and y. Tile (0, 0) begins at the origin of the world's lattice."""
 
-_Floats = NDArray[np.float64]
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Number = Annotated[int, Field(ge=-(2**53), le=2**53)]  # index of a tile or a cell
 _Length = Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
@@ -50,21 +49,19 @@ class TileGrid:
     halo_m: float  # margin of a tile's returns: at most its edge
     corner_m: float  # lower corner of tile (0, 0) along x and y, world
 
-    def lower_corner(self, tile: Tile) -> _Floats:
+    def lower_corner(self, tile: Tile) -> Floats:
         """(2,) lower corner of a tile, world, m."""
         return self.corner_m + np.array(tile) * self.tile_m
 
-    def tiles_of(self, positions: NDArray[Any]) -> NDArray[np.int64]:
+    def tiles_of(self, positions: Array) -> Ints:
         """(N, 2) tiles that contain positions (N, 3), world, m."""
-        return _floor(self._along(positions) / self.tile_m)
+        return np.floor(self._along(positions) / self.tile_m).astype(np.int64)
 
-    def crossed(
-        self, ends: _Floats, others: _Floats
-    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def crossed(self, ends: Floats, others: Floats) -> Iterator[tuple[Ints, Ints]]:
         """Rows (M,) of segments from `ends` to `others` (N, 3), world, m, and the tiles (M, 2) whose halos they enter, unique."""
         a, b = self._along(ends), self._along(others)
-        first = _floor((np.minimum(a, b) - self.halo_m) / self.tile_m)
-        last = _floor((np.maximum(a, b) + self.halo_m) / self.tile_m)
+        lower, upper = np.minimum(a, b) - self.halo_m, np.maximum(a, b) + self.halo_m
+        first, last = (np.floor(ends / self.tile_m).astype(np.int64) for ends in (lower, upper))
         most = (last - first).max(axis=0, initial=-1)
         for step in itertools.product(range(most[0] + 1), range(most[1] + 1)):
             rows = np.flatnonzero((first + step <= last).all(axis=1))
@@ -72,7 +69,7 @@ class TileGrid:
             meets = self._meets(a[rows], b[rows], tiles)
             yield rows[meets], tiles[meets]
 
-    def _meets(self, a: _Floats, b: _Floats, tiles: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _meets(self, a: Floats, b: Floats, tiles: Ints) -> Bools:
         """Whether segments, relative to the corner of tile (0, 0), meet the boxes of their tiles, all (M, 2), by slabs."""
         lower, extent = tiles * self.tile_m - self.halo_m, b - a
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -80,37 +77,28 @@ class TileGrid:
         # A segment parallel to a slab is inside it: the tiles come from the segment's own bounds.
         enter = np.where(extent == 0, -np.inf, ends.min(axis=0)).max(axis=1)
         leave = np.where(extent == 0, np.inf, ends.max(axis=0)).min(axis=1)
-        meets: NDArray[np.bool_] = np.maximum(enter, 0) <= np.minimum(leave, 1)
-        return meets
+        return np.maximum(enter, 0) <= np.minimum(leave, 1)
 
-    def weights(self, tile: Tile, positions: _Floats) -> _Floats:
+    def weights(self, tile: Tile, positions: Floats) -> Floats:
         """(N,) weights of a tile at positions (N, 3), world, m. The weights of all tiles sum to one.
 
         They rise smoothly within half a halo around each edge. The outer half, where a tile knows less, has no weight.
         """
-        beyond_lower = self._along(positions) - np.array(tile) * self.tile_m
+        beyond_lower = self._along(positions, tile)
         factors = np.ones((len(positions), 2))
         for inwards in (beyond_lower, self.tile_m - beyond_lower):
             t = np.clip(inwards / self.halo_m + 0.5, 0.0, 1.0)
             factors *= t * t * (3 - 2 * t)
-        weights: _Floats = factors.prod(axis=1)
-        return weights
+        return factors.prod(axis=1)
 
-    def within_half_a_halo(self, tile: Tile, positions: _Floats) -> NDArray[np.int64]:
+    def within_half_a_halo(self, tile: Tile, positions: Floats) -> Ints:
         """(M,) rows of positions (N, 3), world, m, at which a tile has a weight."""
-        from_corner = self._along(positions) - np.array(tile) * self.tile_m
-        half_m = self.halo_m / 2
+        from_corner, half_m = self._along(positions, tile), self.halo_m / 2
         return np.flatnonzero(((from_corner > -half_m) & (from_corner < self.tile_m + half_m)).all(axis=1))
 
-    def _along(self, positions: NDArray[Any]) -> _Floats:
-        """(N, 2) offsets of positions (N, 3), world, m, from the corner of tile (0, 0)."""
-        along: _Floats = positions[:, :2] - self.corner_m
-        return along
-
-
-def _floor(numbers: _Floats) -> NDArray[np.int64]:
-    found: NDArray[np.int64] = np.floor(numbers).astype(np.int64)
-    return found
+    def _along(self, positions: Array, tile: Tile = (0, 0)) -> Floats:
+        """(N, 2) offsets of positions (N, 3), world, m, from the lower corner of a tile."""
+        return positions[:, :2] - self.corner_m - np.array(tile) * self.tile_m
 
 
 def neighbours(tile: Tile) -> list[Tile]:
@@ -131,7 +119,6 @@ class TilePlan:
 
     @property
     def name(self) -> str:
-        """Name of its files."""
         return f"{self.tile[0]}_{self.tile[1]}"
 
 
@@ -152,17 +139,14 @@ class Plan:
 
     @cached_property
     def grid(self) -> TileGrid:
-        """Grid of the tiles."""
         return TileGrid(self.tile_m, self.halo_m, float(self.config.lattice.position(0)))
 
     @cached_property
     def by_tile(self) -> dict[Tile, TilePlan]:
-        """Tiles by index."""
         return {planned.tile: planned for planned in self.tiles}
 
     @property
     def scale(self) -> IntensityScale | None:
-        """Scale of the intensities."""
         return None if self.intensity_range is None else IntensityScale.between(self.intensity_range)
 
     @property
@@ -170,11 +154,11 @@ class Plan:
         """Edge of a tile, leaf cells."""
         return round(self.tile_m / self.config.leaf_size_m)
 
-    def origin_cells(self, tile: Tile) -> NDArray[np.int64]:
+    def origin_cells(self, tile: Tile) -> Ints:
         """(3,) origin of a tile's map, leaf cells of the lattice."""
         return np.array(self.by_tile[tile].origin_cells, np.int64)
 
-    def box_cells(self, tile: Tile) -> NDArray[np.int64]:
+    def box_cells(self, tile: Tile) -> Ints:
         """(2, 3) first leaf cell of a tile and the one after the last, from the origin of its map, unbounded in height."""
         first = np.array(tile) * self.tile_cells - self.origin_cells(tile)[:2]
         height = MAX_CELLS_FROM_ORIGIN
@@ -196,7 +180,6 @@ class Plan:
         return json.dumps(FORMAT | own, indent=1).encode()
 
     def save(self, folder: Path) -> None:
-        """Write the plan atomically."""
         write_whole(folder / PLAN, self._file_bytes())
 
     def _file_bytes(self) -> bytes:
@@ -207,16 +190,13 @@ class Plan:
     def load(cls, folder: Path) -> Plan:
         """Load the plan of a folder. Raises a ValueError if it is missing, damaged, or of another version."""
         path = folder / PLAN
-        if folder.is_dir() and not path.exists():
-            msg = f"{folder} is not a map: folders written by radarsdf tiles have a {PLAN}"
-            raise ValueError(msg)
+        planned = path.exists() or not folder.is_dir()
+        check(planned, f"{folder} is not a map: folders written by radarsdf tiles have a {PLAN}")
         check_regular_file(path)
-        try:
+        with reading(path, "a complete plan", Exception):  # damaged files raise exceptions of many kinds
             content = path.read_bytes()
             described = by_name(json.loads(content), "the plan")
-            if {name: described.pop(name, None) for name in FORMAT} != FORMAT:
-                msg = f"it is not a plan of {FORMAT}"
-                raise ValueError(msg)
+            check({name: described.pop(name, None) for name in FORMAT} == FORMAT, f"it is not of {FORMAT}")
             described.pop("crc32")
             plan = cls(
                 config=FitConfig.from_dict(described.pop("config")),
@@ -226,9 +206,6 @@ class Plan:
             )
             check(plan._file_bytes() == content, "its checksum is wrong")
             return plan
-        except Exception as error:  # damaged files raise exceptions of many kinds
-            msg = f"{path} is not a complete plan: {error}"
-            raise ValueError(msg) from error
 
 
 def folder_of(folder: Path, tile: Tile) -> Path:
@@ -266,10 +243,7 @@ def is_done(folder: Path, plan: Plan, tile: TilePlan) -> bool:
 def report_of(folder: Path, tile: TilePlan) -> dict[str, Any]:
     """Report of the fit of a finished tile, see :attr:`Map.report`. Raises a ValueError if it is damaged."""
     path = map_path(folder, tile)
-    try:
-        with open_tensors(path, "np") as file:
-            file.check_metadata()
-            return checked_report(json.loads(file.metadata["description"])["report"])
-    except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        msg = f"{path} is not a complete radarsdf map: {error}"
-        raise ValueError(msg) from error
+    wrong = SafetensorError, KeyError, TypeError, RecursionError
+    with reading(path, "a complete radarsdf map", *wrong), open_tensors(path, "np") as file:
+        file.check_metadata()
+        return checked_report(json.loads(file.metadata["description"])["report"])

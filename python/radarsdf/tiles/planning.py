@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from radarsdf._core import cell_keys
-from radarsdf.checks import are_rigid, one_for_each_scan
+from radarsdf.arrays import Bools, Floats, Ints
+from radarsdf.checks import are_rigid, check, one_for_each_scan
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import estimate_rays
 from radarsdf.io.npz import array_in
@@ -57,18 +57,16 @@ class ScanStream:
             if not isinstance(scan, Scan):
                 msg = f"scan {i} is {type(scan).__name__}, not radarsdf.io.Scan"
                 raise TypeError(msg)
-            if np.shape(scan.T_world_sensor) != (4, 4):
-                msg = f"scan {i} has no pose: T_world_sensor must be (4, 4), not {np.shape(scan.T_world_sensor)}"
-                raise ValueError(msg)
+            shape = np.shape(scan.T_world_sensor)
+            check(shape == (4, 4), f"scan {i} has no pose: T_world_sensor must be (4, 4), not {shape}")
             for array in (scan.points, scan.T_world_sensor, scan.intensities, scan.doppler_mps):
                 digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
             rigid.append(bool(are_rigid(np.asarray(scan.T_world_sensor)[None])[0]))
             if rigid[-1]:
                 yield scan
         bad = np.flatnonzero(~np.array(rigid, bool)).tolist()
-        if bad and 2 * len(bad) >= len(rigid):
-            msg = f"{len(bad)} of {len(rigid)} poses are not rigid transforms, the first is pose {bad[0]}"
-            raise ValueError(msg)
+        wrong = f"{len(bad)} of {len(rigid)} poses are not rigid transforms"
+        check(not bad or 2 * len(bad) < len(rigid), f"{wrong}, the first is pose {min(bad, default=0)}")
         for note in LeftOut(poses=bad).notes:
             _LOG.warning(note)
         self.digest = digest.hexdigest()
@@ -80,9 +78,7 @@ def make_plan(scans: ScanStream, folder: Path, config: FitConfig, grid: TileGrid
     for chunk in _chunks(scans, config.returns.accumulate_scans):
         planner.add(chunk, number)
         number += len(chunk)
-    if number == 0:
-        msg = "there are no scans"
-        raise ValueError(msg)
+    check(number != 0, "there are no scans")
     return planner.plan(scans.digest)
 
 
@@ -106,9 +102,9 @@ class _Planner:
 
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
         self._folder, self._config, self._grid = folder, config, grid
-        self._origins: dict[Tile, NDArray[np.int64]] = {}  # (3,) origins of the tiles' maps, leaf cells
-        self._counts: dict[Tile, NDArray[np.int64]] = {}  # numbers of returns in each tile, and of rays
-        self._axes: list[NDArray[np.float64]] = []  # (F, 6) sensor positions and z axes, world
+        self._origins: dict[Tile, Ints] = {}  # (3,) origins of the tiles' maps, leaf cells
+        self._counts: dict[Tile, Ints] = {}  # numbers of returns in each tile, and of rays
+        self._axes: list[Floats] = []  # (F, 6) sensor positions and z axes, world
         self._samples: list[tuple[int, Scan]] = []  # scans with the smallest hashes
         self._intensities = Intensities()
         self._with_intensities: bool | None = None
@@ -117,9 +113,8 @@ class _Planner:
         """Add consecutive scans, the first of which has the index `first`."""
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
-            if self._with_intensities not in (None, has):
-                msg = f"either all scans have intensities, or none has: scan {number} is not like those before it"
-                raise ValueError(msg)
+            alike = self._with_intensities in (None, has)
+            check(alike, f"all scans have intensities, or none: scan {number} is not like those before it")
             self._with_intensities = has
             self._samples.append((zlib.crc32(np.asarray(scan.points).tobytes()), scan))
             self._samples = sorted(self._samples, key=itemgetter(0))[:_SENSOR_SCANS]
@@ -171,9 +166,7 @@ class _Planner:
                 continue
             x, y, z = self._origins[tile].tolist()
             tiles.append(TilePlan(tile=tile, returns=int(returns), rays=int(rays), origin_cells=(x, y, z)))
-        if not tiles:
-            msg = "no return of any scan lies within the ranges"
-            raise ValueError(msg)
+        check(tiles, "no return of any scan lies within the ranges")
         axes = np.concatenate(self._axes)
         np.save(self._folder / SCANS_FILE, axes, allow_pickle=False)
         draft = Plan(
@@ -251,12 +244,12 @@ def rays_path(folder: Path, tile: Tile) -> Path:
     return folder_of(folder, tile) / "rays.bin"
 
 
-def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[np.bool_]]:
+def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, Bools]:
     """Rays that cross a tile, in the frame of its map, and the mask (N,) of returns in it or its halo."""
     path = rays_path(folder, tile.tile)
-    if not path.exists() or path.stat().st_size != tile.rays * _RECORD.itemsize:
-        msg = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean: fit in a new folder"
-        raise ValueError(msg)
+    whole = path.exists() and path.stat().st_size == tile.rays * _RECORD.itemsize
+    wrong = f"{path} does not hold the {tile.rays} rays of the plan, as after radarsdf tiles clean"
+    check(whole, f"{wrong}: fit in a new folder")
     rows = np.fromfile(path, _RECORD)
     numbers, scans = np.unique(rows["scan"], return_inverse=True)
     of_scans = np.array(array_in(folder / SCANS_FILE)[numbers])  # a memory map, of which few rows are read
@@ -276,7 +269,5 @@ def read_rays(folder: Path, plan: Plan, tile: TilePlan) -> tuple[Rays, NDArray[n
     cells = lattice_of(cell_keys(points, plan.config.leaf_size_m, plan.config.num_threads))[:, :2]
     halo = round(plan.halo_m / plan.config.leaf_size_m)
     lower = np.array(tile.tile) * plan.tile_cells - plan.origin_cells(tile.tile)[:2] - halo
-    inside: NDArray[np.bool_] = np.all(
-        (cells >= lower) & (cells < lower + plan.tile_cells + 2 * halo), axis=1
-    )
-    return rays, inside
+    inside = (cells >= lower) & (cells < lower + plan.tile_cells + 2 * halo)
+    return rays, np.asarray(inside.all(axis=1))

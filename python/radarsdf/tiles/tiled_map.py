@@ -9,12 +9,14 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import path_of
-from radarsdf.map import queries
+from radarsdf.map import storage
+from radarsdf.map.free_space import CellsInBox, dense_cells
 from radarsdf.map.map import Map
-from radarsdf.map.radar_map import load_file
+from radarsdf.map.radar_map import RadarMap
+from radarsdf.map.threshold import VOXEL_M, Threshold
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.view_statistics import ViewStatisticsAt
 from radarsdf.tiles.blend import TileBlend
@@ -23,17 +25,16 @@ from radarsdf.tiles.plan import Tile, map_path, report_of
 if TYPE_CHECKING:
     import trimesh
 
-    from radarsdf.map.threshold import Threshold
     from radarsdf.map.view import ViewedMap
-
-_Floats = NDArray[np.float64]
 
 
 class TiledMap(TileBlend):
     """A map in tiles, returned by :func:`radarsdf.fit_tiles` or ``radarsdf.load(folder)``.
 
     It has the methods of :class:`Map`. Where tiles overlap, their fields are averaged with weights that fall smoothly to zero,
-    so neither surface, gradient nor intensity has a seam. Tiles are read on demand.
+    so neither surface, gradient nor intensity has a seam. Tiles are read on demand. The voxels of :meth:`mesh` must divide the edge
+    of a leaf cell, so that triangles of adjacent tiles fit together. They are cached in the folder: another mesh of the same
+    `voxel_size` and `box` is fast.
 
     Parameters
     ----------
@@ -59,44 +60,12 @@ class TiledMap(TileBlend):
     def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
         return partial(TiledMap, memory_bytes=self.memory_bytes), (str(self.folder),)
 
-    def mesh(
-        self,
-        voxel_size: float = queries.VOXEL_M,
-        *,
-        box: ArrayLike | None = None,
-        viewpoint: ArrayLike | None = None,
-        progress: bool | None = None,
-        **limits: Any,
-    ) -> trimesh.Trimesh:
-        """Extract the surface as one mesh, without gaps or duplicate triangles between tiles.
-
-        Triangles of the tiles are cached in the folder, so another mesh of the same `voxel_size` and `box` is fast.
-
-        Parameters
-        ----------
-        voxel_size : float
-            Edge of a voxel, m, which must divide the edge of a leaf cell.
-        box, viewpoint, progress, **limits
-            As for :meth:`Map.mesh`.
-
-        Returns
-        -------
-        trimesh.Trimesh
-            World frame, m, with the attributes and metadata of :meth:`Map.mesh`.
-
-        Raises
-        ------
-        ValueError, MemoryError
-            If an argument is out of range, or the mesh exceeds the memory: :meth:`export` writes 3D Tiles one by one.
-        """
-        return self._mesh_seen_from(viewpoint, voxel_size, box=box, progress=progress, **limits)
-
     def _surface_mesh(self, voxel_size: float, **wanted: Any) -> trimesh.Trimesh:
         from radarsdf.tiles.mesh import mesh_of  # noqa: PLC0415 - trimesh is slow to import
 
         return mesh_of(self, voxel_size, **wanted)
 
-    def cells_near(self, lower: _Floats, upper: _Floats) -> queries.CellsInBox:
+    def cells_near(self, lower: Floats, upper: Floats) -> CellsInBox:
         """Each cell belongs to the tile that contains it; cells of unfinished tiles are unknown."""
         lattice, edge = self.config.lattice, self.plan.tile_cells
         first = np.floor(lattice.cells(lower)).astype(np.int64)
@@ -110,33 +79,28 @@ class TiledMap(TileBlend):
             if (start < stop).all():
                 x, y, z = (stop - start).tolist()
                 here = start - self.plan.origin_cells(planned.tile)
-                found = queries.dense_cells(self.contents_of(planned.tile), here, (x, y, z))
+                found = dense_cells(self.contents_of(planned.tile), here, (x, y, z))
                 place = tuple(slice(a, b) for a, b in zip(start - first, stop - first, strict=True))
                 passed[place], returns[place], observed[place] = found
-        return queries.CellsInBox(lattice.position(first), passed, returns, observed)
+        return CellsInBox(lattice.position(first), passed, returns, observed)
 
     def view_statistics(self) -> ViewStatisticsAt:
         """View statistics of each cell come from its own tile."""
-        scale = self.intensity_scale
-        ends = (0.0, 1.0) if scale is None else (scale.low, scale.high)
         found = []
         for planned in self.tiles:
-            contents = self.contents_of(planned.tile)
-            view_statistics = contents.view_statistics().in_world(contents.origin, *ends)
-            cells = np.floor(self.config.lattice.cells(view_statistics.points)[:, :2])
-            found.append(view_statistics.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
+            of_tile = self.contents_of(planned.tile).views_in_world()
+            cells = np.floor(self.config.lattice.cells(of_tile.points)[:, :2])
+            found.append(of_tile.select((cells // self.plan.tile_cells == planned.tile).all(axis=1)))
         return ViewStatisticsAt.together(found)
 
-    def _viewed_from(self, position: _Floats, range_m: float) -> ViewedMap:
+    def _viewed_from(self, position: Floats, range_m: float) -> ViewedMap:
         from radarsdf.tiles.mesh import viewed_tiles  # noqa: PLC0415 - as above
 
-        tiles = []
-        for planned in self.tiles:
-            lower = self.plan.grid.lower_corner(planned.tile)
-            nearest = np.clip(position[:2], lower, lower + self.plan.tile_m)
-            if np.linalg.norm(nearest - position[:2]) <= range_m:
-                tiles.append(planned.tile)
-        tiles = tiles or [self.tiles[0].tile]  # far from all tiles, any tile shows nothing
+        tiles = [tile.tile for tile in self.tiles]
+        lower = np.array([self.plan.grid.lower_corner(tile) for tile in tiles])
+        away = np.clip(position[:2], lower, lower + self.plan.tile_m) - position[:2]
+        near = np.flatnonzero(np.linalg.norm(away, axis=1) <= range_m)
+        tiles = [tiles[i] for i in near] or tiles[:1]  # far from all tiles, any tile shows nothing
         if self._viewed is None or self._viewed[0] != tiles:
             self._viewed = tiles, viewed_tiles(self, tiles)
         return self._viewed[1]
@@ -144,7 +108,7 @@ class TiledMap(TileBlend):
     def export(
         self,
         path: str | PathLike[str],
-        voxel_size: float = queries.VOXEL_M,
+        voxel_size: float = VOXEL_M,
         *,
         progress: bool | None = None,
         **limits: Any,
@@ -175,7 +139,7 @@ class TiledMap(TileBlend):
         return export_mesh(self, path, voxel_size, progress, **limits)
 
     def threshold(
-        self, voxel_size: float = queries.VOXEL_M, *, progress: bool | None = None, **limits: Any
+        self, voxel_size: float = VOXEL_M, *, progress: bool | None = None, **limits: Any
     ) -> Threshold:
         """Expected precision and coverage of a mesh, computed per tile without a mesh of the whole map.
 
@@ -191,7 +155,8 @@ class TiledMap(TileBlend):
         """
         from radarsdf.tiles.mesh import parts_of  # noqa: PLC0415 - as above
 
-        return parts_of(self, voxel_size, progress, **limits)[2]
+        _, wanted, tally = parts_of(self, voxel_size, progress, **limits)
+        return tally.threshold(wanted.min_confidence)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Copy the plan and the maps of finished tiles to a new folder for :func:`radarsdf.load`.
@@ -215,7 +180,7 @@ class TiledMap(TileBlend):
         self.plan.save(folder)  # last: without it, the folder is no map
 
     @property
-    def origin(self) -> _Floats:
+    def origin(self) -> Floats:
         """(3,) origin of the middle tile, world, m, for coordinates near zero."""
         return self.config.lattice.position(self.tiles[len(self.tiles) // 2].origin_cells)
 
@@ -246,7 +211,7 @@ class TiledMap(TileBlend):
         return sum(len(self.leaf_cells(tile.tile, tile.tile)) for tile in self.tiles)
 
     @cached_property
-    def extent(self) -> _Floats:
+    def extent(self) -> Floats:
         """(2, 3) lower and upper corner of all leaf cells, world, m."""
         of_tiles = [cells for tile in self.tiles if len(cells := self.leaf_cells(tile.tile, tile.tile))]
         lower = np.min([cells.min(axis=0) for cells in of_tiles], axis=0)
@@ -278,7 +243,7 @@ def load(path: str | PathLike[str]) -> Map:
         If it is no radarsdf map, is damaged, of another version, or cannot be read.
     """
     path = path_of(path, "path")
-    return TiledMap(path) if path.is_dir() else load_file(path)
+    return TiledMap(path) if path.is_dir() else RadarMap(storage.load_contents(path))
 
 
 def lacking(radar_map: Map) -> str:
@@ -288,7 +253,7 @@ def lacking(radar_map: Map) -> str:
     return f"{len(missing)} of {len(radar_map.plan.tiles)} tiles"
 
 
-def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
+def predicted(radar_map: Map, rays: Rays) -> tuple[Rays, Floats]:
     """Predicted intensities (N,) for rays, sensor units, and these rays: those in no tile are left out."""
     found = np.asarray(radar_map.intensity(*rays.in_world(), extrapolate=True), np.float64)
     known = np.isfinite(found)

@@ -10,8 +10,9 @@ from urllib.parse import quote
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats, Ints32
+from radarsdf.checks import check
 from radarsdf.io.files import check_outputs, write_whole
 from radarsdf.products import turned
 from radarsdf.tiles.blend import TileBlend
@@ -31,9 +32,7 @@ def content_folder(path: Path) -> Path:
     return folder
 
 
-def write_tileset(
-    city: TileBlend, path: Path, meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int32]]]
-) -> tuple[int, int]:
+def write_tileset(city: TileBlend, path: Path, meshes: Iterable[tuple[Floats, Ints32]]) -> tuple[int, int]:
     """Write ``NAME.json`` and a GLB file per tile with triangles. Returns the numbers of vertices and triangles.
 
     `meshes`: vertices (V, 3), world, m, and faces (F, 3) of each tile. GLB files hold float32 relative to the origin of the
@@ -59,9 +58,7 @@ def write_tileset(
         )
         corners += [vertices.min(axis=0), vertices.max(axis=0)]
         count += len(vertices), len(faces)
-    if not children:
-        msg = "no tile has a triangle, so there is nothing to write"
-        raise ValueError(msg)
+    check(children, "no tile has a triangle, so there is nothing to write")
     error_m = float(np.ptp(corners, axis=0).max()) * _ERROR_OF_EDGE
     root = {
         "boundingVolume": _box(np.array(corners)),
@@ -76,7 +73,7 @@ def write_tileset(
     return num_vertices, num_faces
 
 
-def _glb(local: NDArray[np.float64], faces: NDArray[np.int32]) -> bytes:
+def _glb(local: Floats, faces: Ints32) -> bytes:
     of_trimesh: Any = trimesh.visual  # incompletely typed
     material = of_trimesh.material.PBRMaterial(
         baseColorFactor=[200, 200, 200, 255], metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
@@ -87,7 +84,7 @@ def _glb(local: NDArray[np.float64], faces: NDArray[np.int32]) -> bytes:
     return bytes(data)
 
 
-def _box(points: NDArray[np.float64]) -> dict[str, Any]:
+def _box(points: Floats) -> dict[str, Any]:
     lower, upper = points.min(axis=0), points.max(axis=0)
     half = np.maximum((upper - lower) / 2, 1e-3)  # a flat box would have no volume
     return {"box": [*((lower + upper) / 2).tolist(), *np.diag(half).ravel().tolist()]}
