@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from radarsdf._core import KeptMemory
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
 from radarsdf.field.neural_field import NeuralField
@@ -63,7 +64,7 @@ def fit_rays(
     """Fit a map to the input that `read` returns. See :func:`radarsdf.fit`, also for errors."""
     try:
         # A map created in inference mode could not compute gradients later.
-        with torch.inference_mode(mode=False), ThreadPool(config.num_threads) as pool:
+        with torch.inference_mode(mode=False), KeptMemory(), ThreadPool(config.num_threads) as pool:
             contents, stop = _fit(read, config, progress, checkpoint, pool)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption

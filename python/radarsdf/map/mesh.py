@@ -13,7 +13,7 @@ import torch
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import vertex_areas
+from radarsdf._core import KeptMemory, vertex_areas
 from radarsdf.checks import MAX_POSITION_M, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
@@ -112,8 +112,9 @@ def extract_mesh(
         raise ValueError(msg)
     limits = Limits.of(voxel_size, **wanted)
     local_box = None if box is None else check_box(box) - contents.origin
-    surface = Surface.of(contents, voxel_size, local_box, progress)
-    return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
+    with KeptMemory():
+        surface = Surface.of(contents, voxel_size, local_box, progress)
+        return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
 
 
 def described_mesh(
