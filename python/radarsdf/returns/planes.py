@@ -18,6 +18,7 @@ LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m wit
 NEIGHBOUR_WEIGHT = 0.7
 MAX_FLATNESS = 0.5  # largest ratio of the smallest to the middle variance of a flat surfel
 MIN_SUPPORT = 12.0  # minimum weighted number of returns in the 27 cells of a surfel
+_PLANES_AT_ONCE = 1 << 14  # their moments and axes stay in the cache
 
 
 @dataclass(frozen=True)
@@ -108,15 +109,23 @@ def neighbour_planes(
     num_threads: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
     """Return centres, normals, widest axes and variances (K, 3) of the surfels at `keys` (K,); see :func:`neighbour_support`."""
-    moments = blocks.neighbour_sums(keys, of_cells, NEIGHBOUR_WEIGHT, num_threads)
-    means = moments[:, 1:10] / moments[:, :1]
-    centres = means[:, :3].copy()
-    covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
-    for mean, (i, j) in zip(means[:, 3:].T, UPPER, strict=True):
-        covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
-    variances, axes = principal_axes(covariance, num_threads)
-    normals = axes[:, :, 0]
-    normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
-    # The lower bound is the resolution of float32 coordinates.
-    widest = axes[:, :, 2].astype(np.float32)
-    return centres, normals, widest, np.maximum(variances, (0.0025 * cell_size_m) ** 2)
+    of_planes = [
+        np.empty((len(keys), 3), dtype) for dtype in (np.float64, np.float64, np.float32, np.float64)
+    ]
+    for first in range(0, len(keys), _PLANES_AT_ONCE):
+        part = slice(first, first + _PLANES_AT_ONCE)
+        moments = blocks.neighbour_sums(keys[part], of_cells, NEIGHBOUR_WEIGHT, num_threads)
+        means = moments[:, 1:10] / moments[:, :1]
+        centres = means[:, :3].copy()
+        covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
+        for mean, (i, j) in zip(means[:, 3:].T, UPPER, strict=True):
+            covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
+        variances, axes = principal_axes(covariance, num_threads)
+        normals = axes[:, :, 0]
+        normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
+        # The lower bound is the resolution of float32 coordinates.
+        variances = np.maximum(variances, (0.0025 * cell_size_m) ** 2)
+        for column, found in zip(of_planes, (centres, normals, axes[:, :, 2], variances), strict=True):
+            column[part] = found
+    centres, normals, widest, variances = of_planes
+    return centres, normals, widest, variances
