@@ -81,7 +81,8 @@ void bind_system(py::module_& m) {
   py::class_<Block>(m, "KeptMemory", "A ``with`` block in which freed memory stays with the process for reuse.")
       .def(py::init<>())
       .def("__enter__", [](Block& block) { block.memory = std::make_unique<KeptMemory>(); })
-      .def("__exit__", [](Block& block, const py::args&) { block.memory.reset(); });
+      .def("__exit__",
+           [](Block& block, const py::object&, const py::object&, const py::object&) { block.memory.reset(); });
   m.def(
       "random_bytes",
       [](std::uint64_t seed, std::int64_t rows, std::int64_t columns) {
