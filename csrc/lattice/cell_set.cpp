@@ -127,12 +127,9 @@ void CellSet::insert_marks(std::int64_t count, int num_threads, const Mark& mark
         Partition& own = partitions_[number];
         for (const Marks& marks : parts) {
           for (const Marks::Entry& entry : marks.of_partition(number)) {
-            std::int32_t found = own.numbers.find(entry.block);
-            if (found < 0) {
-              own.masks.push_back(0);
-              found = static_cast<std::int32_t>(own.masks.size()) - 1;
-              own.numbers.insert(entry.block, found);
-            }
+            const auto next = static_cast<std::int32_t>(own.masks.size());
+            const std::int32_t found = own.numbers.find_or_insert(entry.block, next);
+            if (found == next) own.masks.push_back(0);
             own.masks[static_cast<std::size_t>(found)] |= entry.mask;
           }
         }

@@ -77,16 +77,22 @@ class FlatMap {
 
   // Returns false, and keeps the old value, if the key is present.
   bool insert(std::uint64_t key, std::int32_t value) {
+    const std::size_t before = size_;
+    find_or_insert(key, value);
+    return size_ > before;
+  }
+
+  // The value of a key, which is inserted with this value unless it is present.
+  std::int32_t find_or_insert(std::uint64_t key, std::int32_t value) {
     if (2 * (size_ + 1) > slots_.size()) grow();
     const FlatMapView table = view();
-    for (std::uint64_t i = table.home(key);; i = (i + 1) & table.mask) {
-      if (slots_[i].key == key) return false;
-      if (slots_[i].key == kEmptyKey) {
-        slots_[i] = {key, value};
-        ++size_;
-        return true;
-      }
+    std::uint64_t i = table.home(key);
+    while (slots_[i].key != key && slots_[i].key != kEmptyKey) i = (i + 1) & table.mask;
+    if (slots_[i].key == kEmptyKey) {
+      slots_[i] = {key, value};
+      ++size_;
     }
+    return slots_[i].value;
   }
 
  private:

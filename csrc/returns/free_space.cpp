@@ -26,12 +26,12 @@ template <typename Block>
 class Blocks {
  public:
   Block& at(std::uint64_t key) {
-    if (rows_.insert(key, static_cast<std::int32_t>(blocks.size()))) {
+    const auto next = static_cast<std::int32_t>(blocks.size()), found = rows_.find_or_insert(key, next);
+    if (found == next) {
       keys.push_back(key);
       blocks.push_back({});
-      return blocks.back();
     }
-    return blocks[static_cast<std::size_t>(rows_.find(key))];
+    return blocks[static_cast<std::size_t>(found)];
   }
   void clear() {
     rows_.clear();

@@ -47,11 +47,9 @@ void check_scans(const std::int32_t* scans, std::int64_t count) {
 }  // namespace
 
 ReachedCubes::Block& ReachedCubes::block_at(std::uint64_t key) {
-  const std::int32_t found = numbers_.find(key);
-  if (found >= 0) return blocks_[static_cast<std::size_t>(found)];
-  numbers_.insert(key, static_cast<std::int32_t>(blocks_.size()));
-  blocks_.push_back({key, 0});
-  return blocks_.back();
+  const auto next = static_cast<std::int32_t>(blocks_.size()), found = numbers_.find_or_insert(key, next);
+  if (found == next) blocks_.push_back({key, 0});
+  return blocks_[static_cast<std::size_t>(found)];
 }
 
 void ReachedCubes::trace(const float* point, const float* direction, double range_m, double leaf_size_m) {

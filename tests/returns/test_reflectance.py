@@ -65,7 +65,7 @@ def test_with_a_network_the_prediction_is_the_mean_of_two(rays):
 
 
 def test_a_network_is_asked_at_groups_along_unit_vectors(rays, monkeypatch):
-    monkeypatch.setattr(reflectance, "_MOST_ASKED", 1000)
+    monkeypatch.setattr(reflectance, "_MOST_RETURNS", 1000)
     asked = []
 
     def network(points, directions, _):

@@ -6,10 +6,11 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf._core import SurfelMap, cell_keys
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.returns.ghosts import find_ghosts
+from radarsdf.returns.ghosts import find_ghosts, first_crossed
 from radarsdf.returns.noise import SensorNoise, onto_surfels, sensor_noise
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
+from radarsdf.returns.sums import MeanRays, ScanSums
 
 from .walls import a_wall
 
@@ -169,3 +170,24 @@ def test_a_rough_surface_keeps_its_shape():
     }
     assert kept[0.01] > 0.95
     assert kept[0.1] < 0.3  # the grooves are below the noise of this sensor
+
+
+def test_ghosts_of_mean_rays_are_found_around_a_sample_of_them(monkeypatch):
+    points, poses, is_ghost = a_wall(ghosts=40)
+    rays = prepare(points, poses)
+    sums = ScanSums.of(rays, LEAF_M)
+    surfels, means = Surfels.of_sums(sums), MeanRays.of_sums(sums)
+    followed = []
+
+    def counted(surfels, planes, rays, *rest, **options):
+        followed.append(len(rays.keys))
+        return first_crossed(surfels, planes, rays, *rest, **options)
+
+    monkeypatch.setattr("radarsdf.returns.ghosts.first_crossed", counted)
+    found = find_ghosts(surfels, means, surfels.cells_of_leaves(means.keys), NOISE)[
+        surfels.cells_at(rays.points)
+    ]
+    assert found[is_ghost].mean() > 0.9
+    assert found[~is_ghost].mean() < 0.01
+    sampled, near = followed[:2]
+    assert 0 < near < 0.8 * (len(means.keys) - sampled)

@@ -20,6 +20,7 @@ from radarsdf.fitting.average import BAND_CELLS, TRUNCATION_CELLS
 from radarsdf.fitting.sampling import NEAR_BAND_CELLS, seen_jointly
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.memory import available_bytes
+from radarsdf.returns.ghosts import FEWEST_SAMPLED
 from radarsdf.returns.rays import Rays, prepare
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.threads import resolve_num_threads
@@ -191,6 +192,9 @@ def skipped_parts(
     if not config.train:
         what = "training of the surface: returns are averaged, and not moved onto planes"
         skipped.append((what, surface_s - now_s))
+        if config.returns.drop_ghosts:
+            why = f"none of {FEWEST_SAMPLED} or more sampled rays there crosses a surface"
+            skipped.append((f"the search for ghosts in blocks of cells where {why}", None))
     if not config.returns.free_space:
         skipped.append(("free space, which grids and comparisons need (returns.free_space)", None))
     if not network:

@@ -28,6 +28,8 @@ _MIN_OPACITY = 0.5  # share of the rays reaching a surface that end there. A hed
 _REACH_SIGMAS = 3**0.5
 # Share of the returns near a ghost that are behind a surface too. It is lower near a noisy return.
 _MIN_SHARE = 0.5
+# Where none of `FEWEST_SAMPLED` rays crosses a surface, at a significance level of 0.001 fewer than `_MIN_SHARE` do: (1 - 0.5)¹⁰.
+FEWEST_SAMPLED = 10
 
 
 def find_ghosts(
@@ -35,7 +37,9 @@ def find_ghosts(
 ) -> Bools:
     """Return a mask (C,) of the cells of `surfels` that hold ghosts.
 
-    `rays`: all, or the fewer mean rays of leaf cells; `cell_of_ray` (N,): the cell in which each ends.
+    `rays`: all, or the fewer mean rays of leaf cells; `cell_of_ray` (N,): the cell in which each ends. Mean rays are
+    sampled first, every fourth: the others of a block of 4 × 4 × 4 cells are followed only if one of the sample crosses a
+    surface, or the sample is too small to exclude ghosts.
     """
     weights = rays.counts if isinstance(rays, MeanRays) else None
 
@@ -44,12 +48,47 @@ def find_ghosts(
         return counted.astype(np.float64)
 
     flat = np.flatnonzero(surfels.is_flat())
-    first = first_crossed(surfels, flat, rays, noise, num_threads)
+    if isinstance(rays, MeanRays):
+        first = _first_crossed_near_sample(surfels, flat, rays, cell_of_ray, noise, num_threads)
+    else:
+        first = first_crossed(surfels, flat, rays, noise, num_threads)
     passed = np.zeros(len(surfels.keys))
     passed[surfels.cell_of_plane[flat]] = count(first, first >= 0, len(flat))
     opaque = are_opaque(surfels, flat, passed, num_threads)
     behind = are_behind(surfels, flat[opaque], first >= 0, rays, noise, num_threads)
     return mostly_behind(surfels, count(cell_of_ray, behind, len(surfels.keys)), num_threads)
+
+
+def _first_crossed_near_sample(
+    surfels: Surfels,
+    planes: Ints,
+    rays: MeanRays,
+    cell_of_ray: Ints32,
+    noise: SensorNoise,
+    num_threads: int,
+) -> Ints32:
+    """Return :func:`first_crossed` of mean rays, -1 without search where a sample excludes ghosts.
+
+    Measured: on `hugin` and `facade` 0.4 of the rays are not followed, on `wall` 0.7. F-all of `hall`, `yard`, `tunnel`,
+    `car_park`, `facade` and `oculii` differs by -0.09 to +0.05, in the mean by -0.01.
+    """
+    # Two opposite ones of the eight leaf cells of a surfel: a quarter of any plane of leaf cells, whatever the other scans.
+    octant = rays.keys & np.uint64(7)
+    sampled = (octant == 0) | (octant == 7)
+    first = np.full(len(sampled), -1, np.int32)
+
+    def follow(rows: Ints) -> None:
+        first[rows] = first_crossed(surfels, planes, rays.select(rows), noise, num_threads)
+
+    rows = np.flatnonzero(sampled)
+    follow(rows)
+    blocks = surfels.keys[cell_of_ray] >> np.uint64(6)
+    block = np.cumsum(np.diff(blocks, prepend=blocks[:1]) != 0)
+    counts, crossing = (
+        np.bincount(block[rows[of]], minlength=len(rays.keys)) for of in (slice(None), first[rows] >= 0)
+    )
+    follow(np.flatnonzero(~sampled & ~((counts >= FEWEST_SAMPLED) & (crossing == 0))[block]))
+    return first
 
 
 def first_crossed(

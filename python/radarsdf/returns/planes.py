@@ -18,6 +18,7 @@ LEAVES_PER_SURFEL = 2  # leaf cells along the edge of a surfel's cell: 0.4 m wit
 NEIGHBOUR_WEIGHT = 0.7
 MAX_FLATNESS = 0.5  # largest ratio of the smallest to the middle variance of a flat surfel
 MIN_SUPPORT = 12.0  # minimum weighted number of returns in the 27 cells of a surfel
+_PLANES_AT_ONCE = 1 << 14  # their moments and axes stay in the cache
 
 
 @dataclass(frozen=True)
@@ -98,15 +99,20 @@ def neighbour_planes(
     support = blocks.neighbour_sums(keys, counts, NEIGHBOUR_WEIGHT, num_threads)[:, 0]
     # Most cells have few returns: surfels for all of them would dominate time and memory.
     cell_of_plane = np.flatnonzero(support >= MIN_SUPPORT)
-    moments = blocks.neighbour_sums(keys[cell_of_plane], of_cells, NEIGHBOUR_WEIGHT, num_threads)
-    means = moments[:, 1:10] / moments[:, :1]
-    centres = means[:, :3].copy()
-    covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
-    for mean, (i, j) in zip(means[:, 3:].T, UPPER, strict=True):
-        covariance[:, i, j] = covariance[:, j, i] = mean - centres[:, i] * centres[:, j]
-    variances, axes = principal_axes(covariance, num_threads)
-    normals = axes[:, :, 0]
-    normals = np.where(np.einsum("ni,ni->n", normals, moments[:, 10:]) > 0, -1.0, 1.0)[:, None] * normals
+    centres, normals, variances = (np.empty((len(cell_of_plane), 3)) for _ in range(3))
+    widest = np.empty((len(cell_of_plane), 3), np.float32)
+    for first in range(0, len(cell_of_plane), _PLANES_AT_ONCE):
+        part = slice(first, first + _PLANES_AT_ONCE)
+        moments = blocks.neighbour_sums(keys[cell_of_plane[part]], of_cells, NEIGHBOUR_WEIGHT, num_threads)
+        means = moments[:, 1:10] / moments[:, :1]
+        centre = centres[part] = means[:, :3]
+        covariance = np.empty((len(means), 3, 3))  # all nine numbers are written below
+        for mean, (i, j) in zip(means[:, 3:].T, UPPER, strict=True):
+            covariance[:, i, j] = covariance[:, j, i] = mean - centre[:, i] * centre[:, j]
+        variances[part], axes = principal_axes(covariance, num_threads)
+        away = np.einsum("ni,ni->n", axes[:, :, 0], moments[:, 10:]) > 0
+        normals[part] = np.where(away, -1.0, 1.0)[:, None] * axes[:, :, 0]
+        widest[part] = axes[:, :, 2]
     # The lower bound is the resolution of float32 coordinates.
     variances = np.maximum(variances, (0.0025 * cell_size_m) ** 2)
-    return support, cell_of_plane, centres, normals, variances, axes[:, :, 2].astype(np.float32)
+    return support, cell_of_plane, centres, normals, variances, widest

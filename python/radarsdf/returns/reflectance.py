@@ -28,10 +28,13 @@ _KINDS = np.array([
 _TILINGS = 4  # two have 1 to 2 % more error, eight 0 to 1 % less
 _SHRINKAGE = 4.0  # 3 to 10 differ by less than 1 %
 _ROUNDS = 2  # four are no better
-# More returns are grouped by place and view, with 1 to 2 % more error: ungrouped means would take 128 bytes a return. A
-# network, evaluated for each group, takes longer than means and has smaller residuals.
-_MOST_RETURNS, _MOST_ASKED = 200_000, 50_000
-_GROUPS = np.array([[2.5, 0.25, 0.12]])  # a kind of cells, as above
+# More returns are grouped by place and view: a third of the time of cell means, and 0.2 to 0.8 % more error. A network,
+# evaluated for each group, takes longer than means and has smaller residuals, so its groups are larger.
+_MOST_RETURNS = 50_000
+_GROUPS, _GROUPS_ASKED = (
+    np.array([[1.5, 0.2, 0.1]]),
+    np.array([[2.5, 0.25, 0.12]]),
+)  # kinds of cells, as above
 _CORRELATION = 0.1  # intra-group correlation: the effective number of n returns is n / (1 + 0.1 (n - 1))
 _LEAST_MEAN = 0.005  # smallest stored mean, share of the intensity range. A third are smaller and useless
 
@@ -101,8 +104,8 @@ class Reflectance:
         points, directions, ranges_m = rays.in_c_order()
         plane = surfels.flat_planes_at(points, num_threads)
         incidence, kinds = _incidence(normals, plane, directions), kinds_of(normals, plane)
-        most = _MOST_RETURNS if ask is None else _MOST_ASKED
-        groups = _Groups.of(points, directions, incidence, leaf_size_m, most)
+        kind = _in_metres(_GROUPS if ask is None else _GROUPS_ASKED, leaf_size_m)
+        groups = _Groups.of(points, directions, incidence, kind)
         times, share = 1.0, 0.0
         if ask is not None:
             unit_vectors = groups.directions / np.linalg.norm(groups.directions, axis=1, keepdims=True)
@@ -173,12 +176,10 @@ class _Groups:
     counts: Floats  # (G,) number of returns
 
     @classmethod
-    def of(
-        cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, leaf_size_m: float, most: int
-    ) -> _Groups:
-        if len(points) <= most:
+    def of(cls, points: Floats32, directions: Floats32, incidence_rad: Floats32, kind: Floats) -> _Groups:
+        if len(points) <= _MOST_RETURNS:
             return cls(None, points, directions, np.ones(len(points)))
-        rows, count = cell_rows(_in_metres(_GROUPS, leaf_size_m), points, directions, incidence_rad)
+        rows, count = cell_rows(kind, points, directions, incidence_rad)
         counts = np.bincount(rows, minlength=count).astype(np.float64)
         means = [
             _divided(np.stack([np.bincount(rows, column, count) for column in columns.T], 1), counts)
