@@ -37,9 +37,6 @@ Vec3 rotate(const double* pose, const Vec3& vector) {
 
 Vec3 translation(const double* pose) { return {pose[3], pose[7], pose[11]}; }
 
-// In single precision, as the directions of rays.
-Vec3 single(const Vec3& v) { return {double{float(v[0])}, double{float(v[1])}, double{float(v[2])}}; }
-
 // A return in the sensor frame.
 struct Beam {
   Vec3 point, direction;
@@ -159,7 +156,7 @@ const LocalPlanes::Plane& LocalPlanes::plane(std::uint64_t key) const {
   return known != planes_.end() ? known->second : planes_.emplace(key, plane_of(key)).first->second;
 }
 
-std::optional<LocalPlanes::Residual> LocalPlanes::residual(const Vec3& point, const Vec3& direction, double range_m,
+std::optional<LocalPlanes::Residual> LocalPlanes::residual(const Vec3& point, const float* direction, double range_m,
                                                            const Vec3& up, const ReturnVariances& noise) const {
   const auto cell = key(point);
   if (!cell) return std::nullopt;
@@ -173,7 +170,7 @@ std::optional<LocalPlanes::Residual> LocalPlanes::residual(const Vec3& point, co
     spread += along * along / here.variances[a];
   }
   const double of_plane = here.variances[0] / here.count * spread;
-  const double of_return = variance_along(here.axes[0], direction, range_m, up, noise);
+  const double of_return = variance_along(here.axes[0], vec3(direction), range_m, up, noise);
   return Residual{dot(off, here.axes[0]), of_return + of_plane + kLeastM2, &here};
 }
 
@@ -186,7 +183,9 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
   std::vector<Row> rows;
   std::vector<double> squares;
   for (const Beam& beam : beams_of(points, count)) {
-    const Vec3 arm = rotate(pose, beam.point), direction = single(rotate(pose, beam.direction));
+    const Vec3 arm = rotate(pose, beam.point);
+    float direction[3];
+    store(rotate(pose, beam.direction), direction);
     const auto found = residual(arm + translation(pose), direction, beam.range_m, up, noise);
     if (!found) continue;
     Row row{found->value, found->variance, {}};
@@ -230,9 +229,10 @@ void LocalPlanes::scores(const double* points, std::int64_t count, const double*
     const double* pose = poses + 16 * k;
     const Vec3 up{pose[2], pose[6], pose[10]};
     for (const Beam& beam : beams) {
-      const Vec3 direction = rotate(pose, beam.direction);
-      const Vec3 point = beam.range_m * direction + translation(pose);
-      const auto found = residual(point, single(direction), beam.range_m, up, noise);
+      const Vec3 exact = rotate(pose, beam.direction);
+      float direction[3];
+      store(exact, direction);
+      const auto found = residual(beam.range_m * exact + translation(pose), direction, beam.range_m, up, noise);
       *scores++ = found ? 1 / (1 + found->value * found->value / (kSigmas2 * found->variance)) : 0.0;
     }
   }

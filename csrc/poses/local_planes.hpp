@@ -60,7 +60,8 @@ class LocalPlanes {
   Moments moments(const Vec3& point, std::uint64_t key) const;
   Plane plane_of(std::uint64_t key) const;
   const Plane& plane(std::uint64_t key) const;
-  std::optional<Residual> residual(const Vec3& point, const Vec3& direction, double range_m, const Vec3& up,
+  // direction: an array, as gcc 12 -O3 leaves out the rounding of a Vec3 to float and back.
+  std::optional<Residual> residual(const Vec3& point, const float* direction, double range_m, const Vec3& up,
                                    const ReturnVariances& noise) const;
 
   double cell_size_m_;
