@@ -15,25 +15,21 @@ void bind_cells(py::module_& m, py::class_<CellSet>& cls) {
   m.def(
       "cell_keys",
       [](const Array<T>& points, double leaf_size_m, int num_threads) {
-        std::vector<std::uint64_t> keys(static_cast<std::size_t>(check_points(points)));
-        const T* p = points.data();
-        {
-          const py::gil_scoped_release release;
-          cell_keys(p, static_cast<std::int64_t>(keys.size()), leaf_size_m, keys.data(), num_threads);
-        }
-        return to_array(std::move(keys));
+        const std::int64_t count = check_points(points);
+        Array<std::uint64_t> keys = new_array<std::uint64_t>(count);
+        without_gil([&] { cell_keys(points.data(), count, leaf_size_m, keys.mutable_data(), num_threads); });
+        return keys;
       },
-      "points"_a.noconvert(), "leaf_size_m"_a, "num_threads"_a = 0,
+      "points"_array, "leaf_size_m"_a, "num_threads"_a = 0,
       "Morton key (N,) uint64 of the leaf cell of each point (N, 3), local frame, m.");
   cls.def(
       "insert",
       [](CellSet& cells, const Array<T>& points, int num_threads) {
         const std::int64_t count = check_points(points);
-        const T* p = points.data();
         const py::gil_scoped_release release;
-        cells.insert(p, count, num_threads);
+        cells.insert(points.data(), count, num_threads);
       },
-      "points"_a.noconvert(), "num_threads"_a = 0, "Inserts the leaf cells of points (N, 3), local frame, m.");
+      "points"_array, "num_threads"_a = 0, "Inserts the leaf cells of points (N, 3), local frame, m.");
 }
 
 }  // namespace
@@ -48,12 +44,11 @@ void bind_cell_set(py::module_& m) {
           [](CellSet& cells, const Array<float>& points, const Array<float>& directions, const Array<float>& offsets_m,
              int num_threads) {
             const std::int64_t count = check_points(points), num_offsets = check_column(offsets_m, "offsets_m");
-            check_shape(directions, count, 3, "directions");
-            const float *p = points.data(), *d = directions.data(), *o = offsets_m.data();
+            check_shape(directions, {count, 3}, "directions");
             const py::gil_scoped_release release;
-            cells.insert_along(p, d, count, o, num_offsets, num_threads);
+            cells.insert_along(points.data(), directions.data(), count, offsets_m.data(), num_offsets, num_threads);
           },
-          "points"_a.noconvert(), "directions"_a.noconvert(), "offsets_m"_a.noconvert(), "num_threads"_a = 0,
+          "points"_array, "directions"_array, "offsets_m"_array, "num_threads"_a = 0,
           "Inserts the leaf cells of the points at distances `offsets_m` (K,) float32 behind the points (N, 3) float32 "
           "along the unit `directions` (N, 3) float32 of their rays, local frame, m.")
       .def(
@@ -61,38 +56,26 @@ void bind_cell_set(py::module_& m) {
           [](CellSet& cells, const Array<float>& points, const Array<float>& directions, double reach_m,
              int num_threads) {
             const std::int64_t count = check_points(points);
-            check_shape(directions, count, 3, "directions");
-            const float *p = points.data(), *d = directions.data();
+            check_shape(directions, {count, 3}, "directions");
             const py::gil_scoped_release release;
-            cells.insert_rays(p, d, count, reach_m, num_threads);
+            cells.insert_rays(points.data(), directions.data(), count, reach_m, num_threads);
           },
-          "points"_a.noconvert(), "directions"_a.noconvert(), "reach_m"_a, "num_threads"_a = 0,
+          "points"_array, "directions"_array, "reach_m"_a, "num_threads"_a = 0,
           "Inserts the leaf cells that rays cross within `reach_m` before and behind their points (N, 3) float32, "
           "local frame, m; `directions` are unit vectors (N, 3) float32.")
       .def(
           "sorted_keys",
           [](const CellSet& cells, int num_threads) {
-            std::vector<std::uint64_t> keys;
-            {
-              const py::gil_scoped_release release;
-              keys = cells.sorted_keys(num_threads);
-            }
-            return to_array(std::move(keys));
+            return to_array(without_gil([&] { return cells.sorted_keys(num_threads); }));
           },
           "num_threads"_a = 0, "Ascending Morton keys of the cells (C,) uint64.");
   m.def(
       "stable_order",
       [](const Array<std::uint64_t>& keys) {
         const std::int64_t count = check_column(keys, "keys");
-        const std::uint64_t* k = keys.data();
-        std::vector<std::int32_t> order;
-        {
-          const py::gil_scoped_release release;
-          order = stable_order(k, count);
-        }
-        return to_array(std::move(order));
+        return to_array(without_gil([&] { return stable_order(keys.data(), count); }));
       },
-      "keys"_a.noconvert(), "Permutation (N,) int32 that sorts `keys` (N,) uint64 in ascending order, stably.");
+      "keys"_array, "Permutation (N,) int32 that sorts `keys` (N,) uint64 in ascending order, stably.");
   m.def(
       "gather_rows",
       [](const std::vector<Array<float>>& blocks, const Array<std::int32_t>& order, Array<float>& out,
@@ -107,16 +90,12 @@ void bind_cell_set(py::module_& m) {
           columns += block.shape(1);
           matrices.push_back({block.data(), block.shape(1)});
         }
-        check_shape(out, count, columns, "out");
-        const std::int32_t* from = order.data();
-        if (std::any_of(from, from + count, [&](std::int32_t row) { return row < 0 || row >= rows; })) {
-          throw std::invalid_argument("order must lie in [0, rows)");
-        }
-        float* to = out.mutable_data();
+        check_shape(out, {count, columns}, "out");
+        check_numbers(order, 0, rows, "order");
         const py::gil_scoped_release release;
-        gather_rows(matrices, from, count, to, num_threads);
+        gather_rows(matrices, order.data(), count, out.mutable_data(), num_threads);
       },
-      "blocks"_a.noconvert(), "order"_a.noconvert(), "out"_a.noconvert(), "num_threads"_a = 0,
+      "blocks"_array, "order"_array, "out"_array, "num_threads"_a = 0,
       "Writes the rows `order` (M,) int32 of `blocks` (N, W) float32, concatenated, to `out` (M, sum of the W) "
       "float32.");
   bind_cells<float>(m, cell_set);

@@ -6,22 +6,6 @@
 #include "returns/growing_sums.hpp"
 
 namespace radarsdf {
-namespace {
-
-RaysOfScan check_scan(const Array<float>& points, const Array<float>& directions, const Array<float>& ranges_m) {
-  const std::int64_t count = check_points(points);
-  check_shape(directions, count, 3, "directions");
-  if (check_column(ranges_m, "ranges_m") != count) throw std::invalid_argument("ranges_m must be one for each point");
-  return {points.data(), directions.data(), ranges_m.data(), count};
-}
-
-py::array_t<std::int64_t> matrix(std::vector<std::int64_t> values) {
-  const auto rows = static_cast<py::ssize_t>(values.size()) / kSums;
-  return to_array(std::move(values)).reshape({rows, py::ssize_t{kSums}});
-}
-
-}  // namespace
-
 void bind_growing_sums(py::module_& m) {
   using namespace py::literals;
   py::class_<SumsChange>(m, "SumsChange", "Change of `GrowingSums` by added and removed scans.")
@@ -30,12 +14,12 @@ void bind_growing_sums(py::module_& m) {
           "collect",
           [](SumsChange& change, const Array<float>& points, const Array<float>& directions,
              const Array<float>& ranges_m, int sign) {
-            const RaysOfScan rays = check_scan(points, directions, ranges_m);
+            const std::int64_t count = check_rays(points, directions, ranges_m);
             if (sign != 1 && sign != -1) throw std::invalid_argument("sign must be 1 or -1");
             const py::gil_scoped_release release;
-            change.collect(rays, sign);
+            change.collect({points.data(), directions.data(), ranges_m.data(), count}, sign);
           },
-          "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "sign"_a,
+          "points"_array, "directions"_array, "ranges_m"_array, "sign"_a,
           "Adds (1) or removes (-1) a scan: `points`, `directions` (N, 3), `ranges_m` (N,) float32, local frame, m.")
       .def(
           "block_keys", [](const SumsChange& change) { return to_array(change.block_keys()); },
@@ -50,11 +34,7 @@ void bind_growing_sums(py::module_& m) {
       .def(
           "apply",
           [](GrowingSums& sums, const SumsChange& change) {
-            ChangedBlocks changed;
-            {
-              const py::gil_scoped_release release;
-              changed = sums.apply(change);
-            }
+            ChangedBlocks changed = without_gil([&] { return sums.apply(change); });
             return py::make_tuple(to_array(std::move(changed.returns)), to_array(std::move(changed.visibility)));
           },
           "change"_a,
@@ -67,16 +47,11 @@ void bind_growing_sums(py::module_& m) {
           "sums_of",
           [](const GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
             const std::int64_t count = check_column(block_keys, "block_keys");
-            const std::uint64_t* keys = block_keys.data();
-            SumsOfCells found;
-            {
-              const py::gil_scoped_release release;
-              found = sums.sums_of(keys, count);
-            }
-            return py::make_tuple(to_array(std::move(found.keys)), matrix(std::move(found.sums)),
+            SumsOfCells found = without_gil([&] { return sums.sums_of(block_keys.data(), count); });
+            return py::make_tuple(to_array(std::move(found.keys)), to_matrix(std::move(found.sums), kSums),
                                   to_array(std::move(found.scans)));
           },
-          "block_keys"_a.noconvert(),
+          "block_keys"_array,
           "Contents of the blocks with ascending keys (B,): Morton keys (C,) of the leaf cells with returns, their "
           "sums (C, 14) int64, and numbers of scans (C,) uint32.")
       .def(
@@ -85,7 +60,7 @@ void bind_growing_sums(py::module_& m) {
             VisibilityOfBlocks found = sums.visibility_of(block_keys.data(), check_column(block_keys, "block_keys"));
             return py::make_tuple(to_array(std::move(found.keys)), to_array(std::move(found.visibility)));
           },
-          "block_keys"_a.noconvert(),
+          "block_keys"_array,
           "Keys and visibility counts, uint32, of those blocks with ascending keys (B,) that are stored.")
       .def(
           "insert",
@@ -94,24 +69,23 @@ void bind_growing_sums(py::module_& m) {
              const Array<std::uint32_t>& visibility) {
             const std::int64_t cells = check_column(keys, "keys"),
                                blocks = check_column(visibility_keys, "visibility_keys");
-            check_shape(of_cells, cells, kSums, "sums");
-            if (check_column(scans, "scans") != cells || check_column(visibility, "visibility") != blocks) {
-              throw std::invalid_argument("scans must be one for each cell, visibility one for each block");
-            }
+            check_shape(of_cells, {cells, kSums}, "sums");
+            check_shape(scans, {cells}, "scans");
+            check_shape(visibility, {blocks}, "visibility");
             sums.insert({{keys.data(), keys.data() + cells},
                          {of_cells.data(), of_cells.data() + kSums * cells},
                          {scans.data(), scans.data() + cells}},
                         {{visibility_keys.data(), visibility_keys.data() + blocks},
                          {visibility.data(), visibility.data() + blocks}});
           },
-          "keys"_a.noconvert(), "sums"_a.noconvert(), "scans"_a.noconvert(), "visibility_keys"_a.noconvert(),
-          "visibility"_a.noconvert(), "Inserts blocks returned by `sums_of` and `visibility_of`.")
+          "keys"_array, "sums"_array, "scans"_array, "visibility_keys"_array, "visibility"_array,
+          "Inserts blocks returned by `sums_of` and `visibility_of`.")
       .def(
           "erase",
           [](GrowingSums& sums, const Array<std::uint64_t>& block_keys) {
             sums.erase(block_keys.data(), check_column(block_keys, "block_keys"));
           },
-          "block_keys"_a.noconvert(), "Removes blocks with their sums and visibility counts.");
+          "block_keys"_array, "Removes blocks with their sums and visibility counts.");
 }
 
 }  // namespace radarsdf

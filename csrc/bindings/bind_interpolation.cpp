@@ -14,13 +14,10 @@ void scatter_by(const VertexTable& table, const Array<T>& points, const Array<st
                 const std::optional<Array<T>>& directions, const Rows<T>& out_grad, Array<T>& features_grad,
                 const By& by) {
   const PointBatch<T> batch = point_batch(table, points, located, directions);
-  check_features(table, features_grad);
-  check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
-  const std::int64_t stride = row_stride(out_grad, "out_grad");
-  const T* grad = out_grad.data();
-  T* result = features_grad.mutable_data();
+  check_shape(features_grad, {table.num_rows(), kFeatureDim}, "features_grad");
+  const std::int64_t stride = row_stride(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
   const py::gil_scoped_release release;
-  by(batch, grad, stride, result);
+  by(batch, out_grad.data(), stride, features_grad.mutable_data());
 }
 
 template <typename T>
@@ -33,13 +30,11 @@ void bind_kernels(py::class_<VertexTable>& cls) {
       "locate",
       [](const VertexTable& table, const Array<T>& points, Located& located, int num_threads) {
         const std::int64_t count = check_points(points);
-        check_shape(located, count, table.num_levels(), "located");
-        const T* p = points.data();
-        std::int32_t* found = located.mutable_data();
+        check_shape(located, {count, table.num_levels()}, "located");
         const py::gil_scoped_release release;
-        locate(table, p, count, found, num_threads);
+        locate(table, points.data(), count, located.mutable_data(), num_threads);
       },
-      "points"_a.noconvert(), "located"_a.noconvert(), "num_threads"_a = 0,
+      "points"_array, "located"_array, "num_threads"_a = 0,
       "Writes the cell of each point (N, 3), local frame, m, at each level, or -1, to `located` (N, L) int32.");
 
   cls.def(
@@ -47,34 +42,28 @@ void bind_kernels(py::class_<VertexTable>& cls) {
       [](const VertexTable& table, const Array<T>& features, const Array<T>& points, Located& located, Rows<T>& out,
          int num_threads) {
         const std::int64_t count = check_points(points);
-        check_features(table, features);
-        check_shape(located, count, table.num_levels(), "located");
-        check_shape(out, count, table.num_levels() * kFeatureDim, "out");
-        const std::int64_t stride = row_stride(out, "out");
-        const T *f = features.data(), *p = points.data();
-        std::int32_t* found = located.mutable_data();
-        T* result = out.mutable_data();
+        check_shape(features, {table.num_rows(), kFeatureDim}, "features");
+        check_shape(located, {count, table.num_levels()}, "located");
+        const std::int64_t stride = row_stride(out, count, table.num_levels() * kFeatureDim, "out");
         const py::gil_scoped_release release;
-        encode(table, f, p, count, found, result, stride, num_threads);
+        encode(table, features.data(), points.data(), count, located.mutable_data(), out.mutable_data(), stride,
+               num_threads);
       },
-      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "out"_a.noconvert(),
-      "num_threads"_a = 0, "Locates points and writes their interpolated features to `out` (N, 8 L).");
+      "features"_array, "points"_array, "located"_array, "out"_array, "num_threads"_a = 0,
+      "Locates points and writes their interpolated features to `out` (N, 8 L).");
 
   cls.def(
       "interpolate",
       [](const VertexTable& table, const Array<T>& features, const Array<T>& points, const Located& located,
          const Directions& directions, Rows<T>& out, int num_threads) {
         const PointBatch<T> batch = point_batch(table, points, located, directions);
-        check_features(table, features);
-        check_shape(out, batch.count, table.num_levels() * kFeatureDim, "out");
-        const std::int64_t stride = row_stride(out, "out");
-        const T* f = features.data();
-        T* result = out.mutable_data();
+        check_shape(features, {table.num_rows(), kFeatureDim}, "features");
+        const std::int64_t stride = row_stride(out, batch.count, table.num_levels() * kFeatureDim, "out");
         const py::gil_scoped_release release;
-        interpolate(table, f, batch, result, stride, num_threads);
+        interpolate(table, features.data(), batch, out.mutable_data(), stride, num_threads);
       },
-      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true),
-      "out"_a.noconvert(), "num_threads"_a = 0,
+      "features"_array, "points"_array, "located"_array, "directions"_array.none(true), "out"_array,
+      "num_threads"_a = 0,
       "Like `encode` for located points; with `directions` (N, 3), the directional derivative of the features.");
 
   cls.def(
@@ -84,8 +73,8 @@ void bind_kernels(py::class_<VertexTable>& cls) {
         scatter_by(table, points, located, directions, out_grad, features_grad,
                    [&](const auto&... arguments) { scatter(table, arguments..., num_threads); });
       },
-      "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true), "out_grad"_a.noconvert(),
-      "features_grad"_a.noconvert(), "num_threads"_a = 0,
+      "points"_array, "located"_array, "directions"_array.none(true), "out_grad"_array, "features_grad"_array,
+      "num_threads"_a = 0,
       "Adds the transpose of `interpolate`, applied to `out_grad` (N, 8 L), to `features_grad` (num_rows, 8).");
 
   cls.def(
@@ -97,25 +86,23 @@ void bind_kernels(py::class_<VertexTable>& cls) {
                           [&](std::int64_t task) { scatter_task(table, arguments..., level_task(table, task)); });
         });
       },
-      "points"_a.noconvert(), "located"_a.noconvert(), "out_grad"_a.noconvert(), "features_grad"_a.noconvert(),
-      "pool"_a, "Like `scatter`, on the threads of a thread pool, without directions.");
+      "points"_array, "located"_array, "out_grad"_array, "features_grad"_array, "pool"_a,
+      "Like `scatter`, on the threads of a thread pool, without directions.");
 
   cls.def(
       "coordinate_gradient",
       [](const VertexTable& table, const Array<T>& features, const Array<T>& points, const Located& located,
          const Directions& directions, const Rows<T>& out_grad, Array<T>& points_grad, int num_threads) {
         const PointBatch<T> batch = point_batch(table, points, located, directions);
-        check_features(table, features);
-        check_shape(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
-        check_shape(points_grad, batch.count, 3, "points_grad");
-        const std::int64_t stride = row_stride(out_grad, "out_grad");
-        const T *f = features.data(), *grad = out_grad.data();
-        T* result = points_grad.mutable_data();
+        check_shape(features, {table.num_rows(), kFeatureDim}, "features");
+        check_shape(points_grad, {batch.count, 3}, "points_grad");
+        const std::int64_t stride = row_stride(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
         const py::gil_scoped_release release;
-        coordinate_gradient(table, f, batch, grad, stride, result, num_threads);
+        coordinate_gradient(table, features.data(), batch, out_grad.data(), stride, points_grad.mutable_data(),
+                            num_threads);
       },
-      "features"_a.noconvert(), "points"_a.noconvert(), "located"_a.noconvert(), "directions"_a.noconvert().none(true),
-      "out_grad"_a.noconvert(), "points_grad"_a.noconvert(), "num_threads"_a = 0,
+      "features"_array, "points"_array, "located"_array, "directions"_array.none(true), "out_grad"_array,
+      "points_grad"_array, "num_threads"_a = 0,
       "Writes the gradient of (interpolate . out_grad) by the points to `points_grad` (N, 3), 1/m.");
 }
 
@@ -127,35 +114,24 @@ void bind_interpolation(VertexTableClass& table) {
       "into_cells",
       [](const VertexTable& t, Array<float>& points, float step_m, int num_threads) {
         const std::int64_t count = check_points(points);
-        py::array_t<bool> inside(static_cast<py::ssize_t>(count));
-        float* p = points.mutable_data();
-        bool* result = inside.mutable_data();
-        {
-          const py::gil_scoped_release release;
-          into_cells(t, p, count, step_m, result, num_threads);
-        }
+        Array<bool> inside = new_array<bool>(count);
+        without_gil([&] { into_cells(t, points.mutable_data(), count, step_m, inside.mutable_data(), num_threads); });
         return inside;
       },
-      "points"_a.noconvert(), "step_m"_a, "num_threads"_a = 0,
+      "points"_array, "step_m"_a, "num_threads"_a = 0,
       "Moves `points` (N, 3) float32 within `step_m` of a face into an adjacent leaf cell, and returns whether they "
-      "are "
-      "in one (N,).");
+      "are in one (N,).");
   table.def(
       "trilinear",
       [](const VertexTable& t, const Array<float>& values, const Array<float>& points, int num_threads) {
         const std::int64_t count = check_points(points);
         if (t.encoding() != Encoding::kOctree || t.num_levels() != 1 || check_column(values, "values") != t.num_rows())
           throw std::invalid_argument("values must be one for each row of an octree of one level");
-        py::array_t<float> out({static_cast<py::ssize_t>(count), py::ssize_t{4}});
-        const float *v = values.data(), *p = points.data();
-        float* result = out.mutable_data();
-        {
-          const py::gil_scoped_release release;
-          trilinear(t, v, p, count, result, num_threads);
-        }
+        Array<float> out = new_array<float>(count, 4);
+        without_gil([&] { trilinear(t, values.data(), points.data(), count, out.mutable_data(), num_threads); });
         return out;
       },
-      "values"_a.noconvert(), "points"_a.noconvert(), "num_threads"_a = 0,
+      "values"_array, "points"_array, "num_threads"_a = 0,
       "Interpolation of `values` (num_rows,) float32, and its gradient, (N, 4); 0 outside the cells.");
   bind_kernels<float>(table);
   bind_kernels<double>(table);

@@ -17,8 +17,8 @@ void bind_optimiser(VertexTableClass& cls) {
       [](const VertexTable& table, const std::vector<std::tuple<Floats, Integers, Rows<float>>>& batches,
          Floats& features, Integers& states, const Floats& decays, std::int32_t step, double learning_rate,
          double epsilon, HeldThreadPool& pool) {
-        check_features(table, features);
-        check_shape(states, table.num_rows(), sizeof(RowState) / sizeof(std::int32_t), "states");
+        check_shape(features, {table.num_rows(), kFeatureDim}, "features");
+        check_shape(states, {table.num_rows(), sizeof(RowState) / sizeof(std::int32_t)}, "states");
         if (step < 1) throw std::invalid_argument("step must be at least 1");
         if (decays.ndim() != 2 || decays.shape(0) <= step || decays.shape(1) != 2)
           throw std::invalid_argument("decays must have shape (more than step, 2)");
@@ -27,9 +27,8 @@ void bind_optimiser(VertexTableClass& cls) {
         std::vector<std::int64_t> strides;
         for (const auto& [batch_points, located, out_grad] : batches) {
           points.push_back(point_batch(table, batch_points, located, std::optional<Floats>()));
-          check_shape(out_grad, points.back().count, table.num_levels() * kFeatureDim, "out_grad");
           grads.push_back(out_grad.data());
-          strides.push_back(row_stride(out_grad, "out_grad"));
+          strides.push_back(row_stride(out_grad, points.back().count, table.num_levels() * kFeatureDim, "out_grad"));
         }
         const float* powers = decays.data();
         const AdamStep adam{features.mutable_data(),
@@ -44,8 +43,7 @@ void bind_optimiser(VertexTableClass& cls) {
         });
         pool.hold(py::make_tuple(py::cast(&table), batches, features, states, decays));
       },
-      "batches"_a, "features"_a.noconvert(), "states"_a.noconvert(), "decays"_a.noconvert(), "step"_a,
-      "learning_rate"_a, "epsilon"_a, "pool"_a,
+      "batches"_a, "features"_array, "states"_array, "decays"_array, "step"_a, "learning_rate"_a, "epsilon"_a, "pool"_a,
       "Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed "
       "like `scatter`, on the other threads of `pool`; its `finish` waits for it. `states` (num_rows, 8) int32 "
       "are mean gradients in bfloat16 (4 numbers), their mean square as float32, the last step that updated the "

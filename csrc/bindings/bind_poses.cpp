@@ -1,5 +1,6 @@
 #include <pybind11/stl.h>
 
+#include <algorithm>
 #include <memory>
 
 #include "bindings/arrays.hpp"
@@ -10,12 +11,6 @@
 
 namespace radarsdf {
 namespace {
-
-void check_blocks(const Array<double>& blocks, std::int64_t count, const char* name) {
-  if (blocks.ndim() != 3 || blocks.shape(0) != count || blocks.shape(1) != kPose || blocks.shape(2) != kPose) {
-    throw std::invalid_argument(std::string(name) + " must have shape (" + std::to_string(count) + ", 6, 6)");
-  }
-}
 
 void bind_local_planes(py::module_& m) {
   using namespace py::literals;
@@ -28,14 +23,13 @@ void bind_local_planes(py::module_& m) {
             if (sign != 1 && sign != -1) throw std::invalid_argument("sign must be 1 or -1");
             planes.add(points.data(), check_points(points), sign);
           },
-          "points"_a.noconvert(), "sign"_a = 1,
-          "Adds points (N, 3) float64, world frame, m; sign -1 removes them exactly.")
+          "points"_array, "sign"_a = 1, "Adds points (N, 3) float64, world frame, m; sign -1 removes them exactly.")
       .def(
           "agreement",
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& pose,
              const VarianceNumbers& variances) {
             const std::int64_t count = check_points(points);
-            check_shape(pose, 4, 4, "pose");
+            check_shape(pose, {4, 4}, "pose");
             const Agreement found = planes.agreement(points.data(), count, pose.data(), variances_of(variances));
             py::array_t<double> hessian({kPose, kPose}), gradient(kPose), doubt({kPose, kPose});
             std::copy(found.doubt.begin(), found.doubt.end(), doubt.mutable_data());
@@ -43,7 +37,7 @@ void bind_local_planes(py::module_& m) {
             std::copy(found.gradient.begin(), found.gradient.end(), gradient.mutable_data());
             return py::make_tuple(hessian, gradient, doubt, found.weight);
           },
-          "points"_a.noconvert(), "pose"_a.noconvert(), "variances"_a,
+          "points"_array, "pose"_array, "variances"_a,
           "Normal equations of points (N, 3) float64, sensor frame, m, at `pose` (4, 4): Hessian (6, 6) and gradient "
           "(6,) of half the sum of squared normalised residuals, by increments of the pose as in CommonPlanes; the "
           "part of the Hessian (6, 6) caused by errors of normals; the sum of weights.")
@@ -52,15 +46,14 @@ void bind_local_planes(py::module_& m) {
           [](const LocalPlanes& planes, const Array<double>& points, const Array<double>& poses,
              const VarianceNumbers& variances) {
             const std::int64_t count = check_points(points);
-            if (poses.ndim() != 3 || poses.shape(1) != 4 || poses.shape(2) != 4) {
-              throw std::invalid_argument("poses must have shape (K, 4, 4)");
-            }
-            py::array_t<double> scores({poses.shape(0), static_cast<py::ssize_t>(count)});
-            planes.scores(points.data(), count, poses.data(), poses.shape(0), variances_of(variances),
+            const std::int64_t num_poses = poses.ndim() == 3 ? poses.shape(0) : 0;
+            check_shape(poses, {num_poses, 4, 4}, "poses");
+            Array<double> scores = new_array<double>(num_poses, count);
+            planes.scores(points.data(), count, poses.data(), num_poses, variances_of(variances),
                           scores.mutable_data());
             return scores;
           },
-          "points"_a.noconvert(), "poses"_a.noconvert(), "variances"_a,
+          "points"_array, "poses"_array, "variances"_a,
           "Scores 1 / (1 + r² / 4), (K, N) float64, for poses (K, 4, 4) and points (N, 3), sensor frame, m, with the "
           "residual r from a plane in standard deviations; 0 for points without a plane.");
 }
@@ -76,27 +69,19 @@ void bind_poses(py::module_& m) {
                        const Array<double>& positions, const Array<double>& up_of_scan, const Array<double>& centres,
                        const Array<double>& normals, double extent_m, const VarianceNumbers& variances,
                        std::int64_t scans_together, int num_threads) {
-             const std::int64_t count = check_points(points);
-             check_shape(directions, count, 3, "directions");
-             if (check_column(ranges_m, "ranges_m") != count || check_column(scans, "scans") != count ||
-                 check_column(planes, "planes") != count) {
-               throw std::invalid_argument("ranges_m, scans and planes must be one a return");
-             }
-             const std::int64_t num_scans = check_points(positions);
-             check_shape(up_of_scan, num_scans, 3, "up_of_scan");
-             const std::int64_t num_planes = check_points(centres);
-             check_shape(normals, num_planes, 3, "normals");
+             const std::int64_t count = check_rays(points, directions, ranges_m);
+             const std::int64_t num_scans = check_points(positions, "positions");
+             const std::int64_t num_planes = check_points(centres, "centres");
+             check_shape(scans, {count}, "scans");
+             check_shape(planes, {count}, "planes");
+             check_shape(up_of_scan, {num_scans, 3}, "up_of_scan");
+             check_shape(normals, {num_planes, 3}, "normals");
+             check_numbers(planes, -1, num_planes, "planes");
+             check_numbers(scans, 0, num_scans, "scans");
+             if (!std::is_sorted(scans.data(), scans.data() + count)) throw std::invalid_argument("scans must ascend");
              const PosedReturns returns{points.data(),    directions.data(), ranges_m.data(),
                                         scans.data(),     planes.data(),     count,
                                         positions.data(), up_of_scan.data(), num_scans};
-             for (std::int64_t i = 0; i < count; ++i) {
-               if (returns.planes[i] < -1 || returns.planes[i] >= num_planes) {
-                 throw std::invalid_argument("planes must lie in [-1, P)");
-               }
-               if (returns.scans[i] < (i > 0 ? returns.scans[i - 1] : 0) || returns.scans[i] >= num_scans) {
-                 throw std::invalid_argument("scans must ascend in [0, F)");
-               }
-             }
              if (!(extent_m > 0) || scans_together < 1) {
                throw std::invalid_argument("extent_m and scans_together must be positive");
              }
@@ -105,9 +90,9 @@ void bind_poses(py::module_& m) {
              const py::gil_scoped_release release;
              return std::make_unique<CommonPlanes>(returns, of_scans, noise, scans_together, num_threads);
            }),
-           "points"_a.noconvert(), "directions"_a.noconvert(), "ranges_m"_a.noconvert(), "scans"_a.noconvert(),
-           "planes"_a.noconvert(), "positions"_a.noconvert(), "up_of_scan"_a.noconvert(), "centres"_a.noconvert(),
-           "normals"_a.noconvert(), "extent_m"_a, "variances"_a, "scans_together"_a, "num_threads"_a = 0,
+           "points"_array, "directions"_array, "ranges_m"_array, "scans"_array, "planes"_array, "positions"_array,
+           "up_of_scan"_array, "centres"_array, "normals"_array, "extent_m"_a, "variances"_a, "scans_together"_a,
+           "num_threads"_a = 0,
            "Points (N, 3) and directions (N, 3) float32, local frame, m; `ranges_m` (N,) float32; `scans` (N,) int32, "
            "ascending; `planes` (N,) int32, -1 for none. `positions` and `up_of_scan` (F, 3), `centres` and `normals` "
            "(P, 3) float64. `extent_m` of a plane; `variances` along the beam, m^2, in azimuth and elevation, rad^2.")
@@ -121,31 +106,23 @@ void bind_poses(py::module_& m) {
           "solve",
           [](const CommonPlanes& planes, const Array<double>& diagonal, const Array<double>& below,
              const Array<double>& gradient, double tolerance, int max_iterations, bool with_inverse, int num_threads) {
-            const std::int64_t count = diagonal.ndim() == 3 ? diagonal.shape(0) : 0;
-            if (count != static_cast<std::int64_t>(planes.weights().size())) {
-              throw std::invalid_argument("diagonal must be one block a scan");
-            }
-            check_blocks(diagonal, count, "diagonal");
-            check_blocks(below, count - 1, "below");
-            check_shape(gradient, count, kPose, "gradient");
-            py::array_t<double> x({static_cast<py::ssize_t>(count), py::ssize_t{kPose}});
-            const auto blocks = [](std::int64_t n) {
-              return py::array_t<double>({static_cast<py::ssize_t>(n), py::ssize_t{kPose}, py::ssize_t{kPose}});
-            };
-            py::array_t<double> inverse = blocks(with_inverse ? count : 0),
-                                inverse_below = blocks(with_inverse ? count - 1 : 0);
-            const double *d = diagonal.data(), *b = below.data(), *g = gradient.data();
-            double *result = x.mutable_data(), *id = with_inverse ? inverse.mutable_data() : nullptr,
+            const auto count = static_cast<std::int64_t>(planes.weights().size());
+            check_shape(diagonal, {count, kPose, kPose}, "diagonal");
+            check_shape(below, {count - 1, kPose, kPose}, "below");
+            check_shape(gradient, {count, kPose}, "gradient");
+            Array<double> x = new_array<double>(count, kPose);
+            Array<double> inverse = new_array<double>(with_inverse ? count : 0, kPose, kPose),
+                          inverse_below = new_array<double>(with_inverse ? count - 1 : 0, kPose, kPose);
+            double *id = with_inverse ? inverse.mutable_data() : nullptr,
                    *ib = with_inverse ? inverse_below.mutable_data() : nullptr;
-            double decrement = 0;
-            {
-              const py::gil_scoped_release release;
-              decrement = planes.solve(d, b, g, tolerance, max_iterations, result, id, ib, num_threads);
-            }
+            const double decrement = without_gil([&] {
+              return planes.solve(diagonal.data(), below.data(), gradient.data(), tolerance, max_iterations,
+                                  x.mutable_data(), id, ib, num_threads);
+            });
             return py::make_tuple(x, inverse, inverse_below, decrement);
           },
-          "diagonal"_a.noconvert(), "below"_a.noconvert(), "gradient"_a.noconvert(), "tolerance"_a, "max_iterations"_a,
-          "with_inverse"_a, "num_threads"_a = 0,
+          "diagonal"_array, "below"_array, "gradient"_array, "tolerance"_a, "max_iterations"_a, "with_inverse"_a,
+          "num_threads"_a = 0,
           "Increments (F, 6) of the poses: translation, and rotation vector applied from the left about the sensor; "
           "blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), `with_inverse`; squared "
           "Mahalanobis norm of the increments. The prior is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, "

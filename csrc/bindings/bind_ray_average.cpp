@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <cmath>
 #include <utility>
 
 #include "bindings/arrays.hpp"
@@ -15,24 +16,21 @@ void bind_ray_average(VertexTableClass& table) {
       [](const VertexTable& t, const Array<float>& points, const Array<float>& directions, const Array<float>& normals,
          const Array<float>& weights, double truncation_m, int num_threads) {
         const std::int64_t count = check_points(points);
-        check_shape(directions, count, 3, "directions");
-        check_shape(normals, count, 3, "normals");
-        if (weights.ndim() != 1 || weights.shape(0) != count) {
-          throw std::invalid_argument("weights must have shape (N,)");
+        check_shape(directions, {count, 3}, "directions");
+        check_shape(normals, {count, 3}, "normals");
+        check_shape(weights, {count}, "weights");
+        const auto is_count = [](float w) { return w >= 0 && w < 0x1p32F && w == std::floor(w); };
+        if (!std::all_of(weights.data(), weights.data() + count, is_count)) {
+          throw std::invalid_argument("weights must be numbers of returns: integers of at least 0");
         }
-        Array<float> distances(static_cast<py::ssize_t>(t.num_rows()));
-        Array<std::int8_t> sides(static_cast<py::ssize_t>(t.num_rows()));
-        float* result = distances.mutable_data();
-        std::int8_t* of_vertices = sides.mutable_data();
+        Array<float> distances = new_array<float>(t.num_rows());
+        Array<std::int8_t> sides = new_array<std::int8_t>(t.num_rows());
         const AveragedRays rays{points.data(), directions.data(), normals.data(), weights.data(), count};
-        {
-          const py::gil_scoped_release release;
-          average_rays(t, rays, truncation_m, result, of_vertices, num_threads);
-        }
+        without_gil(
+            [&] { average_rays(t, rays, truncation_m, distances.mutable_data(), sides.mutable_data(), num_threads); });
         return std::pair(distances, sides);
       },
-      "points"_a.noconvert(), "directions"_a.noconvert(), "normals"_a.noconvert(), "weights"_a.noconvert(),
-      "truncation_m"_a, "num_threads"_a = 0,
+      "points"_array, "directions"_array, "normals"_array, "weights"_array, "truncation_m"_a, "num_threads"_a = 0,
       "For an octree, mean signed distance of each vertex, (num_rows,) float32, m, to planes through `points` (N, 3) "
       "with `normals` (N, 3). The mean is over rays along `directions` (N, 3) that cross leaf cells of the vertex "
       "within `truncation_m` of their points, one term per cell; all float32, local frame. Also the sides of the "
@@ -44,29 +42,18 @@ void bind_ray_average(VertexTableClass& table) {
       [](const VertexTable& t, const Array<float>& distances_m, const Array<float>& points, const Array<float>& normals,
          const Array<float>& information, const Array<std::int8_t>& sides, int iterations, int num_threads) {
         const std::int64_t count = check_points(points);
-        check_shape(normals, count, 3, "normals");
-        if (check_column(information, "information") != count) {
-          throw std::invalid_argument("information must have shape (N,)");
-        }
-        if (check_column(distances_m, "distances_m") != t.num_rows()) {
-          throw std::invalid_argument("distances_m must have shape (num_rows,)");
-        }
-        if (check_column(sides, "sides") != t.num_rows()) {
-          throw std::invalid_argument("sides must have shape (num_rows,)");
-        }
-        Array<float> result(distances_m.size());
+        check_shape(normals, {count, 3}, "normals");
+        check_shape(information, {count}, "information");
+        check_shape(distances_m, {t.num_rows()}, "distances_m");
+        check_shape(sides, {t.num_rows()}, "sides");
+        Array<float> result = new_array<float>(t.num_rows());
         std::copy_n(distances_m.data(), distances_m.size(), result.mutable_data());
-        float* moved = result.mutable_data();
-        const std::int8_t* of_vertices = sides.data();
         const KnownPlanes planes{points.data(), normals.data(), information.data(), count};
-        {
-          const py::gil_scoped_release release;
-          smooth_distances(t, planes, of_vertices, iterations, moved, num_threads);
-        }
+        without_gil([&] { smooth_distances(t, planes, sides.data(), iterations, result.mutable_data(), num_threads); });
         return result;
       },
-      "distances_m"_a.noconvert(), "points"_a.noconvert(), "normals"_a.noconvert(), "information"_a.noconvert(),
-      "sides"_a.noconvert(), "iterations"_a, "num_threads"_a = 0,
+      "distances_m"_array, "points"_array, "normals"_array, "information"_array, "sides"_array, "iterations"_a,
+      "num_threads"_a = 0,
       "For an octree, smooths `distances_m` (num_rows,) float32 by `iterations` steps towards the minimum of squared "
       "residuals from planes through `points` (N, 3) with `normals` (N, 3) and `information` (N,), m^-2, all float32, "
       "local frame, plus bending energy. Vertices stay on the `sides` (num_rows,) int8 of `average_rays`. An iteration "

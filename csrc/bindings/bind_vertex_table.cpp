@@ -20,7 +20,7 @@ VertexTableClass bind_vertex_table(py::module_& m) {
              const py::gil_scoped_release release;
              return std::make_unique<VertexTable>(std::move(keys), leaf_size_m, num_levels, encoding, num_threads);
            }),
-           "leaf_keys"_a.noconvert(), "leaf_size_m"_a, "num_levels"_a,
+           "leaf_keys"_array, "leaf_size_m"_a, "num_levels"_a,
            py::arg_v("encoding", Encoding::kTriQuadtree, "Encoding.TRI_QUADTREE"), "num_threads"_a = 0)
       .def_property_readonly("num_rows", &VertexTable::num_rows)
       .def_property_readonly("num_cells", &VertexTable::num_cells)
@@ -33,29 +33,15 @@ VertexTableClass bind_vertex_table(py::module_& m) {
       .def(
           "leaf_cells",
           [](const VertexTable& t) {
-            const auto& keys = t.leaf_keys();
-            std::vector<std::int32_t> cells;
-            {
-              const py::gil_scoped_release release;
-              cells = leaf_coordinates(keys);
-            }
-            const auto count = static_cast<py::ssize_t>(keys.size());
-            return Array<std::int32_t>(to_array(std::move(cells)).reshape({count, py::ssize_t{3}}));
+            return to_matrix(without_gil([&] { return leaf_coordinates(t.leaf_keys()); }), 3);
           },
           "Lattice coordinates of the occupied leaf cells (C, 3) int32: cell i spans [i, i + 1) * leaf_size_m.");
   table.def(
       "leaf_vertices",
       [](const VertexTable& t, int num_threads) {
-        LeafVertices vertices;
-        {
-          const py::gil_scoped_release release;
-          vertices = leaf_vertices(t, num_threads);
-        }
-        const auto rows = static_cast<py::ssize_t>(vertices.coordinates.size() / 3);
-        const auto cells = static_cast<py::ssize_t>(vertices.of_cells.size() / 8);
-        return std::make_pair(
-            Array<std::int32_t>(to_array(std::move(vertices.coordinates)).reshape({rows, py::ssize_t{3}})),
-            Array<std::int32_t>(to_array(std::move(vertices.of_cells)).reshape({cells, py::ssize_t{8}})));
+        LeafVertices vertices = without_gil([&] { return leaf_vertices(t, num_threads); });
+        return std::make_pair(to_matrix(std::move(vertices.coordinates), 3),
+                              to_matrix(std::move(vertices.of_cells), 8));
       },
       "num_threads"_a = 0,
       "For an octree, lattice coordinates (V, 3) int32 of the vertices of leaf cells, which have the first V rows of "

@@ -23,10 +23,8 @@ std::vector<Layer<T>> layers_of(const Arrays<T>& weights, const Arrays<T>& biase
     const auto inputs = i == 0 && weights[0].ndim() == 2 ? weights[0].shape(1) : i > 0 ? layers.back().outputs : 0;
     const auto outputs = weights[i].ndim() == 2 ? weights[i].shape(0) : 0;
     if (outputs == 0) throw std::invalid_argument("a layer must have outputs");
-    check_shape(weights[i], outputs, inputs, "weights");
-    if (biases[i].ndim() != 1 || biases[i].shape(0) != outputs) {
-      throw std::invalid_argument("biases must have as many numbers as weights have rows");
-    }
+    check_shape(weights[i], {outputs, inputs}, "weights");
+    check_shape(biases[i], {outputs}, "biases");
     layers.push_back({weights[i].data(), biases[i].data(), inputs, outputs});
   }
   return layers;
@@ -40,10 +38,8 @@ std::vector<LayerGradients<T>> layer_gradients_of(Arrays<T>& weight_grads, Array
   }
   std::vector<LayerGradients<T>> gradients;
   for (std::size_t i = 0; i < layers.size(); ++i) {
-    check_shape(weight_grads[i], layers[i].outputs, layers[i].inputs, "weight_grads");
-    if (bias_grads[i].ndim() != 1 || bias_grads[i].shape(0) != layers[i].outputs) {
-      throw std::invalid_argument("bias_grads must have the shapes of the biases");
-    }
+    check_shape(weight_grads[i], {layers[i].outputs, layers[i].inputs}, "weight_grads");
+    check_shape(bias_grads[i], {layers[i].outputs}, "bias_grads");
     gradients.push_back({weight_grads[i].mutable_data(), bias_grads[i].mutable_data()});
   }
   return gradients;

@@ -78,21 +78,19 @@ void into_cells(const VertexTable& table, float* points, std::int64_t count, flo
                 int num_threads) {
   const auto leaf_m = static_cast<float>(table.leaf_size_m());
   const auto near_face = [&](float x) { return std::abs(x / leaf_m - std::nearbyint(x / leaf_m)) * leaf_m <= step_m; };
-  std::vector<std::int32_t> located(static_cast<std::size_t>(count * table.num_levels()));
+  std::vector<std::int32_t> located(count * table.num_levels());
   locate(table, points, count, located.data(), num_threads);
-  parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      float* p = points + 3 * i;
-      inside[i] = located[static_cast<std::size_t>(i * table.num_levels())] >= 0;
-      if (inside[i] || !(near_face(p[0]) || near_face(p[1]) || near_face(p[2]))) continue;
-      for (int shift = 0; shift < 8 && !inside[i]; ++shift) {
-        std::int32_t cells[kMaxLevels];
-        float moved[3];
-        for (int axis = 0; axis < 3; ++axis) moved[axis] = p[axis] + (shift << axis & 4 ? step_m : -step_m);
-        table.locate(moved, 1, cells);
-        inside[i] = cells[0] >= 0;
-        if (inside[i]) std::copy_n(moved, 3, p);
-      }
+  parallel_for(count, kMinPoints, num_threads, [&](std::int64_t i) {
+    float* p = points + 3 * i;
+    inside[i] = located[i * table.num_levels()] >= 0;
+    if (inside[i] || !(near_face(p[0]) || near_face(p[1]) || near_face(p[2]))) return;
+    for (int shift = 0; shift < 8 && !inside[i]; ++shift) {
+      std::int32_t cells[kMaxLevels];
+      float moved[3];
+      for (int axis = 0; axis < 3; ++axis) moved[axis] = p[axis] + (shift << axis & 4 ? step_m : -step_m);
+      table.locate(moved, 1, cells);
+      inside[i] = cells[0] >= 0;
+      if (inside[i]) std::copy_n(moved, 3, p);
     }
   });
 }
@@ -103,36 +101,34 @@ void trilinear(const VertexTable& table, const float* values, const float* point
   const auto lerp = [](float a, float b, float x) {
     return x < 0.5F ? std::fma(x, b - a, a) : std::fma(x - 1, b - a, b);
   };
-  std::vector<std::int32_t> located(static_cast<std::size_t>(count));
+  std::vector<std::int32_t> located(count);
   locate(table, points, count, located.data(), num_threads);
-  parallel_blocks(count, kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      const std::int32_t cell = located[static_cast<std::size_t>(i)];
-      float *to = out + 4 * i, u[3], at_x[4], along_x[4], at_y[2], along_y[2];
-      std::fill_n(to, 4, 0.0F);
-      if (cell < 0) continue;
-      for (int axis = 0; axis < 3; ++axis) {
-        const float place = points[3 * i + axis] * inverse;
-        u[axis] = place - std::floor(place);
-      }
-      const std::int32_t* rows = table.rows_of(cell);  // the first axis is fastest
-      for (int yz = 0; yz < 4; ++yz) {
-        const float *low = values + rows[yz << 1], *high = values + rows[yz << 1 | 1];
-        at_x[yz] = lerp(*low, *high, u[0]);
-        along_x[yz] = *high - *low;
-      }
-      for (int z = 0; z < 2; ++z) {
-        at_y[z] = lerp(at_x[2 * z], at_x[2 * z + 1], u[1]);
-        along_y[z] = at_x[2 * z + 1] - at_x[2 * z];
-      }
-      to[0] = lerp(at_y[0], at_y[1], u[2]);
-      const float y[2] = {1 - u[1], u[1]}, z[2] = {1 - u[2], u[2]};
-      for (int corner = 0; corner < 4; ++corner)  // PyTorch sums in C order
-        to[1] += z[corner & 1] * y[corner >> 1] * along_x[(corner & 1) << 1 | corner >> 1];
-      to[2] = z[0] * along_y[0] + z[1] * along_y[1];
-      to[3] = at_y[1] - at_y[0];
-      for (int axis = 0; axis < 3; ++axis) to[1 + axis] *= inverse;
+  parallel_for(count, kMinPoints, num_threads, [&](std::int64_t i) {
+    const std::int32_t cell = located[i];
+    float *to = out + 4 * i, u[3], at_x[4], along_x[4], at_y[2], along_y[2];
+    std::fill_n(to, 4, 0.0F);
+    if (cell < 0) return;
+    for (int axis = 0; axis < 3; ++axis) {
+      const float place = points[3 * i + axis] * inverse;
+      u[axis] = place - std::floor(place);
     }
+    const std::int32_t* rows = table.rows_of(cell);  // the first axis is fastest
+    for (int yz = 0; yz < 4; ++yz) {
+      const float *low = values + rows[yz << 1], *high = values + rows[yz << 1 | 1];
+      at_x[yz] = lerp(*low, *high, u[0]);
+      along_x[yz] = *high - *low;
+    }
+    for (int z = 0; z < 2; ++z) {
+      at_y[z] = lerp(at_x[2 * z], at_x[2 * z + 1], u[1]);
+      along_y[z] = at_x[2 * z + 1] - at_x[2 * z];
+    }
+    to[0] = lerp(at_y[0], at_y[1], u[2]);
+    const float y[2] = {1 - u[1], u[1]}, z[2] = {1 - u[2], u[2]};
+    for (int corner = 0; corner < 4; ++corner)  // PyTorch sums in C order
+      to[1] += z[corner & 1] * y[corner >> 1] * along_x[(corner & 1) << 1 | corner >> 1];
+    to[2] = z[0] * along_y[0] + z[1] * along_y[1];
+    to[3] = at_y[1] - at_y[0];
+    for (int axis = 0; axis < 3; ++axis) to[1 + axis] *= inverse;
   });
 }
 
@@ -148,29 +144,27 @@ void fourier(const T* points, std::int64_t count, double half_width_m, int first
 
 template <typename T>
 void spherical_harmonics(const T* directions, std::int64_t count, T* out, std::int64_t stride, int num_threads) {
-  parallel_blocks(count, 4 * kMinPoints, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t n = begin; n < end; ++n) {
-      const T x = directions[3 * n], y = directions[3 * n + 1], z = directions[3 * n + 2];
-      const T xx = x * x, yy = y * y, zz = z * z;
-      // sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times sqrt(2) if m != 0, times the Legendre factor.
-      const T values[16] = {T(0.28209479177387814),
-                            T(0.4886025119029199) * y,
-                            T(0.4886025119029199) * z,
-                            T(0.4886025119029199) * x,
-                            T(1.0925484305920792) * x * y,
-                            T(1.0925484305920792) * y * z,
-                            T(0.31539156525252005) * (2 * zz - xx - yy),
-                            T(1.0925484305920792) * x * z,
-                            T(0.5462742152960396) * (xx - yy),
-                            T(0.5900435899266435) * y * (3 * xx - yy),
-                            T(2.890611442640554) * x * y * z,
-                            T(0.4570457994644658) * y * (4 * zz - xx - yy),
-                            T(0.3731763325901154) * z * (2 * zz - 3 * xx - 3 * yy),
-                            T(0.4570457994644658) * x * (4 * zz - xx - yy),
-                            T(1.445305721320277) * z * (xx - yy),
-                            T(0.5900435899266435) * x * (xx - 3 * yy)};
-      std::copy(values, values + 16, out + n * stride);
-    }
+  parallel_for(count, 4 * kMinPoints, num_threads, [&](std::int64_t n) {
+    const T x = directions[3 * n], y = directions[3 * n + 1], z = directions[3 * n + 2];
+    const T xx = x * x, yy = y * y, zz = z * z;
+    // sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times sqrt(2) if m != 0, times the Legendre factor.
+    const T values[16] = {T(0.28209479177387814),
+                          T(0.4886025119029199) * y,
+                          T(0.4886025119029199) * z,
+                          T(0.4886025119029199) * x,
+                          T(1.0925484305920792) * x * y,
+                          T(1.0925484305920792) * y * z,
+                          T(0.31539156525252005) * (2 * zz - xx - yy),
+                          T(1.0925484305920792) * x * z,
+                          T(0.5462742152960396) * (xx - yy),
+                          T(0.5900435899266435) * y * (3 * xx - yy),
+                          T(2.890611442640554) * x * y * z,
+                          T(0.4570457994644658) * y * (4 * zz - xx - yy),
+                          T(0.3731763325901154) * z * (2 * zz - 3 * xx - 3 * yy),
+                          T(0.4570457994644658) * x * (4 * zz - xx - yy),
+                          T(1.445305721320277) * z * (xx - yy),
+                          T(0.5900435899266435) * x * (xx - 3 * yy)};
+    std::copy(values, values + 16, out + n * stride);
   });
 }
 

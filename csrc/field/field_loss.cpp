@@ -16,21 +16,19 @@ namespace {
 // Factor that converts a sum over a batch to a mean.
 double mean(std::int64_t count) { return 1 / static_cast<double>(std::max<std::int64_t>(count, 1)); }
 
-template <typename T>
-void check_layers(const std::vector<Layer<T>>& layers, std::int64_t num_gradients, std::int64_t inputs,
+void check_layers(const std::vector<Layer<float>>& layers, std::int64_t num_gradients, std::int64_t inputs,
                   const char* message) {
   if (static_cast<std::int64_t>(layers.size()) != num_gradients) {
     throw std::invalid_argument("there must be gradients of all layers");
   }
-  for (const Layer<T>& layer : layers) {
+  for (const Layer<float>& layer : layers) {
     if (layer.inputs != inputs || layer.outputs < 1) throw std::invalid_argument(message);
     inputs = layer.outputs;
   }
 }
 
-template <typename T>
-void add(const std::vector<Layer<T>>& layers, const std::vector<LayerGradients<T>>& from,
-         const std::vector<LayerGradients<T>>& to) {
+void add(const std::vector<Layer<float>>& layers, const std::vector<LayerGradients<float>>& from,
+         const std::vector<LayerGradients<float>>& to) {
   for (std::size_t i = 0; i < layers.size(); ++i) {
     for (std::int64_t k = 0; k < layers[i].outputs * layers[i].inputs; ++k) to[i].weights[k] += from[i].weights[k];
     for (std::int64_t k = 0; k < layers[i].outputs; ++k) to[i].biases[k] += from[i].biases[k];
@@ -39,9 +37,7 @@ void add(const std::vector<Layer<T>>& layers, const std::vector<LayerGradients<T
 
 }  // namespace
 
-template <typename T>
-FieldLoss<T>::FieldLoss(const FieldParameters<T>& parameters, const LossOptions& options,
-                        const NetworkGradients<T>& gradients)
+FieldLoss::FieldLoss(const FieldParameters& parameters, const LossOptions& options, const NetworkGradients& gradients)
     : parameters_(parameters), options_(options), gradients_(gradients) {
   const Frequencies& f = parameters.frequencies;
   if (f.first < 0 || f.count < 0 || f.first > kMaxFrequencies || f.count > kMaxFrequencies - f.first) {
@@ -60,46 +56,28 @@ FieldLoss<T>::FieldLoss(const FieldParameters<T>& parameters, const LossOptions&
   }
 }
 
-template <typename T>
-struct FieldLoss<T>::Job {
-  explicit Job(PassWeights<T> prepared) : weights(std::move(prepared)) {}
+struct FieldLoss::Job {
+  explicit Job(PassWeights prepared) : weights(std::move(prepared)) {}
 
-  PassWeights<T> weights;
-  std::vector<PassInput<T>> parts;
-  std::vector<NetworkGradients<T>> by_networks;  // by part
-  std::vector<FieldLosses> sums;                 // by part
-  FieldLosses means;                             // factors that convert sums to means
-  bool trains, sees;
-  std::unique_ptr<std::int32_t[]> located;  // if the caller does not request it
+  PassWeights weights;
+  std::vector<PassInput> parts;
+  std::vector<NetworkGradients> by_networks;  // by part
+  std::vector<FieldLosses> sums;              // by part
+  FieldLosses means;                          // factors that convert sums to means
+  bool trains, sees;                          // losses of signed distances, of intensities
+  std::unique_ptr<std::int32_t[]> located;    // if the caller does not request it
 };
 
-template <typename T>
-void FieldLoss<T>::begin_sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features,
-                             ThreadPool& pool) {
-  begin(batch, {weight, 0}, by_features, true, false, pool);
-}
-
-template <typename T>
-void FieldLoss<T>::begin_joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
-                               ThreadPool& pool) {
-  begin(batch, weights, by_features, true, true, pool);
-}
-
-template <typename T>
-void FieldLoss<T>::begin_intensity(const LossBatch<T>& batch, double weight, ThreadPool& pool) {
-  begin(batch, {0, weight}, {nullptr, nullptr}, false, true, pool);
-}
-
-template <typename T>
-void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
-                         bool trains, bool sees, ThreadPool& pool) {
+void FieldLoss::begin(TrainedLosses losses, const LossBatch& batch, FieldLosses weights,
+                      const FeatureGradients& by_features, ThreadPool& pool) {
+  const bool trains = losses != TrainedLosses::kIntensity, sees = losses != TrainedLosses::kSdf;
   if (sees && parameters_.intensity.empty()) throw std::invalid_argument("there is no intensity network");
   if (job_) throw std::logic_error("the batch before this one is not finished");
-  const auto job = std::make_shared<Job>(PassWeights<T>(parameters_, trains, sees));
+  const auto job = std::make_shared<Job>(PassWeights(parameters_, trains, sees));
   std::int64_t count = 0, num_seen = 0;
   for (const LossPart& part : batch.parts) {
     const std::int64_t seen = options_.intensity_in_free_space ? part.count : part.num_labelled;
-    const T* rays = batch.rays ? batch.rays + count * batch.ray_stride : nullptr;
+    const float* rays = batch.rays ? batch.rays + count * batch.ray_stride : nullptr;
     job->by_networks.push_back(job->parts.empty() ? gradients_ : of_part(job->parts.size()));
     job->parts.push_back({batch.points + 3 * count,
                           batch.sdf_m + count,
@@ -118,27 +96,25 @@ void FieldLoss<T>::begin(const LossBatch<T>& batch, FieldLosses weights, const F
   job->means = {mean(count), mean(num_seen)};
   job->trains = trains;
   job->sees = sees;
-  FeatureGradients<T> to = by_features;
+  FeatureGradients to = by_features;
   if (!to.located) {
     job->located = large_array<std::int32_t>(count * parameters_.table->num_levels());
     to.located = job->located.get();
   }
   const FieldLosses shares{weights.sdf * job->means.sdf, weights.intensity * job->means.intensity};
-  pool.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to, shares](std::int64_t task) {
-    const auto i = static_cast<std::size_t>(task);
-    const PassInput<T>& part = job->parts[i];
-    const PassRequest<T> request{shares,
-                                 job->trains ? &job->by_networks[i].sdf : nullptr,
-                                 job->sees ? &job->by_networks[i].intensity : nullptr,
-                                 {to.located + part.before * parameters_.table->num_levels(),
-                                  job->trains ? to.interpolated + part.before * parameters_.levels() : nullptr}};
+  pool.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to, shares](std::int64_t i) {
+    const PassInput& part = job->parts[i];
+    const PassRequest request{shares,
+                              job->trains ? &job->by_networks[i].sdf : nullptr,
+                              job->sees ? &job->by_networks[i].intensity : nullptr,
+                              {to.located + part.before * parameters_.table->num_levels(),
+                               job->trains ? to.interpolated + part.before * parameters_.levels() : nullptr}};
     job->sums[i] = run_pass(parameters_, job->weights, options_, part, request);
   });
   job_ = job;
 }
 
-template <typename T>
-FieldLosses FieldLoss<T>::finish(ThreadPool& pool) {
+FieldLosses FieldLoss::finish(ThreadPool& pool) {
   if (!job_) throw std::logic_error("no batch was begun");
   const std::shared_ptr<Job> job = std::move(job_);
   pool.finish();
@@ -154,19 +130,18 @@ FieldLosses FieldLoss<T>::finish(ThreadPool& pool) {
   return losses;
 }
 
-template <typename T>
-NetworkGradients<T> FieldLoss<T>::of_part(std::size_t part) {
+NetworkGradients FieldLoss::of_part(std::size_t part) {
   if (of_parts_.size() < part) of_parts_.resize(part);
-  std::vector<T>& numbers = of_parts_[part - 1];
+  std::vector<float>& numbers = of_parts_[part - 1];
   std::int64_t size = 0;
   for (const auto* layers : {&parameters_.sdf, &parameters_.intensity}) {
-    for (const Layer<T>& layer : *layers) size += layer.outputs * (layer.inputs + 1);
+    for (const Layer<float>& layer : *layers) size += layer.outputs * (layer.inputs + 1);
   }
-  numbers.resize(static_cast<std::size_t>(size));
-  NetworkGradients<T> gradients;
-  T* next = numbers.data();
-  const auto share_out = [&](const std::vector<Layer<T>>& layers, std::vector<LayerGradients<T>>& of_layers) {
-    for (const Layer<T>& layer : layers) {
+  numbers.resize(size);
+  NetworkGradients gradients;
+  float* next = numbers.data();
+  const auto share_out = [&](const std::vector<Layer<float>>& layers, std::vector<LayerGradients<float>>& of_layers) {
+    for (const Layer<float>& layer : layers) {
       of_layers.push_back({next, next + layer.outputs * layer.inputs});
       next += layer.outputs * (layer.inputs + 1);
     }
@@ -175,8 +150,5 @@ NetworkGradients<T> FieldLoss<T>::of_part(std::size_t part) {
   share_out(parameters_.intensity, gradients.intensity);
   return gradients;
 }
-
-template class FieldLoss<float>;
-template class FieldLoss<double>;
 
 }  // namespace radarsdf

@@ -30,13 +30,12 @@ struct IntensityInputs {
 
 // Trainable parameters, as in the NeuralField of the Python package. The caller owns the arrays: values may change
 // between calls, addresses may not.
-template <typename T>
 struct FieldParameters {
   const VertexTable* table;
-  const T* features;  // (num_rows, 8)
+  const float* features;  // (num_rows, 8)
   Frequencies frequencies;
-  std::vector<Layer<T>> sdf;        // outputs the logit of the signed distance, then the geometry feature
-  std::vector<Layer<T>> intensity;  // empty without intensities
+  std::vector<Layer<float>> sdf;        // outputs the logit of the signed distance, then the geometry feature
+  std::vector<Layer<float>> intensity;  // empty without intensities
   IntensityInputs sees;
 
   // Numbers of columns of the interpolated features of all levels, of the cells' encoding, of the Fourier encoding, and
@@ -56,9 +55,8 @@ struct LossOptions {
 };
 
 // Gradients by weights and biases of the layers of both networks.
-template <typename T>
 struct NetworkGradients {
-  std::vector<LayerGradients<T>> sdf, intensity;
+  std::vector<LayerGradients<float>> sdf, intensity;
 };
 
 // Each element has a random byte (see RandomRows). Elements with a byte below `keep` are multiplied by 256 / keep, the
@@ -75,21 +73,19 @@ struct LossPart {
 };
 
 // Samples on rays, by part. The loss of the signed distances needs only points and labels.
-template <typename T>
 struct LossBatch {
-  const T* points;  // (count, 3) local frame, m
-  const T* sdf_m;   // (count) labels, positive in front of the return
+  const float* points;  // (count, 3) local frame, m
+  const float* sdf_m;   // (count) labels, positive in front of the return
   std::vector<LossPart> parts;
-  const T* rays = nullptr;  // (count, kRayColumns), rows ray_stride apart
+  const float* rays = nullptr;  // (count, kRayColumns), rows ray_stride apart
   std::int64_t ray_stride = 0;
   Dropout dropout[2] = {};  // for the cells' encoding and the Fourier encoding: (num_seen, columns)
 };
 
 // Sparse gradients by the features: the input of `scatter` and `adam_task`.
-template <typename T>
 struct FeatureGradients {
   std::int32_t* located;  // (count, num_levels), see VertexTable::locate
-  T* interpolated;        // (count, 8 num_levels), by the interpolated features
+  float* interpolated;    // (count, 8 num_levels), by the interpolated features
 };
 
 // Means over the batch, or their weights in the gradients.
@@ -97,40 +93,36 @@ struct FieldLosses {
   double sdf, intensity;
 };
 
-// Asynchronous: `begin_...` starts a batch, and `finish` waits for it; then all gradients are overwritten. Gradients
+// Which losses a batch trains: that of the signed distances, both, or that of the intensities alone, with frozen
+// features and SDF network.
+enum class TrainedLosses { kSdf, kBoth, kIntensity };
+
+// Asynchronous: `begin` starts a batch, and `finish` waits for it; then all gradients are overwritten. Gradients
 // are computed by part and summed in the order of the parts, independent of the number of threads. One batch at a time;
 // its arrays must remain valid until `finish`.
-template <typename T>
 class FieldLoss {
  public:
   // Throws std::invalid_argument if the arguments are inconsistent.
-  FieldLoss(const FieldParameters<T>& parameters, const LossOptions& options, const NetworkGradients<T>& gradients);
+  FieldLoss(const FieldParameters& parameters, const LossOptions& options, const NetworkGradients& gradients);
 
-  const FieldParameters<T>& parameters() const { return parameters_; }
+  const FieldParameters& parameters() const { return parameters_; }
 
-  // Loss of the signed distances alone.
-  void begin_sdf(const LossBatch<T>& batch, double weight, const FeatureGradients<T>& by_features, ThreadPool& pool);
-  // Both losses.
-  void begin_joint(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features,
-                   ThreadPool& pool);
-  // Loss of the intensities, for the intensity network alone: features and SDF network are frozen.
-  void begin_intensity(const LossBatch<T>& batch, double weight, ThreadPool& pool);
+  // by_features: not used by TrainedLosses::kIntensity.
+  void begin(TrainedLosses losses, const LossBatch& batch, FieldLosses weights, const FeatureGradients& by_features,
+             ThreadPool& pool);
   // Joins the thread pool. Losses that were not requested are 0.
   FieldLosses finish(ThreadPool& pool);
 
  private:
   struct Job;
 
-  // `trains`: whether the first loss trains features and SDF network. `sees`: whether there is a loss of intensities.
-  void begin(const LossBatch<T>& batch, FieldLosses weights, const FeatureGradients<T>& by_features, bool trains,
-             bool sees, ThreadPool& pool);
-  NetworkGradients<T> of_part(std::size_t part);  // part >= 1
+  NetworkGradients of_part(std::size_t part);  // part >= 1
 
-  FieldParameters<T> parameters_;
+  FieldParameters parameters_;
   LossOptions options_;
-  NetworkGradients<T> gradients_;
-  std::vector<std::vector<T>> of_parts_;  // gradients of the networks by all parts except the first
-  std::shared_ptr<Job> job_;              // current batch
+  NetworkGradients gradients_;
+  std::vector<std::vector<float>> of_parts_;  // gradients of the networks by all parts except the first
+  std::shared_ptr<Job> job_;                  // current batch
 };
 
 }  // namespace radarsdf

@@ -10,12 +10,11 @@
 namespace radarsdf {
 
 // Samples of a part of a batch.
-template <typename T>
 struct PassInput {
-  const T* points;
-  const T* sdf_m;
+  const float* points;
+  const float* sdf_m;
   std::int64_t count;
-  const T* rays;
+  const float* rays;
   std::int64_t ray_stride;
   std::int64_t num_labelled;
   std::int64_t num_seen;             // number of leading samples that the intensity network sees
@@ -24,28 +23,25 @@ struct PassInput {
 };
 
 // Requested gradients of a part.
-template <typename T>
 struct PassRequest {
-  FieldLosses shares;                               // weight of one sample in the means over the batch
-  const std::vector<LayerGradients<T>>* sdf;        // null: features and SDF network are frozen, without a loss
-  const std::vector<LayerGradients<T>>* intensity;  // null: no loss of intensities
-  FeatureGradients<T> by_features;                  // `interpolated` is null if they are frozen
+  FieldLosses shares;                                   // weight of one sample in the means over the batch
+  const std::vector<LayerGradients<float>>* sdf;        // null: features and SDF network are frozen, without a loss
+  const std::vector<LayerGradients<float>>* intensity;  // null: no loss of intensities
+  FeatureGradients by_features;                         // `interpolated` is null if they are frozen
 };
 
 // Weights of the networks, prepared once for all parts of a batch.
-template <typename T>
 struct PassWeights {
-  // `trains`, `sees`: see FieldLoss.
-  PassWeights(const FieldParameters<T>& field, bool trains, bool sees);
+  // `trains`, `sees`: whether there are losses of signed distances, and of intensities.
+  PassWeights(const FieldParameters& field, bool trains, bool sees);
 
-  ForwardWeights<T> sdf;
-  std::optional<ForwardWeights<T>> intensity;
-  std::optional<BackwardWeights<T>> sdf_backward, intensity_backward;
+  ForwardWeights<float> sdf;
+  std::optional<ForwardWeights<float>> intensity;
+  std::optional<BackwardWeights<float>> sdf_backward, intensity_backward;
 };
 
 // Returns the losses summed over the samples of a part.
-template <typename T>
-FieldLosses run_pass(const FieldParameters<T>& field, const PassWeights<T>& weights, const LossOptions& options,
-                     const PassInput<T>& part, const PassRequest<T>& request);
+FieldLosses run_pass(const FieldParameters& field, const PassWeights& weights, const LossOptions& options,
+                     const PassInput& part, const PassRequest& request);
 
 }  // namespace radarsdf

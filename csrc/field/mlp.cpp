@@ -21,7 +21,7 @@ constexpr T kOne = 1;
 
 template <typename T>
 std::vector<T> zeros(std::int64_t size) {
-  return std::vector<T>(static_cast<std::size_t>(size));
+  return std::vector<T>(size);
 }
 
 // First column of each hidden layer, and the number of columns.
@@ -208,7 +208,7 @@ ForwardWeights<T>::ForwardWeights(const std::vector<Layer<T>>& own_layers)
     biases.push_back(zeros<T>(columns));
     for (std::int64_t n = 0; n < layer.outputs; ++n) {
       for (std::int64_t k = 0; k < layer.inputs; ++k) {
-        transposed.back()[static_cast<std::size_t>(k * columns + n)] = layer.weights[n * layer.inputs + k];
+        transposed.back()[k * columns + n] = layer.weights[n * layer.inputs + k];
       }
     }
     std::copy_n(layer.biases, layer.outputs, biases.back().begin());

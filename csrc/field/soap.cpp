@@ -31,44 +31,39 @@ bool has_basis(std::int64_t side) { return side <= kLongestSide; }
 std::int64_t square_size(std::int64_t side) { return has_basis(side) ? side * padded(side) : 0; }
 
 // Matrix of rows padded with zeros.
-template <typename T>
 struct Matrix {
-  T* data;
+  float* data;
   std::int64_t rows, columns;
 
   std::int64_t stride() const { return padded(columns); }
   std::int64_t size() const { return rows * stride(); }
-  T* row(std::int64_t r) const { return data + r * stride(); }
+  float* row(std::int64_t r) const { return data + r * stride(); }
 };
 
-template <typename T>
-Matrix<T> zeros_in(std::vector<T>& numbers, std::int64_t rows, std::int64_t columns) {
-  numbers.assign(static_cast<std::size_t>(rows * padded(columns)), T(0));
+Matrix zeros_in(std::vector<float>& numbers, std::int64_t rows, std::int64_t columns) {
+  numbers.assign(rows * padded(columns), 0.0F);
   return {numbers.data(), rows, columns};
 }
 
-template <typename T>
-void transpose(Matrix<T> from, Matrix<T> to) {
+void transpose(Matrix from, Matrix to) {
   for (std::int64_t r = 0; r < from.rows; ++r) {
     for (std::int64_t c = 0; c < from.columns; ++c) to.row(c)[r] = from.row(r)[c];
   }
 }
 
-template <typename T>
-double trace(Matrix<T> square) {
+double trace(Matrix square) {
   double sum = 0;
   for (std::int64_t i = 0; i < square.rows; ++i) sum += static_cast<double>(square.row(i)[i]);
   return sum;
 }
 
-template <typename T>
 class Soap {
  public:
-  explicit Soap(const SoapMatrix<T>& matrix) : matrix_(matrix) {
+  explicit Soap(const SoapMatrix& matrix) : matrix_(matrix) {
     const std::int64_t rows = matrix.rows, columns = matrix.columns;
-    T* next = matrix.memory;
+    float* next = matrix.memory;
     const auto take = [&next](std::int64_t side, std::int64_t width) {
-      const Matrix<T> taken{next, side, width};
+      const Matrix taken{next, side, width};
       next += taken.size();
       return taken;
     };
@@ -101,26 +96,27 @@ class Soap {
     const bool is_power_of_two = (number & (number - 1)) == 0;
     if (number % kTurnEvery == 0 || (number < kTurnEvery && is_power_of_two)) turn();
     into_bases(gradient_, turned_);
-    kernels_.add(turned_.data, T(kBeta), epsilon(), means_.data, squares_.data, turned_.data, turned_.size());
+    kernels_.add(turned_.data, static_cast<float>(kBeta), epsilon(), means_.data, squares_.data, turned_.data,
+                 turned_.size());
     out_of_bases(turned_, gradient_);
     // Bias correction: means are too small by 1 - beta^number, roots of squares by its square root.
     const double grown = 1 - std::pow(kBeta, static_cast<double>(number));
-    const T rate = static_cast<T>(learning_rate / std::sqrt(grown));
+    const float rate = static_cast<float>(learning_rate / std::sqrt(grown));
     for (std::int64_t r = 0; r < matrix_.rows; ++r) {
-      T* weights = matrix_.weights + r * matrix_.columns;
+      float* weights = matrix_.weights + r * matrix_.columns;
       for (std::int64_t c = 0; c < matrix_.columns; ++c) weights[c] -= rate * gradient_.row(r)[c];
     }
   }
 
  private:
-  static void begin(Matrix<T> basis) {
+  static void begin(Matrix basis) {
     if (!basis.data) return;
     for (std::int64_t i = 0; i < basis.rows; ++i) basis.row(i)[i] = 1;
   }
 
   // c = a b, or a' b; adds to c if `add`.
-  void multiply(Matrix<T> a, bool transposed, Matrix<T> b, Matrix<T> c, bool add = false) const {
-    Product<T> product{};
+  void multiply(Matrix a, bool transposed, Matrix b, Matrix c, bool add = false) const {
+    Product<float> product{};
     product.a = a.data;
     product.a_row = transposed ? 1 : a.stride();
     product.a_depth = transposed ? a.stride() : 1;
@@ -136,29 +132,29 @@ class Soap {
 
   void add_to_sums() {
     if (left_.data) {
-      const Matrix<T> transposed = zeros_in(scratch_, matrix_.columns, matrix_.rows);
+      const Matrix transposed = zeros_in(scratch_, matrix_.columns, matrix_.rows);
       transpose(gradient_, transposed);
-      kernels_.scale(left_sum_.data, T(kBeta), left_sum_.size());
+      kernels_.scale(left_sum_.data, static_cast<float>(kBeta), left_sum_.size());
       multiply(gradient_, false, transposed, left_sum_, true);
     }
     if (right_.data) {
-      kernels_.scale(right_sum_.data, T(kBeta), right_sum_.size());
+      kernels_.scale(right_sum_.data, static_cast<float>(kBeta), right_sum_.size());
       multiply(gradient_, true, gradient_, right_sum_, true);
     }
   }
 
   // Rotations preserve the sum of squares, so that of the gradient is the trace of either sum.
-  T epsilon() const {
-    const Matrix<T> sum = left_.data ? left_sum_ : right_sum_;
+  float epsilon() const {
+    const Matrix sum = left_.data ? left_sum_ : right_sum_;
     const double mean_square =
         sum.data ? (1 - kBeta) * trace(sum) / static_cast<double>(matrix_.rows * matrix_.columns) : 0;
-    return static_cast<T>(kFloor * std::sqrt(mean_square) + kLeast);
+    return static_cast<float>(kFloor * std::sqrt(mean_square) + kLeast);
   }
 
   // Rows of a basis are its vectors: turned = left G right'.
-  void into_bases(Matrix<T> from, Matrix<T> to) {
+  void into_bases(Matrix from, Matrix to) {
     if (left_.data) multiply(left_, false, from, half_);
-    const Matrix<T> half = left_.data ? half_ : from;
+    const Matrix half = left_.data ? half_ : from;
     if (right_.data) {
       multiply(half, false, right_transposed_, to);
     } else {
@@ -166,9 +162,9 @@ class Soap {
     }
   }
 
-  void out_of_bases(Matrix<T> from, Matrix<T> to) {
+  void out_of_bases(Matrix from, Matrix to) {
     if (right_.data) multiply(from, false, right_, half_);
-    const Matrix<T> half = right_.data ? half_ : from;
+    const Matrix half = right_.data ? half_ : from;
     if (left_.data) {
       multiply(left_, true, half, to);
     } else {
@@ -186,23 +182,24 @@ class Soap {
     into_bases(turned_, means_);
   }
 
-  void turn_basis(Matrix<T> sum, Matrix<T> basis) {
+  void turn_basis(Matrix sum, Matrix basis) {
     if (!basis.data) return;
-    const auto scale = static_cast<T>(static_cast<double>(sum.rows) / trace(sum));
+    const auto scale = static_cast<float>(static_cast<double>(sum.rows) / trace(sum));
     if (!(std::isfinite(scale) && scale > 0)) return;
-    const Matrix<T> next = zeros_in(scratch_, basis.rows, basis.columns);
+    const Matrix next = zeros_in(scratch_, basis.rows, basis.columns);
     multiply(basis, false, sum, next);
-    for (std::int64_t i = 0; i < next.size(); ++i) next.data[i] = scale * next.data[i] + T(kRidge) * basis.data[i];
+    for (std::int64_t i = 0; i < next.size(); ++i)
+      next.data[i] = scale * next.data[i] + static_cast<float>(kRidge) * basis.data[i];
     if (kernels_.orthonormalise(next.data, next.rows, next.stride())) std::copy_n(next.data, next.size(), basis.data);
   }
 
-  const SoapMatrix<T>& matrix_;
-  Matrix<T> means_{}, squares_{};                                               // moments of gradients in the bases
-  Matrix<T> left_sum_{}, left_{}, right_sum_{}, right_{}, right_transposed_{};  // without data: identity
-  std::vector<T> gradient_numbers_, half_numbers_, turned_numbers_, scratch_;
-  Matrix<T> gradient_{}, half_{}, turned_{};
-  ProductKernel<T> product_kernel_ = RADARSDF_KERNEL(product_kernel<T>)();
-  SoapKernels<T> kernels_ = RADARSDF_KERNEL(soap_kernels<T>)();
+  const SoapMatrix& matrix_;
+  Matrix means_{}, squares_{};                                               // moments of gradients in the bases
+  Matrix left_sum_{}, left_{}, right_sum_{}, right_{}, right_transposed_{};  // without data: identity
+  std::vector<float> gradient_numbers_, half_numbers_, turned_numbers_, scratch_;
+  Matrix gradient_{}, half_{}, turned_{};
+  ProductKernel<float> product_kernel_ = RADARSDF_KERNEL(product_kernel<float>)();
+  SoapKernels kernels_ = RADARSDF_KERNEL(soap_kernels)();
 };
 
 }  // namespace
@@ -211,12 +208,8 @@ std::int64_t soap_memory_size(std::int64_t rows, std::int64_t columns) {
   return 2 * rows * padded(columns) + 2 * square_size(rows) + 3 * square_size(columns);
 }
 
-template <typename T>
-void soap_step(const SoapMatrix<T>& matrix, std::int64_t step, double learning_rate) {
-  Soap<T>(matrix).step(step, learning_rate);
+void soap_step(const SoapMatrix& matrix, std::int64_t step, double learning_rate) {
+  Soap(matrix).step(step, learning_rate);
 }
-
-template void soap_step(const SoapMatrix<float>&, std::int64_t, double);
-template void soap_step(const SoapMatrix<double>&, std::int64_t, double);
 
 }  // namespace radarsdf

@@ -8,18 +8,16 @@ namespace radarsdf {
 // Shampoo maintains running averages of G G' and G' G of gradients G (rows, columns). SOAP is Adam on G rotated into
 // their eigenbases, in which the components of G are nearly uncorrelated, so that individual step sizes are
 // appropriate. A side too long for an eigenbasis is not rotated.
-template <typename T>
 struct SoapMatrix {
-  T* weights;         // (rows, columns)
-  const T* gradient;  // (rows, columns)
-  T* memory;          // state of soap_memory_size numbers, initially zero
+  float* weights;         // (rows, columns)
+  const float* gradient;  // (rows, columns)
+  float* memory;          // state of soap_memory_size numbers, initially zero
   std::int64_t rows, columns;
 };
 
 std::int64_t soap_memory_size(std::int64_t rows, std::int64_t columns);
 
 // `step` counts from 1.
-template <typename T>
-void soap_step(const SoapMatrix<T>& matrix, std::int64_t step, double learning_rate);
+void soap_step(const SoapMatrix& matrix, std::int64_t step, double learning_rate);
 
 }  // namespace radarsdf

@@ -142,9 +142,10 @@ inline void from_corners(Floats* corners) {
   }
 }
 
-void pull(const PlatePlaces& places, const float* distances_m, float* pulls_m, std::int64_t begin, std::int64_t end) {
+void pull(const PlateConstraints& constraints, const float* distances_m, float* pulls_m, std::int64_t begin,
+          std::int64_t end) {
   for (std::int64_t block = begin; block < end; ++block) {
-    const std::int32_t* blocks = places.corners + 8 * block;
+    const std::int32_t* blocks = constraints.corners + 8 * block;
     const Floats one = {1, 1, 1, 1, 1, 1, 1, 1};
     Floats corners[8], pulls[8] = {};
     for (int c = 0; c < 8; ++c)
@@ -152,8 +153,8 @@ void pull(const PlatePlaces& places, const float* distances_m, float* pulls_m, s
     to_corners<1>(corners);
     to_corners<2>(corners);
     to_corners<4>(corners);
-    for (std::int32_t k = places.first[block]; k < places.first[block + 1]; ++k) {
-      const PlateLayer& layer = places.layers[k];
+    for (std::int32_t k = constraints.first[block]; k < constraints.first[block + 1]; ++k) {
+      const ConstraintLayer& layer = constraints.layers[k];
       Floats upper[3], leaves, values[8];
       unpack(layer.x_and_y, upper[0], upper[1]);
       unpack(layer.z_and_leaf, upper[2], leaves);
@@ -162,7 +163,7 @@ void pull(const PlatePlaces& places, const float* distances_m, float* pulls_m, s
       for (int axis = 3; axis-- > 0;)
         for (int c = 0; c < 1 << axis; ++c) values[c] += upper[axis] * (values[c + (1 << axis)] - values[c]);
       const auto weights = load_vector<Floats>(layer.weights);
-      values[0] = weights * (values[0] - places.leaf_m * (leaves - one));
+      values[0] = weights * (values[0] - constraints.leaf_m * (leaves - one));
       for (int axis = 0; axis < 3; ++axis) {
         for (int c = 0; c < 1 << axis; ++c) {
           values[c + (1 << axis)] = upper[axis] * values[c];

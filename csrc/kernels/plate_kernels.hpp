@@ -24,26 +24,27 @@ struct PlateSweep {
   float least_m;             ///< minimum distance of a vertex with a known side
 };
 
-// Points with known distance, at most one in each of the 2 x 2 x 2 cells of a block.
-struct PlateLayer {
-  float weights[8];  ///< 0 without a point
+// Points with known distance, at most one in each of the 2 x 2 x 2 cells of a block; for the layout see
+// returns/smooth_distances.cpp.
+struct ConstraintLayer {
+  float weights[8];  ///< 0 without a constraint
   // Two 16-bit fields each: the interpolation weights of the upper corners along x and y; the weight along z and the
   // distance, 0 to 2 leaf cells from one behind the plane.
   std::uint32_t x_and_y[8], z_and_leaf[8];
 };
 constexpr int kPlateQuanta = 65535;  // steps of an interpolation weight
 
-// Blocks of cells with points, in the same layout as the blocks of vertices.
-struct PlatePlaces {
+// Blocks of cells with constraints.
+struct PlateConstraints {
   const std::int32_t* corners;  ///< (blocks, 8), blocks of vertices; the first one where missing
   const std::int32_t* first;    ///< (blocks + 1), first layer of each block
-  const PlateLayer* layers;
+  const ConstraintLayer* layers;
   float leaf_m;
 };
 
 struct PlateKernels {
   void (*sweep)(const PlateSweep& plates, std::int64_t begin, std::int64_t end);  // blocks
-  void (*pull)(const PlatePlaces& places, const float* distances_m, float* pulls_m, std::int64_t begin,
+  void (*pull)(const PlateConstraints& constraints, const float* distances_m, float* pulls_m, std::int64_t begin,
                std::int64_t end);  // blocks of cells
 };
 

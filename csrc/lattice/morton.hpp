@@ -60,4 +60,9 @@ inline std::uint64_t morton_neighbour(std::uint64_t key, int axis, std::int32_t 
 
 inline std::uint32_t morton_coordinate(std::uint64_t key, int axis) { return compact_bits(key >> axis); }
 
+// Signed coordinate of a leaf cell.
+inline std::int32_t lattice_coordinate(std::uint64_t key, int axis) {
+  return static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias;
+}
+
 }  // namespace radarsdf

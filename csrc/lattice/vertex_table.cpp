@@ -29,7 +29,7 @@ struct VertexGroup {
   std::uint64_t project(std::uint64_t cell_key) const {
     std::uint64_t key = 0;
     for (int axis = 0; axis < 3; ++axis) {
-      if (uses_axis[static_cast<std::size_t>(axis)]) key |= cell_key & key_bits(axis);
+      if (uses_axis[axis]) key |= cell_key & key_bits(axis);
     }
     return key;
   }
@@ -39,7 +39,7 @@ struct VertexGroup {
     keys[0] = projected_key;
     int count = 1;
     for (int axis = 0; axis < 3; ++axis) {
-      if (!uses_axis[static_cast<std::size_t>(axis)]) continue;
+      if (!uses_axis[axis]) continue;
       for (int c = 0; c < count; ++c) keys[c + count] = morton_neighbour(keys[c], axis, 1);
       count *= 2;
     }
@@ -67,7 +67,7 @@ class BlockMasks {
       blocks_.push_back({block_key, {0, 0}});
       numbers_.insert(block_key, found);
     }
-    blocks_[static_cast<std::size_t>(found)].parts.mask |= mask;
+    blocks_[found].parts.mask |= mask;
   }
 
   // Sorts the blocks, assigns rows to their occupied parts from `first_row` on in the order of keys, and returns the
@@ -88,7 +88,7 @@ class BlockMasks {
 
   const Occupancy* find(std::uint64_t block_key) const {
     const std::int32_t found = numbers_.find(block_key);
-    return found >= 0 ? &blocks_[static_cast<std::size_t>(found)].parts : nullptr;
+    return found >= 0 ? &blocks_[found].parts : nullptr;
   }
 
   std::vector<VertexBlock>& blocks() { return blocks_; }
@@ -149,7 +149,7 @@ std::vector<VertexBlock> assign_rows(const VertexGroup& group, const std::vector
     group.corners(block.key, block_keys);
     int bit = 1;
     for (int axis = 0; axis < 3; ++axis) {
-      if (!group.uses_axis[static_cast<std::size_t>(axis)]) continue;
+      if (!group.uses_axis[axis]) continue;
       for (int c = 0; c < bit; ++c) {
         axes[c + bit] = axes[c] | 1 << axis;
         masks[c + bit] = carried(masks[c], axis);
@@ -197,7 +197,7 @@ void write_faces(const VertexGroup& group, const BlockMasks& faces, const std::v
     std::uint64_t block_key = kEmptyKey;
     const Occupancy* block = nullptr;
     for (std::int64_t i = begin; i < end; ++i) {
-      const std::uint64_t key = group.project(keys[static_cast<std::size_t>(i)]);
+      const std::uint64_t key = group.project(keys[i]);
       if (CellBlocks::block_key(key) != block_key) {
         block_key = CellBlocks::block_key(key);
         block = faces.find(block_key);
@@ -235,7 +235,7 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
   }
 
   const std::vector<VertexGroup>& groups = vertex_groups(encoding);
-  const std::size_t num_groups = groups.size(), corners = static_cast<std::size_t>(groups[0].num_corners);
+  const std::size_t num_groups = groups.size(), corners = groups[0].num_corners;
   // Mostly enough for all levels: a growing array would be copied.
   if (num_groups > 1) faces_.reserve(num_groups * 2 * leaf_keys_.size());
   std::vector<std::uint64_t> coarser;
@@ -250,7 +250,7 @@ VertexTable::VertexTable(std::vector<std::uint64_t> leaf_keys, double leaf_size_
       BlockMasks faces = faces_of(groups[g], keys);
       check_interrupt();
       const std::int64_t num_faces = faces.number(static_cast<std::int64_t>(rows_.size() / corners));
-      rows_.resize(rows_.size() + corners * static_cast<std::size_t>(num_faces));
+      rows_.resize(rows_.size() + corners * num_faces);
       std::vector<VertexBlock> blocks = assign_rows(groups[g], faces.blocks(), rows_.data(), num_rows_, num_threads);
       if (num_groups > 1) {
         write_faces(groups[g], faces, keys, &faces_[num_groups * first + g], num_threads);
@@ -310,7 +310,7 @@ void VertexTable::locate(const T* points, std::int64_t count, std::int32_t* cell
         std::int32_t* found = cells + (first + i) * num_levels_ + level;
         found[0] = -1;
         if (found[1] < 0) continue;
-        const Children& parent = children_[static_cast<std::size_t>(found[1] - num_leaves)];
+        const Children& parent = children_[found[1] - num_leaves];
         const auto bit = [&](int axis) { return leaf[i][axis] >> level & 1u; };
         const std::uint32_t child = bit(0) | bit(1) << 1 | bit(2) << 2;
         if (!(parent.mask >> child & 1u)) continue;
@@ -325,8 +325,7 @@ std::vector<std::int32_t> leaf_coordinates(const std::vector<std::uint64_t>& key
   std::vector<std::int32_t> coordinates;
   coordinates.reserve(3 * keys.size());
   for (const std::uint64_t key : keys) {
-    for (int axis = 0; axis < 3; ++axis)
-      coordinates.push_back(static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias);
+    for (int axis = 0; axis < 3; ++axis) coordinates.push_back(lattice_coordinate(key, axis));
   }
   return coordinates;
 }
@@ -337,26 +336,22 @@ LeafVertices leaf_vertices(const VertexTable& table, int num_threads) {
   const auto num_cells = static_cast<std::int64_t>(table.leaf_keys().size());
   const std::int64_t num_vertices =
       blocks.empty() ? 0 : blocks.back().parts.first + count_bits(blocks.back().parts.mask);
-  LeafVertices vertices{std::vector<std::int32_t>(static_cast<std::size_t>(3 * num_vertices)),
-                        std::vector<std::int32_t>(static_cast<std::size_t>(8 * num_cells))};
+  LeafVertices vertices{std::vector<std::int32_t>(3 * num_vertices), std::vector<std::int32_t>(8 * num_cells)};
   const auto num_blocks = static_cast<std::int64_t>(blocks.size());
   parallel_blocks(num_blocks, 1 << 9, num_threads, [&](std::int64_t begin, std::int64_t end) {
     for (auto block = blocks.begin() + begin; block != blocks.begin() + end; ++block) {
       std::int32_t* to = vertices.coordinates.data() + 3 * std::int64_t{block->parts.first};
       for (std::uint64_t bits = block->parts.mask; bits != 0; bits &= bits - 1) {
         const std::uint64_t key = CellBlocks::key_in_block(block->key, lowest_bit(bits));
-        for (int axis = 0; axis < 3; ++axis)
-          *to++ = static_cast<std::int32_t>(morton_coordinate(key, axis)) - kAxisBias;
+        for (int axis = 0; axis < 3; ++axis) *to++ = lattice_coordinate(key, axis);
       }
     }
   });
-  parallel_blocks(num_cells, 1 << 14, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t i = begin; i < end; ++i) {
-      const std::int32_t* rows = table.rows_of(i);
-      std::int32_t* to = vertices.of_cells.data() + 8 * i;
-      // x is the fastest axis of the table's corners, z that of corners in C order.
-      for (int c = 0; c < 8; ++c) to[c] = rows[(c & 1) << 2 | (c & 2) | c >> 2];
-    }
+  parallel_for(num_cells, 1 << 14, num_threads, [&](std::int64_t i) {
+    const std::int32_t* rows = table.rows_of(i);
+    std::int32_t* to = vertices.of_cells.data() + 8 * i;
+    // x is the fastest axis of the table's corners, z that of corners in C order.
+    for (int c = 0; c < 8; ++c) to[c] = rows[(c & 1) << 2 | (c & 2) | c >> 2];
   });
   return vertices;
 }

@@ -132,19 +132,19 @@ void BlockBand::solve(double* x) const {
 BlockBand BlockBand::inverse() const {
   BlockBand z(rows_, width_);
   // Columns in reverse order: Z_ij is the sum over k > j of -Z_ik Y_kj, with Y_kj = L_kj L_jj^-1.
-  std::vector<double> y(static_cast<std::size_t>(kBlock * (width_ + 1)));
+  std::vector<double> y(kBlock * (width_ + 1));
   for (std::int64_t j = rows_ - 1; j >= 0; --j) {
     check_interrupt();
     const std::int64_t last = std::min(rows_ - 1, j + width_);
     for (std::int64_t k = j + 1; k <= last; ++k) {
-      double* yk = &y[static_cast<std::size_t>(kBlock * (k - j))];
+      double* yk = &y[kBlock * (k - j)];
       std::copy(block(k, j), block(k, j) + kBlock, yk);
       divide_by(yk, block(j, j));
     }
     for (std::int64_t i = j + 1; i <= last; ++i) {
       double* entry = z.block(i, j);
       for (std::int64_t k = j + 1; k <= last; ++k) {
-        const double* yk = &y[static_cast<std::size_t>(kBlock * (k - j))];
+        const double* yk = &y[kBlock * (k - j)];
         if (k <= i) {
           subtract_times<false>(z.block(i, k), yk, entry);
         } else {
@@ -157,7 +157,7 @@ BlockBand BlockBand::inverse() const {
     divide_by_transposed(diagonal, block(j, j));
     divide_by(diagonal, block(j, j));
     for (std::int64_t k = j + 1; k <= last; ++k) {
-      subtract_times<true>(&y[static_cast<std::size_t>(kBlock * (k - j))], z.block(k, j), diagonal);
+      subtract_times<true>(&y[kBlock * (k - j)], z.block(k, j), diagonal);
     }
   }
   return z;

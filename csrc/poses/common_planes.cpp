@@ -4,6 +4,7 @@
 #include <cmath>
 #include <numeric>
 #include <stdexcept>
+#include <utility>
 
 #include "util/parallel.hpp"
 
@@ -16,25 +17,24 @@ constexpr double kLeastM2 = 1e-10;          // lower bound of variances, which a
 constexpr int kPlane = 3;                   // unknowns of a plane
 constexpr int kCoupling = kPlane * kPose;
 
-std::size_t size(std::int64_t i) { return static_cast<std::size_t>(i); }
-
 // Completes the unit vector n to an orthonormal basis.
-void across(const double* n, double* e1, double* e2) {
-  const double axis[3] = {std::abs(n[0]) < 0.9 ? 1.0 : 0.0, std::abs(n[0]) < 0.9 ? 0.0 : 1.0, 0.0};
-  cross3(n, axis, e1);
-  const double length = std::sqrt(dot3(e1, e1));
-  for (int i = 0; i < 3; ++i) e1[i] /= length;
-  cross3(n, e1, e2);
+std::pair<Vec3, Vec3> tangents(const Vec3& n) {
+  const Vec3 across = cross(n, std::abs(n[0]) < 0.9 ? Vec3{1, 0, 0} : Vec3{0, 1, 0});
+  const Vec3 e1 = across / norm(across);
+  return {e1, cross(n, e1)};
 }
 
+// y += block x, or block^T x; block: (rows, 6).
+template <int kRows>
 void add_product(const double* block, const double* x, double* y) {
-  for (int a = 0; a < kPose; ++a) {
+  for (int a = 0; a < kRows; ++a) {
     for (int b = 0; b < kPose; ++b) y[a] += block[kPose * a + b] * x[b];
   }
 }
 
+template <int kRows>
 void add_transposed_product(const double* block, const double* x, double* y) {
-  for (int a = 0; a < kPose; ++a) {
+  for (int a = 0; a < kRows; ++a) {
     for (int b = 0; b < kPose; ++b) y[b] += block[kPose * a + b] * x[a];
   }
 }
@@ -105,21 +105,17 @@ struct CommonPlanes::Input {
   Residual residual(std::int64_t i) const {
     Residual found;
     const std::int64_t plane = returns.planes[i], scan = returns.scans[i];
-    const double *n = planes.normals + 3 * plane, *c = planes.centres + 3 * plane, *p = returns.positions + 3 * scan;
-    double off[3], arm[3], e1[3], e2[3];
-    for (int axis = 0; axis < 3; ++axis) {
-      off[axis] = returns.points[3 * i + axis] - c[axis];
-      arm[axis] = returns.points[3 * i + axis] - p[axis];
-    }
-    across(n, e1, e2);
-    found.value = dot3(off, n);
+    const Vec3 n = vec3(planes.normals, plane), point = vec3(returns.points, i);
+    const Vec3 off = point - vec3(planes.centres, plane), arm = point - vec3(returns.positions, scan);
+    const auto [e1, e2] = tangents(n);
+    found.value = dot(off, n);
     found.along[0] = 1;
-    found.along[1] = dot3(off, e1) / planes.extent_m;
-    found.along[2] = dot3(off, e2) / planes.extent_m;
+    found.along[1] = dot(off, e1) / planes.extent_m;
+    found.along[2] = dot(off, e2) / planes.extent_m;
     found.variance =
-        variance_along(n, returns.directions + 3 * i, returns.ranges_m[i], returns.up_of_scan + 3 * scan, noise);
-    std::copy(n, n + 3, found.jacobian);
-    cross3(arm, n, found.jacobian + 3);
+        variance_along(n, vec3(returns.directions, i), returns.ranges_m[i], vec3(returns.up_of_scan, scan), noise);
+    store(n, found.jacobian);
+    store(cross(arm, n), found.jacobian + 3);
     return found;
   }
 };
@@ -128,9 +124,9 @@ CommonPlanes::CommonPlanes(const PosedReturns& returns, const PlanesOfScans& pla
                            std::int64_t scans_together, int num_threads)
     : num_scans_(returns.num_scans),
       width_(std::min(scans_together, returns.num_scans) - 1),
-      weights_(size(returns.num_scans)),
-      diagonal_(size(kBlock * returns.num_scans)),
-      gradient_(size(kPose * returns.num_scans)) {
+      weights_(returns.num_scans),
+      diagonal_(kBlock * returns.num_scans),
+      gradient_(kPose * returns.num_scans) {
   Input input{returns, planes, noise};
   find_clusters(input);
   find_scale(input, num_threads);
@@ -141,21 +137,21 @@ CommonPlanes::CommonPlanes(const PosedReturns& returns, const PlanesOfScans& pla
 void CommonPlanes::find_clusters(Input& input) {
   const PosedReturns& returns = input.returns;
   const std::int64_t num_planes = input.planes.count;
-  input.first.assign(size(num_planes + 1), 0);
+  input.first.assign(num_planes + 1, 0);
   for (std::int64_t i = 0; i < returns.count; ++i) {
-    if (returns.planes[i] >= 0) ++input.first[size(returns.planes[i] + 1)];
+    if (returns.planes[i] >= 0) ++input.first[returns.planes[i] + 1];
   }
   std::partial_sum(input.first.begin(), input.first.end(), input.first.begin());
-  input.rows.resize(size(input.first.back()));
+  input.rows.resize(input.first.back());
   std::vector<std::int64_t> next(input.first.begin(), input.first.end() - 1);
   for (std::int64_t i = 0; i < returns.count; ++i) {
     if (returns.planes[i] < 0) continue;
-    input.rows[size(next[size(returns.planes[i])]++)] = static_cast<std::int32_t>(i);
+    input.rows[next[returns.planes[i]]++] = static_cast<std::int32_t>(i);
   }
-  const auto scan = [&](std::int64_t at) { return returns.scans[input.rows[size(at)]]; };
+  const auto scan = [&](std::int64_t at) { return returns.scans[input.rows[at]]; };
   first_of_plane_.assign(1, 0);
   for (std::int64_t p = 0; p < num_planes; ++p) {
-    const std::int64_t begin = input.first[size(p)], end = input.first[size(p + 1)];
+    const std::int64_t begin = input.first[p], end = input.first[p + 1];
     if (begin < end && scan(begin) != scan(end - 1)) {  // a plane of one scan constrains no pose
       for (std::int64_t k = begin; k < end; ++k) {
         if (k > begin && scan(k) == scan(k - 1)) continue;
@@ -166,26 +162,23 @@ void CommonPlanes::find_clusters(Input& input) {
     }
     first_of_plane_.push_back(static_cast<std::int64_t>(scan_of_cluster_.size()));
   }
-  first_of_scan_.assign(size(num_scans_ + 1), 0);
-  for (const std::int32_t of : scan_of_cluster_) ++first_of_scan_[size(of + 1)];
+  first_of_scan_.assign(num_scans_ + 1, 0);
+  for (const std::int32_t of : scan_of_cluster_) ++first_of_scan_[of + 1];
   std::partial_sum(first_of_scan_.begin(), first_of_scan_.end(), first_of_scan_.begin());
   order_.resize(scan_of_cluster_.size());
   next.assign(first_of_scan_.begin(), first_of_scan_.end() - 1);
   for (std::size_t k = 0; k < order_.size(); ++k) {
-    order_[size(next[size(scan_of_cluster_[k])]++)] = static_cast<std::int32_t>(k);
+    order_[next[scan_of_cluster_[k]]++] = static_cast<std::int32_t>(k);
   }
 }
 
 void CommonPlanes::find_scale(const Input& input, int num_threads) {
   std::vector<double> ratios(input.rows.size());
   if (ratios.empty()) return;
-  parallel_blocks(static_cast<std::int64_t>(ratios.size()), 1 << 10, num_threads,
-                  [&](std::int64_t begin, std::int64_t end) {
-                    for (std::int64_t k = begin; k < end; ++k) {
-                      const Input::Residual found = input.residual(input.rows[size(k)]);
-                      ratios[size(k)] = found.value * found.value / std::max(found.variance, kLeastM2);
-                    }
-                  });
+  parallel_for(static_cast<std::int64_t>(ratios.size()), 1 << 10, num_threads, [&](std::int64_t k) {
+    const Input::Residual found = input.residual(input.rows[k]);
+    ratios[k] = found.value * found.value / std::max(found.variance, kLeastM2);
+  });
   const auto middle = ratios.begin() + static_cast<std::ptrdiff_t>(ratios.size() / 2);
   std::nth_element(ratios.begin(), middle, ratios.end());
   scale_ = std::max(1.0, *middle / kMedianOfSquare);
@@ -193,29 +186,27 @@ void CommonPlanes::find_scale(const Input& input, int num_threads) {
 
 void CommonPlanes::eliminate_planes(Input& input, int num_threads) {
   const std::size_t clusters = scan_of_cluster_.size();
-  input.weights.resize(size(input.returns.count));
+  input.weights.resize(input.returns.count);
   input.taken.resize(kPose * clusters);
   group_end_.resize(clusters);
   coupling_.resize(kCoupling * clusters);
   if (width_ + 1 < num_scans_) band_coupling_.resize(kCoupling * clusters);
-  parallel_blocks(input.planes.count, 1 << 6, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t p = begin; p < end; ++p) eliminate_plane(input, p);
-  });
+  parallel_for(input.planes.count, 1 << 6, num_threads, [&](std::int64_t p) { eliminate_plane(input, p); });
 }
 
 void CommonPlanes::eliminate_plane(Input& input, std::int64_t plane) {
-  const std::size_t base = size(first_of_plane_[size(plane)]), last = size(first_of_plane_[size(plane + 1)]);
+  const std::size_t base = first_of_plane_[plane], last = first_of_plane_[plane + 1];
   if (base == last) return;
   std::vector<PlaneSums> sums(last - base);
   std::size_t cluster = base;
-  for (std::int64_t k = input.first[size(plane)]; k < input.first[size(plane + 1)]; ++k) {
-    const std::int64_t i = input.rows[size(k)];
+  for (std::int64_t k = input.first[plane]; k < input.first[plane + 1]; ++k) {
+    const std::int64_t i = input.rows[k];
     if (input.returns.scans[i] != scan_of_cluster_[cluster]) ++cluster;
     const Input::Residual found = input.residual(i);
     const double variance = scale_ * std::max(found.variance, kLeastM2);
     const double robust = 1 / (1 + found.value * found.value / (kSigmas2 * variance));
     const auto w = static_cast<float>(robust * robust / variance);
-    input.weights[size(i)] = w;
+    input.weights[i] = w;
     sums[cluster - base].add(found.along, w, found.value);
     double* c = &coupling_[kCoupling * cluster];
     for (int l = 0; l < kPlane; ++l) {
@@ -243,11 +234,9 @@ void CommonPlanes::eliminate_plane(Input& input, std::int64_t plane) {
   all.factor();
   all.divide(all.u, 1);
   for (std::size_t k = base; k < last; ++k) {
-    double *c = &coupling_[kCoupling * k], *taken = &input.taken[kPose * k];
+    double* c = &coupling_[kCoupling * k];
     all.divide(c, kPose);
-    for (int l = 0; l < kPlane; ++l) {
-      for (int a = 0; a < kPose; ++a) taken[a] += c[kPose * l + a] * all.u[l];
-    }
+    add_transposed_product<kPlane>(c, all.u, &input.taken[kPose * k]);
   }
 }
 
@@ -256,24 +245,22 @@ void CommonPlanes::sum_scans(const Input& input, int num_threads) {
   const auto begin_of = [&](std::int64_t scan) {
     return std::lower_bound(returns.scans, returns.scans + returns.count, scan) - returns.scans;
   };
-  parallel_blocks(num_scans_, 1, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t s = begin; s < end; ++s) {
-      double *h = &diagonal_[size(kBlock * s)], *g = &gradient_[size(kPose * s)];
-      for (std::int64_t i = begin_of(s); i < begin_of(s + 1); ++i) {
-        const double w = input.weights[size(i)];
-        if (!(w > 0)) continue;
-        const Input::Residual found = input.residual(i);
-        const double* j = found.jacobian;
-        for (int a = 0; a < kPose; ++a) {
-          for (int b = 0; b < kPose; ++b) h[kPose * a + b] += w * j[a] * j[b];
-          g[a] += w * j[a] * found.value;
-        }
-        weights_[size(s)] += w * scale_ * std::max(found.variance, kLeastM2);
+  parallel_for(num_scans_, 1, num_threads, [&](std::int64_t s) {
+    double *h = &diagonal_[kBlock * s], *g = &gradient_[kPose * s];
+    for (std::int64_t i = begin_of(s); i < begin_of(s + 1); ++i) {
+      const double w = input.weights[i];
+      if (!(w > 0)) continue;
+      const Input::Residual found = input.residual(i);
+      const double* j = found.jacobian;
+      for (int a = 0; a < kPose; ++a) {
+        for (int b = 0; b < kPose; ++b) h[kPose * a + b] += w * j[a] * j[b];
+        g[a] += w * j[a] * found.value;
       }
-      for (std::int64_t k = first_of_scan_[size(s)]; k < first_of_scan_[size(s + 1)]; ++k) {
-        const double* taken = &input.taken[size(kPose * std::int64_t{order_[size(k)]})];
-        for (int a = 0; a < kPose; ++a) g[a] -= taken[a];
-      }
+      weights_[s] += w * scale_ * std::max(found.variance, kLeastM2);
+    }
+    for (std::int64_t k = first_of_scan_[s]; k < first_of_scan_[s + 1]; ++k) {
+      const double* taken = &input.taken[kPose * std::int64_t{order_[k]}];
+      for (int a = 0; a < kPose; ++a) g[a] -= taken[a];
     }
   });
 }
@@ -281,20 +268,18 @@ void CommonPlanes::sum_scans(const Input& input, int num_threads) {
 void CommonPlanes::subtract_planes(BlockBand& band, int num_threads) const {
   const std::vector<double>& coupling = band_coupling_.empty() ? coupling_ : band_coupling_;
   // Scans write to disjoint rows.
-  parallel_blocks(num_scans_, 1, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t s = begin; s < end; ++s) {
-      for (std::int64_t k = first_of_scan_[size(s)]; k < first_of_scan_[size(s + 1)]; ++k) {
-        const auto own = size(order_[size(k)]);
-        // Backwards over the clusters of the group, which share its end.
-        for (std::size_t other = own + 1; other-- > 0;) {
-          if (group_end_[other] != group_end_[own]) break;
-          const double *a = &coupling[kCoupling * own], *b = &coupling[kCoupling * other];
-          double* entry = band.block(s, scan_of_cluster_[other]);
-          for (int l = 0; l < kPlane; ++l) {
-            for (int i = 0; i < kPose; ++i) {
-              const double factor = a[kPose * l + i];
-              for (int j = 0; j < kPose; ++j) entry[kPose * i + j] -= factor * b[kPose * l + j];
-            }
+  parallel_for(num_scans_, 1, num_threads, [&](std::int64_t s) {
+    for (std::int64_t k = first_of_scan_[s]; k < first_of_scan_[s + 1]; ++k) {
+      const std::size_t own = order_[k];
+      // Backwards over the clusters of the group, which share its end.
+      for (std::size_t other = own + 1; other-- > 0;) {
+        if (group_end_[other] != group_end_[own]) break;
+        const double *a = &coupling[kCoupling * own], *b = &coupling[kCoupling * other];
+        double* entry = band.block(s, scan_of_cluster_[other]);
+        for (int l = 0; l < kPlane; ++l) {
+          for (int i = 0; i < kPose; ++i) {
+            const double factor = a[kPose * l + i];
+            for (int j = 0; j < kPose; ++j) entry[kPose * i + j] -= factor * b[kPose * l + j];
           }
         }
       }
@@ -306,31 +291,26 @@ void CommonPlanes::apply(const double* diagonal, const double* below, const doub
                          int num_threads) const {
   const std::size_t planes = first_of_plane_.size() - 1;
   std::vector<double> of_plane(kPlane * planes);
-  parallel_blocks(static_cast<std::int64_t>(planes), 1 << 8, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t p = begin; p < end; ++p) {
-      double* z = &of_plane[size(kPlane * p)];
-      for (std::int64_t k = first_of_plane_[size(p)]; k < first_of_plane_[size(p + 1)]; ++k) {
-        const double *c = &coupling_[size(kCoupling * k)], *own = x + kPose * scan_of_cluster_[size(k)];
-        for (int l = 0; l < kPlane; ++l) {
-          for (int a = 0; a < kPose; ++a) z[l] += c[kPose * l + a] * own[a];
-        }
-      }
+  parallel_for(static_cast<std::int64_t>(planes), 1 << 8, num_threads, [&](std::int64_t p) {
+    double* z = &of_plane[kPlane * p];
+    for (std::int64_t k = first_of_plane_[p]; k < first_of_plane_[p + 1]; ++k) {
+      const double *c = &coupling_[kCoupling * k], *own = x + kPose * scan_of_cluster_[k];
+      add_product<kPlane>(c, own, z);
     }
   });
-  parallel_blocks(num_scans_, 8, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t s = begin; s < end; ++s) {
-      double* out = y + kPose * s;
-      std::fill(out, out + kPose, 0.0);
-      add_product(&diagonal_[size(kBlock * s)], x + kPose * s, out);
-      add_product(diagonal + kBlock * s, x + kPose * s, out);
-      if (s > 0) add_product(below + kBlock * (s - 1), x + kPose * (s - 1), out);
-      if (s + 1 < num_scans_) add_transposed_product(below + kBlock * s, x + kPose * (s + 1), out);
-      for (std::int64_t k = first_of_scan_[size(s)]; k < first_of_scan_[size(s + 1)]; ++k) {
-        const std::size_t cluster = size(order_[size(k)]);
-        const double *c = &coupling_[kCoupling * cluster], *z = &of_plane[kPlane * size(plane_of_cluster_[cluster])];
-        for (int l = 0; l < kPlane; ++l) {
-          for (int a = 0; a < kPose; ++a) out[a] -= c[kPose * l + a] * z[l];
-        }
+  parallel_for(num_scans_, 8, num_threads, [&](std::int64_t s) {
+    double* out = y + kPose * s;
+    std::fill(out, out + kPose, 0.0);
+    add_product<kPose>(&diagonal_[kBlock * s], x + kPose * s, out);
+    add_product<kPose>(diagonal + kBlock * s, x + kPose * s, out);
+    if (s > 0) add_product<kPose>(below + kBlock * (s - 1), x + kPose * (s - 1), out);
+    if (s + 1 < num_scans_) add_transposed_product<kPose>(below + kBlock * s, x + kPose * (s + 1), out);
+    for (std::int64_t k = first_of_scan_[s]; k < first_of_scan_[s + 1]; ++k) {
+      const std::size_t cluster = order_[k];
+      const double *c = &coupling_[kCoupling * cluster],
+                   *z = &of_plane[kPlane * std::int64_t{plane_of_cluster_[cluster]}];
+      for (int l = 0; l < kPlane; ++l) {
+        for (int a = 0; a < kPose; ++a) out[a] -= c[kPose * l + a] * z[l];
       }
     }
   });
@@ -342,7 +322,7 @@ double CommonPlanes::solve(const double* diagonal, const double* below, const do
   BlockBand band(num_scans_, std::max<std::int64_t>(width_, 1));
   for (std::int64_t s = 0; s < num_scans_; ++s) {
     for (int k = 0; k < kBlock; ++k) {
-      band.block(s, s)[k] = diagonal_[size(kBlock * s + k)] + diagonal[kBlock * s + k];
+      band.block(s, s)[k] = diagonal_[kBlock * s + k] + diagonal[kBlock * s + k];
       if (s > 0) band.block(s, s - 1)[k] = below[kBlock * (s - 1) + k];
     }
   }
@@ -355,7 +335,7 @@ double CommonPlanes::solve(const double* diagonal, const double* below, const do
       if (s > 0) std::copy(inverse.block(s, s - 1), inverse.block(s, s - 1) + kBlock, inverse_below + kBlock * (s - 1));
     }
   }
-  const std::size_t numbers = size(kPose * num_scans_);
+  const std::size_t numbers = kPose * num_scans_;
   std::vector<double> residual(numbers), direction(numbers), product(numbers), solved(numbers);
   std::fill(x, x + numbers, 0.0);
   for (std::size_t i = 0; i < numbers; ++i) residual[i] = -(gradient_[i] + q[i]);

@@ -1,4 +1,4 @@
-// Normal equations of the poses of scans, from returns on common planes.
+// Bundle adjustment with planes eliminated: normal equations of the poses of scans, from returns on common planes.
 #pragma once
 
 #include <cstdint>
@@ -43,10 +43,8 @@ class CommonPlanes {
   // Ratio of the median of the normalised squared residuals to that of a normal distribution, at least 1. It scales all
   // variances, since wrong poses inflate residuals.
   double scale() const { return scale_; }
-  std::int64_t num_used() const { return num_used_; }  // returns on planes of two scans or more
-  const std::vector<double>& weights() const {
-    return weights_;
-  }  // (scans), sum of the weights of its returns, each in [0, 1]
+  std::int64_t num_used() const { return num_used_; }              // returns on planes of two scans or more
+  const std::vector<double>& weights() const { return weights_; }  // (scans), sums over returns, each in [0, 1]
 
   // Solves (H + P) x = -(g + q) for the increments x (scans, 6): H and g are of the planes; P (prior) is block
   // tridiagonal, diagonal (scans, 6, 6), below (scans - 1, 6, 6), and q (scans, 6) its gradient. By conjugate

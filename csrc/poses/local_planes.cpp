@@ -31,24 +31,25 @@ std::uint64_t key_of(const std::int64_t* cell) {
   return key;
 }
 
-// Directions and ranges of returns, sensor frame.
-struct Beams {
-  std::vector<double> directions;
-  std::vector<double> ranges_m;
+Vec3 rotate(const double* pose, const Vec3& vector) {
+  return {dot(vec3(pose), vector), dot(vec3(pose + 4), vector), dot(vec3(pose + 8), vector)};
+}
 
-  Beams(const double* points, std::int64_t count)
-      : directions(static_cast<std::size_t>(3 * count)), ranges_m(static_cast<std::size_t>(count)) {
-    for (std::size_t i = 0; i < ranges_m.size(); ++i) {
-      ranges_m[i] = std::sqrt(dot3(points + 3 * i, points + 3 * i));
-      for (std::size_t axis = 0; axis < 3; ++axis) {
-        directions[3 * i + axis] = points[3 * i + axis] / std::max(ranges_m[i], 1e-9);
-      }
-    }
-  }
+Vec3 translation(const double* pose) { return {pose[3], pose[7], pose[11]}; }
+
+// A return in the sensor frame.
+struct Beam {
+  Vec3 point, direction;
+  double range_m;
 };
 
-void rotate(const double* pose, const double* vector, double* rotated) {
-  for (int row = 0; row < 3; ++row) rotated[row] = dot3(pose + 4 * row, vector);
+std::vector<Beam> beams_of(const double* points, std::int64_t count) {
+  std::vector<Beam> beams;
+  for (std::int64_t i = 0; i < count; ++i) {
+    const Vec3 point = vec3(points, i);
+    beams.push_back({point, point / std::max(norm(point), 1e-9), norm(point)});
+  }
+  return beams;
 }
 
 }  // namespace
@@ -57,7 +58,7 @@ LocalPlanes::LocalPlanes(double cell_size_m) : cell_size_m_(cell_size_m) {
   if (!(cell_size_m > 0)) throw std::invalid_argument("cell_size_m must be positive");
 }
 
-std::optional<std::uint64_t> LocalPlanes::key(const double* point) const {
+std::optional<std::uint64_t> LocalPlanes::key(const Vec3& point) const {
   std::int64_t cell[3];
   for (int axis = 0; axis < 3; ++axis) {
     const double place = std::floor(point[axis] / cell_size_m_) + static_cast<double>(kHalf);
@@ -67,7 +68,7 @@ std::optional<std::uint64_t> LocalPlanes::key(const double* point) const {
   return key_of(cell);
 }
 
-LocalPlanes::Moments LocalPlanes::moments(const double* point, std::uint64_t key) const {
+LocalPlanes::Moments LocalPlanes::moments(const Vec3& point, std::uint64_t key) const {
   std::int64_t x[3];
   for (int axis = 0; axis < 3; ++axis) {
     const double corner = static_cast<double>(axis_of(key, axis) - kHalf);
@@ -79,10 +80,11 @@ LocalPlanes::Moments LocalPlanes::moments(const double* point, std::uint64_t key
 void LocalPlanes::add(const double* points, std::int64_t count, int sign) {
   std::unordered_map<std::uint64_t, Moments> change;
   for (std::int64_t i = 0; i < count; ++i) {
-    const auto cell = key(points + 3 * i);
+    const Vec3 point = vec3(points, i);
+    const auto cell = key(point);
     if (!cell) throw std::invalid_argument("a point is too far from the origin for cells of this size");
     Moments& sums = change.try_emplace(*cell).first->second;
-    const Moments of_point = moments(points + 3 * i, *cell);
+    const Moments of_point = moments(point, *cell);
     for (std::size_t k = 0; k < kMoments; ++k) sums[k] += sign * of_point[k];
   }
   for (const auto& [cell, sums] : change) {
@@ -154,49 +156,45 @@ const LocalPlanes::Plane& LocalPlanes::plane(std::uint64_t key) const {
   return known != planes_.end() ? known->second : planes_.emplace(key, plane_of(key)).first->second;
 }
 
-std::optional<LocalPlanes::Residual> LocalPlanes::residual(const double* point, const float* direction, double range_m,
-                                                           const double* up, const ReturnVariances& noise) const {
+std::optional<LocalPlanes::Residual> LocalPlanes::residual(const Vec3& point, const float* direction, double range_m,
+                                                           const Vec3& up, const ReturnVariances& noise) const {
   const auto cell = key(point);
   if (!cell) return std::nullopt;
   const Plane& here = plane(*cell);
   if (!here.flat) return std::nullopt;
-  double off[3];
-  for (int axis = 0; axis < 3; ++axis) off[axis] = point[axis] - here.centre[axis];
+  const Vec3 off = point - here.centre;
   // Variance factor of the regression at this point: of its mean and its two slopes.
   double spread = 1;
   for (int a = 1; a < 3; ++a) {
-    const double along = dot3(off, here.axes[a]);
+    const double along = dot(off, here.axes[a]);
     spread += along * along / here.variances[a];
   }
   const double of_plane = here.variances[0] / here.count * spread;
-  const double of_return = variance_along(here.axes[0], direction, range_m, up, noise);
-  return Residual{dot3(off, here.axes[0]), of_return + of_plane + kLeastM2, &here};
+  const double of_return = variance_along(here.axes[0], vec3(direction), range_m, up, noise);
+  return Residual{dot(off, here.axes[0]), of_return + of_plane + kLeastM2, &here};
 }
 
 Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const double* pose,
                                  const ReturnVariances& noise) const {
-  const Beams beams(points, count);
-  const double up[3] = {pose[2], pose[6], pose[10]};
+  const Vec3 up{pose[2], pose[6], pose[10]};
   struct Row {
     double value, variance, jacobian[3][kPose];  // rows: the normal, then its two tilts
   };
   std::vector<Row> rows;
   std::vector<double> squares;
-  for (std::size_t i = 0; i < beams.ranges_m.size(); ++i) {
-    double arm[3], direction[3], point[3];
-    rotate(pose, points + 3 * i, arm);
-    rotate(pose, beams.directions.data() + 3 * i, direction);
-    for (int axis = 0; axis < 3; ++axis) point[axis] = arm[axis] + pose[4 * axis + 3];
-    const float along[3] = {static_cast<float>(direction[0]), static_cast<float>(direction[1]),
-                            static_cast<float>(direction[2])};
-    const auto found = residual(point, along, beams.ranges_m[i], up, noise);
+  for (const Beam& beam : beams_of(points, count)) {
+    const Vec3 arm = rotate(pose, beam.point);
+    float direction[3];
+    store(rotate(pose, beam.direction), direction);
+    const auto found = residual(arm + translation(pose), direction, beam.range_m, up, noise);
     if (!found) continue;
     Row row{found->value, found->variance, {}};
     const Plane& of = *found->plane;
     for (int k = 0; k < 3; ++k) {
       const double tilt = k == 0 ? 1 : std::sqrt(of.variances[0] / (of.count * of.variances[k]));
-      for (int axis = 0; axis < 3; ++axis) row.jacobian[k][axis] = tilt * of.axes[k][axis];
-      cross3(arm, row.jacobian[k], row.jacobian[k] + 3);
+      const Vec3 axis = tilt * of.axes[k];
+      store(axis, row.jacobian[k]);
+      store(cross(arm, axis), row.jacobian[k] + 3);
     }
     rows.push_back(row);
     squares.push_back(row.value * row.value / row.variance);
@@ -226,17 +224,15 @@ Agreement LocalPlanes::agreement(const double* points, std::int64_t count, const
 
 void LocalPlanes::scores(const double* points, std::int64_t count, const double* poses, std::int64_t num_poses,
                          const ReturnVariances& noise, double* scores) const {
-  const Beams beams(points, count);
+  const std::vector<Beam> beams = beams_of(points, count);
   for (std::int64_t k = 0; k < num_poses; ++k) {
     const double* pose = poses + 16 * k;
-    const double up[3] = {pose[2], pose[6], pose[10]};
-    for (std::size_t i = 0; i < beams.ranges_m.size(); ++i) {
-      double direction[3], point[3];
-      rotate(pose, beams.directions.data() + 3 * i, direction);
-      for (int axis = 0; axis < 3; ++axis) point[axis] = beams.ranges_m[i] * direction[axis] + pose[4 * axis + 3];
-      const float along[3] = {static_cast<float>(direction[0]), static_cast<float>(direction[1]),
-                              static_cast<float>(direction[2])};
-      const auto found = residual(point, along, beams.ranges_m[i], up, noise);
+    const Vec3 up{pose[2], pose[6], pose[10]};
+    for (const Beam& beam : beams) {
+      const Vec3 exact = rotate(pose, beam.direction);
+      float direction[3];
+      store(exact, direction);
+      const auto found = residual(beam.range_m * exact + translation(pose), direction, beam.range_m, up, noise);
       *scores++ = found ? 1 / (1 + found->value * found->value / (kSigmas2 * found->variance)) : 0.0;
     }
   }

@@ -48,18 +48,20 @@ class LocalPlanes {
   using Moments = std::array<std::int64_t, kMoments>;
   struct Plane {
     bool flat = false;
-    double centre[3], axes[3][3], variances[3], count;  // axes: the normal first
+    Vec3 centre, axes[3];  // the normal first
+    double variances[3], count;
   };
   struct Residual {
     double value, variance;
     const Plane* plane;
   };
 
-  std::optional<std::uint64_t> key(const double* point) const;
-  Moments moments(const double* point, std::uint64_t key) const;
+  std::optional<std::uint64_t> key(const Vec3& point) const;
+  Moments moments(const Vec3& point, std::uint64_t key) const;
   Plane plane_of(std::uint64_t key) const;
   const Plane& plane(std::uint64_t key) const;
-  std::optional<Residual> residual(const double* point, const float* direction, double range_m, const double* up,
+  // direction: an array, as gcc 12 -O3 leaves out the rounding of a Vec3 to float and back.
+  std::optional<Residual> residual(const Vec3& point, const float* direction, double range_m, const Vec3& up,
                                    const ReturnVariances& noise) const;
 
   double cell_size_m_;

@@ -53,7 +53,7 @@ class Neighbourhood {
           inside = inside && block >= 0 && block < edge_;
           index = index * edge_ + block;
         }
-        if (inside) there_[static_cast<std::size_t>(index)] = *ends_->block(*region, part);
+        if (inside) there_[index] = *ends_->block(*region, part);
       }
     }
   }
@@ -96,7 +96,7 @@ void for_each_run(std::int64_t begin, std::int64_t end, std::int64_t count, cons
                   const Visit& visit) {
   std::int64_t i = begin;
   while (i > 0 && i < count && group_of(i) == group_of(i - 1)) ++i;
-  while (i < std::min(end, count)) {
+  while (i < end) {
     const std::int64_t first = i;
     while (i < count && group_of(i) == group_of(first)) ++i;
     visit(first, i);
@@ -123,11 +123,11 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
   const CellBlocks cells(ends, num_ends);
   const std::vector<Direction> ways = directions();
   constexpr std::int64_t kEnds = 1 << 13;  // per task, which processes the regions that begin there
-  std::vector<std::vector<Marks>> parts(static_cast<std::size_t>((num_ends + kEnds - 1) / kEnds));
-  parallel_tasks(static_cast<std::int64_t>(parts.size()), num_threads, [&](std::int64_t task) {
+  std::vector<std::vector<Marks>> parts(num_chunks(num_ends, kEnds));
+  parallel_chunks(num_ends, kEnds, num_threads, [&](std::int64_t task, std::int64_t begin, std::int64_t end) {
     Neighbourhood near(cells, max_cells + 1);
     const auto region_of = [&](std::int64_t i) { return CellBlocks::region_key(ends[i]); };
-    for_each_run(task * kEnds, (task + 1) * kEnds, num_ends, region_of, [&](std::int64_t first, std::int64_t last) {
+    for_each_run(begin, end, num_ends, region_of, [&](std::int64_t first, std::int64_t last) {
       near.move_to(region_of(first));
       for (std::int64_t i = first; i < last; ++i) {
         std::int32_t own[3];
@@ -147,7 +147,7 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
           }
         }
       }
-      near.take(parts[static_cast<std::size_t>(task)]);
+      near.take(parts[task]);
     });
   });
   std::vector<Marks> between;
@@ -158,7 +158,7 @@ std::vector<std::uint64_t> bridge_cells(const std::uint64_t* leaf_keys, std::int
   std::sort(between.begin(), between.end(), [](const Marks& a, const Marks& b) { return a.block < b.block; });
 
   std::vector<std::uint64_t> all;
-  all.reserve(static_cast<std::size_t>(num_leaves));
+  all.reserve(num_leaves);
   std::int64_t leaf = 0;
   for (std::size_t i = 0; i < between.size();) {
     const std::uint64_t block = between[i].block;
@@ -181,9 +181,9 @@ void block_medians(const std::uint64_t* keys, const double* values, std::int64_t
                    int num_threads) {
   const auto block_of = [&](std::int64_t i) { return keys[i] >> (3 * levels); };
   constexpr std::int64_t kCells = 1 << 14;  // per task, which processes the blocks that begin there
-  parallel_tasks((count + kCells - 1) / kCells, num_threads, [&](std::int64_t task) {
+  parallel_chunks(count, kCells, num_threads, [&](std::int64_t, std::int64_t begin, std::int64_t end) {
     std::vector<double> positive;
-    for_each_run(task * kCells, (task + 1) * kCells, count, block_of, [&](std::int64_t first, std::int64_t last) {
+    for_each_run(begin, end, count, block_of, [&](std::int64_t first, std::int64_t last) {
       positive.clear();
       for (std::int64_t i = first; i < last; ++i) {
         if (values[i] > 0) positive.push_back(values[i]);

@@ -51,9 +51,9 @@ struct NextTo {
 constexpr NextTo kNextTo;
 
 // A block and its 26 neighbours, last coordinate fastest.
-class BlocksRound {
+class BlockNeighbourhood {
  public:
-  explicit BlocksRound(const CellBlocks& cells) : cells_(&cells) {}
+  explicit BlockNeighbourhood(const CellBlocks& cells) : cells_(&cells) {}
 
   void move_to(std::uint64_t block_key) {
     const std::uint64_t region_key = CellBlocks::block_key(block_key);  // a region is a block of blocks
@@ -121,7 +121,7 @@ class SumsOfBlock {
   SumsOfBlock(const double* values, int columns, double weight)
       : values_(values), columns_(columns), weight_(weight), sums_(static_cast<std::size_t>(64 * columns)) {}
 
-  void move_to(const BlocksRound& round) {
+  void move_to(const BlockNeighbourhood& round) {
     std::int64_t first[kWide * kWide * kWide];  // value of each cell that is there
     std::int32_t places[kWide * kWide * kWide];
     int count = 0;
@@ -260,7 +260,7 @@ void neighbour_sums(const CellBlocks& cells, const std::uint64_t* keys, std::int
   const double weights[4] = {1, weight, std::pow(weight, 2), std::pow(weight, 3)};
   const bool of_blocks = columns <= kFewColumns;
   parallel_blocks(count, 1 << 12, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    BlocksRound round(cells);
+    BlockNeighbourhood round(cells);
     SumsOfBlock block(values, of_blocks ? columns : 0, weight);
     std::uint64_t block_key = kEmptyKey;
     std::int32_t rows[kCube];

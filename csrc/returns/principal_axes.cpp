@@ -35,32 +35,30 @@ void rotate(double (&a)[3][3], double (&v)[3][3], int p, int q) {
 }  // namespace
 
 void principal_axes(const double* matrices, std::int64_t count, double* values, double* vectors, int num_threads) {
-  parallel_blocks(count, 1 << 9, num_threads, [&](std::int64_t begin, std::int64_t end) {
-    for (std::int64_t m = begin; m < end; ++m) {
-      double a[3][3], v[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, total = 0;
-      for (int i = 0; i < 3; ++i) {
-        for (int j = i; j < 3; ++j) {
-          a[i][j] = a[j][i] = matrices[9 * m + 3 * i + j];
-          total += std::abs(a[i][j]);
-        }
+  parallel_for(count, 1 << 9, num_threads, [&](std::int64_t m) {
+    double a[3][3], v[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, total = 0;
+    for (int i = 0; i < 3; ++i) {
+      for (int j = i; j < 3; ++j) {
+        a[i][j] = a[j][i] = matrices[9 * m + 3 * i + j];
+        total += std::abs(a[i][j]);
       }
-      const double negligible = total * std::numeric_limits<double>::epsilon() * 1e-3;
-      bool is_finite = std::isfinite(total);
-      for (int sweep = 0; is_finite && sweep < kMaxSweeps; ++sweep) {
-        if (std::abs(a[0][1]) + std::abs(a[0][2]) + std::abs(a[1][2]) <= negligible) break;
-        rotate(a, v, 0, 1);
-        rotate(a, v, 0, 2);
-        rotate(a, v, 1, 2);
-      }
-      int order[3] = {0, 1, 2};
-      if (a[order[1]][order[1]] < a[order[0]][order[0]]) std::swap(order[0], order[1]);
-      if (a[order[2]][order[2]] < a[order[1]][order[1]]) std::swap(order[1], order[2]);
-      if (a[order[1]][order[1]] < a[order[0]][order[0]]) std::swap(order[0], order[1]);
-      const double nan = std::numeric_limits<double>::quiet_NaN();
-      for (int k = 0; k < 3; ++k) {
-        values[3 * m + k] = is_finite ? a[order[k]][order[k]] : nan;
-        for (int i = 0; i < 3; ++i) vectors[9 * m + 3 * i + k] = is_finite ? v[i][order[k]] : nan;
-      }
+    }
+    const double negligible = total * std::numeric_limits<double>::epsilon() * 1e-3;
+    bool is_finite = std::isfinite(total);
+    for (int sweep = 0; is_finite && sweep < kMaxSweeps; ++sweep) {
+      if (std::abs(a[0][1]) + std::abs(a[0][2]) + std::abs(a[1][2]) <= negligible) break;
+      rotate(a, v, 0, 1);
+      rotate(a, v, 0, 2);
+      rotate(a, v, 1, 2);
+    }
+    int order[3] = {0, 1, 2};
+    if (a[order[1]][order[1]] < a[order[0]][order[0]]) std::swap(order[0], order[1]);
+    if (a[order[2]][order[2]] < a[order[1]][order[1]]) std::swap(order[1], order[2]);
+    if (a[order[1]][order[1]] < a[order[0]][order[0]]) std::swap(order[0], order[1]);
+    const double nan = std::numeric_limits<double>::quiet_NaN();
+    for (int k = 0; k < 3; ++k) {
+      values[3 * m + k] = is_finite ? a[order[k]][order[k]] : nan;
+      for (int i = 0; i < 3; ++i) vectors[9 * m + 3 * i + k] = is_finite ? v[i][order[k]] : nan;
     }
   });
 }

@@ -35,7 +35,7 @@ constexpr std::array<EdgeStep, 12> edge_steps() {
     const CellEdge edge = cell_edge(e);
     int step = 0;
     for (int axis = 0; axis < 3; ++axis) step += (edge.corner & axis_bit(axis)) != 0 ? kStep[axis] : 0;
-    steps[static_cast<size_t>(e)] = {edge.axis, step};
+    steps[e] = {edge.axis, step};
   }
   return steps;
 }
@@ -144,17 +144,17 @@ class GridSurface {
   }
 
   Mesh extract() {
-    std::vector<int64_t> first_face(static_cast<size_t>((num_cells_ + kCells - 1) / kCells) + 1);
-    for_each_task([&](size_t task, int64_t begin, int64_t end) { first_face[task + 1] = mark(begin, end); });
-    for (size_t i = 1; i < first_face.size(); ++i) first_face[i] += first_face[i - 1];
-    int64_t num_vertices = 0;
+    std::vector<MeshCounts> offsets(num_chunks(num_cells_, kCells) + 1);
+    parallel_chunks(num_cells_, kCells, num_threads_,
+                    [&](int64_t task, int64_t begin, int64_t end) { offsets[task + 1].faces = mark(begin, end); });
+    int64_t& num_vertices = offsets.back().vertices;
     for (Word& word : words_) {
       word.first = static_cast<int32_t>(num_vertices);
       num_vertices += count_bits(word.cut);
     }
-    Mesh mesh = allocate_mesh(num_vertices, first_face.back(), false);
-    for_each_task([&](size_t task, int64_t begin, int64_t end) {
-      write(begin, end, mesh.vertices.get(), mesh.faces.get() + 3 * first_face[task]);
+    Mesh mesh = sum_up(offsets, false);
+    parallel_chunks(num_cells_, kCells, num_threads_, [&](int64_t task, int64_t begin, int64_t end) {
+      write(begin, end, mesh.vertices.get(), mesh.faces.get() + 3 * offsets[task].faces);
     });
     return mesh;
   }
@@ -165,19 +165,12 @@ class GridSurface {
     int32_t first = 0;                         // vertex of the mesh
   };
 
-  template <typename Task>
-  void for_each_task(const Task& task) const {
-    parallel_tasks((num_cells_ + kCells - 1) / kCells, num_threads_, [&](int64_t i) {
-      task(static_cast<size_t>(i), i * kCells, std::min(num_cells_, (i + 1) * kCells));
-    });
-  }
-
   const int32_t* rows_of(int64_t i) const { return table_->rows_of(cells_[i]); }
 
   void number_vertices_of_cells() {
-    numbers_.assign(static_cast<size_t>(table_->num_rows()), 0);
+    numbers_.assign(table_->num_rows(), 0);
     for (int64_t i = 0; i < num_cells_; ++i)
-      for (int c = 0; c < 8; ++c) numbers_[static_cast<size_t>(rows_of(i)[c])] = 1;
+      for (int c = 0; c < 8; ++c) numbers_[rows_of(i)[c]] = 1;
     int32_t count = 0;
     for (int32_t& number : numbers_) {
       const int32_t used = number;
@@ -192,15 +185,14 @@ class GridSurface {
   void for_each_brick(int64_t begin, int64_t end, const Visit& visit) const {
     Samples samples;
     for (int64_t i = begin; i < end; ++i) {
-      const uint64_t key = table_->leaf_keys()[static_cast<size_t>(cells_[i])];
+      const uint64_t key = table_->leaf_keys()[cells_[i]];
       samples.rows = rows_of(i);
       float values[8];
       for (int c = 0; c < 8; ++c) values[c] = distances_m_[samples.rows[c]];
       for (const Brick& brick : bricks_) {
         samples.brick = &brick;
         for (int axis = 0; axis < 3; ++axis) {
-          const auto cell = static_cast<int32_t>(morton_coordinate(key, axis)) - kAxisBias;
-          samples.lower[axis] = cell * voxels_.parts + brick.first[axis];
+          samples.lower[axis] = lattice_coordinate(key, axis) * voxels_.parts + brick.first[axis];
         }
         samples.interpolate(values, used(samples));
         if (samples.voxels != 0) visit(samples);
@@ -260,20 +252,15 @@ class GridSurface {
         const int32_t vertex = word.first + count_bits(word.cut.load(std::memory_order_relaxed) & (bit - 1));
         found[axis][at] = vertex;
         if (!set(word.written, bit)) return;
-        const double before = double{samples.distances_m[at]};
-        const double after = double{samples.distances_m[at + kStep[axis]]};
-        std::array<double, 3> index;
-        for (int k = 0; k < 3; ++k) index[static_cast<size_t>(k)] = samples.lower[k] + at / kStep[k] % kSide;
-        write_vertex(lattice, index, static_cast<size_t>(axis), edge_fraction(before, after, 0),
-                     vertices + 3 * int64_t{vertex});
+        Vec3 index;
+        for (int k = 0; k < 3; ++k) index[k] = samples.lower[k] + at / kStep[k] % kSide;
+        write_vertex(lattice, index, axis, double{samples.distances_m[at]},
+                     double{samples.distances_m[at + kStep[axis]]}, 0, vertices + 3 * int64_t{vertex});
       });
       for (uint64_t voxels = samples.voxels; voxels != 0; voxels &= voxels - 1) {
         const int at = lowest_bit(voxels);
-        const CellTriangles& triangles = samples.triangles(at);
-        for (size_t n = 0; n < 3u * triangles.num_triangles; ++n) {
-          const EdgeStep& edge = kEdgeSteps[triangles.edges[n]];
-          *faces++ = found[edge.axis][at + edge.step];
-        }
+        const auto vertex_of = [&](int edge) { return found[kEdgeSteps[edge].axis][at + kEdgeSteps[edge].step]; };
+        faces = write_triangles(samples.triangles(at), vertex_of, faces);
       }
     });
   }
@@ -300,23 +287,21 @@ std::vector<int32_t> cells_near_surface(const VertexTable& table, const float* d
                                         int num_threads) {
   check_octree(table);
   const auto count = static_cast<int64_t>(table.leaf_keys().size());
-  std::vector<std::uint8_t> is_near(static_cast<size_t>(count));
-  parallel_blocks(count, 1 << 14, num_threads, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const int32_t* rows = table.rows_of(i);
-      bool any_below = false, any_above = false, all_known = true;
-      for (int c = 0; c < 8; ++c) {
-        const float distance_m = distances_m[rows[c]];
-        any_below |= distance_m <= margin_m;
-        any_above |= distance_m >= -margin_m;
-        all_known &= distance_m == distance_m;
-      }
-      is_near[static_cast<size_t>(i)] = any_below && any_above && all_known;
+  std::vector<std::uint8_t> is_near(count);
+  parallel_for(count, 1 << 14, num_threads, [&](int64_t i) {
+    const int32_t* rows = table.rows_of(i);
+    bool any_below = false, any_above = false, all_known = true;
+    for (int c = 0; c < 8; ++c) {
+      const float distance_m = distances_m[rows[c]];
+      any_below |= distance_m <= margin_m;
+      any_above |= distance_m >= -margin_m;
+      all_known &= distance_m == distance_m;
     }
+    is_near[i] = any_below && any_above && all_known;
   });
   std::vector<int32_t> rows;
   for (int64_t i = 0; i < count; ++i)
-    if (is_near[static_cast<size_t>(i)] != 0) rows.push_back(static_cast<int32_t>(i));
+    if (is_near[i] != 0) rows.push_back(static_cast<int32_t>(i));
   return rows;
 }
 

@@ -50,9 +50,9 @@ void marching_cubes_dense_backward(const T* volume, const std::array<int64_t, 3>
   const int64_t plane = strides[0];
   if (shape[0] * plane == 0 && num_vertices > 0) refuse_edges();
   // First vertex of each plane, and the end.
-  std::vector<int64_t> first(static_cast<size_t>(shape[0]) + 1);
+  std::vector<int64_t> first(shape[0] + 1);
   for (int64_t i = 0; i <= shape[0]; ++i) {
-    first[static_cast<size_t>(i)] = std::lower_bound(edges, edges + num_vertices, 3 * i * plane) - edges;
+    first[i] = std::lower_bound(edges, edges + num_vertices, 3 * i * plane) - edges;
   }
   if (first.front() != 0 || first.back() != num_vertices) refuse_edges();
 
@@ -68,14 +68,14 @@ void marching_cubes_dense_backward(const T* volume, const std::array<int64_t, 3>
     const int64_t end = begin + plane;
     std::fill(volume_grad + begin, volume_grad + end, T{0});
     if (i > 0) {
-      for (int64_t v = first[static_cast<size_t>(i) - 1]; v < first[static_cast<size_t>(i)]; ++v) {
+      for (int64_t v = first[i - 1]; v < first[i]; ++v) {
         if (edges[v] % 3 != 0) continue;
         const int64_t lower = edges[v] / 3;
         if (lower < begin - plane || lower >= begin) refuse_edges();
         volume_grad[lower + plane] += static_cast<T>(gradient(v, lower, 0).upper);
       }
     }
-    for (int64_t v = first[static_cast<size_t>(i)]; v < first[static_cast<size_t>(i) + 1]; ++v) {
+    for (int64_t v = first[i]; v < first[i + 1]; ++v) {
       const auto axis = static_cast<size_t>(edges[v] % 3);
       const int64_t lower = edges[v] / 3;
       const int64_t upper_end = axis == 0 ? shape[0] * plane : end;

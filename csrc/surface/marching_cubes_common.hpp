@@ -1,16 +1,19 @@
-// Shared code of dense and sparse marching cubes: cuts of edges, checks, allocation of the result.
+// The extractor that marching cubes on volumes, on lists of cells and on grids share: tasks count their vertices and
+// faces, offsets in the mesh follow by sums, and tasks write from their offsets on.
 #pragma once
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
 #include <stdexcept>
+#include <vector>
 
 #include "surface/marching_cubes.hpp"
+#include "surface/marching_cubes_table.hpp"
 #include "util/large_array.hpp"
+#include "util/vec3.hpp"
 
 namespace radarsdf {
 
@@ -23,10 +26,12 @@ inline double edge_fraction(double a, double b, double level) {
   return std::max(min_edge_fraction, std::min(1 - min_edge_fraction, fraction));
 }
 
-inline void write_vertex(const Lattice& lattice, const std::array<double, 3>& index, std::size_t axis, double fraction,
+// Writes the vertex on the edge from the sample at `index` along the axis, with the samples at its ends.
+inline void write_vertex(const Lattice& lattice, const Vec3& index, int axis, double before, double after, double level,
                          double* vertex) {
+  const double fraction = edge_fraction(before, after, level);
   constexpr double direction[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
-  for (std::size_t i = 0; i < 3; ++i) {
+  for (int i = 0; i < 3; ++i) {
     vertex[i] = (index[i] + fraction * direction[axis][i]) * lattice.spacing[i] + lattice.origin[i];
   }
 }
@@ -41,16 +46,33 @@ inline void check_lattice(const Lattice& lattice, double level) {
   if (!std::isfinite(level)) throw std::invalid_argument("level must be finite");
 }
 
-inline Mesh allocate_mesh(std::int64_t num_vertices, std::int64_t num_faces, bool with_edges) {
-  if (num_vertices > std::numeric_limits<std::int32_t>::max()) {
-    throw std::invalid_argument("the mesh has more vertices than int32 faces can number: extract it in parts");
+// Writes the triangles of a cell; returns the end. vertex_of(edge): of its cut edges.
+template <typename VertexOf>
+std::int32_t* write_triangles(const CellTriangles& cell, const VertexOf& vertex_of, std::int32_t* faces) {
+  for (int n = 0; n < 3 * cell.num_triangles; ++n) *faces++ = vertex_of(cell.edges[n]);
+  return faces;
+}
+
+// Numbers of vertices and faces of each task, at index task + 1; after sum_up, the offsets of its output.
+struct MeshCounts {
+  std::int64_t vertices = 0, faces = 0;
+};
+
+// Returns the mesh of the summed size.
+inline Mesh sum_up(std::vector<MeshCounts>& counts, bool with_edges) {
+  for (std::size_t i = 1; i < counts.size(); ++i) {
+    counts[i].vertices += counts[i - 1].vertices;
+    counts[i].faces += counts[i - 1].faces;
   }
   Mesh mesh;
-  mesh.num_vertices = num_vertices;
-  mesh.num_faces = num_faces;
-  mesh.vertices = large_array<double>(3 * num_vertices);
-  mesh.faces = large_array<std::int32_t>(3 * num_faces);
-  if (with_edges) mesh.edges = large_array<std::int64_t>(num_vertices);
+  mesh.num_vertices = counts.back().vertices;
+  mesh.num_faces = counts.back().faces;
+  if (mesh.num_vertices > std::numeric_limits<std::int32_t>::max()) {
+    throw std::invalid_argument("the mesh has more vertices than int32 faces can number: extract it in parts");
+  }
+  mesh.vertices = large_array<double>(3 * mesh.num_vertices);
+  mesh.faces = large_array<std::int32_t>(3 * mesh.num_faces);
+  if (with_edges) mesh.edges = large_array<std::int64_t>(mesh.num_vertices);
   return mesh;
 }
 

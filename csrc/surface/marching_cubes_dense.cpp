@@ -72,15 +72,10 @@ void for_each_cut_window(const VolumeSigns& signs, int64_t i, int64_t j, const V
   }
 }
 
-// Counts, then by prefix sums output offsets, of a plane of samples and the slab of cells above it.
-struct PlaneOffsets {
-  int64_t vertices = 0;
-  int64_t faces = 0;
-};
-
-PlaneOffsets count_plane(const VolumeSigns& signs, int64_t i) {
+// Counts of a plane of samples and the slab of cells above it.
+MeshCounts count_plane(const VolumeSigns& signs, int64_t i) {
   const auto& table = marching_cubes_table();
-  PlaneOffsets count;
+  MeshCounts count;
   for (int64_t j = 0; j < signs.shape[1]; ++j) {
     for_each_cut_window(signs, i, j, [&](const CutWindow& cut) {
       count.vertices += count_bits(cut.edges[0] | static_cast<uint64_t>(cut.edges[1]) << word_bits);
@@ -98,8 +93,8 @@ PlaneOffsets count_plane(const VolumeSigns& signs, int64_t i) {
 template <typename T>
 class SlabWriter {
  public:
-  SlabWriter(const T* volume, const VolumeSigns& signs, const std::vector<PlaneOffsets>& offsets,
-             const Lattice& lattice, double level, Mesh& mesh)
+  SlabWriter(const T* volume, const VolumeSigns& signs, const std::vector<MeshCounts>& offsets, const Lattice& lattice,
+             double level, Mesh& mesh)
       : volume_(volume),
         signs_(signs),
         offsets_(offsets),
@@ -107,9 +102,9 @@ class SlabWriter {
         level_(level),
         mesh_(mesh),
         strides_{signs.shape[1] * signs.shape[2], signs.shape[2], 1},
-        lower_(new int32_t[static_cast<size_t>(3 * strides_[0])]),
-        upper_(new int32_t[static_cast<size_t>(3 * strides_[0])]),
-        edges_(new int32_t[static_cast<size_t>(3 * strides_[0])]),
+        lower_(new int32_t[3 * strides_[0]]),
+        upper_(new int32_t[3 * strides_[0]]),
+        edges_(new int32_t[3 * strides_[0]]),
         first_edge_(static_cast<size_t>(signs.shape[1]) + 1) {}
 
   // Writes the triangles of slabs [begin, end) and the vertices of the planes below them. The last plane of the volume
@@ -119,7 +114,7 @@ class SlabWriter {
     write_plane(begin);
     for (int64_t i = begin; i < end; ++i) {
       number_vertices(i + 1, upper_.get());
-      write_triangles(i);
+      write_slab(i);
       if (i + 1 < end || i + 2 == signs_.shape[0]) write_plane(i + 1);
       std::swap(lower_, upper_);
     }
@@ -128,12 +123,12 @@ class SlabWriter {
  private:
   // Lists the cut edges of a plane by row, and stores the vertex of each. Other elements of `vertices` stay unset.
   void number_vertices(int64_t i, int32_t* vertices) {
-    auto vertex = static_cast<int32_t>(offsets_[static_cast<size_t>(i)].vertices);
+    auto vertex = static_cast<int32_t>(offsets_[i].vertices);
     int32_t* next_edge = edges_.get();
     for (int64_t j = 0; j < signs_.shape[1]; ++j) {
       const T* row = volume_ + i * strides_[0] + j * strides_[1];
       int32_t* row_vertices = vertices + 3 * j * strides_[1];
-      first_edge_[static_cast<size_t>(j)] = next_edge - edges_.get();
+      first_edge_[j] = next_edge - edges_.get();
       for_each_cut_window(signs_, i, j, [&](const CutWindow& cut) {
         for (size_t axis = 0; axis < 3; ++axis) {
           for (uint32_t bits = cut.edges[axis]; bits != 0; bits &= bits - 1) {
@@ -158,46 +153,44 @@ class SlabWriter {
   }
 
   void write_edges(int64_t i) {
-    int64_t* out = mesh_.edges.get() + offsets_[static_cast<size_t>(i)].vertices;
+    int64_t* out = mesh_.edges.get() + offsets_[i].vertices;
     for (int64_t j = 0; j < signs_.shape[1]; ++j) {
       const int64_t row = 3 * (i * strides_[0] + j * strides_[1]);
-      const int64_t end = first_edge_[static_cast<size_t>(j) + 1];
-      for (int64_t e = first_edge_[static_cast<size_t>(j)]; e < end; ++e) *out++ = row + edges_[static_cast<size_t>(e)];
+      const int64_t end = first_edge_[j + 1];
+      for (int64_t e = first_edge_[j]; e < end; ++e) *out++ = row + edges_[e];
     }
   }
 
   void write_vertices(int64_t i) {
-    double* vertex = mesh_.vertices.get() + 3 * offsets_[static_cast<size_t>(i)].vertices;
+    double* vertex = mesh_.vertices.get() + 3 * offsets_[i].vertices;
     for (int64_t j = 0; j < signs_.shape[1]; ++j) {
       const T* row = volume_ + i * strides_[0] + j * strides_[1];
-      const int32_t* const end = edges_.get() + first_edge_[static_cast<size_t>(j) + 1];
-      for (const int32_t* edge = edges_.get() + first_edge_[static_cast<size_t>(j)]; edge != end; ++edge, vertex += 3) {
-        const auto axis = static_cast<size_t>(*edge % 3);
+      const int32_t* const end = edges_.get() + first_edge_[j + 1];
+      for (const int32_t* edge = edges_.get() + first_edge_[j]; edge != end; ++edge, vertex += 3) {
+        const int axis = *edge % 3;
         const int64_t k = *edge / 3;
-        const double fraction =
-            edge_fraction(static_cast<double>(row[k]), static_cast<double>(row[k + strides_[axis]]), level_);
-        write_vertex(lattice_, {static_cast<double>(i), static_cast<double>(j), static_cast<double>(k)}, axis, fraction,
-                     vertex);
+        write_vertex(lattice_, {static_cast<double>(i), static_cast<double>(j), static_cast<double>(k)}, axis,
+                     static_cast<double>(row[k]), static_cast<double>(row[k + strides_[axis]]), level_, vertex);
       }
     }
   }
 
-  void write_triangles(int64_t i) {
+  void write_slab(int64_t i) {
     const auto& table = marching_cubes_table();
-    int32_t* faces = mesh_.faces.get() + 3 * offsets_[static_cast<size_t>(i)].faces;
+    int32_t* faces = mesh_.faces.get() + 3 * offsets_[i].faces;
     for (int64_t j = 0; j + 1 < signs_.shape[1]; ++j) {
       std::array<const int32_t*, 12> vertices{};  // vertices on the edges of the row's first cell
       for (int edge = 0; edge < 12; ++edge) {
         const auto [corner, axis] = cell_edge(edge);
         const int64_t sample = (j + ((corner >> 1) & 1)) * strides_[1] + (corner & 1);
-        vertices[static_cast<size_t>(edge)] = (corner & axis_bit(0) ? upper_ : lower_).get() + 3 * sample + axis;
+        vertices[edge] = (corner & axis_bit(0) ? upper_ : lower_).get() + 3 * sample + axis;
       }
       for_each_cut_window(signs_, i, j, [&](const CutWindow& cut) {
         for (uint32_t cells = cut.cells; cells != 0; cells &= cells - 1) {
           const int bit = lowest_bit(cells);
-          const CellTriangles& cell = table[cut.pattern(bit)];
           const int64_t offset = 3 * (cut.first + bit);
-          for (size_t n = 0; n < 3u * cell.num_triangles; ++n) *faces++ = vertices[cell.edges[n]][offset];
+          const auto vertex_of = [&](int edge) { return vertices[edge][offset]; };
+          faces = write_triangles(table[cut.pattern(bit)], vertex_of, faces);
         }
       });
     }
@@ -205,7 +198,7 @@ class SlabWriter {
 
   const T* volume_;
   const VolumeSigns& signs_;
-  const std::vector<PlaneOffsets>& offsets_;
+  const std::vector<MeshCounts>& offsets_;
   const Lattice& lattice_;
   double level_;
   Mesh& mesh_;
@@ -223,17 +216,12 @@ Mesh marching_cubes_dense(const T* volume, const std::array<int64_t, 3>& shape, 
                           const Lattice& lattice, double level, int num_threads, bool with_edges) {
   check_lattice(lattice, level);
   const auto [nx, ny, nz] = shape;
-  if (nx < 2 || ny < 2 || nz < 2) return allocate_mesh(0, 0, with_edges);  // no cells
+  std::vector<MeshCounts> offsets(nx + 1);
+  if (nx < 2 || ny < 2 || nz < 2) return sum_up(offsets, with_edges);  // no cells
   if (nz > std::numeric_limits<int32_t>::max() / 3) throw std::invalid_argument("the volume's rows are too long");
   const VolumeSigns signs = read_signs(volume, shape, mask, level, num_threads);
-
-  std::vector<PlaneOffsets> offsets(static_cast<size_t>(nx) + 1);
-  parallel_tasks(nx, num_threads, [&](int64_t i) { offsets[static_cast<size_t>(i) + 1] = count_plane(signs, i); });
-  for (size_t i = 1; i < offsets.size(); ++i) {
-    offsets[i].vertices += offsets[i - 1].vertices;
-    offsets[i].faces += offsets[i - 1].faces;
-  }
-  Mesh mesh = allocate_mesh(offsets.back().vertices, offsets.back().faces, with_edges);
+  parallel_tasks(nx, num_threads, [&](int64_t i) { offsets[i + 1] = count_plane(signs, i); });
+  Mesh mesh = sum_up(offsets, with_edges);
 
   // More parts than threads balance the load; each numbers the first plane of the next again, so not many more.
   const int64_t num_slabs = nx - 1;

@@ -17,23 +17,6 @@ namespace {
 constexpr int64_t block_size = 1 << 14;
 constexpr int32_t no_vertex = -1;
 
-// Calls task(block, begin, end) for each block of [0, size).
-template <typename Task>
-void for_each_block(int64_t size, int num_threads, const Task& task) {
-  parallel_tasks((size + block_size - 1) / block_size, num_threads, [&](int64_t block) {
-    task(static_cast<size_t>(block), block * block_size, std::min(size, (block + 1) * block_size));
-  });
-}
-
-// Counts per block, at index block + 1; sum_up() converts them to the offset of each block, and the total.
-std::vector<int64_t> block_counts(int64_t size) {
-  return std::vector<int64_t>(static_cast<size_t>((size + block_size - 1) / block_size) + 1);
-}
-
-void sum_up(std::vector<int64_t>& counts) {
-  for (size_t i = 1; i < counts.size(); ++i) counts[i] += counts[i - 1];
-}
-
 constexpr unsigned is_nan = 1 << 8;
 
 // Signs of the corners, or 0 (a pattern without triangles) if a value is NaN. signs: 0, 1 or is_nan for each value.
@@ -81,31 +64,32 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
   // does not matter; relaxed atomics only avoid a data race, at no cost.
   const int64_t num_edges = 3 * num_corners;
   const auto edges = large_array<std::atomic<int32_t>>(num_edges);
-  for_each_block(num_edges, num_threads, [&](size_t, int64_t begin, int64_t end) {
-    for (int64_t e = begin; e < end; ++e) edges[static_cast<size_t>(e)].store(no_vertex, std::memory_order_relaxed);
+  parallel_chunks(num_edges, block_size, num_threads, [&](int64_t, int64_t begin, int64_t end) {
+    for (int64_t e = begin; e < end; ++e) edges[e].store(no_vertex, std::memory_order_relaxed);
   });
   const auto edge_of = [&](const int32_t* cell, int edge) -> std::atomic<int32_t>& {
     const auto [corner, axis] = cell_edge(edge);
-    return edges[static_cast<size_t>(3 * int64_t{cell[corner]} + axis)];
+    return edges[3 * int64_t{cell[corner]} + axis];
   };
 
   const auto signs = large_array<std::uint16_t>(num_corners);
-  for_each_block(num_corners, num_threads, [&](size_t, int64_t begin, int64_t end) {
+  parallel_chunks(num_corners, block_size, num_threads, [&](int64_t, int64_t begin, int64_t end) {
     for (int64_t c = begin; c < end; ++c) {
       const auto value = static_cast<double>(values[c]);
-      signs[static_cast<size_t>(c)] = static_cast<std::uint16_t>(value > level ? 1 : value == value ? 0 : is_nan);
+      signs[c] = static_cast<std::uint16_t>(value > level ? 1 : value == value ? 0 : is_nan);
     }
   });
   const auto patterns = large_array<std::uint8_t>(num_cells);
-  std::vector<int64_t> first_face = block_counts(num_cells);
-  for_each_block(num_cells, num_threads, [&](size_t block, int64_t begin, int64_t end) {
+  // Of vertices by block of corners, of faces by block of cells.
+  std::vector<MeshCounts> offsets(num_chunks(std::max(num_corners, num_cells), block_size) + 1);
+  parallel_chunks(num_cells, block_size, num_threads, [&](int64_t block, int64_t begin, int64_t end) {
     for (int64_t m = begin; m < end; ++m) {
       const int32_t* cell = cells + 8 * m;
       check_corner_numbers(cell, num_corners);
-      const std::uint8_t pattern = patterns[static_cast<size_t>(m)] = sign_pattern(signs.get(), cell);
+      const std::uint8_t pattern = patterns[m] = sign_pattern(signs.get(), cell);
       if (pattern == 0 || pattern == 255) continue;
       check_corner_positions(corners, cell);
-      first_face[block + 1] += table[pattern].num_triangles;
+      offsets[block + 1].faces += table[pattern].num_triangles;
       for (std::uint32_t bits = table[pattern].cut_edges; bits != 0; bits &= bits - 1) {
         const int edge = lowest_bit(bits);
         const auto [lower, axis] = cell_edge(edge);
@@ -114,42 +98,30 @@ Mesh marching_cubes_sparse(const int32_t* corners, const T* values, int64_t num_
       }
     }
   });
-  sum_up(first_face);
-
-  std::vector<int64_t> first_vertex = block_counts(num_corners);
-  for_each_block(num_corners, num_threads, [&](size_t block, int64_t begin, int64_t end) {
+  parallel_chunks(num_corners, block_size, num_threads, [&](int64_t block, int64_t begin, int64_t end) {
     for (int64_t e = 3 * begin; e < 3 * end; ++e) {
-      first_vertex[block + 1] += edges[static_cast<size_t>(e)].load(std::memory_order_relaxed) != no_vertex;
+      offsets[block + 1].vertices += edges[e].load(std::memory_order_relaxed) != no_vertex;
     }
   });
-  sum_up(first_vertex);
-
-  Mesh mesh = allocate_mesh(first_vertex.back(), first_face.back(), false);
-  for_each_block(num_corners, num_threads, [&](size_t block, int64_t begin, int64_t end) {
-    auto vertex = static_cast<int32_t>(first_vertex[block]);
+  Mesh mesh = sum_up(offsets, false);
+  parallel_chunks(num_corners, block_size, num_threads, [&](int64_t block, int64_t begin, int64_t end) {
+    auto vertex = static_cast<int32_t>(offsets[block].vertices);
     for (int64_t c = begin; c < end; ++c) {
-      const int32_t* position = corners + 3 * c;
-      for (size_t axis = 0; axis < 3; ++axis) {
-        auto& edge = edges[static_cast<size_t>(3 * c) + axis];
+      for (int axis = 0; axis < 3; ++axis) {
+        auto& edge = edges[3 * c + axis];
         const int32_t upper = edge.load(std::memory_order_relaxed);
         if (upper == no_vertex) continue;
-        const double fraction =
-            edge_fraction(static_cast<double>(values[c]), static_cast<double>(values[upper]), level);
-        write_vertex(
-            lattice,
-            {static_cast<double>(position[0]), static_cast<double>(position[1]), static_cast<double>(position[2])},
-            axis, fraction, mesh.vertices.get() + 3 * int64_t{vertex});
+        write_vertex(lattice, vec3(corners, c), axis, static_cast<double>(values[c]),
+                     static_cast<double>(values[upper]), level, mesh.vertices.get() + 3 * int64_t{vertex});
         edge.store(vertex++, std::memory_order_relaxed);
       }
     }
   });
-  for_each_block(num_cells, num_threads, [&](size_t block, int64_t begin, int64_t end) {
-    int32_t* faces = mesh.faces.get() + 3 * first_face[block];
+  parallel_chunks(num_cells, block_size, num_threads, [&](int64_t block, int64_t begin, int64_t end) {
+    int32_t* faces = mesh.faces.get() + 3 * offsets[block].faces;
     for (int64_t m = begin; m < end; ++m) {
-      const CellTriangles& cell = table[patterns[static_cast<size_t>(m)]];
-      for (size_t n = 0; n < 3u * cell.num_triangles; ++n) {
-        *faces++ = edge_of(cells + 8 * m, cell.edges[n]).load(std::memory_order_relaxed);
-      }
+      const auto vertex_of = [&](int edge) { return edge_of(cells + 8 * m, edge).load(std::memory_order_relaxed); };
+      faces = write_triangles(table[patterns[m]], vertex_of, faces);
     }
   });
   return mesh;

@@ -11,14 +11,13 @@
 #include <utility>
 #include <vector>
 
+#include "util/vec3.hpp"
+
 namespace radarsdf {
 namespace {
 
 constexpr int num_edges = 12;
 using Loop = std::vector<int>;  // edges, in order
-using Point = std::array<double, 3>;
-
-std::array<int, 3> corner_position(int corner) { return {corner >> 2, (corner >> 1) & 1, corner & 1}; }
 
 int edge_between(int corner_a, int corner_b) {
   for (int edge = 0; edge < num_edges; ++edge) {
@@ -42,14 +41,13 @@ std::array<int, 4> face_corners(int axis, bool upper) {
 // the positive side. On a face with two diagonally opposite positive corners this separates the positive corners, the
 // rule of property 1.
 void trace_face(int pattern, const std::array<int, 4>& corners, std::array<int, num_edges>& next) {
-  const auto corner = [&](int i) { return corners[static_cast<std::size_t>((i + 4) % 4)]; };
+  const auto corner = [&](int i) { return corners[(i + 4) % 4]; };
   const auto positive = [&](int i) { return ((pattern >> corner(i)) & 1) != 0; };
   for (int i = 0; i < 4; ++i) {
     if (!positive(i) || positive(i + 1)) continue;
     int first = i;
     while (positive(first - 1)) --first;
-    next[static_cast<std::size_t>(edge_between(corner(i), corner(i + 1)))] =
-        edge_between(corner(first - 1), corner(first));
+    next[edge_between(corner(i), corner(i + 1))] = edge_between(corner(first - 1), corner(first));
   }
 }
 
@@ -62,9 +60,9 @@ std::vector<Loop> trace_loops(int pattern) {
   std::vector<Loop> loops;
   for (int start = 0; start < num_edges; ++start) {
     Loop loop;
-    for (int edge = start; next[static_cast<std::size_t>(edge)] >= 0;) {
+    for (int edge = start; next[edge] >= 0;) {
       loop.push_back(edge);
-      edge = std::exchange(next[static_cast<std::size_t>(edge)], -1);
+      edge = std::exchange(next[edge], -1);
     }
     if (!loop.empty()) loops.push_back(loop);
   }
@@ -81,19 +79,16 @@ bool share_face(int edge_a, int edge_b) {
   return false;
 }
 
-Point edge_middle(int edge) {
+Vec3 edge_middle(int edge) {
   const auto [corner, axis] = cell_edge(edge);
-  const auto position = corner_position(corner);
-  Point middle{static_cast<double>(position[0]), static_cast<double>(position[1]), static_cast<double>(position[2])};
-  middle[static_cast<std::size_t>(axis)] += 0.5;
+  Vec3 middle{static_cast<double>(corner >> 2), static_cast<double>(corner >> 1 & 1), static_cast<double>(corner & 1)};
+  middle[axis] += 0.5;
   return middle;
 }
 
 // Deviation from an equilateral triangle: squared sides over area, infinite if degenerate.
 double shape_cost(int edge_a, int edge_b, int edge_c) {
-  const Point a = edge_middle(edge_a), b = edge_middle(edge_b), c = edge_middle(edge_c);
-  const Point ab{b[0] - a[0], b[1] - a[1], b[2] - a[2]}, ac{c[0] - a[0], c[1] - a[1], c[2] - a[2]};
-  const auto dot = [](const Point& p, const Point& q) { return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]; };
+  const Vec3 a = edge_middle(edge_a), ab = edge_middle(edge_b) - a, ac = edge_middle(edge_c) - a;
   const double double_area = std::sqrt(dot(ab, ab) * dot(ac, ac) - dot(ab, ac) * dot(ab, ac));
   return (dot(ab, ab) + dot(ac, ac) - dot(ab, ac)) / double_area;  // |ab|²+|ac|²+|bc|² is twice the numerator
 }

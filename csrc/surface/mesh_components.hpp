@@ -11,6 +11,9 @@ struct MeshComponents {
   std::vector<std::int64_t> sizes;         ///< faces per component
 };
 
+// Throws std::invalid_argument for a face with a vertex out of range.
+void check_faces(const std::int32_t* faces, std::int64_t num_faces, std::int64_t num_vertices);
+
 // faces: (num_faces, 3) vertices in [0, num_vertices). Faces are connected if they share a vertex. Serial union-find in
 // nearly linear time.
 MeshComponents mesh_components(const std::int32_t* faces, std::int64_t num_faces, std::int64_t num_vertices);

@@ -101,7 +101,7 @@ void trace(const TriangleTree& tree, const double* origin, bool front_only, RayP
   int64_t stack[kStack] = {1}, size = 1;
   while (size > 0) {
     const int64_t i = stack[--size];
-    const TreeBox& box = tree.boxes[static_cast<size_t>(i)];
+    const TreeBox& box = tree.boxes[i];
     float low[3], high[3];
     for (int axis = 0; axis < 3; ++axis) {
       low[axis] = static_cast<float>(lower[axis] + double{box.low[axis]});
@@ -111,11 +111,11 @@ void trace(const TriangleTree& tree, const double* origin, bool front_only, RayP
     if (i >= tree.leaves) {
       const int64_t leaf = i - tree.leaves;
       for (int64_t row = tree.first(leaf); row < tree.first(leaf + 1); ++row) {
-        meet(tree.triangles[static_cast<size_t>(row)], static_cast<std::int32_t>(row), origin, front_only, packet);
+        meet(tree.triangles[row], static_cast<std::int32_t>(row), origin, front_only, packet);
       }
       continue;
     }
-    const TreeBox *left = &tree.boxes[static_cast<size_t>(2 * i)], *right = left + 1;
+    const TreeBox *left = &tree.boxes[2 * i], *right = left + 1;
     float way = 0;  // from the left to the right box, along the rays
     for (int axis = 0; axis < 3; ++axis) {
       way += towards[axis] * (right->low[axis] + right->high[axis] - left->low[axis] - left->high[axis]);

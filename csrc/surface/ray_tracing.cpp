@@ -5,12 +5,12 @@
 #include <cmath>
 #include <limits>
 #include <stdexcept>
-#include <vector>
 
 #include "lattice/morton.hpp"
 #include "surface/ray_packet.hpp"
 #include "util/integers.hpp"
 #include "util/parallel.hpp"
+#include "util/stable_order.hpp"
 
 namespace radarsdf {
 namespace {
@@ -23,23 +23,12 @@ constexpr double kFarther = 1.0001;                // margin beyond max_range_m:
 // Rows of directions (count, 3), below 2^32, in Morton order, so that neighbours have similar directions.
 class ByDirection {
  public:
-  ByDirection(const float* directions, int64_t count, int num_threads) : keys_(static_cast<size_t>(count)) {
-    parallel_blocks(count, kTaskRays, num_threads, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) {
-        keys_[static_cast<size_t>(i)] = key(directions + 3 * i) << 32 | static_cast<uint64_t>(i);
-      }
-    });
-    std::vector<uint64_t> sorted(keys_.size());
-    for (int shift = 32; shift < 32 + 3 * kBits; shift += kBits) {  // radix sort: std::sort takes longer than the rays
-      const auto digit = [&](uint64_t own) { return static_cast<size_t>(own >> shift & ((1 << kBits) - 1)); };
-      std::array<size_t, (1 << kBits) + 1> firsts{};
-      for (const uint64_t own : keys_) ++firsts[digit(own) + 1];
-      for (size_t i = 1; i < firsts.size(); ++i) firsts[i] += firsts[i - 1];
-      for (const uint64_t own : keys_) sorted[firsts[digit(own)]++] = own;
-      keys_.swap(sorted);
-    }
+  ByDirection(const float* directions, int64_t count, int num_threads) : keys_(count) {
+    parallel_for(count, kTaskRays, num_threads,
+                 [&](int64_t i) { keys_[i] = key(directions + 3 * i) << 32 | static_cast<uint64_t>(i); });
+    radix_sort(keys_, 32, 32 + 3 * kBits);  // std::sort takes longer than the rays
   }
-  int64_t row(int64_t i) const { return static_cast<int64_t>(keys_[static_cast<size_t>(i)] & 0xffffffff); }
+  int64_t row(int64_t i) const { return static_cast<int64_t>(keys_[i] & 0xffffffff); }
 
  private:
   static constexpr int kBits = 10;  // per axis
@@ -53,7 +42,7 @@ class ByDirection {
     return morton_key(cell[0], cell[1], cell[2]);
   }
 
-  std::vector<uint64_t> keys_;
+  UninitialisedVector<uint64_t> keys_;
 };
 
 // Distance from the origin to the plane of a triangle along the ray, m.
@@ -92,7 +81,7 @@ void SurfaceTracer::first_hits(const double* origin, const float* directions, in
     trace(tree_, origin, front_only, packet);
     for (size_t i = 0; i < rows.size(); ++i) {
       if (packet.triangles[i] < 0) continue;
-      const TreeTriangle& triangle = tree_.triangles[static_cast<size_t>(packet.triangles[i])];
+      const TreeTriangle& triangle = tree_.triangles[packet.triangles[i]];
       const double range_m = range_to(triangle, origin, directions + 3 * rows[i]);
       if (!(range_m <= max_range_m)) continue;
       ranges_m[rows[i]] = static_cast<float>(range_m);
@@ -102,12 +91,11 @@ void SurfaceTracer::first_hits(const double* origin, const float* directions, in
   for (int64_t begin = 0; begin < count; begin += kSortedRays) {
     const int64_t size = std::min(count - begin, kSortedRays);
     const ByDirection order(directions + 3 * begin, size, num_threads);
-    parallel_tasks((size + kTaskRays - 1) / kTaskRays, num_threads, [&](int64_t task) {
-      for (int64_t first = task * kTaskRays; first < std::min(size, (task + 1) * kTaskRays);
-           first += RayPacket::kRays) {
+    parallel_chunks(size, kTaskRays, num_threads, [&](int64_t, int64_t task_begin, int64_t task_end) {
+      for (int64_t first = task_begin; first < task_end; first += RayPacket::kRays) {
         std::array<int64_t, RayPacket::kRays> rows;
         for (int64_t i = 0; i < RayPacket::kRays; ++i) {  // the last packet is padded with its last ray
-          rows[static_cast<size_t>(i)] = begin + order.row(std::min(first + i, size - 1));
+          rows[i] = begin + order.row(std::min(first + i, size - 1));
         }
         trace_packet(rows);
       }

@@ -12,6 +12,7 @@
 #include "util/integers.hpp"
 #include "util/large_array.hpp"
 #include "util/parallel.hpp"
+#include "util/stable_order.hpp"
 
 namespace radarsdf {
 namespace {
@@ -64,26 +65,11 @@ KeyFormat key_format(const int32_t* cells, int64_t num_cells) {
   return format;
 }
 
-// Least significant digit first; 2048 counters fit the L1 cache.
-void radix_sort(Keys& keys, int bits) {
-  constexpr int digit_bits = 11;
-  constexpr uint64_t digit_mask = (1 << digit_bits) - 1;
-  Keys sorted(keys.size());
-  for (int shift = 0; shift < bits; shift += digit_bits) {
-    check_interrupt();
-    std::array<size_t, digit_mask + 2> first{};
-    for (const uint64_t key : keys) ++first[(key >> shift & digit_mask) + 1];
-    for (size_t digit = 1; digit < first.size(); ++digit) first[digit] += first[digit - 1];
-    for (const uint64_t key : keys) sorted[first[key >> shift & digit_mask]++] = key;
-    keys.swap(sorted);
-  }
-}
-
 // Union of a and b + step, both strictly increasing. Blocks are split at keys of `a`, so they do not overlap.
 Keys merge_shifted(const Keys& a, const Keys& b, uint64_t step, int num_threads) {
   const auto size = static_cast<int64_t>(a.size());
   const int64_t num_blocks = std::clamp<int64_t>(size / min_block, 1, resolve_num_threads(num_threads));
-  std::vector<Keys> parts(static_cast<size_t>(num_blocks));
+  std::vector<Keys> parts(num_blocks);
   parallel_tasks(num_blocks, num_threads, [&](int64_t block) {
     const auto cut = [&](int64_t i) { return a.data() + size * i / num_blocks; };
     const auto cut_b = [&](int64_t i) {
@@ -94,7 +80,7 @@ Keys merge_shifted(const Keys& a, const Keys& b, uint64_t step, int num_threads)
     };
     const uint64_t *ia = cut(block), *ib = cut_b(block);
     const uint64_t *end_a = cut(block + 1), *end_b = cut_b(block + 1);
-    Keys part(static_cast<size_t>((end_a - ia) + (end_b - ib)));
+    Keys part((end_a - ia) + (end_b - ib));
     uint64_t* out = part.data();
     while (ia != end_a && ib != end_b) {  // branch-free: comparisons of keys are unpredictable
       const uint64_t key_a = *ia, key_b = *ib + step;
@@ -104,8 +90,8 @@ Keys merge_shifted(const Keys& a, const Keys& b, uint64_t step, int num_threads)
     }
     out = std::copy(ia, end_a, out);
     out = std::transform(ib, end_b, out, [&](uint64_t key) { return key + step; });
-    part.resize(static_cast<size_t>(out - part.data()));
-    parts[static_cast<size_t>(block)] = std::move(part);
+    part.resize(out - part.data());
+    parts[block] = std::move(part);
   });
   Keys merged = std::move(parts[0]);
   for (size_t i = 1; i < parts.size(); ++i) merged.insert(merged.end(), parts[i].begin(), parts[i].end());
@@ -115,14 +101,14 @@ Keys merge_shifted(const Keys& a, const Keys& b, uint64_t step, int num_threads)
 // Each thread sorts a part; the sorted set does not depend on the partition.
 Keys sorted_set(const int32_t* cells, int64_t num_cells, const KeyFormat& format, int num_threads) {
   const int64_t num_parts = std::clamp<int64_t>(num_cells / min_block, 1, resolve_num_threads(num_threads));
-  std::vector<Keys> parts(static_cast<size_t>(num_parts));
+  std::vector<Keys> parts(num_parts);
   parallel_tasks(num_parts, num_threads, [&](int64_t part) {
     const int64_t begin = num_cells * part / num_parts;
-    Keys keys(static_cast<size_t>(num_cells * (part + 1) / num_parts - begin));
+    Keys keys(num_cells * (part + 1) / num_parts - begin);
     for (size_t m = 0; m < keys.size(); ++m) keys[m] = format.encode(cells + 3 * (begin + static_cast<int64_t>(m)));
-    radix_sort(keys, format.bits);
+    radix_sort(keys, 0, format.bits);
     keys.erase(std::unique(keys.begin(), keys.end()), keys.end());
-    parts[static_cast<size_t>(part)] = std::move(keys);
+    parts[part] = std::move(keys);
   });
   for (; parts.size() > 1; parts.resize((parts.size() + 1) / 2)) {
     const size_t half = (parts.size() + 1) / 2;
@@ -134,9 +120,8 @@ Keys sorted_set(const int32_t* cells, int64_t num_cells, const KeyFormat& format
 
 std::unique_ptr<int32_t[]> decode_all(const Keys& keys, const KeyFormat& format, int num_threads) {
   auto points = large_array<int32_t>(3 * static_cast<int64_t>(keys.size()));
-  parallel_blocks(static_cast<int64_t>(keys.size()), min_block, num_threads, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) format.decode(keys[static_cast<size_t>(i)], points.get() + 3 * i);
-  });
+  parallel_for(static_cast<int64_t>(keys.size()), min_block, num_threads,
+               [&](int64_t i) { format.decode(keys[i], points.get() + 3 * i); });
   return points;
 }
 
@@ -169,12 +154,11 @@ SparseLattice sparse_lattice(const int32_t* cells, int64_t num_cells, int num_th
     const uint64_t* const keys = corner_keys.data();
     std::array<const uint64_t*, 4> found{};
     for (size_t row = 0; row < 4; ++row) {
-      found[row] =
-          std::lower_bound(keys, keys + corner_keys.size(), cell_keys[static_cast<size_t>(begin)] + steps[row]);
+      found[row] = std::lower_bound(keys, keys + corner_keys.size(), cell_keys[begin] + steps[row]);
     }
     for (int64_t m = begin; m < end; ++m) {
       for (size_t row = 0; row < 4; ++row) {
-        const uint64_t key = cell_keys[static_cast<size_t>(m)] + steps[row];
+        const uint64_t key = cell_keys[m] + steps[row];
         while (*found[row] < key) ++found[row];
         int32_t* corners = lattice.cell_corners.get() + 8 * m + 2 * static_cast<int64_t>(row);
         corners[0] = static_cast<int32_t>(found[row] - keys);

@@ -5,6 +5,7 @@
 #include <limits>
 #include <stdexcept>
 
+#include "surface/mesh_components.hpp"
 #include "util/integers.hpp"
 #include "util/parallel.hpp"
 
@@ -41,11 +42,7 @@ int widest_axis(const Centre* begin, const Centre* end) {
 
 TriangleTree::TriangleTree(const double* vertices, int64_t num_vertices, const int32_t* faces, int64_t num_faces,
                            int num_threads) {
-  for (int64_t i = 0; i < 3 * num_faces; ++i) {
-    if (faces[i] < 0 || faces[i] >= num_vertices) {
-      throw std::invalid_argument("a face refers to a vertex that does not exist");
-    }
-  }
+  check_faces(faces, num_faces, num_vertices);
   for (int64_t i = 0; i < 3 * num_vertices; ++i) {
     if (!std::isfinite(vertices[i])) throw std::invalid_argument("vertices must be finite");
   }
@@ -56,16 +53,14 @@ TriangleTree::TriangleTree(const double* vertices, int64_t num_vertices, const i
     for (int axis = 0; axis < 3; ++axis) lower[axis] = std::min(lower[axis], vertex(0, i)[axis]);
   }
 
-  LargeVector<Centre> centres(static_cast<size_t>(num_faces));
-  parallel_blocks(num_faces, kMinBlock, num_threads, [&](int64_t begin, int64_t end) {
-    for (int64_t face = begin; face < end; ++face) {
-      Centre& centre = centres[static_cast<size_t>(face)];
-      centre.face = static_cast<int32_t>(face);
-      for (int axis = 0; axis < 3; ++axis) {
-        double sum = 0;
-        for (int corner = 0; corner < 3; ++corner) sum += vertex(face, corner)[axis] - lower[axis];
-        centre.at[axis] = static_cast<float>(sum);
-      }
+  LargeVector<Centre> centres(num_faces);
+  parallel_for(num_faces, kMinBlock, num_threads, [&](int64_t face) {
+    Centre& centre = centres[face];
+    centre.face = static_cast<int32_t>(face);
+    for (int axis = 0; axis < 3; ++axis) {
+      double sum = 0;
+      for (int corner = 0; corner < 3; ++corner) sum += vertex(face, corner)[axis] - lower[axis];
+      centre.at[axis] = static_cast<float>(sum);
     }
   });
   leaves = 1;
@@ -78,28 +73,26 @@ TriangleTree::TriangleTree(const double* vertices, int64_t num_vertices, const i
     });
   }
 
-  triangles.resize(static_cast<size_t>(num_faces));
-  boxes.assign(static_cast<size_t>(2 * leaves), kNothing);
-  parallel_blocks(leaves, kMinBlock, num_threads, [&](int64_t begin, int64_t end) {
-    for (int64_t leaf = begin; leaf < end; ++leaf) {
-      TreeBox& box = boxes[static_cast<size_t>(leaves + leaf)];
-      for (int64_t row = first(leaf); row < first(leaf + 1); ++row) {
-        const int32_t face = centres[static_cast<size_t>(row)].face;
-        const double* corners[3] = {vertex(face, 0), vertex(face, 1), vertex(face, 2)};
-        TreeTriangle& triangle = triangles[static_cast<size_t>(row)];
-        triangle.face = face;
-        triangle.lengths[0] = triangle.lengths[1] = 0;
-        for (int axis = 0; axis < 3; ++axis) {
-          triangle.corner[axis] = corners[0][axis];
-          for (int edge = 0; edge < 2; ++edge) {
-            triangle.edges[edge][axis] = static_cast<float>(corners[edge + 1][axis] - corners[0][axis]);
-            triangle.lengths[edge] += std::abs(triangle.edges[edge][axis]);
-          }
-          const auto [low, high] = std::minmax({corners[0][axis], corners[1][axis], corners[2][axis]});
-          const auto low_m = static_cast<float>(low - lower[axis]), high_m = static_cast<float>(high - lower[axis]);
-          box.low[axis] = std::min(box.low[axis], std::nextafter(low_m, -kInfinity));
-          box.high[axis] = std::max(box.high[axis], std::nextafter(high_m, kInfinity));
+  triangles.resize(num_faces);
+  boxes.assign(2 * leaves, kNothing);
+  parallel_for(leaves, kMinBlock, num_threads, [&](int64_t leaf) {
+    TreeBox& box = boxes[leaves + leaf];
+    for (int64_t row = first(leaf); row < first(leaf + 1); ++row) {
+      const int32_t face = centres[row].face;
+      const double* corners[3] = {vertex(face, 0), vertex(face, 1), vertex(face, 2)};
+      TreeTriangle& triangle = triangles[row];
+      triangle.face = face;
+      triangle.lengths[0] = triangle.lengths[1] = 0;
+      for (int axis = 0; axis < 3; ++axis) {
+        triangle.corner[axis] = corners[0][axis];
+        for (int edge = 0; edge < 2; ++edge) {
+          triangle.edges[edge][axis] = static_cast<float>(corners[edge + 1][axis] - corners[0][axis]);
+          triangle.lengths[edge] += std::abs(triangle.edges[edge][axis]);
         }
+        const auto [low, high] = std::minmax({corners[0][axis], corners[1][axis], corners[2][axis]});
+        const auto low_m = static_cast<float>(low - lower[axis]), high_m = static_cast<float>(high - lower[axis]);
+        box.low[axis] = std::min(box.low[axis], std::nextafter(low_m, -kInfinity));
+        box.high[axis] = std::max(box.high[axis], std::nextafter(high_m, kInfinity));
       }
     }
   });

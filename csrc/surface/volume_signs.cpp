@@ -58,7 +58,7 @@ VolumeSigns read_signs(const T* volume, const std::array<int64_t, 3>& shape, con
   const int64_t nx = shape[0], ny = shape[1], nz = shape[2];
   VolumeSigns signs{shape, BitVolume(shape), {}};
   const T threshold = round_down<T>(level);
-  std::vector<std::uint8_t> plane_has_nan(static_cast<size_t>(nx));
+  std::vector<std::uint8_t> plane_has_nan(nx);
   parallel_tasks(nx, num_threads, [&](int64_t i) {
     bool has_nan = false;
     for (int64_t j = 0; j < ny; ++j) {
@@ -68,7 +68,7 @@ VolumeSigns read_signs(const T* volume, const std::array<int64_t, 3>& shape, con
       for (int64_t k = 0; k < nz; ++k) row_has_nan |= row[k] != row[k];
       has_nan |= row_has_nan != 0;
     }
-    plane_has_nan[static_cast<size_t>(i)] = has_nan;
+    plane_has_nan[i] = has_nan;
   });
   if (!mask && std::find(plane_has_nan.begin(), plane_has_nan.end(), 1) == plane_has_nan.end()) return signs;
 

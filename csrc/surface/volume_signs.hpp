@@ -18,7 +18,7 @@ class BitVolume {
   explicit BitVolume(const std::array<std::int64_t, 3>& shape)
       : rows_per_plane_(shape[1]),
         words_((shape[2] + word_bits - 1) / word_bits + 1),
-        bits_(new std::uint32_t[static_cast<std::size_t>(shape[0] * shape[1] * words_)]) {}
+        bits_(new std::uint32_t[shape[0] * shape[1] * words_]) {}
 
   std::uint32_t* row(std::int64_t i, std::int64_t j) { return bits_.get() + (i * rows_per_plane_ + j) * words_; }
   const std::uint32_t* row(std::int64_t i, std::int64_t j) const {

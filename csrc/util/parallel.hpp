@@ -63,4 +63,23 @@ void parallel_blocks(std::int64_t size, std::int64_t min_block, int num_threads,
   parallel_tasks(blocks, num_threads, [&](std::int64_t i) { body(size * i / blocks, size * (i + 1) / blocks); });
 }
 
+// Runs body(chunk, begin, end) for the chunks of [0, size), which do not depend on the number of threads.
+inline std::int64_t num_chunks(std::int64_t size, std::int64_t chunk_size) {
+  return (size + chunk_size - 1) / chunk_size;
+}
+template <typename Body>
+void parallel_chunks(std::int64_t size, std::int64_t chunk_size, int num_threads, const Body& body) {
+  parallel_tasks(num_chunks(size, chunk_size), num_threads, [&](std::int64_t chunk) {
+    body(chunk, chunk * chunk_size, std::min(size, (chunk + 1) * chunk_size));
+  });
+}
+
+// Runs body(i) for i in [0, size), in blocks.
+template <typename Body>
+void parallel_for(std::int64_t size, std::int64_t min_block, int num_threads, const Body& body) {
+  parallel_blocks(size, min_block, num_threads, [&](std::int64_t begin, std::int64_t end) {
+    for (std::int64_t i = begin; i < end; ++i) body(i);
+  });
+}
+
 }  // namespace radarsdf

@@ -5,13 +5,12 @@
 #include <limits>
 #include <stdexcept>
 
-#include "util/large_array.hpp"
 #include "util/parallel.hpp"
 
 namespace radarsdf {
 namespace {
 
-constexpr int kDigitBits = 11;
+constexpr int kDigitBits = 11;  // 2048 counters fit the L1 cache
 constexpr int kDigits = (64 + kDigitBits - 1) / kDigitBits;
 constexpr std::uint64_t kDigitMask = (1 << kDigitBits) - 1;
 
@@ -33,10 +32,10 @@ std::vector<std::int32_t> stable_order(const std::uint64_t* keys, std::int64_t c
   for (std::int64_t i = 0; i < count; ++i) {
     from[i] = {static_cast<std::uint32_t>(keys[i]), static_cast<std::uint32_t>(keys[i] >> 32),
                static_cast<std::int32_t>(i)};
-    for (int number = 0; number < kDigits; ++number) ++counts[static_cast<std::size_t>(number)][from[i].digit(number)];
+    for (int number = 0; number < kDigits; ++number) ++counts[number][from[i].digit(number)];
   }
   for (int number = 0; number < kDigits; ++number) {
-    auto& places = counts[static_cast<std::size_t>(number)];
+    auto& places = counts[number];
     if (std::find(places.begin(), places.end(), count) != places.end()) continue;  // constant digit
     check_interrupt();
     std::int32_t next = 0;
@@ -48,9 +47,21 @@ std::vector<std::int32_t> stable_order(const std::uint64_t* keys, std::int64_t c
     for (std::int64_t i = 0; i < count; ++i) to[places[from[i].digit(number)]++] = from[i];
     from.swap(to);
   }
-  std::vector<std::int32_t> order(static_cast<std::size_t>(count));
+  std::vector<std::int32_t> order(count);
   for (std::size_t i = 0; i < order.size(); ++i) order[i] = from[i].position;
   return order;
+}
+
+void radix_sort(UninitialisedVector<std::uint64_t>& keys, int begin_bit, int end_bit) {
+  UninitialisedVector<std::uint64_t> sorted(keys.size());
+  for (int shift = begin_bit; shift < end_bit; shift += kDigitBits) {
+    check_interrupt();
+    std::array<std::size_t, kDigitMask + 2> first{};
+    for (const std::uint64_t key : keys) ++first[(key >> shift & kDigitMask) + 1];
+    for (std::size_t digit = 1; digit < first.size(); ++digit) first[digit] += first[digit - 1];
+    for (const std::uint64_t key : keys) sorted[first[key >> shift & kDigitMask]++] = key;
+    keys.swap(sorted);
+  }
 }
 
 }  // namespace radarsdf

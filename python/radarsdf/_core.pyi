@@ -458,7 +458,6 @@ class FieldLoss:
     """
     Losses of batches and their gradients, as defined by the package's neural field and losses. An object is not thread-safe.
     """
-    @typing.overload
     def __init__(
         self,
         table: VertexTable,
@@ -478,27 +477,6 @@ class FieldLoss:
         """
         `features` (num_rows, 8); `frequencies`: half width (m), first exponent and number; `sdf`, `intensity`: weights and biases of the layers, `intensity` may be None; `sees`: whether the intensity network has the inputs SDF, viewing direction and range. The arrays are kept by reference: each call reads their current values.
         """
-    @typing.overload
-    def __init__(
-        self,
-        table: VertexTable,
-        features: numpy.typing.NDArray[numpy.float64],
-        frequencies: tuple[
-            typing.SupportsFloat | typing.SupportsIndex,
-            typing.SupportsInt | typing.SupportsIndex,
-            typing.SupportsInt | typing.SupportsIndex,
-        ],
-        sdf: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]],
-        intensity: tuple[list[numpy.typing.NDArray[numpy.float64]], list[numpy.typing.NDArray[numpy.float64]]]
-        | None,
-        sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
-        sigma_m: typing.SupportsFloat | typing.SupportsIndex,
-        intensity_in_free_space: bool,
-    ) -> None:
-        """
-        `features` (num_rows, 8); `frequencies`: half width (m), first exponent and number; `sdf`, `intensity`: weights and biases of the layers, `intensity` may be None; `sees`: whether the intensity network has the inputs SDF, viewing direction and range. The arrays are kept by reference: each call reads their current values.
-        """
-    @typing.overload
     def begin_intensity(
         self,
         points: numpy.typing.NDArray[numpy.float32],
@@ -516,25 +494,6 @@ class FieldLoss:
         """
         Like `begin_joint`, for the intensities alone, with frozen SDF network and features: writes to `intensity_gradients` only.
         """
-    @typing.overload
-    def begin_intensity(
-        self,
-        points: numpy.typing.NDArray[numpy.float64],
-        sdf_m: numpy.typing.NDArray[numpy.float64],
-        parts: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        rays: numpy.typing.NDArray[numpy.float64],
-        dropout: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        weight: typing.SupportsFloat | typing.SupportsIndex,
-        pool: ThreadPool,
-    ) -> None:
-        """
-        Like `begin_joint`, for the intensities alone, with frozen SDF network and features: writes to `intensity_gradients` only.
-        """
-    @typing.overload
     def begin_joint(
         self,
         points: numpy.typing.NDArray[numpy.float32],
@@ -556,29 +515,6 @@ class FieldLoss:
         """
         Like `begin_sdf`, for both losses: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the rays of the samples. `dropout` has up to two pairs, for the encodings of cells and positions: seed of `random_bytes` (samples seen, columns), and the bound below which a byte keeps its element.
         """
-    @typing.overload
-    def begin_joint(
-        self,
-        points: numpy.typing.NDArray[numpy.float64],
-        sdf_m: numpy.typing.NDArray[numpy.float64],
-        parts: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        rays: numpy.typing.NDArray[numpy.float64],
-        dropout: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        weights: tuple[
-            typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex
-        ],
-        located: numpy.typing.NDArray[numpy.int32],
-        interpolated_grad: numpy.typing.NDArray[numpy.float64],
-        pool: ThreadPool,
-    ) -> None:
-        """
-        Like `begin_sdf`, for both losses: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the rays of the samples. `dropout` has up to two pairs, for the encodings of cells and positions: seed of `random_bytes` (samples seen, columns), and the bound below which a byte keeps its element.
-        """
-    @typing.overload
     def begin_sdf(
         self,
         points: numpy.typing.NDArray[numpy.float32],
@@ -589,22 +525,6 @@ class FieldLoss:
         weight: typing.SupportsFloat | typing.SupportsIndex,
         located: numpy.typing.NDArray[numpy.int32],
         interpolated_grad: numpy.typing.NDArray[numpy.float32],
-        pool: ThreadPool,
-    ) -> None:
-        """
-        Starts computing the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m, on the other threads of `pool`; `finish` waits for it. `parts` are consecutive samples for one thread: numbers of samples, and of samples with intensity labels. Gradients are summed in the order of the parts, independent of the number of threads. Gradients of `weight` times the loss are written to `sdf_gradients` and, by the interpolated features, to `interpolated_grad` (N, 8 L), the cells of the points to `located` (N, L) int32.
-        """
-    @typing.overload
-    def begin_sdf(
-        self,
-        points: numpy.typing.NDArray[numpy.float64],
-        sdf_m: numpy.typing.NDArray[numpy.float64],
-        parts: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        weight: typing.SupportsFloat | typing.SupportsIndex,
-        located: numpy.typing.NDArray[numpy.int32],
-        interpolated_grad: numpy.typing.NDArray[numpy.float64],
         pool: ThreadPool,
     ) -> None:
         """
@@ -615,16 +535,12 @@ class FieldLoss:
         Joins the thread pool until the batch is complete. Returns both mean losses, 0 for one that was not requested.
         """
     @property
-    def intensity_gradients(
-        self,
-    ) -> list[numpy.typing.NDArray[numpy.float32]] | list[numpy.typing.NDArray[numpy.float64]]:
+    def intensity_gradients(self) -> list[numpy.typing.NDArray[numpy.float32]]:
         """
         Like `sdf_gradients`, of the intensity network.
         """
     @property
-    def sdf_gradients(
-        self,
-    ) -> list[numpy.typing.NDArray[numpy.float32]] | list[numpy.typing.NDArray[numpy.float64]]:
+    def sdf_gradients(self) -> list[numpy.typing.NDArray[numpy.float32]]:
         """
         Gradients by weights and biases of each layer of the SDF network in turn, written by the last call that trained it.
         """
@@ -1386,24 +1302,10 @@ def soap_memory_size(
     Number of elements of SOAP's state of a matrix of weights.
     """
 
-@typing.overload
 def soap_step(
     weights: list[numpy.typing.NDArray[numpy.float32]],
     gradients: list[numpy.typing.NDArray[numpy.float32]],
     memories: list[numpy.typing.NDArray[numpy.float32]],
-    step: typing.SupportsInt | typing.SupportsIndex,
-    learning_rate: typing.SupportsFloat | typing.SupportsIndex,
-    pool: ThreadPool | None = None,
-) -> None:
-    """
-    Updates matrices of weights by step `step` >= 1 of SOAP. `memories`, the states of `soap_memory_size` elements each, are zero before the first step. The matrices are distributed to the threads of a `pool`.
-    """
-
-@typing.overload
-def soap_step(
-    weights: list[numpy.typing.NDArray[numpy.float64]],
-    gradients: list[numpy.typing.NDArray[numpy.float64]],
-    memories: list[numpy.typing.NDArray[numpy.float64]],
     step: typing.SupportsInt | typing.SupportsIndex,
     learning_rate: typing.SupportsFloat | typing.SupportsIndex,
     pool: ThreadPool | None = None,

@@ -296,6 +296,15 @@ def test_the_same_bits_for_any_number_of_threads():
     np.testing.assert_allclose(table.average_rays(*backwards, 0.6)[0], one, atol=1e-5)
 
 
+@pytest.mark.parametrize("weight", [0.5, 2.25, -1, np.nan, np.inf])
+def test_weights_are_numbers_of_returns(weight):
+    rays = some_rays(20)
+    table = VertexTable(keys_along(rays[0], rays[1], 0.4), LEAF_M, 1, Encoding.OCTREE)
+    rays[3][7] = weight
+    with pytest.raises(ValueError, match="weights"):
+        table.average_rays(*rays, 0.6)
+
+
 def test_sides_need_many_rays_in_front_and_more_behind():
     x, y = np.meshgrid(*[np.arange(-0.95, 1, 0.1)] * 2)
     points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]).astype(np.float32)

@@ -54,7 +54,7 @@ class Made:
             return dataclasses.replace(found, by_parameters=[p.clone() for p in found.by_parameters])
 
 
-def make_batch(rays, dtype=torch.float32, batch_size=400, parts=3, **changes):
+def make_batch(rays, batch_size=400, parts=3, **changes):
     config = FitConfig(**grouped(**changes))
     field = NeuralField(near_leaf_keys(rays, config, 1), config, with_intensity=True)
     field.initialise(torch.Generator().manual_seed(0))
@@ -65,32 +65,20 @@ def make_batch(rays, dtype=torch.float32, batch_size=400, parts=3, **changes):
         rays, config, batch_size, generator, intensities=torch.from_numpy(rays.intensities.copy())
     )
     batch = sampler.batch(parts)
-    dtypes = {torch.float32: np.float32, torch.float64: np.float64}
-    exact = {name: getattr(batch, name).astype(dtypes[dtype]) for name in ("points", "sdf_m", "of_ray")}
-    return Made(field.to(dtype), config, dataclasses.replace(batch, **exact))
+    return Made(field, config, batch)
 
 
-@pytest.fixture
-def default_dtype(dtype):
-    """Default dtype, which is that of the factors of dropout."""
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    yield
-    torch.set_default_dtype(before)
-
-
-@pytest.mark.usefixtures("instruction_set", "default_dtype")
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize("changes", CONFIGS.values(), ids=CONFIGS)
-def test_losses_and_gradients_equal_autograd(rays, changes, stage, dtype):
-    batch = make_batch(rays, dtype, **changes)
+def test_losses_and_gradients_equal_autograd(rays, changes, stage):
+    batch = make_batch(rays, **changes)
     found, expected = (
         batch.gradients(kind, stage, optimiser="adam") for kind in (CoreGradients, AutogradGradients)
     )
     assert found.touched is None
     assert expected.touched is None
-    tolerance = 3e-5 if dtype == torch.float32 else 1e-12
+    tolerance = 3e-5
     assert found.losses.keys() == expected.losses.keys()
     for name, loss in found.losses.items():
         assert loss == pytest.approx(expected.losses[name], rel=tolerance)
@@ -101,11 +89,9 @@ def test_losses_and_gradients_equal_autograd(rays, changes, stage, dtype):
         torch.testing.assert_close(a, b, rtol=0, atol=tolerance * max(b.abs().max().item(), 1e-3))
 
 
-@pytest.mark.usefixtures("default_dtype")
-@pytest.mark.parametrize("dtype", [torch.float64])
 @pytest.mark.parametrize("stage", ["joint", "intensity"])
-def test_nan_labels_have_no_loss(rays, stage, dtype):
-    batch = make_batch(rays, dtype)
+def test_nan_labels_have_no_loss(rays, stage):
+    batch = make_batch(rays)
     whole = batch.gradients(CoreGradients, stage).losses["intensity"]
     for every, share in ((3, 2 / 3), (1, 0)):
         batch.batch.of_ray[::every, _core.RAY_INTENSITY] = np.nan
@@ -113,22 +99,20 @@ def test_nan_labels_have_no_loss(rays, stage, dtype):
             batch.gradients(kind, stage, optimiser="adam") for kind in (CoreGradients, AutogradGradients)
         )
         assert found.losses["intensity"] == pytest.approx(share * whole, rel=0.1)
-        assert found.losses == pytest.approx(expected.losses, rel=1e-12)
+        assert found.losses == pytest.approx(expected.losses, rel=3e-5)
         for a, b in zip(found.by_parameters, expected.by_parameters, strict=True):
-            torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+            torch.testing.assert_close(a, b, rtol=0, atol=3e-5 * max(b.abs().max().item(), 1e-3))
     assert expected.by_parameters[-1].abs().max() == 0
 
 
-@pytest.mark.usefixtures("default_dtype")
-@pytest.mark.parametrize("dtype", [torch.float64])
 @pytest.mark.parametrize("stage", ["sdf", "joint"])
-def test_touched_features_have_the_gradient_of_autograd(rays, stage, dtype):
-    batch = make_batch(rays, dtype)
+def test_touched_features_have_the_gradient_of_autograd(rays, stage):
+    batch = make_batch(rays)
     dense, rows = (batch.gradients(CoreGradients, stage, optimiser=name) for name in ("adam", "soap"))
     touched, by_features = rows.touched, torch.zeros_like(batch.field.cells.features)
     columns = touched.points, touched.located, None, touched.gradient
     batch.field.cells.table.scatter(*columns, by_features.numpy())
-    torch.testing.assert_close(by_features, dense.by_parameters[0], rtol=0, atol=1e-15)
+    torch.testing.assert_close(by_features, dense.by_parameters[0], rtol=0, atol=1e-6)
     assert len(rows.by_parameters) == len(dense.by_parameters) - 1
     near = np.abs(batch.batch.sdf_m) < 0.1
     assert (touched.located[near, 0] >= 0).mean() > 0.9

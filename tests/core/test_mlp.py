@@ -183,19 +183,19 @@ def way_of_the_formula(rows, columns):
 @pytest.mark.parametrize(("rows", "columns"), [(20, 37), (2, 3), (3, 520)])
 def test_steps_equal_the_formula(rows, columns):
     start, steps = way_of_the_formula(rows, columns)
-    weights, memory = start.copy(), memory_of(start)
+    weights = start.astype(np.float32)
+    memory = memory_of(weights)
     for step, (gradient, expected) in enumerate(steps, start=1):
-        _core.soap_step([weights], [gradient], [memory], step, RATE)
-        np.testing.assert_allclose(weights, expected, atol=1e-6)
+        _core.soap_step([weights], [gradient.astype(np.float32)], [memory], step, RATE)
+        np.testing.assert_allclose(weights, expected, atol=3e-4)
     assert np.abs(weights).max() > 10 * RATE
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_it_converges_faster_than_adam_with_correlated_inputs(dtype):
+def test_it_converges_faster_than_adam_with_correlated_inputs():
     rng = np.random.default_rng(1)
-    inputs = dependent_gradients(rng, 2000, 24).astype(dtype)
-    truth = rng.normal(size=(8, 24)).astype(dtype)
+    inputs = dependent_gradients(rng, 2000, 24).astype(np.float32)
+    truth = rng.normal(size=(8, 24)).astype(np.float32)
 
     def error_after(move):
         weights = np.zeros_like(truth)
@@ -211,18 +211,17 @@ def test_it_converges_faster_than_adam_with_correlated_inputs(dtype):
         moments[0] += 0.1 * (gradient - moments[0])
         moments[1] += 0.001 * (gradient**2 - moments[1])
         mean, square = moments[0] / (1 - 0.9**step), moments[1] / (1 - 0.999**step)
-        weights -= (rate * mean / (np.sqrt(square) + 1e-15)).astype(dtype)
+        weights -= (rate * mean / (np.sqrt(square) + 1e-15)).astype(np.float32)
 
     soap = error_after(lambda w, g, step, rate: _core.soap_step([w], [g], [memory], step, rate))
     assert soap < 0.25 * error_after(adam)
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_degenerate_gradients_give_finite_weights(dtype):
+def test_degenerate_gradients_give_finite_weights():
     rng = np.random.default_rng(2)
     for scale in (0.0, 1e-30, 1e-10, 1e12):
-        weights = np.zeros((24, 40), dtype)
+        weights = np.zeros((24, 40), np.float32)
         memory = memory_of(weights)
         for step in range(1, 100):
             gradient = scale * rng.normal(size=weights.shape)
@@ -230,7 +229,7 @@ def test_degenerate_gradients_give_finite_weights(dtype):
             gradient[:, 1] = gradient[:, 4]  # two identical inputs
             if step == 50:
                 gradient[:] = 0
-            _core.soap_step([weights], [gradient.astype(dtype)], [memory], step, RATE)
+            _core.soap_step([weights], [gradient.astype(np.float32)], [memory], step, RATE)
         assert np.isfinite(weights).all()
         assert np.isfinite(memory).all()
         assert np.abs(weights).max() < 100 * 20 * RATE

@@ -16,7 +16,9 @@
 #include "util/parallel.hpp"
 #include "util/parallel_sort.hpp"
 #include "util/random_bytes.hpp"
+#include "util/stable_order.hpp"
 #include "util/thread_pool.hpp"
+#include "util/vec3.hpp"
 
 TEST_CASE("bit counts and positions equal those of std::bitset") {
   std::mt19937_64 generator(1);
@@ -133,6 +135,38 @@ TEST_CASE("blocks partition a range and have bounded size") {
       CHECK(longest <= 1 << 18);
     }
   }
+}
+
+TEST_CASE("chunks partition a range independent of the number of threads") {
+  for (const int threads : test::kThreads) {
+    for (const std::int64_t size : {0, 1, 9, 10, 11}) {
+      std::vector<int> chunk_of(size, -1);
+      radarsdf::parallel_chunks(size, 5, threads, [&](std::int64_t chunk, std::int64_t begin, std::int64_t end) {
+        for (std::int64_t i = begin; i < end; ++i) chunk_of[i] = static_cast<int>(chunk);
+      });
+      for (std::int64_t i = 0; i < size; ++i) CHECK(chunk_of[i] == i / 5);
+      CHECK(radarsdf::num_chunks(size, 5) == (size == 0 ? 0 : 1 + (size - 1) / 5));
+    }
+  }
+}
+
+TEST_CASE("radix_sort sorts by the upper bits and keeps the order of equal ones") {
+  radarsdf::UninitialisedVector<std::uint64_t> keys;
+  for (std::uint64_t i = 0; i < 20'000; ++i) keys.push_back(radarsdf::random_word(1, i % 9'000) >> 32 << 20 | i);
+  auto expected = keys;  // the lower bits are the input order, so sorting all bits is stable
+  std::sort(expected.begin(), expected.end());
+  radarsdf::radix_sort(keys, 20, 52);
+  CHECK(std::equal(keys.begin(), keys.end(), expected.begin(), expected.end()));
+}
+
+TEST_CASE("the cross product is orthogonal, with the length of the area") {
+  const radarsdf::Vec3 a{1, 2, 2}, b{-3, 0.5, 4}, c = cross(a, b);
+  CHECK(dot(a, c) == doctest::Approx(0));
+  CHECK(dot(b, c) == doctest::Approx(0));
+  CHECK(dot(c, c) == doctest::Approx(dot(a, a) * dot(b, b) - dot(a, b) * dot(a, b)));
+  CHECK(norm(a) == 3);
+  const double rows[] = {0, 0, 0, 2, 4, 4};
+  CHECK(norm(radarsdf::vec3(rows, 1) / 2 - a) == 0);
 }
 
 TEST_CASE("the exception of a task reaches the caller and cancels the other tasks") {
