@@ -16,7 +16,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
+from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance, turns_fast
 from radarsdf.poses.imu import Inertial, UnusableGyroscopeError, levelled
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
@@ -129,15 +129,17 @@ def odometry(
     checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
     if velocities is not None:
-        sign = -1 if sign_significance(checked.scans, velocities, times_s)[0] < -CLEAR else 1
-        velocities = velocities.scaled(-1.0) if sign < 0 else velocities
+        significance, yaws = sign_significance(checked.scans, velocities, times_s)
+        if significance < -CLEAR:
+            sign, yaws, velocities = -1, yaws[::-1], velocities.scaled(-1.0)
     if imu is None and isinstance(points, Scans):
         imu = points.imu
     limits, notes = config.returns, [*checked.notes]
     with ThreadPool(config.num_threads) as pool:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-        drive = Drive(scans, times_s, velocities, None)
+        drive, consistency = Drive(scans, times_s, velocities, None), None
         if velocities is not None:
+            drive = dataclasses.replace(drive, yaws=yaws if turns_fast(yaws[0]) else None)
             consistency = Consistency.of_returns(drive, config, pool.num_threads)
             velocities, tested = consistency.applied(velocities)
             notes += tested
@@ -146,7 +148,11 @@ def odometry(
                 velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
         drive = dataclasses.replace(
-            drive, times_s=times_s, velocities=velocities, gyroscope=inertial.gyroscope
+            drive,
+            times_s=times_s,
+            velocities=velocities,
+            gyroscope=inertial.gyroscope,
+            yaws=None if velocities is None else drive.yaws,
         )
         try:
             drive, tracked = followed(drive, config, pool.num_threads, progress)
@@ -159,6 +165,8 @@ def odometry(
         segments = np.array([found.segment for found in tracked])
         poses, covariance, loops = _together(drive, tracked, segments, config, pool.num_threads)
         notes += loops
+        if consistency is not None and velocities is not None:
+            covariance = consistency.widened(poses, covariance, segments, drive)
         if inertial.alignment is not None:
             poses, covariance = levelled(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
