@@ -98,9 +98,7 @@ def contradiction(
     In each window, the mean difference along the longer ones is compared with its standard error (Student's t). `scans` (K + 1,):
     those between which the steps are.
     """
-    # The other source has errors, too: where the sensor moves evenly, second differences have six times their variance.
-    jumps = np.diff(shown_m, 2, axis=0) if len(shown_m) > 2 else np.zeros((1, 3))
-    all_weights = 1 / (variances_m2 + np.median(jumps**2) / 6)
+    all_weights = 1 / (variances_m2 + _unevenness_m2(shown_m))  # the other source has errors, too
     worst, found, tried = 0.0, None, list(_windows(len(shown_m)))
     for rows in tried:
         shown, doppler, weights = shown_m[rows], doppler_m[rows], all_weights[rows]
@@ -127,17 +125,33 @@ def contradiction(
     return found
 
 
-def of_poses(
-    velocities: SensorVelocities, times_s: Floats, poses: Floats
-) -> tuple[Contradiction | None, Clock]:
-    """Test velocities and times (F,) against given poses (F, 4, 4); return the clearest contradiction, and errors of the times."""
+def of_poses(velocities: SensorVelocities, times_s: Floats, poses: Floats) -> tuple[str | None, Clock]:
+    """Test velocities and times (F,) against given poses (F, 4, 4).
+
+    Return the clearest contradiction in words that go on "the Doppler is wrong: ", and errors of the times.
+    """
     shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
     clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
-    motion = DopplerMotion.by(velocities, times_s - clock.errors_s, poses)
+    times_s = times_s - clock.errors_s
+    motion, rows = DopplerMotion.by(velocities, times_s, poses), np.arange(len(times_s))
+    variance_m2 = _unevenness_m2(shown)
     scans = np.append(np.flatnonzero(known), np.flatnonzero(known)[-1:] + 1)
     variances = motion.shares[known, :3].mean(axis=1)
     found = contradiction(shown[known], motion.steps[known, :3, 3], variances, scans)
-    return found, clock
+    if found is not None:
+        return found.words("the poses"), clock
+    covariance = np.tile(variance_m2 * np.eye(3), (len(shown), 1, 1))
+    delay = delay_of(velocities, _runs(times_s), rows, motion, shown, covariance, known)
+    return (_delayed("the poses", delay) if delay else None), clock
+
+
+def _unevenness_m2(shown_m: Floats) -> float:
+    """Return the variance of a component of steps (K, 3): where the sensor moves evenly, second differences have six times it."""
+    return float(np.median(np.diff(shown_m, 2, axis=0) ** 2) / 6) if len(shown_m) > 2 else 0.0
+
+
+def _delayed(source: str, delay: int) -> str:
+    return f"{source} agree with that of {abs(delay)} scans {'later' if delay > 0 else 'earlier'}"
 
 
 @dataclass(frozen=True)
@@ -292,8 +306,7 @@ class Consistency:
             shown = f"the returns show {self.scale:.1f} times its speeds. Give it in m/s, and times in s"
             return None, [f"{NOT_USED}: {shown}."]
         if self.delay:
-            shown = f"the returns agree with that of {abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
-            return None, [f"{NOT_USED}: {shown}. Give each scan its own."]
+            return None, [f"{NOT_USED}: {_delayed('the returns', self.delay)}. Give each scan its own."]
         wide = self.most > _SCALE_MEASURED or self.least < 1 / _SCALE_MEASURED
         notes = []
         if wide:
