@@ -44,7 +44,8 @@ _SHIFTS_M = np.concatenate(
 )
 # Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
 _SAME_SCALE = 1.1
-_SCALE_MEASURED = 1.2  # beyond which confidence limits of that ratio leave the scale of the Doppler open
+_MEASURED = 0.2  # relative difference from the Doppler beyond which confidence limits leave its scale open
+_UNKNOWN_SCALE = 0.5  # standard deviation of the scale without evidence: half or twice the speed
 _MOST_LATE = 10  # scans
 _SAME_RESIDUALS = 1.25  # ratio of squared residuals up to which a delay does not matter
 _EVEN = 1e-3  # unevenness of times that does not matter, share of an interval
@@ -212,13 +213,10 @@ class Doubt:
 class Consistency:
     """Comparison of a drive's Doppler with its returns."""
 
-    scale: float = 1.0  # ratio of the speeds by returns to those by Doppler
-    least: float = float(_SCALES[0])  # confidence limits of this ratio
-    most: float = float(_SCALES[-1])
     delay: int = 0  # of the Doppler, scans, where one explains the returns significantly better
     contradicted: Contradiction | None = None  # in a window
     clock: Clock | None = None
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[Doubt, ...] | None = None  # None: too few scans with motion
 
     @classmethod
     def of_returns(cls, drive: Drive, config: FitConfig, num_threads: int) -> Consistency:
@@ -269,15 +267,11 @@ class Consistency:
         at = rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)]
         if found is not None:
             found = dataclasses.replace(found, first=int(at[found.first]), last=int(at[found.last]))
-        scale, least, most = 1.0, float(_SCALES[0]), float(_SCALES[-1])
-        if (~pairs.slow).sum() >= _FEWEST_STEPS:
-            scale, least, most = _scale(pairs.gains[~pairs.slow])
-        if np.isfinite(pairs.along).sum() >= _FEWEST_STEPS and found is None:
-            least, most = min(least, 1.0), max(most, 1.0)  # the windows decide
         doubts = [
             dataclasses.replace(one, first=int(at[one.first]), last=int(at[one.last])) for one in doubts
         ]
-        return cls(scale, least, most, delay, found, clock, tuple(doubts))
+        known = found is not None or (~pairs.slow).sum() >= _FEWEST_STEPS
+        return cls(delay, found, clock, tuple(doubts) if known else None)
 
     def widened(self, poses: Floats, covariance: Floats, segments: NDArray[np.int64], drive: Drive) -> Floats:
         """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt."""
@@ -285,7 +279,7 @@ class Consistency:
         covariance, scans, velocities = covariance.copy(), np.arange(len(poses)), drive.velocities.mean_mps
         usual = np.median(velocities[np.linalg.norm(velocities, axis=1) >= _STILL_MPS], axis=0)
         durations_s = np.diff(drive.times_s, prepend=drive.times_s[:1])[:, None]
-        for doubt in self.doubts:
+        for doubt in self.doubts or ():
             inside = (scans > doubt.first) & (scans <= doubt.last)
             speeds = (
                 np.broadcast_to(usual, velocities.shape) if doubt.share is None else doubt.share * velocities
@@ -302,21 +296,17 @@ class Consistency:
         """Return velocities with an open scale in their covariance, or None if returns contradict them; and notes."""
         if self.contradicted is not None:
             return None, [f"{NOT_USED}: {self.contradicted.words('the returns')}."]
-        if self.least > _SAME_SCALE or self.most < 1 / _SAME_SCALE:
-            shown = f"the returns show {self.scale:.1f} times its speeds. Give it in m/s, and times in s"
-            return None, [f"{NOT_USED}: {shown}."]
         if self.delay:
             return None, [f"{NOT_USED}: {_delayed('the returns', self.delay)}. Give each scan its own."]
-        wide = self.most > _SCALE_MEASURED or self.least < 1 / _SCALE_MEASURED
+        if self.doubts is None:
+            velocities = dataclasses.replace(velocities, common_sigma=_UNKNOWN_SCALE)
+            return velocities, ["Assumed: the Doppler is in m/s; too few scans with motion decide its scale."]
         notes = []
-        if wide:
-            shown = f"{self.least:.1f} to {self.most:.1f} times its speeds"
-            notes = [f"Assumed: the Doppler is in m/s; the returns agree with {shown}."]
-            doubt = max(self.most - 1, 1 - self.least) / ERRORS
-            velocities = dataclasses.replace(velocities, common_sigma=doubt)
         if self.doubts:
             scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
-            notes.append(f"Assumed: the Doppler is right; the returns of the scans {scans} do not decide it.")
+            notes = [
+                f"Assumed: the Doppler is right; the returns of the scans {scans} do not decide its scale."
+            ]
         return velocities, notes
 
 
@@ -486,7 +476,7 @@ def _judged(pairs: _Pairs) -> tuple[Contradiction | None, list[Doubt]]:
         if len(moving) >= _FEWEST_STEPS:
             answers += [(*test(moving), True) for test in (_reverse, _scale_by_gains, _scale_by_steps)]
             doubt = moving.select(slice(None), _BY_CHANCE).doubt
-            if doubt > _SCALE_MEASURED - 1:
+            if doubt > _MEASURED:
                 doubts.append(Doubt(rows.start, rows.stop, doubt))
         found += [
             (confirmed, excess, Contradiction(rows.start, rows.stop, ratio, confirmed))
@@ -501,22 +491,6 @@ def _t_values(samples: Floats) -> Floats:
     errors = samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
     found: Floats = samples.mean(axis=0) / np.maximum(errors, 1e-9)
     return found
-
-
-def _scale(gains: Floats) -> tuple[float, float, float]:
-    """Return the best scale by gains (K, S), and the limits of those that are not significantly worse."""
-    best = int(np.argmax(gains.mean(axis=0)))
-    losses = gains[:, best, None] - gains
-    errors = losses.std(axis=0, ddof=1) / np.sqrt(len(gains))
-    # The best of many scales is compared with each.
-    needed = float(student.ppf(1 - _BY_CHANCE / len(_SCALES), len(gains) - 1))
-    possible = _SCALES[losses.mean(axis=0) <= needed * errors]
-    if best in (
-        0,
-        len(_SCALES) - 1,
-    ):  # no maximum: of a radar that is too narrow, gains increase with the scale
-        possible = _SCALES
-    return float(_SCALES[best]), float(possible[0]), float(possible[-1])
 
 
 def delay_of(
