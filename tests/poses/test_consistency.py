@@ -1,11 +1,18 @@
 """Doppler and times that contradict the motion by returns or poses."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf.live.tracking import Lost
-from radarsdf.poses.consistency import Clock, contradiction
+from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.consistency import Clock, Consistency, contradiction, of_poses
+from radarsdf.poses.doppler import sign_significance, turns_fast
+from radarsdf.poses.tracking import Drive
 from radarsdf.simulate import measured_motion
+
+from bench.kinds import KINDS
 
 HALF = np.arange(20) >= 10
 FACTORS = {
@@ -85,6 +92,41 @@ def test_true_uneven_times_are_kept():
     even_m = np.full((19, 1), 2.0) * [1.0, 0, 0] + 0.01 * rng.standard_normal((19, 3))
     evened_s = times_s - Clock.of(times_s, even_m, moved_m, np.ones(19, bool)).errors_s
     assert np.diff(evened_s).std() < 0.2 * np.diff(times_s).std()
+
+
+@pytest.mark.parametrize("factor", [1, -1])
+def test_a_changed_sign_of_a_sensor_that_turns_fast_is_found(factor):
+    """Regression: scans turned by 20 degrees a step agreed with no motion, and poses were off by 137 standard deviations."""
+    lap = radarsdf.simulate.oculii(seed=5, frames=20)
+    motion = measured_motion(lap, seed=5)
+    speeds = [values if i < 10 else factor * values for i, values in enumerate(motion.doppler_mps)]
+    checked = CheckedScans.of(lap.points, speeds, motion.times_s)
+    significance, yaws = sign_significance(checked.scans, checked.velocities, checked.times_s)
+    assert turns_fast(yaws[0])
+    drive = Drive(checked.scans, checked.times_s, checked.velocities, None, yaws=yaws)
+    tested = Consistency.of_returns(drive, radarsdf.FitConfig(num_threads=1), 1)
+    if factor == 1:
+        assert significance > 4
+        assert (tested.contradicted, tested.doubts) == (None, ())
+    else:
+        assert (tested.contradicted.ratio, tested.contradicted.first) == (-1, 9)
+
+
+@pytest.mark.parametrize("fault", ["sign from half", "zero from half"])
+def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(fault):
+    tunnel = KINDS["tunnel"](seed=5, frames=20)
+    motion = measured_motion(tunnel, seed=5)
+    speeds = [factor * values for factor, values in zip(FACTORS[fault], motion.doppler_mps, strict=True)]
+    found, worst = odometry(tunnel, speeds, motion.times_s)
+    assert found.report["notes"]
+    assert worst < 4
+
+
+def test_doppler_of_other_scans_contradicts_given_poses(street, motion):
+    velocities = CheckedScans.of(street.points, motion.doppler_mps, motion.times_s).velocities
+    assert of_poses(velocities, motion.times_s, street.poses)[0] is None
+    late = dataclasses.replace(velocities, mean_mps=velocities.mean_mps[np.maximum(np.arange(20) - 3, 0)])
+    assert "3 scans later" in of_poses(late, motion.times_s, street.poses)[0]
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.0, -1.0, 1.2])

@@ -277,14 +277,12 @@ class Consistency:
         """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt."""
         assert drive.velocities is not None
         covariance, scans, velocities = covariance.copy(), np.arange(len(poses)), drive.velocities.mean_mps
-        usual = np.median(velocities[np.linalg.norm(velocities, axis=1) >= _STILL_MPS], axis=0)
+        moving = np.linalg.norm(velocities, axis=1) >= _STILL_MPS
         durations_s = np.diff(drive.times_s, prepend=drive.times_s[:1])[:, None]
         for doubt in self.doubts or ():
             inside = (scans > doubt.first) & (scans <= doubt.last)
-            speeds = (
-                np.broadcast_to(usual, velocities.shape) if doubt.share is None else doubt.share * velocities
-            )
-            steps_m = inside[:, None] * durations_s * np.einsum("fij,fj->fi", poses[:, :3, :3], speeds)
+            speeds = doubt.share * velocities if doubt.share else np.median(velocities[moving], axis=0)
+            steps_m = inside[:, None] * durations_s * np.einsum("...ij,...j->...i", poses[:, :3, :3], speeds)
             off_m = np.cumsum(steps_m, axis=0) / norm.ppf(1 - _BY_CHANCE)
             for segment in np.unique(segments):
                 rows = np.flatnonzero(segments == segment)
