@@ -255,11 +255,9 @@ class Consistency:
         begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
         fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
         shown = steps(poses)[:, :3, 3]
-        delay = (
-            delay_of(velocities, _runs(drive.times_s), rows, motion, shown, covariance, fastest)
-            if every <= _MOST_LATE
-            else 0
-        )
+        delay = 0
+        if every <= _MOST_LATE:
+            delay = delay_of(velocities, _runs(drive.times_s), rows, motion, shown, covariance, fastest)
         observed = np.isfinite(along)
         shown = np.where(observed[:, None], own * (1 + np.nan_to_num(along)[:, None]), own)
         clock = Clock.of(times_s, shown, own, observed) if every == 1 else None
@@ -267,11 +265,9 @@ class Consistency:
         at = rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)]
         if found is not None:
             found = dataclasses.replace(found, first=int(at[found.first]), last=int(at[found.last]))
-        doubts = [
-            dataclasses.replace(one, first=int(at[one.first]), last=int(at[one.last])) for one in doubts
-        ]
+        doubted = tuple(Doubt(int(at[one.first]), int(at[one.last]), one.share) for one in doubts)
         known = found is not None or (~pairs.slow).sum() >= _FEWEST_STEPS
-        return cls(delay, found, clock, tuple(doubts) if known else None)
+        return cls(delay, found, clock, doubted if known else None)
 
     def widened(self, poses: Floats, covariance: Floats, segments: NDArray[np.int64], drive: Drive) -> Floats:
         """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt."""
@@ -444,24 +440,24 @@ def _scale_by_steps(moving: _Pairs) -> _Found:
     excess = (abs(share) - _SAME_TRACKED) / max(limit, 1e-9)
     # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
     other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
-    better = (
-        moving.gains[np.isfinite(moving.along)][:, [other]]
-        - moving.gains[np.isfinite(moving.along)][:, [_SAME]]
+    gains = moving.gains[np.isfinite(moving.along)]
+    confirmed = other == _SAME or (
+        len(gains) >= _FEWEST_STEPS and _t_values(gains[:, other] - gains[:, _SAME]) > 0
     )
-    confirmed = other == _SAME or (len(better) >= _FEWEST_STEPS and _t_values(better)[0] > 0)
     return (excess if confirmed else 0.0), 1 + share
 
 
 def _judged(pairs: _Pairs) -> tuple[Contradiction | None, list[Doubt]]:
     """Judge Doppler by window of pairs: return the clearest contradiction, and windows with their doubt."""
     tried = list(_windows(len(pairs)))
-    found, doubts = [(False, 1.0, None)], list[Doubt]()
+    found = list[tuple[bool, float, Contradiction]]()
+    doubts = list[Doubt]()
     # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
     moving = pairs.select(~pairs.slow, _BY_CHANCE)
     pattern_moves = len(moving) >= _FEWEST_STEPS and _t_values(moving.moved) < moving.needed(moving.moved)
     for rows in tried:
         window = pairs.select(rows, _BY_CHANCE / len(tried))
-        answers = []
+        answers = list[tuple[float, float | None, bool]]()
         still, moving = window.select(window.slow, window.level), window.select(~window.slow, window.level)
         if len(still) >= max(_FEWEST_STEPS, _MOSTLY * len(window)):
             if pattern_moves:
@@ -481,7 +477,7 @@ def _judged(pairs: _Pairs) -> tuple[Contradiction | None, list[Doubt]]:
             for excess, ratio, confirmed in answers
             if excess > 1
         ]
-    return max(found, key=lambda one: one[:2])[2], doubts
+    return (max(found, key=lambda one: one[:2])[2] if found else None), doubts
 
 
 def _t_values(samples: Floats) -> Floats:
