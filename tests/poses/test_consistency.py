@@ -153,3 +153,16 @@ def test_a_live_map_is_lost_where_its_doppler_turns_wrong(street, motion, fault)
     with pytest.raises(Lost):
         drive()
     assert 10 <= len(live) < 14
+
+
+def test_a_live_map_is_lost_if_scans_part_without_motion_by_doppler():
+    """Regression: a pattern that moves with the sensor confirmed its standstill for 45 m."""
+    lap = radarsdf.simulate.oculii(seed=5, frames=20)
+    live = radarsdf.LiveMap()
+
+    def drive():
+        for i, scan in enumerate(lap.points):
+            live.integrate(scan, doppler_mps=np.zeros(len(scan)), time_s=0.1 * i)
+
+    with pytest.raises(Lost):
+        drive()
