@@ -38,7 +38,8 @@ _SCALES = np.geomspace(0.4, 2.5, 17)
 _BACK, _AHEAD = [0, 1, 2, 6, 7, 8], [5, 4, 3, 11, 10, 9]  # opposite shifts
 _SAME = len(_SCALES) // 2
 _SAME_TRACKED = 0.05  # relative difference of tracked steps and right Doppler: simulated scenes up to 0.02
-_PARTED = 0.15  # increase of log distances between scans of a sensor that moved. A stationary real one: up to 0.1
+# Increase of log distances between scans of a sensor that moved. A stationary real one: up to 0.1.
+_PARTED = 0.15
 _SHIFTS_M = np.concatenate(
     [np.outer([-4.0, -2.0, -1.0, 1.0, 2.0, 4.0], axis) for axis in ([1, 0, 0], [0, 1, 0])]
 )
