@@ -376,8 +376,10 @@ class _Pairs:
 
     def select(self, rows: slice | NDArray[np.bool_], level: float) -> _Pairs:
         """Select pairs, to test at a level."""
-        columns = (self.gains, self.losses, self.moved, self.parted, self.along, self.slow)
-        return _Pairs(*(column[rows] for column in columns), level)
+        gains, losses, moved, parted, along = (
+            column[rows] for column in (self.gains, self.losses, self.moved, self.parted, self.along)
+        )
+        return _Pairs(gains, losses, moved, parted, along, self.slow[rows], level)
 
     def __len__(self) -> int:
         return len(self.slow)
