@@ -1,11 +1,18 @@
 """Doppler and times that contradict the motion by returns or poses."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf.live.tracking import Lost
-from radarsdf.poses.consistency import Clock, contradiction
+from radarsdf.poses.checked_scans import CheckedScans
+from radarsdf.poses.consistency import Clock, Consistency, contradiction, of_poses
+from radarsdf.poses.doppler import sign_significance, turns_fast
+from radarsdf.poses.drive import Drive
 from radarsdf.simulate import measured_motion
+
+from scenes.kinds import KINDS
 
 from .drift import thinned
 
@@ -89,6 +96,41 @@ def test_true_uneven_times_are_kept():
     assert np.diff(evened_s).std() < 0.2 * np.diff(times_s).std()
 
 
+@pytest.mark.parametrize("factor", [1, -1])
+def test_a_changed_sign_of_a_sensor_that_turns_fast_is_found(factor):
+    """Regression: scans turned by 20 degrees a step agreed with no motion, and poses were off by 137 standard deviations."""
+    lap = radarsdf.simulate.oculii(seed=5, frames=20)
+    motion = measured_motion(lap, seed=5)
+    speeds = [values if i < 10 else factor * values for i, values in enumerate(motion.doppler_mps)]
+    checked = CheckedScans.of(lap.points, speeds, motion.times_s)
+    significance, yaws = sign_significance(checked.scans, checked.velocities, checked.times_s)
+    assert turns_fast(yaws[0])
+    drive = Drive(checked.scans, checked.times_s, checked.velocities, None, yaws=yaws)
+    tested = Consistency.of_returns(drive, radarsdf.FitConfig(num_threads=1), 1)
+    if factor == 1:
+        assert significance > 4
+        assert (tested.contradicted, tested.doubts) == (None, ())
+    else:
+        assert (tested.contradicted.ratio, tested.contradicted.first) == (-1, 9)
+
+
+@pytest.mark.parametrize("fault", ["sign from half", "zero from half"])
+def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(fault):
+    tunnel = KINDS["tunnel"](seed=5, frames=20)
+    motion = measured_motion(tunnel, seed=5)
+    speeds = [factor * values for factor, values in zip(FACTORS[fault], motion.doppler_mps, strict=True)]
+    found, worst = odometry(tunnel, speeds, motion.times_s)
+    assert found.report["notes"]
+    assert worst < 4
+
+
+def test_doppler_of_other_scans_contradicts_given_poses(street, motion):
+    velocities = CheckedScans.of(street.points, motion.doppler_mps, motion.times_s).velocities
+    assert of_poses(velocities, motion.times_s, street.poses)[0] is None
+    late = dataclasses.replace(velocities, mean_mps=velocities.mean_mps[np.maximum(np.arange(20) - 3, 0)])
+    assert "3 scans later" in of_poses(late, motion.times_s, street.poses)[0]
+
+
 @pytest.mark.parametrize("ratio", [1.0, 0.0, -1.0, 1.2])
 def test_ratios_of_speeds_are_tested_by_window(ratio):
     rng = np.random.default_rng(2)
@@ -113,3 +155,16 @@ def test_a_live_map_is_lost_where_its_doppler_turns_wrong(street, motion, fault)
     with pytest.raises(Lost):
         drive()
     assert 10 <= len(live) < 14
+
+
+def test_a_live_map_is_lost_if_scans_part_without_motion_by_doppler():
+    """Regression: a pattern that moves with the sensor confirmed its standstill for 45 m."""
+    lap = radarsdf.simulate.oculii(seed=5, frames=20)
+    live = radarsdf.LiveMap()
+
+    def drive():
+        for i, scan in enumerate(lap.points):
+            live.integrate(scan, doppler_mps=np.zeros(len(scan)), time_s=0.1 * i)
+
+    with pytest.raises(Lost):
+        drive()

@@ -92,8 +92,9 @@ def _compared_with_poses(
     cosine = float(np.median(np.einsum("na,na->n", a, b)))
     sign = -1.0 if cosine < -0.8 else 1.0
     if times is not None:
-        yield from _compared_speeds(recording, scans, by_poses, sign * by_doppler)
-        yield from _compared_in_block(recording, times, sign)
+        found = list(_compared_speeds(recording, scans, by_poses, sign * by_doppler))
+        yield from found
+        yield from _compared_in_block(recording, times, sign, known=bool(found))
     if cosine < -0.8:
         # Sign conventions differ, and moving returns are found with either: so this is not a fault of the data.
         evidence = f"By its Doppler the sensor moves backwards where its poses move forwards (median cosine {cosine:.2f})."
@@ -120,11 +121,12 @@ def _compared_speeds(
     scans = np.append(scans[used], scans[used][-1:])
     found = contradiction(by_poses[used], by_doppler[used], variances, scans)
     if found is not None:
-        words = found.words("the poses")
-        yield Finding("doppler_contradicts_poses", "warning", f"{words[0].upper()}{words[1:]}.")
+        yield _contradiction(found.words("the poses"))
 
 
-def _compared_in_block(recording: Scans, times_s: FloatArray, sign: float) -> Iterator[Finding]:
+def _compared_in_block(
+    recording: Scans, times_s: FloatArray, sign: float, *, known: bool
+) -> Iterator[Finding]:
     """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone."""
     assert recording.doppler_mps is not None
     begin = max(0, (len(recording) - _BLOCK) // 2)
@@ -139,8 +141,14 @@ def _compared_in_block(recording: Scans, times_s: FloatArray, sign: float) -> It
         evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
         yield Finding("doppler_offset", "warning", evidence)
     contradicted, clock = of_poses(velocities, times_s[rows], recording.poses[rows])
+    if contradicted is not None and not known:
+        yield _contradiction(contradicted)
     if contradicted is None and clock.note:
         yield Finding("times_uneven", "warning", clock.note[0])
+
+
+def _contradiction(words: str) -> Finding:
+    return Finding("doppler_contradicts_poses", "warning", f"{words[0].upper()}{words[1:]}.")
 
 
 def velocity_of_poses(T_world_sensor: FloatArray, times_s: FloatArray) -> FloatArray:

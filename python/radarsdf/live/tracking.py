@@ -186,7 +186,7 @@ class Follower:
         drive = Drive([step.scan for step in steps], times_s, velocities, None)
         tested = Consistency.of_returns(drive, self.config, self.config.num_threads)
         trusted, notes = tested.applied(velocities)
-        undecided = tested.contradicted is not None and np.isnan(tested.contradicted.ratio)
+        undecided = tested.contradicted is not None and not tested.contradicted.confirmed
         if trusted is None and not undecided:
             self._judged_s = -np.inf  # the next scans are judged, too
             return notes[-1]
@@ -326,6 +326,7 @@ class Follower:
             evidence, yaws = sign_significance(drive.scans, velocities.scaled(sign or 1.0), drive.times_s)
             # Until the sign is clear, the scans are placed by the likelier one, and re-estimated.
             likelier = sign or int(np.sign(evidence))
+            yaws = yaws[int(evidence < 0)]
             sign = sign or (likelier if abs(evidence) > CLEAR else 0)
             # By the prior alone, a vehicle that turns by 13 degrees between the first scans would be lost.
             durations_s = np.diff(drive.times_s)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 from scipy.stats import t as student
 
 from radarsdf.config.fit_config import FitConfig
@@ -17,12 +18,11 @@ from radarsdf.poses.doppler import (
     NOT_USED,
     DopplerMotion,
     SensorVelocities,
-    log_distance_gains,
-    shift_losses,
+    log_distances,
 )
 from radarsdf.poses.drive import Drive, track_once
 from radarsdf.poses.planes import plane_cell_m
-from radarsdf.poses.rigid import Floats, steps
+from radarsdf.poses.rigid import Floats, rotation, steps
 from radarsdf.poses.tracking import Tracked, Tracker
 
 _BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
@@ -39,16 +39,20 @@ _SCALES = np.geomspace(0.4, 2.5, 17)
 _BACK, _AHEAD = [0, 1, 2, 6, 7, 8], [5, 4, 3, 11, 10, 9]  # opposite shifts
 _SAME = len(_SCALES) // 2
 _SAME_TRACKED = 0.05  # relative difference of tracked steps and right Doppler: simulated scenes up to 0.02
+# Increase of log distances between scans of a sensor that moved. A stationary real one: up to 0.1.
+_PARTED = 0.15
 _SHIFTS_M = np.concatenate(
     [np.outer([-4.0, -2.0, -1.0, 1.0, 2.0, 4.0], axis) for axis in ([1, 0, 0], [0, 1, 0])]
 )
 # Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
 _SAME_SCALE = 1.1
-_SCALE_MEASURED = 1.2  # beyond which confidence limits of that ratio leave the scale of the Doppler open
+_MEASURED = 0.2  # relative difference from the Doppler beyond which confidence limits leave its scale open
+_UNKNOWN_SCALE = 0.5  # standard deviation of the scale without evidence: half or twice the speed
 _MOST_LATE = 10  # scans
 _SAME_RESIDUALS = 1.25  # ratio of squared residuals up to which a delay does not matter
 _EVEN = 1e-3  # unevenness of times that does not matter, share of an interval
 _LEAST_STEP_M = 0.1  # minimum motion in a step that reveals its duration
+_LATER = 4  # of all pairs, the share between a scan and a much later one
 _MOSTLY = 0.8  # share of steps without motion by Doppler from which on returns must confirm it
 _LEAST_SEEN = 0.5  # share of a step's prior variance that the returns remove, if their difference counts
 _STILL_MPS = 0.1  # slower Doppler, in which compensation for ego motion leaves only noise, tells no direction
@@ -60,14 +64,17 @@ class Contradiction:
 
     first: int  # scan
     last: int
-    # Of the speeds by the other source to those by Doppler: infinite where Doppler shows no motion, NaN where this is undecided.
-    ratio: float
+    ratio: (
+        float | None
+    )  # of the speeds by the other source to those by Doppler. None: Doppler shows no motion
+    confirmed: bool = True  # by the other source. Else this source observes neither motion nor its absence
 
     def words(self, source: str) -> str:
         """Describe in words, without a full stop."""
-        if not np.isfinite(self.ratio):
-            return f"from scan {self.first} to {self.last}, it shows no motion, which {source} do not confirm"
-        return f"from scan {self.first} to {self.last}, {source} show {self.ratio:.2f} times its speeds"
+        scans = f"from scan {self.first} to {self.last}"
+        if self.ratio is None:
+            return f"{scans}, it shows no motion, which {source} do not confirm"
+        return f"{scans}, {source} show {self.ratio:.2f} times its speeds"
 
 
 def _runs(times_s: Floats) -> NDArray[np.int64]:
@@ -94,9 +101,7 @@ def contradiction(
     In each window, the mean difference along the longer ones is compared with its standard error (Student's t). `scans` (K + 1,):
     those between which the steps are.
     """
-    # The other source has errors, too: where the sensor moves evenly, second differences have six times their variance.
-    jumps = np.diff(shown_m, 2, axis=0) if len(shown_m) > 2 else np.zeros((1, 3))
-    all_weights = 1 / (variances_m2 + np.median(jumps**2) / 6)
+    all_weights = 1 / (variances_m2 + _unevenness_m2(shown_m))  # the other source has errors, too
     worst, found, tried = 0.0, None, list(_windows(len(shown_m)))
     for rows in tried:
         shown, doppler, weights = shown_m[rows], doppler_m[rows], all_weights[rows]
@@ -118,22 +123,38 @@ def contradiction(
             by_doppler, by_other = (
                 float((weights * np.einsum("ki,ki->k", moves, longer)).sum()) for moves in (doppler, shown)
             )
-            ratio = by_other / by_doppler if abs(by_doppler) > 0.05 * abs(by_other) else np.inf
+            ratio = by_other / by_doppler if abs(by_doppler) > 0.05 * abs(by_other) else None
             worst, found = excess, Contradiction(int(scans[rows.start]), int(scans[rows.stop]), ratio)
     return found
 
 
-def of_poses(
-    velocities: SensorVelocities, times_s: Floats, poses: Floats
-) -> tuple[Contradiction | None, Clock]:
-    """Test velocities and times (F,) against given poses (F, 4, 4); return the clearest contradiction, and errors of the times."""
+def of_poses(velocities: SensorVelocities, times_s: Floats, poses: Floats) -> tuple[str | None, Clock]:
+    """Test velocities and times (F,) against given poses (F, 4, 4).
+
+    Return the clearest contradiction in words that go on "the Doppler is wrong: ", and errors of the times.
+    """
     shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
     clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
-    motion = DopplerMotion.by(velocities, times_s - clock.errors_s, poses)
+    times_s = times_s - clock.errors_s
+    motion, rows = DopplerMotion.by(velocities, times_s, poses), np.arange(len(times_s))
+    variance_m2 = _unevenness_m2(shown)
     scans = np.append(np.flatnonzero(known), np.flatnonzero(known)[-1:] + 1)
     variances = motion.shares[known, :3].mean(axis=1)
     found = contradiction(shown[known], motion.steps[known, :3, 3], variances, scans)
-    return found, clock
+    if found is not None:
+        return found.words("the poses"), clock
+    covariance = np.tile(variance_m2 * np.eye(3), (len(shown), 1, 1))
+    delay = delay_of(velocities, _runs(times_s), rows, motion, shown, covariance, known)
+    return (_delayed("the poses", delay) if delay else None), clock
+
+
+def _unevenness_m2(shown_m: Floats) -> float:
+    """Return the variance of a component of steps (K, 3): where the sensor moves evenly, second differences have six times it."""
+    return float(np.median(np.diff(shown_m, 2, axis=0) ** 2) / 6) if len(shown_m) > 2 else 0.0
+
+
+def _delayed(source: str, delay: int) -> str:
+    return f"{source} agree with that of {abs(delay)} scans {'later' if delay > 0 else 'earlier'}"
 
 
 @dataclass(frozen=True)
@@ -182,17 +203,22 @@ class Clock:
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """Window of scans in which the returns do not exclude another motion than that by Doppler."""
+
+    first: int  # scan
+    last: int
+    share: float | None  # largest relative difference of this motion. None: Doppler shows no motion
+
+
+@dataclass(frozen=True)
 class Consistency:
     """Comparison of a drive's Doppler with its returns."""
 
-    scale: float = 1.0  # ratio of the speeds by returns to those by Doppler
-    least: float = float(_SCALES[0])  # confidence limits of this ratio
-    most: float = float(_SCALES[-1])
     delay: int = 0  # of the Doppler, scans, where one explains the returns significantly better
     contradicted: Contradiction | None = None  # in a window
     clock: Clock | None = None
-    # Relative difference of the speeds that tracking shows, but pairs of scans do not decide.
-    undecided: float = 0.0
+    doubts: tuple[Doubt, ...] | None = None  # None: too few scans with motion
 
     @classmethod
     def of_returns(cls, drive: Drive, config: FitConfig, num_threads: int) -> Consistency:
@@ -209,7 +235,8 @@ class Consistency:
         free = compared.scaled(1.0, _FREE_SCALE)
         free.covariance[:] += (_FREE_ACROSS * compared.usual_mps) ** 2 * np.eye(3)
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads)
-        tracked, _ = track_once(Drive(scans, times_s, free, None), tracker)
+        yaws = drive.yaws if every == 1 else None
+        tracked, _ = track_once(Drive(scans, times_s, free, None, yaws=yaws), tracker)
         segments, counts = np.array(
             [(found.segment, len(scan)) for found, scan in zip(tracked, scans, strict=True)]
         ).T
@@ -220,50 +247,63 @@ class Consistency:
             return cls()
         poses = np.stack([found.pose for found in tracked])
         motion = DopplerMotion.by(compared, times_s, poses)
-        pairs = np.flatnonzero(usable)  # also where tracking was lost: by wrong Doppler, it may be
-        pairs = pairs[:: -(-len(pairs) // _PAIRS)]
-        gains = np.array([_gains(scans[i], scans[i + 1], motion.steps[i]) for i in pairs])
+        rows_of_pairs = np.flatnonzero(usable)  # also where tracking was lost: by wrong Doppler, it may be
+        rows_of_pairs = rows_of_pairs[:: -(-len(rows_of_pairs) // _PAIRS)]
+        own, covariance = motion.steps[:, :3, 3], _step_covariances(tracked)
+        along = np.where(followed, _relative_differences(tracked, motion, free), np.nan)
+        pairs = _compared(scans, poses, motion, along, rows_of_pairs, None if yaws is None else yaws[1])
         # The fastest steps: of slow ones, errors of the returns seem delays.
-        ways_m, count = np.linalg.norm(motion.steps[:, :3, 3], axis=1) * usable, min(_DELAYED, len(usable))
-        begin = int(np.argmax(np.convolve(ways_m, np.ones(count), "valid")))
+        lengths_m, count = np.linalg.norm(own, axis=1) * usable, min(_DELAYED, len(usable))
+        begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
         fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
-        delay = (
-            _delay(velocities, _runs(drive.times_s), rows, motion, tracked, fastest)
-            if every <= _MOST_LATE
-            else 0
-        )
-        slow = np.linalg.norm(compared.mean_mps, axis=1)[pairs] < _STILL_MPS
-        along = np.where(followed, _relative_differences(tracked, motion, free), np.nan)[pairs]
-        shown, own = steps(poses)[:, :3, 3], motion.steps[:, :3, 3]
-        clock = Clock.of(times_s, shown, own, followed) if every == 1 else None
-        window, undecided = _judged(gains, along, slow)
-        if window is not None:
-            first, last = pairs[window.first], pairs[min(window.last, len(pairs) - 1)] + 1
-            window = dataclasses.replace(window, first=int(rows[first]), last=int(rows[last]))
-        scale, least, most = 1.0, float(_SCALES[0]), float(_SCALES[-1])
-        if (~slow).sum() >= _FEWEST_STEPS:
-            scale, least, most = _scale(gains[~slow, : len(_SCALES)])
-        if np.isfinite(along).sum() >= _FEWEST_STEPS and window is None:
-            least, most = min(least, 1.0), max(most, 1.0)  # the windows decide
-        return cls(scale, least, most, delay, window, clock, undecided)
+        shown = steps(poses)[:, :3, 3]
+        delay = 0
+        if every <= _MOST_LATE:
+            delay = delay_of(velocities, _runs(drive.times_s), rows, motion, shown, covariance, fastest)
+        observed = np.isfinite(along)
+        shown = np.where(observed[:, None], own * (1 + np.nan_to_num(along)[:, None]), own)
+        clock = Clock.of(times_s, shown, own, observed) if every == 1 else None
+        found, doubts = _judged(pairs)
+        at = rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)]
+        if found is not None:
+            found = dataclasses.replace(found, first=int(at[found.first]), last=int(at[found.last]))
+        doubted = tuple(Doubt(int(at[one.first]), int(at[one.last]), one.share) for one in doubts)
+        known = found is not None or (~pairs.slow).sum() >= _FEWEST_STEPS
+        return cls(delay, found, clock, doubted if known else None)
+
+    def widened(self, poses: Floats, covariance: Floats, segments: NDArray[np.int64], drive: Drive) -> Floats:
+        """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt."""
+        assert drive.velocities is not None
+        covariance, scans, velocities = covariance.copy(), np.arange(len(poses)), drive.velocities.mean_mps
+        moving = np.linalg.norm(velocities, axis=1) >= _STILL_MPS
+        durations_s = np.diff(drive.times_s, prepend=drive.times_s[:1])[:, None]
+        for doubt in self.doubts or ():
+            inside = (scans > doubt.first) & (scans <= doubt.last)
+            speeds = doubt.share * velocities if doubt.share else np.median(velocities[moving], axis=0)
+            steps_m = inside[:, None] * durations_s * np.einsum("...ij,...j->...i", poses[:, :3, :3], speeds)
+            off_m = np.cumsum(steps_m, axis=0) / norm.ppf(1 - _BY_CHANCE)
+            for segment in np.unique(segments):
+                rows = np.flatnonzero(segments == segment)
+                off = off_m[rows] - off_m[rows[len(rows) // 2]]
+                covariance[rows, :3, :3] += off[:, :, None] * off[:, None, :]
+        return covariance
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
         """Return velocities with an open scale in their covariance, or None if returns contradict them; and notes."""
         if self.contradicted is not None:
             return None, [f"{NOT_USED}: {self.contradicted.words('the returns')}."]
-        if self.least > _SAME_SCALE or self.most < 1 / _SAME_SCALE:
-            shown = f"the returns show {self.scale:.1f} times its speeds. Give it in m/s, and times in s"
-            return None, [f"{NOT_USED}: {shown}."]
         if self.delay:
-            shown = f"the returns agree with that of {abs(self.delay)} scans {'later' if self.delay > 0 else 'earlier'}"
-            return None, [f"{NOT_USED}: {shown}. Give each scan its own."]
-        wide = self.most > _SCALE_MEASURED or self.least < 1 / _SCALE_MEASURED
-        if not wide and not self.undecided:
-            return velocities, []
-        shown = f"{min(self.least, 1 - self.undecided):.1f} to {max(self.most, 1 + self.undecided):.1f} times its speeds"
-        doubt = max((self.most - 1) / ERRORS, (1 - self.least) / ERRORS, self.undecided)
-        velocities = dataclasses.replace(velocities, common_sigma=doubt)
-        return velocities, [f"Assumed: the Doppler is in m/s; the returns agree with {shown}."]
+            return None, [f"{NOT_USED}: {_delayed('the returns', self.delay)}. Give each scan its own."]
+        if self.doubts is None:
+            velocities = dataclasses.replace(velocities, common_sigma=_UNKNOWN_SCALE)
+            return velocities, ["Assumed: the Doppler is in m/s; too few scans with motion decide its scale."]
+        notes = []
+        if self.doubts:
+            scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
+            notes = [
+                f"Assumed: the Doppler is right; the returns of the scans {scans} do not decide its scale."
+            ]
+        return velocities, notes
 
 
 def _relative_differences(tracked: list[Tracked], motion: DopplerMotion, prior: SensorVelocities) -> Floats:
@@ -287,60 +327,161 @@ def _step_covariances(tracked: list[Tracked]) -> Floats:
     return covariances
 
 
-def _gains(first: Floats, second: Floats, step: Floats) -> Floats:
-    """Return how much nearer returns of two scans are after scales of a step (4, 4) than after the reverse, and than after shifts."""
-    turned = np.einsum("ni,ji->nj", second, step[:3, :3])
-    gains = log_distance_gains(first, turned, np.multiply.outer(_SCALES, step[:3, 3]))
-    return np.concatenate([gains, shift_losses(first, turned, _SHIFTS_M)])
+def _compared(
+    scans: list[Floats],
+    poses: Floats,
+    motion: DopplerMotion,
+    along: Floats,
+    rows: NDArray[np.int64],
+    reversed_yaws: Floats | None,
+) -> _Pairs:
+    """Compare the returns of scans `rows` (K,) with those of the next ones, at the rotations of tracked poses.
 
-
-def _judged(gains: Floats, along: Floats, slow: NDArray[np.bool_]) -> tuple[Contradiction | None, float]:
-    """Judge Doppler by window of K pairs of scans; return the clearest contradiction, and the largest undecided one, a share.
-
-    `gains` (K, S): of :func:`_gains`; `along` (K,): relative differences of tracked steps and Doppler, NaN where tracking was lost;
-    `slow` (K,): pairs without motion by Doppler.
+    `reversed_yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
     """
-    tried, count = list(_windows(len(gains))), len(_SCALES)
-    found: list[tuple[float, slice, float]] = []  # excess over what is needed, window, ratio
-    undecided = 0.0
+    scales, later = len(_SCALES), max(len(rows) // _LATER, 2)
+    gains, losses, moved, parted = [], [], [], np.full(len(rows), np.nan)
+    speeds_mps = np.linalg.norm(motion.velocities.mean_mps, axis=1)
+    slow = speeds_mps[rows] < _STILL_MPS
+    for k, i in enumerate(rows.tolist()):
+        step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
+        shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])
+        turns = [motion.steps[i, :3, :3]]
+        if reversed_yaws is not None and np.isfinite(reversed_yaws[i]):
+            turns.append(rotation(np.array([0.0, 0.0, reversed_yaws[i]])))
+        apart = np.min([log_distances(scans[i], scans[i + 1] @ turn.T, shifts_m) for turn in turns], axis=0)
+        ahead, back, still, shifted = np.split(apart, [scales, 2 * scales, 2 * scales + 1])
+        gains.append(back - ahead)
+        losses.append(shifted - still)
+        moved.append(still[0] - ahead[_SAME])
+        if slow[k : k + later + 1].all() and k + later < len(rows):
+            turn = poses[i, :3, :3].T @ poses[rows[k + later], :3, :3]
+            second = scans[rows[k + later]] @ turn.T
+            parted[k] = log_distances(scans[i], second, np.zeros((1, 3)))[0] - still[0]
+    return _Pairs(np.array(gains), np.array(losses), np.array(moved), parted, along[rows], slow)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """K pairs of scans, and how well their returns agree with hypotheses of the motion between them."""
+
+    gains: (
+        Floats  # (K, S) how much nearer returns are after scales of the Doppler's step than after the reverse
+    )
+    losses: Floats  # (K, T) how much nearer they are without a step than after shifts
+    moved: Floats  # (K,) how much nearer they are after the Doppler's step than without one
+    parted: Floats  # (K,) how much farther, without steps, they are from those of a scan much later. NaN at the end
+    along: Floats  # (K,) relative differences of tracked steps and Doppler. NaN where returns hardly observe them
+    slow: NDArray[np.bool_]  # (K,) whether there is no motion by Doppler
+    level: float = _BY_CHANCE  # significance level of a test
+
+    def select(self, rows: slice | NDArray[np.bool_], level: float) -> _Pairs:
+        """Select pairs, to test at a level."""
+        gains, losses, moved, parted, along = (
+            column[rows] for column in (self.gains, self.losses, self.moved, self.parted, self.along)
+        )
+        return _Pairs(gains, losses, moved, parted, along, self.slow[rows], level)
+
+    def __len__(self) -> int:
+        return len(self.slow)
+
+    def needed(self, samples: Floats, tests: int = 1) -> float:
+        """Return the least significant t value of samples (K, ...), the largest of some tests."""
+        return float(student.ppf(1 - self.level / tests, len(samples) - 1))
+
+    @property
+    def tracked(self) -> tuple[float, float]:
+        """Mean relative difference of tracked steps, and its confidence limits. Infinite ones if too few are known."""
+        shares = self.along[np.isfinite(self.along)]
+        if len(shares) < _FEWEST_STEPS:
+            return 0.0, np.inf
+        return float(shares.mean()), float(self.needed(shares) * shares.std(ddof=1) / np.sqrt(len(shares)))
+
+    @property
+    def doubt(self) -> float:
+        """Largest relative difference of the Doppler from a motion that the returns do not exclude."""
+        own = self.gains[:, _SAME]
+        if _t_values(own) < self.needed(own):
+            return 2.0  # of the reverse
+        losses = own[:, None] - self.gains
+        possible = _SCALES[_t_values(losses) <= self.needed(losses)]
+        share, limit = self.tracked
+        return min(float(np.abs(possible - 1).max(initial=0)), abs(share) + limit)
+
+
+# What a test of pairs finds: its t value, over the least significant one, and the ratio of the speeds.
+_Found = tuple[float, float | None]
+
+
+def _motion_unseen_by_doppler(still: _Pairs) -> _Found:
+    """Test pairs without motion by Doppler: opposite shifts agree differently, or later scans agree less and less."""
+    asymmetry = float(np.abs(_t_values(still.losses[:, _BACK] - still.losses[:, _AHEAD])).max())
+    parted = still.parted[np.isfinite(still.parted)]
+    excess = asymmetry / still.needed(still.losses, still.losses.shape[1])
+    if len(parted) >= _FEWEST_STEPS and parted.mean() > _PARTED:
+        excess = max(excess, float(_t_values(parted)) / still.needed(parted))
+    return excess, None
+
+
+def _reverse(moving: _Pairs) -> _Found:
+    own = moving.gains[:, _SAME]
+    return -float(_t_values(own)) / moving.needed(own), -1.0
+
+
+def _scale_by_gains(moving: _Pairs) -> _Found:
+    means = moving.gains.mean(axis=0)
+    best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
+    share, limit = moving.tracked
+    # Of a radar that is too narrow, gains increase up to the end of the scales.
+    if best in (here, 0, len(_SCALES) - 1) or abs(share) + limit < _SAME_SCALE - 1:
+        return 0.0, 1.0
+    loss = moving.gains[:, best] - moving.gains[:, here]
+    return float(_t_values(loss)) / moving.needed(loss, len(_SCALES)), float(_SCALES[best])
+
+
+def _scale_by_steps(moving: _Pairs) -> _Found:
+    share, limit = moving.tracked
+    excess = (abs(share) - _SAME_TRACKED) / max(limit, 1e-9)
+    # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
+    other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
+    gains = moving.gains[np.isfinite(moving.along)]
+    confirmed = other == _SAME or (
+        len(gains) >= _FEWEST_STEPS and _t_values(gains[:, other] - gains[:, _SAME]) > 0
+    )
+    return (excess if confirmed else 0.0), 1 + share
+
+
+def _judged(pairs: _Pairs) -> tuple[Contradiction | None, list[Doubt]]:
+    """Judge Doppler by window of pairs: return the clearest contradiction, and windows with their doubt."""
+    tried = list(_windows(len(pairs)))
+    found = list[tuple[bool, float, Contradiction]]()
+    doubts = list[Doubt]()
+    # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
+    moving = pairs.select(~pairs.slow, _BY_CHANCE)
+    pattern_moves = len(moving) >= _FEWEST_STEPS and _t_values(moving.moved) < moving.needed(moving.moved)
     for rows in tried:
-        moving, still = gains[rows][~slow[rows], :count], gains[rows][slow[rows], count:]
-        level, steps_here = _BY_CHANCE / len(tried), len(moving) + len(still)
-        # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
-        if len(still) >= max(_FEWEST_STEPS, _MOSTLY * steps_here) and 2 * steps_here >= len(gains) - 1:
-            # Without motion by Doppler, which compensation for ego motion leaves, too, returns must agree less after any shift.
-            level /= still.shape[1]
-            needed = student.ppf(1 - level, len(still) - 1)
-            confirmed = float(_t_values(still).min() / needed)
-            moved = float(np.abs(_t_values(still[:, _BACK] - still[:, _AHEAD])).max() / needed)
-            found.append((max(2 - confirmed, moved), rows, np.inf if moved > 1 else np.nan))
-        if len(moving) < _FEWEST_STEPS:
-            continue
-        needed = float(student.ppf(1 - level, len(moving) - 1))
-        found.append((-float(_t_values(moving[:, _SAME])) / needed, rows, -1.0))
-        shares = along[rows][~slow[rows]]
-        known = np.isfinite(shares)
-        tracked, share, error = known.sum() >= _FEWEST_STEPS, 0.0, np.inf
-        if tracked:
-            share, error = float(shares[known].mean()), shares[known].std(ddof=1) / np.sqrt(known.sum())
-        means = moving.mean(axis=0)
-        best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
-        same = abs(share) + needed * error < _SAME_SCALE - 1
-        # Of a radar that is too narrow, gains increase up to the end of the scales.
-        if best != here and 0 < best < count - 1 and not same:
-            loss = float(_t_values(moving[:, best] - moving[:, here]))
-            found.append((loss / student.ppf(1 - level / count, len(moving) - 1), rows, _SCALES[best]))
-        excess = (abs(share) - _SAME_TRACKED) / max(needed * error, 1e-9)
-        if tracked and excess > 1:
-            # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
-            other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
-            better = float(_t_values(moving[known][:, other] - moving[known][:, _SAME]))
-            if better > 0 or other == _SAME:
-                found.append((excess, rows, 1 + share))
-            elif better > -needed:
-                undecided = max(undecided, abs(share))
-    excess, rows, ratio = max(found, key=lambda one: one[0], default=(0.0, slice(0), 1.0))
-    return Contradiction(rows.start, rows.stop, float(ratio)) if excess > 1 else None, undecided
+        window = pairs.select(rows, _BY_CHANCE / len(tried))
+        answers = list[tuple[float, float | None, bool]]()
+        still, moving = window.select(window.slow, window.level), window.select(~window.slow, window.level)
+        if len(still) >= max(_FEWEST_STEPS, _MOSTLY * len(window)):
+            if pattern_moves:
+                doubts.append(Doubt(rows.start, rows.stop, None))
+            answers = [(*_motion_unseen_by_doppler(still), True)]
+            # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
+            if 2 * len(window) >= len(pairs) - 1:
+                needed = still.needed(still.losses, still.losses.shape[1])
+                answers.append((2 - float(_t_values(still.losses).min()) / needed, None, False))
+        if len(moving) >= _FEWEST_STEPS:
+            answers += [(*test(moving), True) for test in (_reverse, _scale_by_gains, _scale_by_steps)]
+            doubt = moving.select(slice(None), _BY_CHANCE).doubt
+            if doubt > _MEASURED:
+                doubts.append(Doubt(rows.start, rows.stop, doubt))
+        found += [
+            (confirmed, excess, Contradiction(rows.start, rows.stop, ratio, confirmed))
+            for excess, ratio, confirmed in answers
+            if excess > 1
+        ]
+    return (max(found, key=lambda one: one[:2])[2] if found else None), doubts
 
 
 def _t_values(samples: Floats) -> Floats:
@@ -350,37 +491,25 @@ def _t_values(samples: Floats) -> Floats:
     return found
 
 
-def _scale(gains: Floats) -> tuple[float, float, float]:
-    """Return the best scale by gains (K, S), and the limits of those that are not significantly worse."""
-    best = int(np.argmax(gains.mean(axis=0)))
-    losses = gains[:, best, None] - gains
-    errors = losses.std(axis=0, ddof=1) / np.sqrt(len(gains))
-    # The best of many scales is compared with each.
-    needed = float(student.ppf(1 - _BY_CHANCE / len(_SCALES), len(gains) - 1))
-    possible = _SCALES[losses.mean(axis=0) <= needed * errors]
-    if best in (
-        0,
-        len(_SCALES) - 1,
-    ):  # no maximum: of a radar that is too narrow, gains increase with the scale
-        possible = _SCALES
-    return float(_SCALES[best]), float(possible[0]), float(possible[-1])
-
-
-def _delay(
+def delay_of(
     velocities: SensorVelocities,
     runs: NDArray[np.int64],  # of scans without a gap
     rows: NDArray[np.int64],
     motion: DopplerMotion,
-    tracked: list[Tracked],
+    shown: Floats,
+    covariance: Floats,
     followed: NDArray[np.bool_],
 ) -> int:
-    """Return the delay, scans, of the Doppler with which steps by returns agree best, if significantly; else 0."""
+    """Return the delay, scans, of the Doppler with which steps (K, 3) by another source agree best, if significantly; else 0.
+
+    `velocities` and `runs`: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of `shown`.
+    """
     # The steps by delayed Doppler explain the residuals of those by its own (J test, Davidson and MacKinnon 1981).
-    poses = np.stack([found.pose for found in tracked])
-    covariance = _step_covariances(tracked)
-    covariance += [motion.velocities.step_covariance(i, d) for i, d in enumerate(motion.durations_s.tolist())]
+    covariance = covariance + [
+        motion.velocities.step_covariance(i, d) for i, d in enumerate(motion.durations_s.tolist())
+    ]
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    own, shown = motion.steps[:, :3, 3], steps(poses)[:, :3, 3]
+    own = motion.steps[:, :3, 3]
     found, last = [(np.inf, 0)], len(velocities.mean_mps) - 1
     for delay in set(range(-_MOST_LATE, _MOST_LATE + 1)) - {0}:
         at = np.clip(rows + delay, 0, last)
@@ -389,7 +518,9 @@ def _delay(
         if (count := int(used.sum())) < _FEWEST_STEPS:
             continue
         delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[at])
-        later = dataclasses.replace(motion, velocities=delayed).at(poses).steps[:, :3, 3]
+        later = (
+            dataclasses.replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3]).steps[:, :3, 3]
+        )
         scaled, left, change = (
             np.einsum("fij,fj->fi", whitening, moves)[used] for moves in (own, shown - own, later - own)
         )

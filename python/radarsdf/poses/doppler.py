@@ -198,8 +198,13 @@ class DopplerMotion(KnownMotion):
 
     def at(self, poses: Floats) -> DopplerMotion:
         """Update the translations for the rotations of `poses`."""
-        between, means = steps(poses), self.velocities.mean_mps
-        turns = rotation_vector(between[:, :3, :3], self.turns)
+        return self.turned(steps(poses)[:, :3, :3])
+
+    def turned(self, rotations: Floats) -> DopplerMotion:
+        """Update the translations for rotations (F - 1, 3, 3) of the steps."""
+        between, means = self.steps.copy(), self.velocities.mean_mps
+        between[:, :3, :3] = rotations
+        turns = rotation_vector(rotations, self.turns)
         between[:, :3, 3] = way(turns, means[:-1], means[1:], self.durations_s[:, None])
         return dataclasses.replace(self, steps=between)
 
@@ -221,46 +226,40 @@ class _Pair:
         return found
 
 
-def log_distance_gains(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
-    """Return how much nearer (K,) returns of scans in common axes are after shifts (K, 3) than after the reverse ones."""
-    # What scans have in common wherever they were taken, such as density, clutter, or walls along the motion, cancels.
-    both_m = np.concatenate([shifts_m, -shifts_m])
-    ahead, back = np.split(
-        _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), both_m).mean(axis=1), 2
-    )
-    found: Floats = back - ahead
-    return found
-
-
-def shift_losses(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
-    """Return how much nearer (K,) returns of scans in common axes are than after shifts (K, 3)."""
-    both_m = np.concatenate([np.zeros((1, 3)), shifts_m])
-    distances = _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), both_m).mean(axis=1)
-    found: Floats = distances[1:] - distances[0]
+def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
+    """Return mean log distances (K,) to the nearest returns of scans in common axes, the second after shifts (K, 3)."""
+    found: Floats = _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), shifts_m).mean(axis=1)
     return found
 
 
 def sign_significance(
     scans: Sequence[Floats], velocities: SensorVelocities, times_s: Floats
 ) -> tuple[float, Floats]:
-    """Return the standard errors by which scans agree better with velocities than reversed, and the yaws (F - 1,) between them."""
+    """Return the standard errors by which scans agree better with velocities than reversed, and the yaws (2, F - 1) for both."""
     durations_s = np.diff(times_s)
     moved_m = 0.5 * (velocities.mean_mps[1:] + velocities.mean_mps[:-1]) * durations_s[:, None]
     usable = velocities.found[1:] & velocities.found[:-1] & (durations_s <= 2 * np.median(durations_s))
     usable &= np.array([min(len(a), len(b)) > 0 for a, b in itertools.pairwise(scans)], bool)
-    # The longest steps are most informative: if the first are twice as clear as needed, the others are not compared.
-    pairs = sorted(np.flatnonzero(usable).tolist(), key=lambda i: -float(moved_m[i] @ moved_m[i]))[:_PAIRS]
-    yaws = np.full(len(durations_s), np.nan)
-    gains, turns, significance = [], [], 0.0
-    for some in (pairs[:_FIRST_PAIRS], pairs[_FIRST_PAIRS:]):
+    # The longest steps are most informative: if the first are twice as clear as needed, the others are not compared, unless
+    # the sensor turns so fast that each yaw is needed.
+    pairs = sorted(np.flatnonzero(usable).tolist(), key=lambda i: -float(moved_m[i] @ moved_m[i]))
+    yaws = np.full((2, len(durations_s)), np.nan)
+    gains, significance = [], 0.0
+    for some in (pairs[:_FIRST_PAIRS], pairs[_FIRST_PAIRS:_PAIRS], pairs[_PAIRS:]):
         for i in some:
-            gain, both_turns = _reversal_gains(scans[i], scans[i + 1], moved_m[i])
+            gain, yaws[:, i] = _reversal_gains(scans[i], scans[i + 1], moved_m[i])
             gains.append(gain)
-            turns.append(both_turns)
-        if not gains or abs(significance := _significance(gains)) > 2 * CLEAR:
+        significance = _significance(gains) if gains else 0.0
+        clear = abs(significance) > 2 * CLEAR or len(gains) >= min(_PAIRS, len(pairs))
+        if clear and not turns_fast(yaws[int(significance < 0)]):
             break
-    yaws[pairs[: len(turns)]] = [of_both[0 if significance >= 0 else 1] for of_both in turns]
     return significance, yaws
+
+
+def turns_fast(yaws: Floats) -> bool:
+    """Return whether yaws (F - 1,) between scans, NaN if unknown, are beyond those that tracking expects of an unknown sensor."""
+    known = np.abs(yaws[np.isfinite(yaws)])
+    return bool(len(known) and np.median(known) > YAW_STEP_RAD)
 
 
 def _significance(gains: Sequence[Floats]) -> float:

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.doppler import DopplerMotion, SensorVelocities
+from radarsdf.poses.doppler import YAW_STEP_RAD, DopplerMotion, SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, Priors, SteadyMotion
 from radarsdf.poses.planes import plane_cell_m
@@ -47,6 +47,8 @@ class Drive:
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
     # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
     steady: Priors = _MOVES, _TURNS
+    # (2, F - 1) rough yaws between scans of a sensor that turns fast, for the sign of the Doppler and its reverse. NaN if unknown.
+    yaws: Floats | None = None
 
     def predict(self, i: int, turn: MotionRate | None, move: MotionRate | None) -> PredictedStep:
         """Predict the step to scan `i` from the rates of the previous one; None if unknown."""
@@ -55,6 +57,10 @@ class Drive:
         elapsed_s = (duration_s + before_s) / 2
         if self.gyroscope is not None:
             turned = self.gyroscope.step(i - 1)
+        elif self.yaws is not None and np.isfinite(self.yaws[0, i - 1]):
+            variance = self.turns.usual * duration_s**2
+            variance[2] = YAW_STEP_RAD**2 / 4
+            turned = MotionRate(np.array([0.0, 0.0, self.yaws[0, i - 1]]), np.diag(variance))
         else:
             turned = self.turns.after(turn, elapsed_s).integrate(duration_s)
         if self.velocities is not None:

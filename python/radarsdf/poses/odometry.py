@@ -16,7 +16,7 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
-from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance
+from radarsdf.poses.doppler import CLEAR, ERRORS, NOT_USED, motion_significance, sign_significance, turns_fast
 from radarsdf.poses.drive import LATERAL_MPS2, LEAST_OBSERVED, Drive, track_drive
 from radarsdf.poses.gyroscope import UnusableGyroscopeError
 from radarsdf.poses.imu import Inertial, level_poses
@@ -130,15 +130,18 @@ def odometry(
         raise ValueError(msg)
     checked.check_intervals()
     times_s, velocities, sign = checked.times_s, checked.velocities, 1
-    if velocities is not None and sign_significance(checked.scans, velocities, times_s)[0] < -CLEAR:
-        velocities, sign = velocities.scaled(-1.0), -1
+    if velocities is not None:
+        significance, yaws = sign_significance(checked.scans, velocities, times_s)
+        if significance < -CLEAR:
+            sign, yaws, velocities = -1, yaws[::-1], velocities.scaled(-1.0)
     if imu is None and isinstance(points, Scans):
         imu = points.imu
     limits, notes = config.returns, [*checked.notes]
     with ThreadPool(config.num_threads) as pool:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
+        drive, consistency = Drive(scans, times_s, velocities, None), None
         if velocities is not None:
-            drive = Drive(scans, times_s, velocities, None)
+            drive = dataclasses.replace(drive, yaws=yaws if turns_fast(yaws[0]) else None)
             consistency = Consistency.of_returns(drive, config, pool.num_threads)
             velocities, tested = consistency.applied(velocities)
             notes += tested
@@ -146,7 +149,13 @@ def odometry(
                 times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
                 velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
-        drive = Drive(scans, times_s, velocities, inertial.gyroscope)
+        drive = dataclasses.replace(
+            drive,
+            times_s=times_s,
+            velocities=velocities,
+            gyroscope=inertial.gyroscope,
+            yaws=None if velocities is None else drive.yaws,
+        )
         try:
             drive, tracked = track_drive(drive, config, pool.num_threads, progress)
         except UnusableGyroscopeError as why:
@@ -158,8 +167,10 @@ def odometry(
         segments = np.array([found.segment for found in tracked])
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
-    if inertial.alignment is not None:
-        poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
+        if consistency is not None and velocities is not None:
+            covariance = consistency.widened(poses, covariance, segments, drive)
+        if inertial.alignment is not None:
+            poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
     lengths_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     length_m = float(lengths_m[np.diff(segments) == 0].sum())
     gyroscope = drive.gyroscope

@@ -156,8 +156,7 @@ def refine_poses(
             motions.append(DopplerMotion.by(velocities, times_s - clock.errors_s, given))
         else:
             notes.append(
-                f"{NOT_USED}: {contradicted.words('the given poses')}. If it is right, leave the poses out: "
-                "radarsdf.odometry"
+                f"{NOT_USED}: {contradicted}. If it is right, leave the poses out: radarsdf.odometry"
             )
     cell_m = LEAVES_PER_SURFEL * config.leaf_size_m
     with ThreadPool(config.num_threads) as pool:
