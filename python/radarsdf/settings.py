@@ -10,6 +10,8 @@ from pydantic import ConfigDict, ValidationError
 from pydantic.dataclasses import dataclass
 from typing_extensions import dataclass_transform
 
+from radarsdf.checks import check
+
 _Class = TypeVar("_Class", bound=type)
 _RULES = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
@@ -22,9 +24,8 @@ def settings(cls: _Class) -> _Class:
 
 def by_name(values: Any, what: str) -> dict[str, Any]:
     """Convert to a dict of settings by name. Raises a ValueError for anything but a mapping of names."""
-    if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
-        msg = f"{what} must be a mapping of names to values, not {values!r:.50}"
-        raise ValueError(msg)
+    fits = isinstance(values, Mapping) and all(isinstance(name, str) for name in values)
+    check(fits, f"{what} must be a mapping of names to values, not {values!r:.50}")
     return dict(values)
 
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from radarsdf.arrays import Array, Floats, Ints
 from radarsdf.poses.rigid import between, turned_by
-
-FloatArray = NDArray[np.float64]
 
 _NEIGHBOURS = 4  # nearest returns of the same scan whose mean distance is the spacing at a return
 MIN_RETURNS = _NEIGHBOURS + 2  # scans with fewer are not compared
@@ -31,11 +28,11 @@ class Agreement:
     About `queries` returns per scan are looked up. They are sampled at equal steps, not at random.
     """
 
-    def __init__(self, scans: Sequence[NDArray[Any]], returns: int, queries: int) -> None:
+    def __init__(self, scans: Sequence[Array], returns: int, queries: int) -> None:
         self._scans, self._returns, self._queries = scans, returns, queries
-        self._trees: dict[int, tuple[cKDTree, FloatArray, FloatArray]] = {}
+        self._trees: dict[int, tuple[cKDTree, Floats, Floats]] = {}
 
-    def scores(self, pairs: NDArray[np.int64], T_j_i: FloatArray) -> FloatArray:
+    def scores(self, pairs: Ints, T_j_i: Floats) -> Floats:
         """Scores (H, P) of pairs (P, 2) of scans i and j under H hypotheses; lower scores mean better agreement.
 
         `T_j_i` (H, P, 4, 4): isometries, proper or improper, from the frame of scan i to that of scan j.
@@ -50,7 +47,7 @@ class Agreement:
         """Median distance between neighbouring returns of scan i, m; 0 if it has too few."""
         return float(np.median(self._tree(i)[1])) if len(self._scans[i]) >= MIN_RETURNS else 0.0
 
-    def _one_way(self, i: int, j: int, T_j_i: FloatArray) -> FloatArray:
+    def _one_way(self, i: int, j: int, T_j_i: Floats) -> Floats:
         """Mean logarithms (H,) of the distances of returns of scan i from scan j, over the spacing there."""
         queries = self._tree(i)[2]
         tree, spacing, _ = self._tree(j)
@@ -59,10 +56,9 @@ class Agreement:
         distances, nearest = tree.query(moved.reshape(-1, 3), distance_upper_bound=_MOST * spacing.max())
         quotients = distances / np.append(spacing, 1.0)[nearest]  # the row is n if none was found
         logs = np.log(np.clip(quotients, _LEAST, _MOST)).reshape(moved.shape[:2])
-        means: FloatArray = logs.mean(axis=1)
-        return means
+        return logs.mean(axis=1)
 
-    def _tree(self, i: int) -> tuple[cKDTree, FloatArray, FloatArray]:
+    def _tree(self, i: int) -> tuple[cKDTree, Floats, Floats]:
         """Tree, spacing at its returns, and queries of a scan."""
         if i not in self._trees:
             scan = self._scans[i]
@@ -81,13 +77,11 @@ class Agreement:
 class Comparison:
     """Gain in agreement of H hypotheses over the data as they are, over P pairs of scans."""
 
-    gains: (
-        FloatArray  # (H,) mean decrease of the score. exp(-gain) is the factor by which the distances shrink
-    )
-    errors: FloatArray  # (H,) standard error of the mean, from the differences between the pairs
+    gains: Floats  # (H,) mean decrease of the score. exp(-gain) is the factor by which the distances shrink
+    errors: Floats  # (H,) standard error of the mean, from the differences between the pairs
 
     @classmethod
-    def of(cls, given: FloatArray, others: FloatArray) -> Comparison:
+    def of(cls, given: Floats, others: Floats) -> Comparison:
         """Compare scores `given` (P,) or (H, P) with scores `others` (H, P)."""
         better = given - others
         count = better.shape[1]
@@ -96,14 +90,12 @@ class Comparison:
         return cls(better.mean(axis=1), np.maximum(spread, 1e-3) / np.sqrt(count))
 
     @property
-    def significance(self) -> FloatArray:
+    def significance(self) -> Floats:
         """(H,) gains over their standard errors."""
         return self.gains / self.errors
 
 
-def choose_pairs(
-    scans: Sequence[NDArray[Any]], positions: FloatArray, count: int, lags: Sequence[int] = LAGS
-) -> NDArray[np.int64]:
+def choose_pairs(scans: Sequence[Array], positions: Floats, count: int, lags: Sequence[int] = LAGS) -> Ints:
     """Choose about `count` pairs (P, 2) of scans, spread over the drive, at small and large lags.
 
     Neighbours overlap most; but at high frame rates, the sensor hardly moves between them, and every hypothesis agrees.
@@ -121,19 +113,19 @@ def choose_pairs(
     return np.concatenate([pairs_apart(usable, lag, -(-count // len(ways))) for lag in ways])
 
 
-def pairs_apart(scans: NDArray[np.int64], lag: int, count: int) -> NDArray[np.int64]:
+def pairs_apart(scans: Ints, lag: int, count: int) -> Ints:
     """Pairs (P, 2) of scans (K,) at a lag: about `count`, at equal steps."""
     last = len(scans) - lag
     firsts = np.unique(np.linspace(0, last - 1, min(last, count)).round().astype(int))
     return np.stack([scans[firsts], scans[firsts + lag]], 1)
 
 
-def relative(T_world_sensor: FloatArray, pairs: NDArray[np.int64]) -> FloatArray:
+def relative(T_world_sensor: Floats, pairs: Ints) -> Floats:
     """(P, 4, 4) motions T_j_i of pairs (P, 2) of poses (F, 4, 4), from scan i to scan j."""
     return between(T_world_sensor[pairs[:, 1]], T_world_sensor[pairs[:, 0]])
 
 
-def inverse(T_a_b: FloatArray) -> FloatArray:
+def inverse(T_a_b: Floats) -> Floats:
     """Invert isometries (…, 4, 4)."""
     found = np.zeros_like(T_a_b)
     transposed = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
@@ -160,25 +152,23 @@ class Hypothesis:
 
     finding: str  # name of the finding if the hypothesis is right
     what: str  # completes "the scans agree better if"
-    T_j_i: FloatArray  # (P, 4, 4) motions between the frames of the original points of scan pairs
+    T_j_i: Floats  # (P, 4, 4) motions between the frames of the original points of scan pairs
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # vertical axis in the frame of the original points
 
 
-def hypotheses(
-    T_world_sensor: FloatArray, pairs: NDArray[np.int64], *, all_axes: bool = True
-) -> list[Hypothesis]:
+def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) -> list[Hypothesis]:
     """Hypotheses about rigid poses (F, 4, 4) for pairs (P, 2) of scans i and j, the more common mistakes first.
 
     `all_axes`: whether to try all 47 permutations and reflections of axes, of points and positions, or the eight most common.
     """
     poses, motions = T_world_sensor, relative(T_world_sensor, pairs)
 
-    def positions(values: FloatArray) -> FloatArray:
+    def positions(values: Floats) -> Floats:
         changed = poses.copy()
         changed[:, :3, 3] = values
         return relative(changed, pairs)
 
-    def rotations(values: Rotation) -> FloatArray:
+    def rotations(values: Rotation) -> Floats:
         changed = poses.copy()
         changed[:, :3, :3] = values.as_matrix()
         return relative(changed, pairs)
@@ -222,26 +212,26 @@ def hypotheses(
     return found
 
 
-def _transform(matrix: FloatArray) -> FloatArray:
+def _transform(matrix: Floats) -> Floats:
     """Embed a matrix (3, 3) as a transform (4, 4)."""
     found = np.eye(4)
     found[:3, :3] = matrix
     return found
 
 
-def _written(matrix: FloatArray) -> str:
+def _written(matrix: Floats) -> str:
     """Format a signed permutation as a user would write it: x, -y, -z."""
     axes = np.argmax(np.abs(matrix), axis=1)
     return ", ".join("-" * int(row[axis] < 0) + "xyz"[axis] for row, axis in zip(matrix, axes, strict=True))
 
 
-def _surprise(matrix: FloatArray) -> tuple[bool, bool, float]:
+def _surprise(matrix: Floats) -> tuple[bool, bool, float]:
     """Sort key of matrices: the identity first, then those that keep z up, a more common mistake, then few signs."""
     key = matrix[2, 2] != 1 and not np.array_equal(matrix, _CAMERA_OF_RADAR.T), float((matrix < 0).sum())
     return not np.array_equal(matrix, np.eye(3)), *key
 
 
-def _kind(matrix: FloatArray) -> str:
+def _kind(matrix: Floats) -> str:
     """Name of the finding for axes that must be mapped by this matrix."""
     if any(np.array_equal(matrix, m) for m in (_CAMERA_OF_RADAR, _CAMERA_OF_RADAR.T)):
         return "camera_frame"
@@ -249,7 +239,7 @@ def _kind(matrix: FloatArray) -> str:
     return "mirrored" if keeps_axes and np.linalg.det(matrix) < 0 else "axes_swapped"
 
 
-def _angles(poses: FloatArray) -> Iterator[tuple[str, Rotation]]:
+def _angles(poses: Floats) -> Iterator[tuple[str, Rotation]]:
     """Rotations (F,) as if their angles were in another unit, with a description."""
     rotations = Rotation.from_matrix(poses[:, :3, :3])
     # Angles in rad taken for degrees are 57 times too small.

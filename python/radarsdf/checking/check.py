@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Bools, Ints
 from radarsdf.checking import frames, noise, piecewise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
@@ -109,9 +110,7 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
     return sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
-def _drift(
-    recording: Scans, numbers: NDArray[np.int64], config: FitConfig, found: list[Finding]
-) -> list[Finding]:
+def _drift(recording: Scans, numbers: Ints, config: FitConfig, found: list[Finding]) -> list[Finding]:
     """Drift of the poses, or another fault that refined poses would hide."""
     drift = list(noise.check_drift(recording, config))
     if not drift:
@@ -126,7 +125,7 @@ def _drift(
 
 
 def _of_poses(
-    recording: Scans, numbers: NDArray[np.int64], config: FitConfig | None, effort: frames.Effort
+    recording: Scans, numbers: Ints, config: FitConfig | None, effort: frames.Effort
 ) -> list[Finding]:
     found = list(frames.check_still(recording, effort))
     if not found:
@@ -142,7 +141,7 @@ def _of_poses(
     return found
 
 
-def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
+def _usable(recording: Scans) -> tuple[list[Finding], Scans, Ints]:
     """Findings about unusable rows, scans and poses, the recording without them, and the numbers (F,) of its scans."""
     found: list[Finding] = []
     numbers = np.arange(len(recording))
@@ -175,7 +174,7 @@ def _usable(recording: Scans) -> tuple[list[Finding], Scans, NDArray[np.int64]]:
     return found, recording, numbers
 
 
-def _far(recording: Scans, returns: list[NDArray[np.bool_]], num_far: int) -> Iterator[Finding]:
+def _far(recording: Scans, returns: list[Bools], num_far: int) -> Iterator[Finding]:
     """Report returns that a fit leaves out as too far away, and a farthest range that is much too frequent."""
     lengths = [
         np.linalg.norm(scan[mask], axis=1) for scan, mask in zip(recording.points, returns, strict=True)
@@ -191,7 +190,7 @@ def _far(recording: Scans, returns: list[NDArray[np.bool_]], num_far: int) -> It
         yield Finding("range_sentinel", "warning", evidence)
 
 
-def _without(recording: Scans, left_out: list[NDArray[np.bool_]]) -> Scans:
+def _without(recording: Scans, left_out: list[Bools]) -> Scans:
     """Remove the rows in the mask (N_i,) of each scan."""
     points, intensities, doppler_mps = (
         None if arrays is None else [values[~mask] for values, mask in zip(arrays, left_out, strict=True)]

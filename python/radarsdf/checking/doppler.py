@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_scans
+from radarsdf.arrays import Array, Floats, Ints
+from radarsdf.checking.recording import Finding, ascending_times_s, some_scans
 from radarsdf.poses.consistency import contradiction, of_poses
-from radarsdf.poses.doppler import (
-    LEAST_MPS,
-    NoVelocityError,
-    SensorVelocities,
-    radial_offset_mps,
-)
+from radarsdf.poses.doppler import LEAST_MPS, NoVelocityError, SensorVelocities, radial_offset_mps
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
 from radarsdf.scans import Scans
 
@@ -53,16 +47,14 @@ def check_doppler(recording: Scans) -> Iterator[Finding]:
     yield from _compared_with_poses(recording, scans[good], by_doppler)
 
 
-def _velocities(
-    recording: Scans, values: list[NDArray[Any]]
-) -> tuple[NDArray[np.int64], list[SensorVelocity]]:
+def _velocities(recording: Scans, values: list[Array]) -> tuple[Ints, list[SensorVelocity]]:
     """Velocities of some scans from `values`, which may be Doppler, and the scans."""
     scans = [i for i in some_scans(recording) if len(recording.points[i]) >= MIN_DOPPLER_RETURNS]
     found = sensor_velocities([recording.points[i] for i in scans], [values[i] for i in scans])
     return np.array(scans, np.int64), found
 
 
-def _are_speeds(recording: Scans, values: list[NDArray[Any]]) -> bool:
+def _are_speeds(recording: Scans, values: list[Array]) -> bool:
     """Whether values (N_i,) of the scans are Doppler: most scans fit a velocity, which is not zero in all."""
     if min(float(np.min(value, initial=0)) for value in values) >= 0:
         return False  # Doppler has both signs, or a negative one for approaching returns
@@ -73,9 +65,7 @@ def _are_speeds(recording: Scans, values: list[NDArray[Any]]) -> bool:
     return bool(np.median(np.linalg.norm(found, axis=1)) > _STILL_MPS)
 
 
-def _compared_with_poses(
-    recording: Scans, scans: NDArray[np.int64], by_doppler: FloatArray
-) -> Iterator[Finding]:
+def _compared_with_poses(recording: Scans, scans: Ints, by_doppler: Floats) -> Iterator[Finding]:
     """Compare the directions of velocities (K, 3) of scans (K,) from Doppler with those from poses: sign and yaw."""
     times = ascending_times_s(recording)
     knots = np.arange(len(recording), dtype=np.float64) if times is None else times
@@ -113,7 +103,7 @@ def _compared_with_poses(
 
 
 def _compared_speeds(
-    recording: Scans, scans: NDArray[np.int64], by_poses: FloatArray, by_doppler: FloatArray
+    recording: Scans, scans: Ints, by_poses: Floats, by_doppler: Floats
 ) -> Iterator[Finding]:
     """Compare velocities (K, 3) of scans (K,), sensor frame, m/s, by window."""
     used = (scans > 0) & (scans < len(recording) - 1)
@@ -124,9 +114,7 @@ def _compared_speeds(
         yield _contradiction(found.words("the poses"))
 
 
-def _compared_in_block(
-    recording: Scans, times_s: FloatArray, sign: float, *, known: bool
-) -> Iterator[Finding]:
+def _compared_in_block(recording: Scans, times_s: Floats, sign: float, *, known: bool) -> Iterator[Finding]:
     """Compare successive scans in the middle: times with even ones, and Doppler with that of a velocity alone."""
     assert recording.doppler_mps is not None
     begin = max(0, (len(recording) - _BLOCK) // 2)
@@ -151,7 +139,7 @@ def _contradiction(words: str) -> Finding:
     return Finding("doppler_contradicts_poses", "warning", f"{words[0].upper()}{words[1:]}.")
 
 
-def velocity_of_poses(T_world_sensor: FloatArray, times_s: FloatArray) -> FloatArray:
+def velocity_of_poses(T_world_sensor: Floats, times_s: Floats) -> Floats:
     """(F, 3) velocities of the sensor in its own frame at the poses (F, 4, 4), m/s, from central differences."""
     rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
     half = rotations[:-1] * Rotation.from_rotvec((rotations[:-1].inv() * rotations[1:]).as_rotvec() / 2)

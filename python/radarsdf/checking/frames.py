@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.checking.agreement import (
     LAGS,
     MIN_RETURNS,
@@ -23,7 +23,7 @@ from radarsdf.checking.agreement import (
     pairs_apart,
     relative,
 )
-from radarsdf.checking.recording import Finding, FloatArray, Severity, ascending_times_s, some_points
+from radarsdf.checking.recording import Finding, Severity, ascending_times_s, some_points
 from radarsdf.io.poses import Trajectory
 from radarsdf.poses.rigid import between
 from radarsdf.scans import Scans
@@ -186,11 +186,7 @@ def check_clock(recording: Scans, *, far: bool = False) -> Iterator[Finding]:
 
 
 def _best(
-    recording: Scans,
-    pairs: NDArray[np.int64],
-    guesses: list[Hypothesis],
-    scores: FloatArray,
-    in_world: bool,
+    recording: Scans, pairs: Ints, guesses: list[Hypothesis], scores: Floats, in_world: bool
 ) -> tuple[Hypothesis, float, float] | None:
     """Return the hypothesis that is clearly better than the data as they are, its gain and its significance."""
     # `in_world`: whether the points may be in the world frame.
@@ -219,7 +215,7 @@ def _best(
 
 
 def _best_of(
-    guesses: list[Hypothesis], scores: FloatArray, possible: NDArray[np.bool_], upright: NDArray[np.bool_]
+    guesses: list[Hypothesis], scores: Floats, possible: Bools, upright: Bools
 ) -> tuple[Hypothesis, float, float] | None:
     """:func:`_best` for pairs of scans at similar lags."""
     comparison = Comparison.of(scores[0], scores[1:])
@@ -246,7 +242,7 @@ def _best_of(
     return guesses[chosen], float(comparison.gains[chosen]), float(comparison.significance[chosen])
 
 
-def _looks_out_of_its_frame(recording: Scans, pairs: NDArray[np.int64]) -> bool:
+def _looks_out_of_its_frame(recording: Scans, pairs: Ints) -> bool:
     """Whether the returns stay in one place of their own frame, but not of the sensor frame according to the poses."""
     # If the sensor moves far between scans, they agree best as if it stood still, when its field of view is the same. But in
     # the world frame, the centroid of the returns and their mean direction move.
@@ -268,6 +264,5 @@ def _looks_out_of_its_frame(recording: Scans, pairs: NDArray[np.int64]) -> bool:
     return bool(sum(significances) / np.sqrt(2) < _FIELD_OF_VIEW_STAYS)
 
 
-def _mean_direction(scan: FloatArray) -> FloatArray:
-    direction: FloatArray = (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)
-    return direction
+def _mean_direction(scan: Floats) -> Floats:
+    return (scan / np.maximum(np.linalg.norm(scan, axis=1), 1e-12)[:, None]).mean(axis=0)

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from radarsdf.checking.recording import Finding, FloatArray, some_scans
+from radarsdf.arrays import Floats
+from radarsdf.checking.recording import Finding, some_scans
 from radarsdf.returns.intensities import Plausible
 from radarsdf.scans import Scans
 
@@ -50,7 +51,7 @@ def check_intensities(recording: Scans) -> Iterator[Finding]:
         yield from _scale(values)
 
 
-def _outliers(outliers: FloatArray, usual: FloatArray) -> Iterator[Finding]:
+def _outliers(outliers: Floats, usual: Floats) -> Iterator[Finding]:
     """Report outliers: repeated values mark missing measurements, single ones are faults."""
     levels, counts = np.unique(outliers, return_counts=True)
     total = len(outliers) + len(usual)
@@ -65,7 +66,7 @@ def _outliers(outliers: FloatArray, usual: FloatArray) -> Iterator[Finding]:
             yield Finding(name, "warning", evidence)
 
 
-def _scale(values: FloatArray) -> Iterator[Finding]:
+def _scale(values: Floats) -> Iterator[Finding]:
     """Report quantisation, an offset, and clipping at the end of the scale."""
     levels, counts = np.unique(values, return_counts=True)
     shares = counts / len(values)

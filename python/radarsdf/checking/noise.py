@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points, some_scans
+from radarsdf.arrays import Floats, Ints
+from radarsdf.checking.recording import Finding, ascending_times_s, some_points, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import check_extent, estimate_rays
 from radarsdf.poses.checked_scans import median_range_m
@@ -136,7 +136,7 @@ def _check_poses(rays: Rays, surfels: Surfels, noise: SensorNoise) -> Iterator[F
     yield Finding("poses_disagree", "warning" if other > 2 * one else "note", evidence)
 
 
-def _of_pairs(values: FloatArray, group: NDArray[np.int64], count: int) -> FloatArray:
+def _of_pairs(values: Floats, group: Ints, count: int) -> Floats:
     """(2, G) number of pairs, and sum of their squared differences, of values (N,) in G groups."""
     sums = [np.bincount(group, weights, count) for weights in (None, values, values**2)]
     return np.stack([sums[0] * (sums[0] - 1) / 2, sums[0] * sums[2] - sums[1] ** 2])
@@ -183,7 +183,7 @@ def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
             yield Finding("poses_drift", "warning", evidence)
 
 
-def _excess_of_few_steps(given: FloatArray, refined: FloatArray, lever_m: float) -> float:
+def _excess_of_few_steps(given: Floats, refined: Floats, lever_m: float) -> float:
     """Share of the four largest squared differences of steps, over that of exponentially distributed ones."""
     off_m = (step_vectors(refined) - step_vectors(given)) * np.repeat([1.0, lever_m], 3)
     off_m2 = np.sort((off_m**2).sum(axis=1))

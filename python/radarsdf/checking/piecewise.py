@@ -6,9 +6,9 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from radarsdf.arrays import Ints
 from radarsdf.checking.agreement import LAGS, MIN_RETURNS, Agreement, Comparison, relative
 from radarsdf.checking.frames import FULL
 from radarsdf.checking.recording import Finding
@@ -21,7 +21,7 @@ _MIN_GAIN, _MIN_SIGNIFICANCE = 0.05, 8.0
 _CLOSES = 0.5  # share of the difference to the usual score
 
 
-def check_order(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[Finding]:
+def check_order(recording: Scans, numbers: Ints) -> Iterator[Finding]:
     """Find two scans or blocks of scans that changed places. `numbers` (F,): of the scans."""
     rows = np.flatnonzero([len(scan) >= MIN_RETURNS for scan in recording.points])
     count = len(rows)

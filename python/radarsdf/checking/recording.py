@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Array, Floats
 from radarsdf.checks import (
     MAX_TIME_S,
+    check,
     check_scan_shapes,
     check_values_of_scans,
     one_for_each_scan,
@@ -19,8 +21,6 @@ from radarsdf.checks import (
     refuse_masked,
 )
 from radarsdf.scans import Scans
-
-FloatArray = NDArray[np.float64]
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
@@ -123,16 +123,14 @@ def checked_input(
     T_world_sensor = pose_matrices(poses, len(scans))
     times = None if times_s is None else real_array(times_s, "times_s").copy()
     if times is not None:
-        if times.shape != (len(scans),):
-            msg = f"times_s must have shape ({len(scans)},), not {times.shape}"
-            raise ValueError(msg)
+        check(times.shape == (len(scans),), f"times_s must have shape ({len(scans)},), not {times.shape}")
         times[np.abs(times) > MAX_TIME_S] = np.nan
     doppler = _values(doppler_mps, scans, "doppler_mps")
     values = _values(intensities, scans, "intensities")
     return Scans(scans, T_world_sensor, values, doppler_mps=doppler, times_s=times)
 
 
-def ascending_times_s(scans: Scans) -> FloatArray | None:
+def ascending_times_s(scans: Scans) -> Floats | None:
     """Times (F,) if they are strictly ascending, else None."""
     times = scans.times_s
     return times if times is not None and (np.diff(times) > 0).all() else None
@@ -143,12 +141,12 @@ def some_scans(scans: Scans) -> list[int]:
     return list(range(0, len(scans), -(-len(scans) // _SAMPLE)))
 
 
-def some_points(scans: Scans) -> list[FloatArray]:
+def some_points(scans: Scans) -> list[Floats]:
     """Returns (N_i, 3) of :func:`some_scans`."""
     return [np.asarray(scans.points[i], np.float64) for i in some_scans(scans)]
 
 
-def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
+def _numbers(values: ArrayLike, name: str) -> Array:
     """Convert to an array of real numbers. float32 is kept: only samples enter computations."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f":
         refuse_masked(values, name)
@@ -156,9 +154,7 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
     return real_array(values, name)
 
 
-def _values(
-    given: Sequence[ArrayLike] | None, scans: list[NDArray[Any]], name: str
-) -> list[NDArray[Any]] | None:
+def _values(given: Sequence[ArrayLike] | None, scans: list[Array], name: str) -> list[Array] | None:
     if given is None:
         return None
     each = enumerate(one_for_each_scan(given, name))

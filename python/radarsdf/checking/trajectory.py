@@ -6,12 +6,12 @@ import functools
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from radarsdf.arrays import Floats, Ints
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
 from radarsdf.checking.frames import FULL, Effort
-from radarsdf.checking.recording import Finding, FloatArray, ascending_times_s, some_points
+from radarsdf.checking.recording import Finding, ascending_times_s, some_points
 from radarsdf.checks import are_rigid
 from radarsdf.poses.checked_scans import median_range_m
 from radarsdf.poses.rigid import step_vectors, steps
@@ -83,7 +83,7 @@ def check_times(recording: Scans) -> Iterator[Finding]:
     yield Finding("times", "warning", evidence)
 
 
-def check_duplicates(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[Finding]:
+def check_duplicates(recording: Scans, numbers: Ints) -> Iterator[Finding]:
     """Check for duplicate scans, or poses shared by different scans. `numbers` (F,): of the scans, for messages."""
     first_of: dict[tuple[object, ...], int] = {}
     repeated = []
@@ -115,7 +115,7 @@ def check_duplicates(recording: Scans, numbers: NDArray[np.int64]) -> Iterator[F
     yield Finding("duplicate_poses", "warning" if held else "note", f"{evidence}{leap}.")
 
 
-def check_jumps(recording: Scans, numbers: NDArray[np.int64], effort: Effort = FULL) -> Iterator[Finding]:
+def check_jumps(recording: Scans, numbers: Ints, effort: Effort = FULL) -> Iterator[Finding]:
     """Find jumps: steps far longer than their neighbours, without which the scans agree better.
 
     A recording that pauses while the sensor moves has long steps too, but the scans agree with them.
@@ -153,12 +153,7 @@ def check_jumps(recording: Scans, numbers: NDArray[np.int64], effort: Effort = F
 
 
 def _agree_without(
-    recording: Scans,
-    agreement: Agreement,
-    jump: int,
-    suspects: list[int],
-    motions: FloatArray,
-    durations: FloatArray,
+    recording: Scans, agreement: Agreement, jump: int, suspects: list[int], motions: Floats, durations: Floats
 ) -> bool:
     """Whether the scans near a step agree clearly better if it is replaced by the motion of the neighbouring steps."""
     # If that repairs the poses, the scans then agree about as well as those next to the step. Without this condition,
@@ -197,7 +192,6 @@ def _agree_without(
     return False
 
 
-def _steps_m(recording: Scans) -> FloatArray:
+def _steps_m(recording: Scans) -> Floats:
     """(F - 1,) lengths of the steps between poses."""
-    lengths: FloatArray = np.linalg.norm(np.diff(recording.poses[:, :3, 3], axis=0), axis=1)
-    return lengths
+    return np.linalg.norm(np.diff(recording.poses[:, :3, 3], axis=0), axis=1)

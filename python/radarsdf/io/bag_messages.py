@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Bools, Floats, Floats32
 from radarsdf.checks import check
 from radarsdf.extras import require
 from radarsdf.io.files import check_regular_file
 from radarsdf.scans import Columns, Notes
-
-FloatArray = NDArray[np.float64]
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
@@ -144,7 +142,7 @@ def _radar_scan(message: Any) -> Columns:
     return {name: _column(message.returns, name.removesuffix("_rad")) for name in names}
 
 
-def _column(rows: list[Any], attribute: str) -> NDArray[np.float32]:
+def _column(rows: list[Any], attribute: str) -> Floats32:
     return np.array([getattr(row, attribute) for row in rows], np.float32)
 
 
@@ -171,7 +169,7 @@ def _ars548_list(message: Any) -> Columns:
     return _ars548(columns, flags.T != 0)
 
 
-def _ars548(returns: Columns, invalid: NDArray[np.bool_]) -> Columns:
+def _ars548(returns: Columns, invalid: Bools) -> Columns:
     """Columns with NaN where `invalid` (8, N) is set: flags of range, azimuth, elevation and rate, each before its deviation."""
     columns = {name: returns[name] for name in ("rcs", "range_std", "azimuth_std", "elevation_std")}
     for i, name in enumerate(("range", "azimuth_rad", "elevation_rad", "range_rate")):
@@ -288,7 +286,7 @@ class Clock(NamedTuple):
     zeros: Callable[[], None]  # called for stamps of zero
 
     @classmethod
-    def of(cls, times_s: FloatArray, what: str, wanted: str | None, notes: Notes) -> Clock:
+    def of(cls, times_s: Floats, what: str, wanted: str | None, notes: Notes) -> Clock:
         """Clock of messages, of which `times_s` (2, N) are stamps and records: by default the stamps, unless zero or constant."""
         stamps_s, known = times_s[0], times_s[:, times_s[0] != 0]
         if wanted is None and (not known.size or (len(stamps_s) > 1 and np.ptp(stamps_s) == 0)):

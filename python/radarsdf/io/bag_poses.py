@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.io.bag_messages import (
     PATH,
     POSE_TYPES,
     TRANSFORM_TYPES,
     Clock,
-    FloatArray,
     read_messages,
     topics_of,
     topics_with,
@@ -55,7 +55,7 @@ class Track:
     numbers: array[float] = field(default_factory=lambda: array("d"))  # stamp, record time, pose
 
     @cached_property
-    def table(self) -> FloatArray:
+    def table(self) -> Floats:
         """(P, 9) the usable poses: finite, with a unit quaternion."""
         table = np.array(self.numbers).reshape(-1, 9)
         return table[are_poses(table[:, 2:])]
@@ -66,7 +66,7 @@ class Track:
         return bool((np.abs(self.table[:, 2:] - self.table[0, 2:]) <= _CONSTANT).all())
 
     @cached_property
-    def matrix(self) -> FloatArray:
+    def matrix(self) -> Floats:
         """T_parent_child (4, 4) of a constant transform."""
         return np.asarray(pose_matrices_of(self.table[-1:, 2:])[0])
 
@@ -80,7 +80,7 @@ class Track:
         clock = Clock.of(times_s, name, request.stamps, request.notes)
         return trajectory_of(np.column_stack([clock.times(*times_s), self.table[:, 2:]]), name)
 
-    def link(self, request: Request) -> Trajectory | FloatArray:
+    def link(self, request: Request) -> Trajectory | Floats:
         """T_parent_child: constant, static from one time to the next, or moving."""
         name = f"TF from {self.parent} to {self.child}"
         if self.constant:
@@ -112,7 +112,7 @@ class TransformTree:
             chain.append(parent)
         return chain
 
-    def rigid_top(self, frame: str) -> tuple[str, FloatArray]:
+    def rigid_top(self, frame: str) -> tuple[str, Floats]:
         """Return the highest frame rigidly attached to this one, and T_top_frame (4, 4)."""
         T_top_frame = np.eye(4)
         for top in self.chain(frame):
@@ -122,7 +122,7 @@ class TransformTree:
             T_top_frame = track.matrix @ T_top_frame
         return top, T_top_frame
 
-    def fixed(self, base: str, sensor: str) -> FloatArray | None:
+    def fixed(self, base: str, sensor: str) -> Floats | None:
         """T_base_sensor (4, 4) if the two frames are rigidly attached; None if they are not, or are unknown."""
         (top, T_top_base), (other, T_top_sensor) = self.rigid_top(base), self.rigid_top(sensor)
         return np.linalg.inv(T_top_base) @ T_top_sensor if top == other else None

@@ -11,6 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from radarsdf.arrays import Array
 from radarsdf.checks import check, path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
@@ -78,12 +79,12 @@ def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
     return len(columns["scan"])
 
 
-def _ply(file: BinaryIO, rows: NDArray[Any]) -> None:
+def _ply(file: BinaryIO, rows: Array) -> None:
     file.write(ply_header(rows.dtype, len(rows)))
     file.write(rows.tobytes())
 
 
-def _pcd(file: BinaryIO, rows: NDArray[Any]) -> None:
+def _pcd(file: BinaryIO, rows: Array) -> None:
     names = rows.dtype.names or ()
     kinds = [rows.dtype[name].str[1:] for name in names]
     header = f"""\
@@ -102,13 +103,13 @@ DATA binary
     file.write(header.encode("ascii") + rows.tobytes())
 
 
-def _csv(file: BinaryIO, rows: NDArray[Any]) -> None:
+def _csv(file: BinaryIO, rows: Array) -> None:
     names = rows.dtype.names or ()
     formats = ",".join(_CSV_FORMATS[rows.dtype[name].str[1:]] for name in names)
     np.savetxt(file, rows, formats, header=",".join(names), comments="")
 
 
-def _las(compressed: bool, file: BinaryIO, rows: NDArray[Any]) -> None:
+def _las(compressed: bool, file: BinaryIO, rows: Array) -> None:
     laspy = require("laspy", what="LAS and LAZ files are written by")
     as_names = {"intensity": LAS_INTENSITY, "time": "gps_time"}
     header = laspy.LasHeader(point_format=_LAS_FORMAT, version="1.4")
@@ -125,7 +126,7 @@ def _las(compressed: bool, file: BinaryIO, rows: NDArray[Any]) -> None:
         writer.write_points(points)
 
 
-def records(columns: Columns) -> NDArray[Any]:
+def records(columns: Columns) -> Array:
     """(N,) one record per row of the columns, of which there must be at least one."""
     dtype = np.dtype([(name, array.dtype.newbyteorder("<")) for name, array in columns.items()])
     rows = np.zeros(len(next(iter(columns.values()))), dtype)
@@ -134,7 +135,7 @@ def records(columns: Columns) -> NDArray[Any]:
     return rows
 
 
-def face_records(faces: NDArray[np.integer[Any]]) -> NDArray[Any]:
+def face_records(faces: NDArray[np.integer[Any]]) -> Array:
     """(T,) one record per triangle (T, 3), as in a binary PLY file."""
     rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("rows", "<i4", (3,))]))
     rows["count"], rows["rows"] = 3, faces
@@ -151,7 +152,7 @@ def ply_header(dtype: np.dtype[Any], count: int, num_faces: int | None = None) -
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-_WRITERS: dict[str, Callable[[BinaryIO, NDArray[Any]], None]] = {
+_WRITERS: dict[str, Callable[[BinaryIO, Array], None]] = {
     ".ply": _ply,
     ".pcd": _pcd,
     ".las": partial(_las, False),

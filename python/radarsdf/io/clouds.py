@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from radarsdf.arrays import Floats, Floats32
 from radarsdf.checks import check, path_of
 from radarsdf.extras import require
 from radarsdf.io.fields import Fields, names_of
@@ -57,7 +57,7 @@ def read_columns(path: Path, columns: GivenColumns = None) -> Columns:
         raise ValueError(msg) from error
 
 
-def read_points(path: str | PathLike[str]) -> NDArray[np.float64]:
+def read_points(path: str | PathLike[str]) -> Floats:
     """Read points, such as ground truth from a lidar, from a file of any format that :func:`read` supports.
 
     Parameters
@@ -126,7 +126,7 @@ def check_kitti(paths: Sequence[Path]) -> None:
         )
 
 
-def _variance(numbers: NDArray[np.float32], width: int) -> float:
+def _variance(numbers: Floats32, width: int) -> float:
     return float(numbers[: len(numbers) // width * width].reshape(-1, width).var(axis=0).mean())
 
 
@@ -182,7 +182,7 @@ def _pcd(path: Path, _: GivenColumns) -> Columns:
     return {names[i]: as_numbers(words[:, sum(counts[:i])]) for i in scalars}
 
 
-def read_viewpoint(path: Path) -> NDArray[np.float64]:
+def read_viewpoint(path: Path) -> Floats:
     """T_world_sensor (4, 4) of a PCD file's ``VIEWPOINT`` (tx ty tz qw qx qy qz); the identity if it has none."""
     with path.open("rb") as file:
         numbers = np.array(_pcd_header(file).get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import check, check_pose
 from radarsdf.io.files import reading
 from radarsdf.io.poses import pose_matrices_of, read_calibration, trajectory_of
@@ -84,9 +84,7 @@ def _view_of_delft(folder: Path, request: Request) -> Scans:
     return read_files(posed, folder, replace(request, poses=poses, extrinsic=np.eye(4)))
 
 
-def _delft_pose(
-    frame: str, radar: Path, lidar: Path, extrinsic: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
+def _delft_pose(frame: str, radar: Path, lidar: Path, extrinsic: Floats | None) -> Floats:
     """T_map_radar (4, 4) of a frame. ``mapToCamera`` is T_map_camera, despite its name."""
     path = lidar / "pose" / f"{frame}.json"
     with reading(path, "a pose mapToCamera of View-of-Delft", TypeError, IndexError, RecursionError):

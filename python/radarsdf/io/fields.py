@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Floats
 from radarsdf.checks import check
 from radarsdf.io.text import are_degrees
 from radarsdf.io.units import factor_of, known_factor, without_unit
@@ -124,7 +124,7 @@ class Fields:
         degrees = (self.in_degrees and dimension == "angle") or _squeeze(bare) in _IN_DEGREES
         return factor_of("deg" if degrees and not unit else unit, dimension, name)
 
-    def with_unit(self, columns: Mapping[str, NDArray[Any]], notes: Notes) -> Fields:
+    def with_unit(self, columns: Mapping[str, Array], notes: Notes) -> Fields:
         """Return these fields with the unit of their angles, from their names or else from the values in a cloud."""
         names = [self.names[role] for role in _POLAR[1:]] if self.polar else []
         if all(plain_name(name)[1] for name in names):
@@ -146,14 +146,10 @@ class Fields:
             notes.add(f"unused fields: {listed}; fields={{role: name}} or --field selects others")
 
     def scan(
-        self,
-        columns: Mapping[str, NDArray[Any]],
-        T_world_sensor: NDArray[np.float64],
-        time_s: float | None,
-        notes: Notes,
+        self, columns: Mapping[str, Array], T_world_sensor: Floats, time_s: float | None, notes: Notes
     ) -> Scan:
         """Build a scan of the finite returns in the columns, (N,) each. Positions are float64 if x, y or z need it, else float32."""
-        values: dict[str, NDArray[Any]] = {}  # m, rad, m/s
+        values: dict[str, Array] = {}  # m, rad, m/s
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are dropped
             for role in self.used:
                 column, factor = columns[self.names[role]], self.factor(role)
@@ -176,7 +172,7 @@ class Fields:
         return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigmas), notes)
 
 
-def columns_of(scan: Scan, points: NDArray[Any]) -> Columns:
+def columns_of(scan: Scan, points: Array) -> Columns:
     """Columns of a scan with these points (N, 3), in any frame, by role."""
     columns: dict[str, Any] = dict(zip("xyz", points.T, strict=True))
     columns |= {"intensity": scan.intensities, "doppler": scan.doppler_mps}

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import check, path_of
 
 _MAX_NAME_BYTES = 255  # limit of nearly all file systems
@@ -183,7 +183,7 @@ def _lock(descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def check_fits_float32(path: str | PathLike[str], points: NDArray[np.float64]) -> None:
+def check_fits_float32(path: str | PathLike[str], points: Floats) -> None:
     """Raise a ValueError if float32 would round points (N, 3), m, by more than a millimetre."""
     near = np.abs(points).max(initial=0.0) <= _MAX_FLOAT32_M
     what = f"float32 coordinates are too coarse {_MAX_FLOAT32_M:g} m from the origin: write .ply"

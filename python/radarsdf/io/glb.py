@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from radarsdf.arrays import Array, Floats
 
 _SRGB = np.arange(256) / 255
 SRGB_TO_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
@@ -24,12 +25,12 @@ _FLOAT, _UNSIGNED_INT = 5126, 5125
 
 
 def encode_glb(
-    vertices: NDArray[Any],
-    faces: NDArray[Any],
-    attributes: Mapping[str, NDArray[Any]],
+    vertices: Array,
+    faces: Array,
+    attributes: Mapping[str, Array],
     *,
     material: Mapping[str, Any] = MATT,
-    matrix: NDArray[np.float64] | None = None,
+    matrix: Floats | None = None,
     extras: Mapping[str, float] | None = None,
 ) -> bytes:
     """Encode a mesh of vertices (V, 3) and faces (F, 3). `attributes`: finite (V,) or (V, 3), linear colours as COLOR_0.

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Bytes, Floats
 from radarsdf.checks import check, path_of, positions
 from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.clouds import has_faces, ply_bytes, read_points
@@ -114,7 +114,7 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     return cast("trimesh.Trimesh", mesh)
 
 
-def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
+def read_ground_truth(path: str | PathLike[str]) -> Floats:
     """Read points (M, 3) float64, world frame, m, from a cloud or an ``.npz`` file, or sample a mesh uniformly.
 
     The same file gives the same points. Raises the errors of :func:`radarsdf.io.read_points`.
@@ -136,7 +136,7 @@ def read_ground_truth(path: str | PathLike[str]) -> NDArray[np.float64]:
     return read_points(file)
 
 
-def _scalars_and_colors(mesh: trimesh.Trimesh) -> tuple[Columns, NDArray[np.uint8] | None]:
+def _scalars_and_colors(mesh: trimesh.Trimesh) -> tuple[Columns, Bytes | None]:
     """Scalar attributes (V,) float32 by name, and sRGB colours (V, 4), if there are any, of the vertices."""
     attributes, visual = mesh.vertex_attributes.items(), cast(Any, mesh.visual)
     scalars = {n: np.asarray(v, np.float32) for n, v in attributes if np.shape(v) == (len(mesh.vertices),)}

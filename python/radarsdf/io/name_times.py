@@ -8,8 +8,8 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.io.text import unit_since_1970
 from radarsdf.scans import Notes
 
@@ -76,14 +76,14 @@ def _split(stem: str) -> tuple[str, float, str, str] | None:
     return None
 
 
-def _readings(fractions: list[str], decimal_point: bool) -> dict[str, NDArray[np.float64]]:
+def _readings(fractions: list[str], decimal_point: bool) -> dict[str, Floats]:
     """Possible values of the digits of fractions, s, by what they are."""
     digits = [f for f in fractions if f]
     lengths = {len(f) for f in digits} or {0}
     longest, ragged = max(lengths), len(lengths) > 1
     # Ragged decimals have lost the zeros at their ends, ragged integers those at their beginnings.
     ends, begins = (any(f[i] == "0" for f in digits if len(f) > 1) for i in (-1, 0))
-    values: dict[str, NDArray[np.float64]] = {}
+    values: dict[str, Floats] = {}
     if (not ends and decimal_point) if ragged else (decimal_point or longest > 2 or not longest):
         values[" with decimals" if longest else ""] = np.array([float(f"0.{f}0") for f in fractions])
     if not begins and (ragged or longest > 7):

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Array, Bytes
 from radarsdf.checks import check, instance, path_of
 from radarsdf.imu import Imu
 from radarsdf.io.files import check_regular_file, reading, whole_file
@@ -75,7 +76,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     frames, first = np.unique(frame[order], return_index=True)
     rows = np.split(order, first)[1:]  # np.split's first part, before the first scan, is empty
 
-    def by_scan(name: str) -> list[NDArray[Any]] | None:
+    def by_scan(name: str) -> list[Array] | None:
         return [arrays[name][r] for r in rows] if name in arrays else None
 
     return Scans(
@@ -90,7 +91,7 @@ def read_scans(path: str | PathLike[str]) -> Scans:
     )
 
 
-def _check_scans(arrays: Mapping[str, NDArray[Any]]) -> None:
+def _check_scans(arrays: Mapping[str, Array]) -> None:
     """Raise a ValueError unless the arrays are consistent."""
     known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
     for name, array in arrays.items():
@@ -137,14 +138,14 @@ def write_scans(path: str | PathLike[str], scans: Scans) -> None:
     write_arrays(target, arrays, compressed=True)
 
 
-def array_in(path: Path) -> NDArray[Any]:
+def array_in(path: Path) -> Array:
     """Map the array of an ``.npy`` file into memory; a header that claims more than the file holds is refused."""
     check_regular_file(path)
     with reading(path, "a complete .npy file", EOFError):
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
-def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDArray[Any]]:
+def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, Array]:
     """Read those of the named arrays that an ``.npz`` file has, in this order. Raises the errors of :func:`read_scans`."""
     check_regular_file(path)
     arrays = {}
@@ -161,7 +162,7 @@ def arrays_of(path: str | PathLike[str], names: Iterable[str]) -> dict[str, NDAr
     return arrays
 
 
-def check_arrays(arrays: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[Any, ...]]) -> None:
+def check_arrays(arrays: Mapping[str, Array], wanted: Mapping[str, tuple[Any, ...]]) -> None:
     """Raise a ValueError unless the wanted arrays exist with their type and shape. A length of None matches any."""
     for name, (dtype, *shape) in wanted.items():
         array = arrays.get(name, np.zeros(0, "O"))
@@ -191,5 +192,5 @@ def check_archive(path: str | PathLike[str]) -> None:
     check(content[-size:].tobytes() == _comment(content[:-size]), "its checksum is wrong")
 
 
-def _comment(content: NDArray[np.uint8]) -> bytes:
+def _comment(content: Bytes) -> bytes:
     return b"\x08\0%08x" % zlib.crc32(content.data)

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
+from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, pose_matrices, real_array
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.npz import array_in
@@ -54,8 +55,8 @@ _ROLES = (
 class Trajectory:
     """P poses T_world_base of a frame `base` that moves, or keeps each pose until the next one."""
 
-    times_s: NDArray[np.float64]  # (P,) ascending
-    positions: NDArray[np.float64]  # (P, 3) world frame, m
+    times_s: Floats  # (P,) ascending
+    positions: Floats  # (P, 3) world frame, m
     rotations: Rotation  # P rotations R_world_base
     held: bool = False  # each pose holds until the next one
 
@@ -67,7 +68,7 @@ class Trajectory:
     def _slerp(self) -> Slerp:
         return Slerp(self.times_s, self.rotations)
 
-    def poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def poses(self, times_s: Floats) -> Floats:
         """Interpolate poses T_world_base (N, 4, 4) at times (N,), s, within the trajectory: linearly, and by slerp."""
         poses = np.tile(np.eye(4), (len(times_s), 1, 1))
         poses[:, :3, :3] = self._slerp(times_s).as_matrix()
@@ -75,7 +76,7 @@ class Trajectory:
             poses[:, axis, 3] = np.interp(times_s, self.times_s, self.positions[:, axis])
         return poses
 
-    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+    def pose_at(self, time_s: float, max_gap_s: float) -> Floats | None:
         """Interpolate the pose T_world_base (4, 4) at one time, s; None outside the trajectory and in longer gaps.
 
         A time up to a millisecond beyond the ends, or beyond the edge of a longer gap, gets the pose there: times in files are
@@ -101,7 +102,7 @@ class TransformChain:
 
     links: tuple[Any, ...]  # matrices (4, 4), or poses by time
 
-    def pose_at(self, time_s: float, max_gap_s: float) -> NDArray[np.float64] | None:
+    def pose_at(self, time_s: float, max_gap_s: float) -> Floats | None:
         """T_world_base (4, 4) at a time, s; None if a moving link has no pose near enough."""
         pose = np.eye(4)
         for link in self.links:
@@ -120,12 +121,12 @@ class NumberedPoses(NamedTuple):
     """P poses T_world_sensor with the numbers of their scans, which may have gaps."""
 
     numbers: list[int]
-    matrices: NDArray[np.float64]  # (P, 4, 4)
+    matrices: Floats  # (P, 4, 4)
 
 
 StampedPoses: TypeAlias = Trajectory | TransformChain
 
-Poses: TypeAlias = StampedPoses | NumberedPoses | NDArray[np.float64]
+Poses: TypeAlias = StampedPoses | NumberedPoses | Floats
 """Poses by time, by number of the scan, or (F, 4, 4) in the order of the scans."""
 
 UNPOSED: StampedPoses = TransformChain(())
@@ -136,14 +137,14 @@ class NoPoses(ValueError):
     """Scans have no poses, and none were passed."""
 
 
-def are_poses(table: NDArray[np.float64]) -> NDArray[np.bool_]:
+def are_poses(table: Floats) -> Bools:
     """Mask (P,) of the rows (P, 7) x y z qx qy qz qw that are finite and have a unit quaternion."""
     with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers may overflow
         unit = np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= _MAX_NORM_ERROR
     return np.asarray(unit & np.isfinite(table).all(axis=1))
 
 
-def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
+def pose_matrices_of(table: Floats) -> Floats:
     """Convert rows (P, 7) x y z qx qy qz qw to matrices (P, 4, 4); NaN for rows that are not poses."""
     good = are_poses(table)
     poses = np.full((len(table), 4, 4), np.nan)
@@ -154,7 +155,7 @@ def pose_matrices_of(table: NDArray[np.float64]) -> NDArray[np.float64]:
     return poses
 
 
-def trajectory_of(table: NDArray[np.float64], name: str, notes: Notes | None = None) -> Trajectory:
+def trajectory_of(table: Floats, name: str, notes: Notes | None = None) -> Trajectory:
     """Build a trajectory from rows (P, 8) of time, position and quaternion, in any order.
 
     Of several poses at one time, the first is used. Omissions are added to `notes`.
@@ -253,7 +254,7 @@ def _pose_columns(table: Table) -> Columns:
         kinds = "8 (TUM: time x y z qx qy qz qw), 12 (KITTI), 16, or 4, or names of columns"
         check(roles, f"it has {width} columns: poses have {kinds}")
         names = heads[0] if heads else roles
-    found: dict[str, tuple[NDArray[np.float64], str]] = {}
+    found: dict[str, tuple[Floats, str]] = {}
     for role, name, column in zip(roles, names, values.T, strict=True):
         found.setdefault(role, (column, name))
     columns = {role: column for role, (column, _) in found.items()}
@@ -272,7 +273,7 @@ def _role_of(name: str) -> str:
     return next((role.format(*match.groups()) for match, role in matches if match), "")
 
 
-def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.float64]:
+def rigid_or_nan(poses: Array, name: str, notes: Notes) -> Floats:
     """Check poses (F, 4, 4) in the order of the scans. Damaged ones become NaN and are noted: their scans have none."""
     with reading(name, "poses (F, 4, 4)", TypeError):
         matrices = pose_matrices(poses)
@@ -287,7 +288,7 @@ def rigid_or_nan(poses: NDArray[Any], name: str, notes: Notes) -> NDArray[np.flo
     return np.where(bad[:, None, None], np.nan, matrices)
 
 
-def read_transform(path: Path) -> NDArray[np.float64] | None:
+def read_transform(path: Path) -> Floats | None:
     """Read a rigid transform (4, 4) from a text file; None if there is no file."""
     if not path.is_file():
         return None
@@ -295,7 +296,7 @@ def read_transform(path: Path) -> NDArray[np.float64] | None:
         return check_pose(read_numbers(path, 4), "the matrix")
 
 
-def read_calibration(path: Path) -> NDArray[np.float64] | None:
+def read_calibration(path: Path) -> Floats | None:
     """Read ``Tr`` or ``Tr_velo_to_cam`` of a KITTI calibration as T_camera_sensor (4, 4); None if it has neither."""
     check_regular_file(path)
     lines = [line.partition(":") for line in read_text(path).splitlines()]

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import check
 from radarsdf.io.clouds import CLOUD_SUFFIXES, TEXT_SUFFIXES, UNNAMED, check_kitti, read_columns, read_points
 from radarsdf.io.fields import Fields
@@ -49,10 +49,10 @@ SCAN_FOLDERS = ("radar", "scans", "points", "pointclouds", "clouds", "pcd", "PCD
 _NOT_SCANS = {*POSE_FILES, *TIME_FILES, "calib.txt", BASE_T_RADAR.lower(), "readme.txt", "license.txt"}
 _TRUTH_STEM = "lidar"  # lidar.pcd or lidar.ply next to the scans is their ground truth
 
-Truth = Callable[[], NDArray[np.float64] | None]
+Truth = Callable[[], Floats | None]
 """Loads ground truth on demand, (M, 3), world frame, m; None if there is none."""
 
-FindPoses = Callable[[str], StampedPoses | NDArray[np.float64] | None]
+FindPoses = Callable[[str], StampedPoses | Floats | None]
 
 
 # Arguments of :func:`radarsdf.io.read` that only bags, and only scans with poses, can use.
@@ -65,11 +65,11 @@ class Request:
     """Arguments of :func:`radarsdf.io.read`."""
 
     poses: Any = None
-    extrinsic: NDArray[np.float64] | None = None
+    extrinsic: Floats | None = None
     topic: tuple[str, ...] = ()  # empty: the only candidate
     pose_topic: str | None = None
     imu_topic: str | None = None
-    R_sensor_imu: NDArray[np.float64] | None = None
+    R_sensor_imu: Floats | None = None
     fields: Mapping[str, Any] | None = None
     columns: int | Sequence[str] | None = None
     max_gap_s: float = MAX_GAP_S
@@ -132,10 +132,7 @@ def posed(
 
 
 def _scan(
-    raw: RawScan,
-    T_world_sensor: NDArray[np.float64],
-    layouts: dict[tuple[str, ...], Fields],
-    request: Request,
+    raw: RawScan, T_world_sensor: Floats, layouts: dict[tuple[str, ...], Fields], request: Request
 ) -> Scan | None:
     """Read a scan and attach its pose; None, and counted, if it is damaged or empty.
 
@@ -162,12 +159,8 @@ def _scan(
 
 
 def scan_poses(
-    poses: Poses,
-    count: int,
-    times_s: Sequence[float] | None,
-    T_base_sensor: NDArray[np.float64] | None,
-    request: Request,
-) -> tuple[StampedPoses | NDArray[np.float64], Sequence[float] | None]:
+    poses: Poses, count: int, times_s: Sequence[float] | None, T_base_sensor: Floats | None, request: Request
+) -> tuple[StampedPoses | Floats, Sequence[float] | None]:
     """Return the poses T_world_sensor of `count` scans, and their times, s, if known."""
     about = request.notes.about
     if isinstance(poses, NumberedPoses):
@@ -267,7 +260,7 @@ def natural(path: Path) -> tuple[Any, ...]:
     return tuple((int(part), part) if i % 2 else (0, part) for i, part in enumerate(parts))
 
 
-def lidar_map(folder: Path) -> NDArray[np.float64] | None:
+def lidar_map(folder: Path) -> Floats | None:
     """Points (M, 3), world frame, m, of ``lidar.pcd`` or ``lidar.ply``; None if there is neither."""
     path = first_file([folder], (f"{_TRUTH_STEM}.pcd", f"{_TRUTH_STEM}.ply"))
     return None if path is None else read_points(path)
@@ -306,7 +299,7 @@ def _listed_times(path: Path, notes: Notes) -> list[float]:
     return [float(time_s) for time_s in in_seconds(times, path.name, notes)]
 
 
-def _by_number(poses: NumberedPoses, numbers: Sequence[int], notes: Notes) -> NDArray[np.float64]:
+def _by_number(poses: NumberedPoses, numbers: Sequence[int], notes: Notes) -> Floats:
     """T_world_sensor (F, 4, 4) of the scans with these numbers; NaN for those without a pose, which are counted."""
     if all(np.ptp(of) + 1 == len(numbers) == len(of) for of in (numbers, poses.numbers)):
         numbers = sorted(poses.numbers)  # one of them counts from 0, the other one from 1

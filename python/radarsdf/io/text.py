@@ -7,11 +7,11 @@ import re
 from bisect import bisect
 from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Floats
 from radarsdf.checks import check
 from radarsdf.io.files import reading
 from radarsdf.scans import Notes
@@ -27,7 +27,7 @@ class Table(NamedTuple):
     """Table of R rows of numbers in a text file."""
 
     heads: list[list[str]]  # words of the lines and comments above the rows: one may name the columns
-    values: NDArray[np.float64]  # (R, W), NaN for words that are not numbers, and for rows of another width
+    values: Floats  # (R, W), NaN for words that are not numbers, and for rows of another width
 
 
 def read_table(path: Path) -> Table:
@@ -55,7 +55,7 @@ def read_table(path: Path) -> Table:
     return Table(heads, _values(rows) if rows else np.zeros((0, len(heads[-1]) if heads else 0)))
 
 
-def _values(rows: list[str]) -> NDArray[np.float64]:
+def _values(rows: list[str]) -> Floats:
     """Parse rows to numbers (R, W): by NumPy at once or, if some are damaged, row by row."""
     separator = _separator(rows[0])
     if separator == ";":
@@ -77,7 +77,7 @@ def _values(rows: list[str]) -> NDArray[np.float64]:
     return table
 
 
-def read_numbers(path: Path, columns: int | None = None) -> NDArray[np.float64]:
+def read_numbers(path: Path, columns: int | None = None) -> Floats:
     """Read a table of finite numbers (R, columns) from a text file; None: any number of columns."""
     with reading(path, f"a table of {columns or 'any number of'} columns of finite numbers"):
         values = read_table(path).values
@@ -92,7 +92,7 @@ def read_text(path: Path) -> str:
     return path.read_bytes().decode("utf-8-sig", errors="replace")
 
 
-def as_numbers(words: NDArray[Any]) -> NDArray[np.float64]:
+def as_numbers(words: Array) -> Floats:
     """Convert words (N,) to numbers; NaN for those that are none."""
     with contextlib.suppress(ValueError):
         return words.astype(np.float64)
@@ -117,7 +117,7 @@ def unit_since_1970(time: float) -> tuple[str, float]:
     return _SINCE_1970[bisect(_LIMITS, abs(time))]
 
 
-def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[np.float64]:
+def in_seconds(times: Floats, name: str, notes: Notes) -> Floats:
     """Convert times (N,) of the file `name` to s. They may be in ms, µs or ns since 1970, which is noted."""
     check(np.isfinite(times).all(), f"{name} holds a time that is not finite")
     unit, scale = unit_since_1970(float(np.median(times)) if len(times) else 0.0)
@@ -126,7 +126,7 @@ def in_seconds(times: NDArray[np.float64], name: str, notes: Notes) -> NDArray[n
     return times * scale
 
 
-def are_degrees(azimuth: NDArray[Any], elevation: NDArray[Any]) -> bool:
+def are_degrees(azimuth: Array, elevation: Array) -> bool:
     """Whether angles (N,) must be in degrees because they exceed the range of radians."""
     finite = np.isfinite(azimuth) & np.isfinite(elevation)
     if not finite.any():

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy import constants
+
+from radarsdf.arrays import Floats
 
 _NAMES = {
     "length": {
@@ -69,6 +69,6 @@ def factor_of(unit: str, dimension: str, column: str) -> float:
     return factor
 
 
-def scaled(column: NDArray[np.float64], name: str, dimension: str) -> NDArray[np.float64]:
+def scaled(column: Floats, name: str, dimension: str) -> Floats:
     """Convert a column to m, s, m/s or rad by the unit in its name, if it has one."""
     return column * factor_of(without_unit(name)[1], dimension, name)

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from radarsdf.arrays import Floats
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.live.store import LoggedScan, ScanId, ScanLog
 from radarsdf.poses.consistency import Consistency
@@ -28,7 +29,7 @@ from radarsdf.poses.doppler import (
 )
 from radarsdf.poses.drive import LEAST_OBSERVED, Drive, rates_of, track_drive
 from radarsdf.poses.motion import MotionRate, PredictedStep
-from radarsdf.poses.rigid import Floats, rotation_vector
+from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begin_segment
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
@@ -354,8 +355,7 @@ def _pull(before: Tracked, found: Tracked, expected: PredictedStep) -> float:
 
 def _covariance(velocity: SensorVelocity) -> Floats:
     """Return the covariance (3, 3), m²/s², of a velocity including systematic errors."""
-    covariance: Floats = velocity.covariance + LEAST_MPS**2 * np.eye(3)
-    return covariance
+    return velocity.covariance + LEAST_MPS**2 * np.eye(3)
 
 
 def _now(step: Step, log: ScanLog) -> Step | None:

@@ -101,8 +101,7 @@ def marching_cubes(
     if not isinstance(samples, Tensor):
         return _core.marching_cubes_dense(samples, *rest)
     if samples.requires_grad and torch.is_grad_enabled():
-        mesh: tuple[Tensor, Tensor] = _MarchingCubes.apply(samples, *rest)  # type: ignore[no-untyped-call]
-        return mesh
+        return _MarchingCubes.apply(samples, *rest)  # type: ignore[no-untyped-call]
     vertices, faces = _core.marching_cubes_dense(samples.detach().numpy(), *rest)
     return torch.from_numpy(vertices), torch.from_numpy(faces)
 

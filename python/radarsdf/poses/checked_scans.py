@@ -8,14 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from radarsdf.checks import MAX_TIME_S, real_array
-from radarsdf.poses.doppler import (
-    NOT_USED,
-    NoVelocityError,
-    SensorVelocities,
-    radial_offset_mps,
-)
-from radarsdf.poses.rigid import Floats
+from radarsdf.arrays import Floats
+from radarsdf.checks import MAX_TIME_S, check, real_array
+from radarsdf.poses.doppler import NOT_USED, NoVelocityError, SensorVelocities, radial_offset_mps
 from radarsdf.returns.moving import checked_doppler, without_filler
 from radarsdf.returns.rays import check_scans
 from radarsdf.scans import Scans, filled
@@ -44,9 +39,8 @@ class CheckedScans:
         times: ArrayLike | None,
     ) -> CheckedScans:
         """Check scans (N_i, 3), Doppler (N_i,) and times (F,). Raise a TypeError or ValueError if they are invalid."""
-        if doppler_mps is not None and times is None and not isinstance(points, Scans):
-            msg = "Doppler needs times: the time of each scan (times_s), s"
-            raise ValueError(msg)
+        fits = doppler_mps is None or times is not None or isinstance(points, Scans)
+        check(fits, "Doppler needs times: the time of each scan (times_s), s")
         given, doppler_mps, times = filled(points, doppler_mps=doppler_mps, times_s=times)
         scans, _, left_out = check_scans(given)
         if (range_m := median_range_m(scans)) > _MOST_M:
@@ -116,11 +110,9 @@ def median_range_m(scans: Sequence[Floats]) -> float:
 
 def _checked_times(times: ArrayLike, num_scans: int) -> Floats:
     """Return times (F,), s. Raise a ValueError if they are invalid."""
-    times_s: Floats = real_array(times, "times_s")
-    if times_s.shape != (num_scans,):
-        msg = f"times_s must be one for each of {num_scans} scans, not {times_s.shape}"
-        raise ValueError(msg)
-    if not (np.abs(times_s) <= MAX_TIME_S).all() or (np.diff(times_s) < 0).any():
-        msg = f"times_s must be finite, within {MAX_TIME_S:g} s, and ascend from scan to scan"
-        raise ValueError(msg)
+    times_s = real_array(times, "times_s")
+    one_each = times_s.shape == (num_scans,)
+    check(one_each, f"times_s must be one for each of {num_scans} scans, not {times_s.shape}")
+    ascending = (np.abs(times_s) <= MAX_TIME_S).all() and not (np.diff(times_s) < 0).any()
+    check(ascending, f"times_s must be finite, within {MAX_TIME_S:g} s, and ascend from scan to scan")
     return times_s

@@ -8,21 +8,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.doppler import (
-    ERRORS,
-    NOT_USED,
-    DopplerMotion,
-    SensorVelocities,
-    log_distances,
-)
+from radarsdf.poses.doppler import ERRORS, NOT_USED, DopplerMotion, SensorVelocities, log_distances
 from radarsdf.poses.drive import Drive, track_once
 from radarsdf.poses.planes import plane_cell_m
-from radarsdf.poses.rigid import Floats, rotation, steps
+from radarsdf.poses.rigid import rotation, steps
 from radarsdf.poses.tracking import Tracked, Tracker
 
 _BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
@@ -77,11 +71,10 @@ class Contradiction:
         return f"{scans}, {source} show {self.ratio:.2f} times its speeds"
 
 
-def _runs(times_s: Floats) -> NDArray[np.int64]:
+def _runs(times_s: Floats) -> Ints:
     """Number (F,) the runs of scans without a gap."""
     durations_s = np.diff(times_s)
-    runs: NDArray[np.int64] = np.append(0, np.cumsum(durations_s > 2 * np.median(durations_s)))
-    return runs
+    return np.append(0, np.cumsum(durations_s > 2 * np.median(durations_s)))
 
 
 def _windows(count: int) -> Iterator[slice]:
@@ -94,7 +87,7 @@ def _windows(count: int) -> Iterator[slice]:
 
 
 def contradiction(
-    shown_m: Floats, doppler_m: Floats, variances_m2: Floats, scans: NDArray[np.int64]
+    shown_m: Floats, doppler_m: Floats, variances_m2: Floats, scans: Ints
 ) -> Contradiction | None:
     """Test displacements (K, 3) of steps by another source and by Doppler, with variances (K,) of a component of the latter.
 
@@ -165,7 +158,7 @@ class Clock:
     sigma_s: float = 0.0  # standard deviation where it is undecided whether times or firing are uneven
 
     @classmethod
-    def of(cls, times_s: Floats, shown_m: Floats, doppler_m: Floats, known: NDArray[np.bool_]) -> Clock:
+    def of(cls, times_s: Floats, shown_m: Floats, doppler_m: Floats, known: Bools) -> Clock:
         """Compare times (F,) with those of a radar that fires evenly: which explain the steps (F - 1, 3) that another source shows?"""
         durations_s, errors_s = np.diff(times_s), np.zeros(len(times_s))
         runs = _runs(times_s)
@@ -271,7 +264,7 @@ class Consistency:
         known = found is not None or (~pairs.slow).sum() >= _FEWEST_STEPS
         return cls(delay, found, clock, doubted if known else None)
 
-    def widened(self, poses: Floats, covariance: Floats, segments: NDArray[np.int64], drive: Drive) -> Floats:
+    def widened(self, poses: Floats, covariance: Floats, segments: Ints, drive: Drive) -> Floats:
         """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt."""
         assert drive.velocities is not None
         covariance, scans, velocities = covariance.copy(), np.arange(len(poses)), drive.velocities.mean_mps
@@ -323,8 +316,7 @@ def _step_covariances(tracked: list[Tracked]) -> Floats:
     """Return the covariances (F - 1, 3, 3) of translations between tracked scans, in the frame of the first, m²."""
     axes = np.stack([found.pose[:3, :3] for found in tracked[:-1]])
     of_steps = np.stack([found.covariance[:3, :3] for found in tracked[1:]])
-    covariances: Floats = np.einsum("fji,fjk,fkl->fil", axes, of_steps, axes)
-    return covariances
+    return np.einsum("fji,fjk,fkl->fil", axes, of_steps, axes)
 
 
 def _compared(
@@ -332,7 +324,7 @@ def _compared(
     poses: Floats,
     motion: DopplerMotion,
     along: Floats,
-    rows: NDArray[np.int64],
+    rows: Ints,
     reversed_yaws: Floats | None,
 ) -> _Pairs:
     """Compare the returns of scans `rows` (K,) with those of the next ones, at the rotations of tracked poses.
@@ -372,10 +364,10 @@ class _Pairs:
     moved: Floats  # (K,) how much nearer they are after the Doppler's step than without one
     parted: Floats  # (K,) how much farther, without steps, they are from those of a scan much later. NaN at the end
     along: Floats  # (K,) relative differences of tracked steps and Doppler. NaN where returns hardly observe them
-    slow: NDArray[np.bool_]  # (K,) whether there is no motion by Doppler
+    slow: Bools  # (K,) whether there is no motion by Doppler
     level: float = _BY_CHANCE  # significance level of a test
 
-    def select(self, rows: slice | NDArray[np.bool_], level: float) -> _Pairs:
+    def select(self, rows: slice | Bools, level: float) -> _Pairs:
         """Select pairs, to test at a level."""
         gains, losses, moved, parted, along = (
             column[rows] for column in (self.gains, self.losses, self.moved, self.parted, self.along)
@@ -487,18 +479,17 @@ def _judged(pairs: _Pairs) -> tuple[Contradiction | None, list[Doubt]]:
 def _t_values(samples: Floats) -> Floats:
     """Return the means over K samples (K, ...) in standard errors."""
     errors = samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
-    found: Floats = samples.mean(axis=0) / np.maximum(errors, 1e-9)
-    return found
+    return samples.mean(axis=0) / np.maximum(errors, 1e-9)
 
 
 def delay_of(
     velocities: SensorVelocities,
-    runs: NDArray[np.int64],  # of scans without a gap
-    rows: NDArray[np.int64],
+    runs: Ints,  # of scans without a gap
+    rows: Ints,
     motion: DopplerMotion,
     shown: Floats,
     covariance: Floats,
-    followed: NDArray[np.bool_],
+    followed: Bools,
 ) -> int:
     """Return the delay, scans, of the Doppler with which steps (K, 3) by another source agree best, if significantly; else 0.
 

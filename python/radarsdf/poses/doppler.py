@@ -6,14 +6,13 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from radarsdf.arrays import Array, Bools, Floats, Ints
 from radarsdf.poses.motion import KnownMotion, spans_of, way
-from radarsdf.poses.rigid import Floats, rotation, rotation_vector, step_vectors, steps
+from radarsdf.poses.rigid import rotation, rotation_vector, step_vectors, steps
 from radarsdf.products import normal_matrix
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, folding_interval_mps, sensor_velocities
 
@@ -55,17 +54,15 @@ class SensorVelocities:
     mean_mps: Floats  # (F, 3)
     covariance: Floats  # (F, 3, 3), m²/s²
     change: Floats  # (3,) spectral density of the acceleration by component (random walk), m²/s³
-    static: list[NDArray[np.bool_]]  # F masks (N_i,) of the returns that agree with the velocity
-    found: NDArray[np.bool_]  # (F,) whether the returns agree on a velocity. Else it is interpolated
+    static: list[Bools]  # F masks (N_i,) of the returns that agree with the velocity
+    found: Bools  # (F,) whether the returns agree on a velocity. Else it is interpolated
     # Standard deviation of the systematic error of all velocities in any direction, share of the speed.
     common_sigma: float = _IN_COMMON
     clock_sigma_s: float = 0.0  # standard deviation of the times of scans
     climb_assumed: int = 0  # number of scans with Doppler that hardly measures the vertical velocity
 
     @classmethod
-    def of(
-        cls, scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], times_s: Floats
-    ) -> SensorVelocities:
+    def of(cls, scans: Sequence[Floats], doppler_mps: Sequence[Array], times_s: Floats) -> SensorVelocities:
         """Estimate from scans (N_i, 3), sensor frame, m. Raise a NoVelocityError if less than half, or two, yield a velocity."""
         each = sensor_velocities(scans, doppler_mps)
         found = np.array([velocity.found for velocity in each], bool)
@@ -94,7 +91,7 @@ class SensorVelocities:
             covariance[i] = np.diag(change * away_s) + covariance[found].mean(axis=0)
         return cls(mean, covariance, change, static, found, climb_assumed=weak)
 
-    def select(self, rows: slice | NDArray[np.int64]) -> SensorVelocities:
+    def select(self, rows: slice | Ints) -> SensorVelocities:
         """Select scans."""
         mean_mps, covariance = self.mean_mps[rows], self.covariance[rows]
         static = [self.static[i] for i in np.arange(len(self.static))[rows]]
@@ -123,7 +120,7 @@ class SensorVelocities:
 
 
 def radial_offset_mps(
-    scans: Sequence[Floats], doppler_mps: Sequence[NDArray[Any]], velocities: SensorVelocities
+    scans: Sequence[Floats], doppler_mps: Sequence[Array], velocities: SensorVelocities
 ) -> float:
     """Return a significant constant in the Doppler of all static returns, m/s, or 0.
 
@@ -222,14 +219,12 @@ class _Pair:
         first, second = self._sampled
         of_second = self._trees[0].query(second @ turn.T + shifts_m[:, None])[0]
         of_first = self._trees[1].query((first - shifts_m[:, None]) @ turn)[0]
-        found: Floats = np.log(np.maximum(np.concatenate([of_second, of_first], axis=1), _LEAST_M))
-        return found
+        return np.log(np.maximum(np.concatenate([of_second, of_first], axis=1), _LEAST_M))
 
 
 def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
     """Return mean log distances (K,) to the nearest returns of scans in common axes, the second after shifts (K, 3)."""
-    found: Floats = _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), shifts_m).mean(axis=1)
-    return found
+    return _Pair(first, second, _FEW_SAMPLED).log_distances(np.eye(3), shifts_m).mean(axis=1)
 
 
 def sign_significance(

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import hides_bar
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.doppler import YAW_STEP_RAD, DopplerMotion, SensorVelocities
 from radarsdf.poses.gyroscope import Gyroscope
 from radarsdf.poses.motion import Motion, MotionPrior, MotionRate, PredictedStep, Priors, SteadyMotion
 from radarsdf.poses.planes import plane_cell_m
-from radarsdf.poses.rigid import Floats, rotation
+from radarsdf.poses.rigid import rotation
 from radarsdf.poses.tracking import Tracked, Tracker
 
 _PASSES = 3

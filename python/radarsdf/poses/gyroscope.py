@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from radarsdf.arrays import Floats
 from radarsdf.poses.motion import MotionRate
-from radarsdf.poses.rigid import Floats, rotation, rotation_vector
+from radarsdf.poses.rigid import rotation, rotation_vector
 
 # Prior bias and noise, of cheap gyroscopes, until they are estimated from the drive.
 FIRST_BIAS_RAD_S = 0.02

@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
+from radarsdf.arrays import Floats
 from radarsdf.imu import Imu
 from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.gyroscope import FIRST_BIAS_RAD_S, Gyroscope, integrate_rates, interpolate
-from radarsdf.poses.rigid import Floats, covariance_in, nearest_rotation, rotation
+from radarsdf.poses.rigid import covariance_in, nearest_rotation, rotation
 
 # Minimum length of a window: longer ones gave the same rotation for the real walk, to 0.5 degrees.
 _WINDOW_S, _WINDOW_SCANS = 4.0, 10

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from radarsdf.arrays import Floats, Ints
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.rigid import Floats
 from radarsdf.poses.verdict import NEIGHBOURS, Verdict, density, median_apart_m
 from radarsdf.returns.noise import SensorNoise
 
@@ -63,7 +62,7 @@ def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_
     return notes
 
 
-def _visits(positions: Floats, range_m: float) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _visits(positions: Floats, range_m: float) -> Iterator[tuple[Ints, Ints]]:
     """Yield the scans of each later visit of a place and those of earlier ones, from positions (F, 3)."""
     lengths_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     path_m = np.concatenate([[0.0], np.cumsum(lengths_m)])

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from radarsdf.poses.rigid import Floats, rotation, rotation_vector, skew, step_vectors, steps, transform
+from radarsdf.arrays import Bools, Floats
+from radarsdf.poses.rigid import rotation, rotation_vector, skew, step_vectors, steps, transform
 
 _PRIOR_STEPS = 3.0  # weight of the initial motion prior, steps
 _SPAN = 4.0  # width of a search, standard deviations
@@ -264,7 +264,7 @@ class SteadyMotion(KnownMotion):
 
     @classmethod
     def by(
-        cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, measured: NDArray[np.bool_]
+        cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, measured: Bools
     ) -> SteadyMotion:
         """Build from times (F,) and approximate poses (F, 4, 4) of scans.
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.imu import Imu
@@ -23,7 +24,7 @@ from radarsdf.poses.imu import Inertial, level_poses
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.planes import SensorReturns, plane_cell_m
 from radarsdf.poses.refine import PosesEstimate
-from radarsdf.poses.rigid import Floats, steps
+from radarsdf.poses.rigid import steps
 from radarsdf.poses.tracking import WINDOW, Tracked
 from radarsdf.returns.rays import within_ranges
 from radarsdf.scans import Scans
@@ -46,7 +47,7 @@ class Odometry:
     """(F, 4, 4) T_world_sensor, m. The world is the frame of the first scan; with an accelerometer, rotated so that z points up."""
     covariance: Floats
     """(F, 6, 6) as in :class:`RefinedPoses`, relative to the middle scan of each segment."""
-    segments: NDArray[np.int64]
+    segments: Ints
     """(F,) segment of the drive of each scan. A new segment begins where tracking was lost, mostly over a gap in time: its
     position relative to the previous one is dead reckoning, and no map should join them."""
     report: dict[str, Any]
@@ -192,7 +193,7 @@ def odometry(
 
 
 def _estimate_jointly(
-    drive: Drive, tracked: list[Tracked], segments: NDArray[np.int64], config: FitConfig, num_threads: int
+    drive: Drive, tracked: list[Tracked], segments: Ints, config: FitConfig, num_threads: int
 ) -> tuple[Floats, Floats, list[str]]:
     """Jointly estimate poses and covariances of all scans of each segment; return them with notes on open loops."""
     poses = np.stack([found.pose for found in tracked])
@@ -248,7 +249,7 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
     return assumed
 
 
-def _summarize(segments: NDArray[np.int64], length_m: float, doppler: bool, inertial: Inertial) -> str:
+def _summarize(segments: Ints, length_m: float, doppler: bool, inertial: Inertial) -> str:
     """Return the verdict in words."""
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
     sentences = [f"{len(segments)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]

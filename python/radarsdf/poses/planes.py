@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from radarsdf._core import CellBlocks, CommonPlanes
+from radarsdf.arrays import Bools, Floats, Floats32, Ints32
 from radarsdf.config.groups import ReturnsConfig
-from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise, sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, NEIGHBOUR_WEIGHT, Surfels
 from radarsdf.returns.rays import Rays
@@ -91,14 +90,12 @@ def plane_cell_m(scans: Sequence[Floats], leaf_size_m: float) -> float:
 class SensorReturns:
     """Returns in the sensor frame, scan by scan."""
 
-    directions: NDArray[np.float32]  # (N, 3) unit vectors
-    ranges_m: NDArray[np.float32]  # (N,)
-    scans: NDArray[np.int32]  # (N,) ascending
+    directions: Floats32  # (N, 3) unit vectors
+    ranges_m: Floats32  # (N,)
+    scans: Ints32  # (N,) ascending
 
     @classmethod
-    def of(
-        cls, scans: Sequence[NDArray[np.float64]], min_range_m: float, max_range_m: float | None
-    ) -> SensorReturns:
+    def of(cls, scans: Sequence[Floats], min_range_m: float, max_range_m: float | None) -> SensorReturns:
         """Build from scans (N_i, 3), sensor frame, m, without returns outside these ranges."""
         points = np.concatenate(scans)
         ranges_m = np.sqrt(np.einsum("ni,ni->n", points, points))
@@ -111,7 +108,7 @@ class SensorReturns:
     def __len__(self) -> int:
         return len(self.scans)
 
-    def select(self, part: NDArray[np.bool_]) -> SensorReturns:
+    def select(self, part: Bools) -> SensorReturns:
         """Select returns by a mask (N,)."""
         return SensorReturns(self.directions[part], self.ranges_m[part], self.scans[part])
 
@@ -191,7 +188,7 @@ def common_planes(
     return common, known
 
 
-def _planes_of(points: NDArray[np.float32], surfels: Surfels, num_threads: int) -> NDArray[np.int32]:
+def _planes_of(points: Floats32, surfels: Surfels, num_threads: int) -> Ints32:
     """Return the flat surfel (N,) of each point (N, 3), local, m: that of the cell of its projection onto the surface; -1: none."""
     # Noise moves returns across surfaces into other cells. By the cells of the returns themselves, it would be truncated at cell
     # borders, differently for near and far returns, and rotate poses.

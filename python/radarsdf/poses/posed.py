@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from radarsdf.arrays import Floats
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.poses.odometry import Odometry
 from radarsdf.poses.refine import RefinedPoses
-from radarsdf.poses.rigid import Floats
 
 _MOST = 500  # maximum number of poses in a report: enough for a plot
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
+from radarsdf.arrays import Floats
 from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
@@ -21,7 +22,7 @@ from radarsdf.poses.doppler import NOT_USED, DopplerMotion
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
 from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
-from radarsdf.poses.rigid import Floats, aligned, increments, moved, moved_by, steps
+from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL
@@ -274,5 +275,4 @@ def _by_biases(
     information = np.diag(own) + np.einsum("kfi,lfi->kl", by, moved_by)
     values, axes = np.linalg.eigh((information + information.T) / 2)
     root = np.einsum("kfi,kl->lfi", moved_by, axes / np.sqrt(1 + np.maximum(values, 0.0)))
-    found: Floats = np.einsum("lfi,lfj->fij", root, root)
-    return found
+    return np.einsum("lfi,lfj->fij", root, root)

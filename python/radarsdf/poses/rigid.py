@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Floats = NDArray[np.float64]
+from radarsdf.arrays import Floats
 
 
 def moved(poses: Floats, increments: Floats) -> Floats:

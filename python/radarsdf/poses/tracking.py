@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from radarsdf._core import LocalPlanes
+from radarsdf.arrays import Floats
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.motion import PredictedStep
 from radarsdf.poses.planes import SensorReturns, reduction
-from radarsdf.poses.rigid import Floats, covariance_in, increments, moved, rotation, rotation_vector
+from radarsdf.poses.rigid import covariance_in, increments, moved, rotation, rotation_vector
 from radarsdf.returns.noise import sensor_noise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, Surfels
 

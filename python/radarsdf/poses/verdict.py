@@ -11,8 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
+from radarsdf.arrays import Bools, Floats
 from radarsdf.poses.planes import SensorReturns
-from radarsdf.poses.rigid import Floats
 from radarsdf.returns.noise import SensorNoise
 
 NEIGHBOURS = 16  # nearest neighbours of a return; those of other scans contribute to the density
@@ -28,7 +28,7 @@ _NEARBY = 0.5
 _MOST_COUNTED = 100_000  # maximum number of returns counted in these cells
 
 
-def held_out(count: int, seed: int) -> NDArray[np.bool_]:
+def held_out(count: int, seed: int) -> Bools:
     """Return a mask (count,) of the held-out returns."""
     return np.random.default_rng(seed).random(count) < _HELD_OUT
 
@@ -134,7 +134,7 @@ def density(distances_m: Floats, variances_m2: Floats) -> Floats:
         return np.asarray(np.exp(-0.5 * distances_m**2 / variances_m2) / variances_m2**1.5)
 
 
-def median_apart_m(distances_m: Floats, others: NDArray[np.bool_]) -> float:
+def median_apart_m(distances_m: Floats, others: Bools) -> float:
     """Return the median distance to the nearest neighbour of another scan, else to the last one, of neighbours (N, K)."""
     nearest = np.where(others.any(axis=1), others.argmax(axis=1), -1)
     return float(np.median(distances_m[np.arange(len(nearest)), nearest]))

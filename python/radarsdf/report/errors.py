@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.evaluation import intensity_metrics, surface_metrics, uncertainty_metrics
 from radarsdf.report import plots
 from radarsdf.report.subject import Subject
@@ -15,8 +15,6 @@ from radarsdf.returns.moving import rays_as_measured
 from radarsdf.threads import resolve_num_threads
 from radarsdf.tiles.tiled_map import predicted
 from radarsdf.view.quantities import Scale
-
-_Floats = NDArray[np.float64]
 
 _SAMPLES = 1_000_000
 _MATCH_M = 0.4  # a vertex farther from the truth is an outlier rather than an inaccurate surface
@@ -55,7 +53,7 @@ def uncertainty_values(subject: Subject) -> dict[str, Any] | None:
     }
 
 
-def _calibration(subject: Subject, sigma_m: _Floats) -> dict[str, Any] | None:
+def _calibration(subject: Subject, sigma_m: Floats) -> dict[str, Any] | None:
     """Errors compared with predicted uncertainties, or None if too little of the surface is near the truth."""
     mesh, truth = subject.mesh, subject.ground_truth
     if truth is None:

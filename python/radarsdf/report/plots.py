@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.render.figures import new_figure, png_of
-
-_Floats = NDArray[np.float64]
 
 _FIRST, _SECOND = "#0072b2", "#d55e00"  # distinguishable by colour-blind readers
 
@@ -40,7 +38,7 @@ def reliability(predicted_m: Sequence[float], measured_m: Sequence[float]) -> by
     return _png(figure)
 
 
-def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
+def predicted_over_measured(measured: Floats, predicted: Floats) -> bytes:
     """Plot the density of predicted over measured intensities (N,), with the diagonal."""
     from matplotlib.colors import LogNorm  # noqa: PLC0415 - an extra
 
@@ -56,7 +54,7 @@ def predicted_over_measured(measured: _Floats, predicted: _Floats) -> bytes:
     return _png(figure)
 
 
-def trajectory(before: _Floats | None, after: _Floats) -> bytes:
+def trajectory(before: Floats | None, after: Floats) -> bytes:
     """Plot positions (N, 3) from above. `before`: input positions of the same scans."""
     figure, above = _subplots()
     paths = [("after", after, _FIRST, 1.5)]

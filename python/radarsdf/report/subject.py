@@ -8,9 +8,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from radarsdf.arrays import Floats
 from radarsdf.checking.recording import Finding
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
@@ -34,7 +35,7 @@ class Subject:
     limits: Mapping[str, Any] = field(default_factory=dict)  # limits of the mesh: arguments of `Map.mesh`
 
     @property
-    def viewpoint(self) -> NDArray[np.float64]:
+    def viewpoint(self) -> Floats:
         """(3,) sensor position for predicted intensities: that of the middle scan, or the map's origin; world, m."""
         if self.scans is None:
             return self.radar_map.origin
@@ -54,7 +55,7 @@ class Subject:
         return thinned(self.mesh, MAX_VERTICES, self.voxel_size_m)
 
     @cached_property
-    def ground_truth(self) -> NDArray[np.float64] | None:
+    def ground_truth(self) -> Floats | None:
         """(M, 3) ground-truth points in the box, world, m; None if there are none."""
         if self.scans is None or self.scans.ground_truth is None:
             return None

@@ -7,8 +7,8 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Bytes, Floats
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.threshold import Threshold
 from radarsdf.render.picture import eye_around, middle_of, render
@@ -17,9 +17,6 @@ from radarsdf.view.framing import framing_pose
 from radarsdf.view.glb import glb
 from radarsdf.view.quantities import Scale
 from radarsdf.view.serving import free_port, set_initial_camera, start_server, stop_server
-
-_Floats = NDArray[np.float64]
-_Colors = NDArray[np.uint8]
 
 _WIDTH, _HEIGHT = 1040, 650  # pixels
 _SCENE_ASPECT = 8 / 5  # aspect ratio of its frame on any screen, see the style in page.html
@@ -58,8 +55,8 @@ def surface_values(subject: Subject) -> dict[str, Any] | None:
 
 
 def colored(
-    mesh: Any, values: NDArray[Any] | None, label: str, scale: Scale | None = None
-) -> tuple[_Colors, dict[str, Any] | None]:
+    mesh: Any, values: Array | None, label: str, scale: Scale | None = None
+) -> tuple[Bytes, dict[str, Any] | None]:
     """Map values (V,) of the vertices to colours (V, 3), with a legend. NaN is grey, as is everything without values."""
     if values is None or not np.isfinite(values).any():
         return np.full((len(mesh.vertices), 3), NEUTRAL, np.uint8), None
@@ -67,18 +64,18 @@ def colored(
     return scale(values), {"label": label, "scale": scale}
 
 
-def colored_picture(mesh: Any, values: NDArray[Any], label: str, scale: Scale) -> dict[str, Any]:
+def colored_picture(mesh: Any, values: Array, label: str, scale: Scale) -> dict[str, Any]:
     """Render a mesh coloured by values (V,) of its vertices, and describe the colours."""
     colors, legend = colored(mesh, values, label, scale)
     return {"picture": picture(mesh, colors), "legend": legend}
 
 
-def views(mesh: Any, colors: _Colors) -> dict[str, bytes]:
+def views(mesh: Any, colors: Bytes) -> dict[str, bytes]:
     """Render a mesh from each of :data:`SIDES`, by name."""
     return {name: picture(mesh, colors, *side) for name, side in SIDES.items()}
 
 
-def picture(mesh: Any, colors: _Colors, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
+def picture(mesh: Any, colors: Bytes, turn_deg: float = 25.0, rise_deg: float = 36.0) -> bytes:
     """Render a mesh with vertex colours (V, 3), seen from :func:`eye_around`, as JPEG."""
     from PIL import Image  # noqa: PLC0415 - comes with matplotlib, an extra
 
@@ -89,7 +86,7 @@ def picture(mesh: Any, colors: _Colors, turn_deg: float = 25.0, rise_deg: float 
     return file.getvalue()
 
 
-def scene(vertices: _Floats, faces: NDArray[Any], colors: _Colors, sensors: _Floats | None = None) -> str:
+def scene(vertices: Floats, faces: Array, colors: Bytes, sensors: Floats | None = None) -> str:
     """Export a self-contained HTML page that shows a mesh in 3D, made by viser.
 
     `vertices` (V, 3) and `sensors` (F, 3), drawn as points, are in m near the origin, since the page computes in

@@ -60,12 +60,7 @@ def find_ghosts(
 
 
 def _first_crossed_near_sample(
-    surfels: Surfels,
-    planes: Ints,
-    rays: MeanRays,
-    cell_of_ray: Ints32,
-    noise: SensorNoise,
-    num_threads: int,
+    surfels: Surfels, planes: Ints, rays: MeanRays, cell_of_ray: Ints32, noise: SensorNoise, num_threads: int
 ) -> Ints32:
     """Return :func:`first_crossed` of mean rays, -1 without search where a sample excludes ghosts.
 

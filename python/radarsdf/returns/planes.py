@@ -85,11 +85,7 @@ class Surfels:
 
 
 def neighbour_planes(
-    blocks: CellBlocks,
-    keys: Keys,
-    of_cells: Floats,
-    cell_size_m: float,
-    num_threads: int = 0,
+    blocks: CellBlocks, keys: Keys, of_cells: Floats, cell_size_m: float, num_threads: int = 0
 ) -> tuple[Array, ...]:
     """Fit planes to the neighbourhoods of `keys` (K,). `of_cells`: moments by cell of `blocks`.
 

@@ -20,15 +20,7 @@ from radarsdf.io.meshes import check_mesh_path, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
-from radarsdf.map.mesh import (
-    Surface,
-    crossed,
-    one_for_equal,
-    per_cell,
-    renumbered,
-    subdivided,
-    with_all,
-)
+from radarsdf.map.mesh import Surface, crossed, one_for_equal, per_cell, renumbered, subdivided, with_all
 from radarsdf.map.threshold import TALLY_NUMBERS, Limits, Tally
 from radarsdf.map.view import ViewedMap
 from radarsdf.memory import check_triangles, check_views

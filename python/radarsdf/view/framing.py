@@ -6,24 +6,23 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from radarsdf.arrays import Floats
 
 FOV_RAD = 0.85  # vertical field of view: less than viser's, so that walls stay upright
 ASPECT = 1.3  # width over height of a page's frame, until the page reports its own
 _TO_EYE = np.array([-0.33, -0.57, 0.5])
 _MARGIN = 1.08
 
-_Floats = NDArray[np.float64]
-
 
 class CameraPose(NamedTuple):
     """A camera pose."""
 
-    position: _Floats  # (3,) m
-    look_at: _Floats  # (3,) m, centre of the orbit of the user's rotations
+    position: Floats  # (3,) m
+    look_at: Floats  # (3,) m, centre of the orbit of the user's rotations
 
 
-def framing_pose(points: _Floats, to_eye: _Floats = _TO_EYE, aspect: float = ASPECT) -> CameraPose:
+def framing_pose(points: Floats, to_eye: Floats = _TO_EYE, aspect: float = ASPECT) -> CameraPose:
     """Nearest camera, with z up, that sees all points (N, 3), m, in the direction `to_eye` (3,), which must not be vertical."""
     back = to_eye / np.linalg.norm(to_eye)
     right = np.cross([0.0, 0.0, 1.0], back)

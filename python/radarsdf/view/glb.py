@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Bytes, Floats32
 from radarsdf.io.glb import MATT, SRGB_TO_LINEAR, encode_glb
 
 # Colours as they are, like those of point clouds and legends.
@@ -24,25 +22,25 @@ _FIT = (0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081)
 _BITS = np.uint32(13)  # dropped mantissa bits, below the 256 levels of a screen: zeros compress better
 
 
-def glb(vertices: NDArray[Any], faces: NDArray[Any], colors: NDArray[np.uint8]) -> bytes:
+def glb(vertices: Array, faces: Array, colors: Bytes) -> bytes:
     """Encode vertices (V, 3), as float32, faces (F, 3) and sRGB colours (V, 3) as the bytes of a GLB file."""
     return encode_glb(vertices, faces, {"COLOR_0": light_to_show(colors)}, material=_UNLIT)
 
 
-def lightness_of(normals: NDArray[Any]) -> NDArray[np.float32]:
+def lightness_of(normals: Array) -> Floats32:
     """(V,) lightness factor, at most 1, for normals (V, 3), which makes the shape visible."""
     light = np.clip(np.asarray(normals, np.float64) @ _TO_LIGHT, 0.0, 1.0)
     return np.asarray(_SHADE + (1 - _SHADE) * light, np.float32)
 
 
-def shaded(colors: NDArray[np.uint8], lightness: NDArray[Any]) -> NDArray[np.uint8]:
+def shaded(colors: Bytes, lightness: Array) -> Bytes:
     """Scale the OKLab lightness and chroma of sRGB colours (V, 3) by factors (V,): both are cube roots of light."""
     light = SRGB_TO_LINEAR[colors] * np.asarray(lightness, np.float64)[:, None] ** 3
     srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.asarray(np.rint(255 * srgb), np.uint8)
 
 
-def light_to_show(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
+def light_to_show(colors: Bytes) -> Floats32:
     """(V, 3) linear colours of an unlit mesh that the page shows as these sRGB colours (V, 3): the inverse tone mapping."""
     a, b, c, d, e = _FIT
     y = SRGB_TO_LINEAR[colors] @ np.linalg.inv(_OUT).T

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Floats
 from radarsdf.changes.changes import COLORS, NAMES, Changes, Region, colors_of
 from radarsdf.checks import check
 from radarsdf.view.framing import framing_pose
@@ -41,9 +41,9 @@ class GrowingView(Page):
     def __init__(self, **address: Any) -> None:
         super().__init__(**address)
         self._start()
-        self._origin: NDArray[np.float64] | None = None
+        self._origin: Floats | None = None
 
-    def show(self, mesh: trimesh.Trimesh, path: NDArray[np.float64]) -> None:
+    def show(self, mesh: trimesh.Trimesh, path: Floats) -> None:
         """Show a mesh and the sensor positions (F, 3), world, m, instead of the previous ones."""
         if len(mesh.faces) == 0:
             return

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Bytes, Ints
 from radarsdf.map.colors import intensity_colors
 from radarsdf.map.map import Map
 from radarsdf.view.surface import ShownSurface
 
 Color = tuple[int, int, int]
 Position = tuple[float, float, float]
-_Rows = NDArray[np.int64]
 
 _SAMPLES = 30_000  # vertices from which the intensity limits are estimated
 
@@ -29,13 +27,13 @@ class Scale:
     high: float
 
     @classmethod
-    def of(cls, values: NDArray[Any]) -> Scale:
+    def of(cls, values: Array) -> Scale:
         """Build from the 2nd and the 98th percentile of values (N,)."""
         known = values[np.isfinite(values)]
         low, high = np.percentile(known, [2, 98]) if len(known) else (0.0, 1.0)
         return cls(float(low), float(high))
 
-    def __call__(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+    def __call__(self, values: Array) -> Bytes:
         """(N, 3) sRGB of values (N,)."""
         return intensity_colors(values, self.low, self.high)[:, :3]
 
@@ -50,11 +48,11 @@ class Quantity:
     """A scalar per vertex."""
 
     label: str  # name and unit
-    values: Callable[[_Rows, Position], NDArray[Any]]  # (N,) of vertices (N,), for a sensor at a position
+    values: Callable[[Ints, Position], Array]  # (N,) of vertices (N,), for a sensor at a position
     scale: Scale
     of_sensor: bool = False  # whether it depends on the sensor position
 
-    def colors(self, rows: _Rows, sensor: Position) -> NDArray[np.uint8]:
+    def colors(self, rows: Ints, sensor: Position) -> Bytes:
         """(N, 3) sRGB of vertices (N,)."""
         return self.scale(self.values(rows, sensor))
 
@@ -63,14 +61,14 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     """Quantities by name, the default first. The intensity scale is that for the first `sensor` position."""
     vertices, found = surface.vertices, {}
 
-    def intensity(rows: _Rows, sensor: Position) -> NDArray[Any]:
+    def intensity(rows: Ints, sensor: Position) -> Array:
         return np.asarray(radar_map.intensity(vertices[rows], np.array(sensor)))
 
     if radar_map.has_intensity:
         some = np.arange(0, len(vertices), max(1, len(vertices) // _SAMPLES))
         scale = Scale.of(intensity(some, sensor))
         found["intensity"] = Quantity("predicted intensity, sensor units", intensity, scale, of_sensor=True)
-    of_vertices: dict[str, tuple[str, NDArray[Any]]] = {
+    of_vertices: dict[str, tuple[str, Array]] = {
         "uncertainty": ("uncertainty (standard error), m", surface.uncertainty_m),
         "confidence": ("confidence (probability)", surface.confidence),
         "height": ("height, m", vertices[:, 2]),
@@ -81,7 +79,7 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     return found
 
 
-def _lookup(values: NDArray[Any]) -> Callable[[_Rows, Position], NDArray[Any]]:
+def _lookup(values: Array) -> Callable[[Ints, Position], Array]:
     return lambda rows, _: values[rows]
 
 

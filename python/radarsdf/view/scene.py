@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from radarsdf.arrays import Array, Bytes, Floats, Ints
 from radarsdf.map.colors import NEUTRAL
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
@@ -198,7 +198,7 @@ class Canvas:
                 self._cloud.visible = False
         self._shown(state)
 
-    def _colors(self, rows: NDArray[np.int64], state: State) -> NDArray[np.uint8]:
+    def _colors(self, rows: Ints, state: State) -> Bytes:
         colors = self._quantities[state.quantity].colors(rows, state.sensor)
         return shaded(colors, self._surface.lightness[rows])
 
@@ -246,7 +246,7 @@ class ScanClouds:
             text += f"; median error of the intensity {np.median(errors):.1f}" if errors.size else ""
         self._text.content = text
 
-    def _draw(self, what: str, world: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
+    def _draw(self, what: str, world: Floats, colors: Bytes) -> None:
         local = (world - self._map.origin).astype(np.float32)
         if what in self.nodes:
             self.nodes[what].points, self.nodes[what].colors = local, colors
@@ -256,7 +256,7 @@ class ScanClouds:
         self.nodes[what] = self._server.scene.add_point_cloud(f"/scans/{what}", local, colors, **options)
 
 
-def add_path(server: Any, name: str, path: NDArray[Any], color: tuple[int, int, int]) -> Any:
+def add_path(server: Any, name: str, path: Array, color: tuple[int, int, int]) -> Any:
     """Add a line through points (N, 3), m, to the scene."""
     path = path.astype(np.float32)
     segments = np.stack([path[:-1], path[1:]], axis=1)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from radarsdf._core import SurfaceTracer
+from radarsdf.arrays import Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check, whole_number
 from radarsdf.map.mesh import renumbered, with_all
 from radarsdf.map.threshold import Limits, Threshold
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
     from radarsdf.map.map import Map
 
-_Floats = NDArray[np.float64]
-_Rows = NDArray[np.int64]
 
 _MIN_VERTICES = 1000  # smallest max_vertices: fewer show nothing useful
 
@@ -30,11 +29,11 @@ _MIN_VERTICES = 1000  # smallest max_vertices: fewer show nothing useful
 class ShownSurface:
     """Triangles and the attributes of their vertices."""
 
-    vertices: _Floats  # (V, 3) world, m
-    faces: NDArray[np.int32]  # (F, 3) rows of vertices; normals point into free space
-    uncertainty_m: NDArray[np.float32]  # (V,)
-    confidence: NDArray[np.float32]  # (V,)
-    lightness: NDArray[np.float32]  # (V,) factor of colours
+    vertices: Floats  # (V, 3) world, m
+    faces: Ints32  # (F, 3) rows of vertices; normals point into free space
+    uncertainty_m: Floats32  # (V,)
+    confidence: Floats32  # (V,)
+    lightness: Floats32  # (V,) factor of colours
     threshold: Threshold  # confidence threshold of the mesh
     spacing_m: float  # spacing of vertices: the voxel edge, or more if the mesh was thinned
 
@@ -65,17 +64,17 @@ class ShownSurface:
             spacing_m,
         )
 
-    def kept(self, max_uncertainty_m: float, min_confidence: float) -> NDArray[np.bool_]:
+    def kept(self, max_uncertainty_m: float, min_confidence: float) -> Bools:
         """Return a mask (V,) of vertices within the limits."""
         return Limits(None, max_uncertainty_m, 0).met(min_confidence, self.confidence, self.uncertainty_m)
 
-    def part(self, kept: NDArray[np.bool_]) -> tuple[_Rows, NDArray[np.int32]]:
+    def part(self, kept: Bools) -> tuple[Ints, Ints32]:
         """Rows (N,) of the vertices of triangles with all vertices kept, and these triangles (M, 3) as indices of these rows."""
         used, faces = renumbered(len(kept), self.faces[with_all(kept, self.faces)])
         return np.flatnonzero(used), faces
 
 
-def spread_evenly(points: _Floats, count: int, edge_m: float) -> tuple[_Rows, _Rows, float]:
+def spread_evenly(points: Floats, count: int, edge_m: float) -> tuple[Ints, Ints, float]:
     """Choose at most `count` evenly spread points of (N, 3), m: the nearest to the mean of each cube of a grid.
 
     Returns the chosen rows (M,), the index in M that represents each point (N,), and the edge of the cubes, m. The search
@@ -121,8 +120,8 @@ def thinned(mesh: trimesh.Trimesh, max_vertices: int, edge_m: float) -> tuple[tr
 
 
 def first_hit(
-    vertices: _Floats, faces: NDArray[np.int32], ray_origin: ArrayLike, ray_direction: ArrayLike
-) -> _Floats | None:
+    vertices: Floats, faces: Ints32, ray_origin: ArrayLike, ray_direction: ArrayLike
+) -> Floats | None:
     """Point (3,) where a ray first hits a mesh, or None. The direction is of any length."""
     origin, direction = np.asarray(ray_origin, np.float64), np.asarray(ray_direction, np.float64)
     direction = direction / np.linalg.norm(direction)

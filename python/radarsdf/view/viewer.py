@@ -6,8 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from radarsdf.arrays import Floats
 from radarsdf.map.map import Map
 from radarsdf.scans import Scans
 from radarsdf.view.framing import FOV_RAD, CameraPose, framing_pose
@@ -72,7 +73,7 @@ class Viewer(Page):
         set_initial_camera(server, framing_pose(self._extent))
         x, y, z = (origin if scans is None else scans.poses[0, :3, 3]).tolist()
         self.quantities = quantities_of(radar_map, surface, (x, y, z))  # choices of the surface's colour
-        self._clicked: NDArray[np.float64] | None = None
+        self._clicked: Floats | None = None
         panel = self._add_controls()
         self._clouds = None if scans is None else self._add_scans(panel, scans)
         self._canvas = Canvas(server, radar_map, surface, self.quantities, self._clouds, self._describe)
@@ -179,7 +180,7 @@ class Viewer(Page):
 
         client.camera.on_update(on_update)
 
-    def _add_sensor(self, position: NDArray[np.float64]) -> None:
+    def _add_sensor(self, position: Floats) -> None:
         scale = _GIZMO_SHARE * float(np.linalg.norm(np.ptp(self._extent, axis=0)))
         self._gizmo = self._server.scene.add_transform_controls(
             "/sensor",
@@ -207,12 +208,7 @@ class Viewer(Page):
         away_m = float(np.linalg.norm(point - np.asarray(event.ray_origin)))
         radius_m = max(_MARK_SHARE * away_m, 0.5 * self.surface.spacing_m)
         self._server.scene.add_icosphere(
-            "/clicked",
-            radius_m,
-            _MARK_COLOR,
-            position=tuple(point),
-            cast_shadow=False,
-            receive_shadow=False,
+            "/clicked", radius_m, _MARK_COLOR, position=tuple(point), cast_shadow=False, receive_shadow=False
         )
         self._describe(self._painter.newest)
 
