@@ -30,13 +30,10 @@ _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the retu
 # ones, and across.
 _FREE_SCALE, _FREE_ACROSS = 0.15, 0.04
 _SCALES = np.geomspace(0.4, 2.5, 17)
-_BACK, _AHEAD = [0, 1, 2, 6, 7, 8], [5, 4, 3, 11, 10, 9]  # opposite shifts
 _SAME = len(_SCALES) // 2
 _SAME_TRACKED = 0.05  # relative difference of tracked steps and right Doppler: simulated scenes up to 0.02
-# Increase of log distances between scans of a sensor that moved. A stationary real one: up to 0.1.
-_PARTED = 0.15
 _SHIFTS_M = np.concatenate(
-    [np.outer([-4.0, -2.0, -1.0, 1.0, 2.0, 4.0], axis) for axis in ([1, 0, 0], [0, 1, 0])]
+    [np.outer([sign * 4.0, sign * 2.0, sign], axis) for sign in (1, -1) for axis in np.eye(3)[:2]]
 )
 # Ratio of the speeds by returns and by Doppler that the estimate may be wrong by: 1.06 for a sparse radar.
 _SAME_SCALE = 1.1
@@ -46,21 +43,18 @@ _MOST_LATE = 10  # scans
 _SAME_RESIDUALS = 1.25  # ratio of squared residuals up to which a delay does not matter
 _EVEN = 1e-3  # unevenness of times that does not matter, share of an interval
 _LEAST_STEP_M = 0.1  # minimum motion in a step that reveals its duration
-_LATER = 4  # of all pairs, the share between a scan and a much later one
 _MOSTLY = 0.8  # share of steps without motion by Doppler from which on returns must confirm it
 _LEAST_SEEN = 0.5  # share of a step's prior variance that the returns remove, if their difference counts
 _STILL_MPS = 0.1  # slower Doppler, in which compensation for ego motion leaves only noise, tells no direction
 
 
 @dataclass(frozen=True)
-class Contradiction:
-    """Window of scans in which Doppler and another source of motion exclude each other."""
+class OtherMotion:
+    """Motion in a window of scans that another source shows, or does not exclude, instead of that by Doppler."""
 
     first: int  # scan
     last: int
-    ratio: (
-        float | None
-    )  # of the speeds by the other source to those by Doppler. None: Doppler shows no motion
+    ratio: float | None  # of its speeds to those by Doppler. None: Doppler shows no motion
     confirmed: bool = True  # by the other source. Else this source observes neither motion nor its absence
 
     def words(self, source: str) -> str:
@@ -88,7 +82,7 @@ def _windows(count: int) -> Iterator[slice]:
 
 def contradiction(
     shown_m: Floats, doppler_m: Floats, variances_m2: Floats, scans: Ints
-) -> Contradiction | None:
+) -> OtherMotion | None:
     """Test displacements (K, 3) of steps by another source and by Doppler, with variances (K,) of a component of the latter.
 
     In each window, the mean difference along the longer ones is compared with its standard error (Student's t). `scans` (K + 1,):
@@ -117,7 +111,7 @@ def contradiction(
                 float((weights * np.einsum("ki,ki->k", moves, longer)).sum()) for moves in (doppler, shown)
             )
             ratio = by_other / by_doppler if abs(by_doppler) > 0.05 * abs(by_other) else None
-            worst, found = excess, Contradiction(int(scans[rows.start]), int(scans[rows.stop]), ratio)
+            worst, found = excess, OtherMotion(int(scans[rows.start]), int(scans[rows.stop]), ratio)
     return found
 
 
@@ -196,22 +190,13 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Window of scans in which the returns do not exclude another motion than that by Doppler."""
-
-    first: int  # scan
-    last: int
-    share: float | None  # largest relative difference of this motion. None: Doppler shows no motion
-
-
-@dataclass(frozen=True)
 class Consistency:
     """Comparison of a drive's Doppler with its returns."""
 
     delay: int = 0  # of the Doppler, scans, where one explains the returns significantly better
-    contradicted: Contradiction | None = None  # in a window
+    contradicted: OtherMotion | None = None  # in a window
     clock: Clock | None = None
-    doubts: tuple[Doubt, ...] | None = None  # None: too few scans with motion
+    doubts: tuple[OtherMotion, ...] | None = None  # not excluded. None: too few scans with motion
 
     @classmethod
     def of_returns(cls, drive: Drive, config: FitConfig, num_threads: int) -> Consistency:
@@ -230,39 +215,30 @@ class Consistency:
         tracker = Tracker(plane_cell_m(scans, config.leaf_size_m), config.returns, num_threads)
         yaws = drive.yaws if every == 1 else None
         tracked, _ = track_once(Drive(scans, times_s, free, None, yaws=yaws), tracker)
-        segments, counts = np.array(
-            [(found.segment, len(scan)) for found, scan in zip(tracked, scans, strict=True)]
-        ).T
-        usable = np.diff(_runs(times_s)) == 0
-        usable &= np.minimum(counts[1:], counts[:-1]) > 0
-        followed = (np.diff(segments) == 0) & usable
+        seen = np.array([len(scan) > 0 for scan in scans])
+        usable = (np.diff(_runs(times_s)) == 0) & seen[1:] & seen[:-1]
         if usable.sum() < _FEWEST_STEPS:
             return cls()
+        followed = usable & (np.diff([found.segment for found in tracked]) == 0)
         poses = np.stack([found.pose for found in tracked])
         motion = DopplerMotion.by(compared, times_s, poses)
+        own, shown, covariance = motion.steps[:, :3, 3], steps(poses)[:, :3, 3], _step_covariances(tracked)
+        along = np.where(followed, _relative_differences(shown, covariance, motion, free), np.nan)
         rows_of_pairs = np.flatnonzero(usable)  # also where tracking was lost: by wrong Doppler, it may be
         rows_of_pairs = rows_of_pairs[:: -(-len(rows_of_pairs) // _PAIRS)]
-        own, covariance = motion.steps[:, :3, 3], _step_covariances(tracked)
-        along = np.where(followed, _relative_differences(tracked, motion, free), np.nan)
-        pairs = _compared(scans, poses, motion, along, rows_of_pairs, None if yaws is None else yaws[1])
-        # The fastest steps: of slow ones, errors of the returns seem delays.
-        lengths_m, count = np.linalg.norm(own, axis=1) * usable, min(_DELAYED, len(usable))
-        begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
-        fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
-        shown = steps(poses)[:, :3, 3]
+        pairs = _Pairs.of(scans, motion, along, rows_of_pairs, None if yaws is None else yaws[1])
         delay = 0
         if every <= _MOST_LATE:
+            # The fastest steps: of slow ones, errors of the returns seem delays.
+            lengths_m, count = np.linalg.norm(own, axis=1) * usable, min(_DELAYED, len(usable))
+            begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
+            fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
             delay = delay_of(velocities, _runs(drive.times_s), rows, motion, shown, covariance, fastest)
-        observed = np.isfinite(along)
-        shown = np.where(observed[:, None], own * (1 + np.nan_to_num(along)[:, None]), own)
-        clock = Clock.of(times_s, shown, own, observed) if every == 1 else None
-        found, doubts = _judged(pairs)
-        at = rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)]
-        if found is not None:
-            found = dataclasses.replace(found, first=int(at[found.first]), last=int(at[found.last]))
-        doubted = tuple(Doubt(int(at[one.first]), int(at[one.last]), one.share) for one in doubts)
+        shown = own * (1 + np.nan_to_num(along)[:, None])
+        clock = Clock.of(times_s, shown, own, np.isfinite(along)) if every == 1 else None
+        found, doubts = _judged(pairs, rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)])
         known = found is not None or (~pairs.slow).sum() >= _FEWEST_STEPS
-        return cls(delay, found, clock, doubted if known else None)
+        return cls(delay, found, clock, doubts if known else None)
 
     def widened(self, poses: Floats, covariance: Floats, segments: Ints, drive: Drive) -> Floats:
         """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt."""
@@ -272,7 +248,8 @@ class Consistency:
         durations_s = np.diff(drive.times_s, prepend=drive.times_s[:1])[:, None]
         for doubt in self.doubts or ():
             inside = (scans > doubt.first) & (scans <= doubt.last)
-            speeds = doubt.share * velocities if doubt.share else np.median(velocities[moving], axis=0)
+            usual_mps = np.median(velocities[moving], axis=0)
+            speeds = usual_mps if doubt.ratio is None else (doubt.ratio - 1) * velocities
             steps_m = inside[:, None] * durations_s * np.einsum("...ij,...j->...i", poses[:, :3, :3], speeds)
             off_m = np.cumsum(steps_m, axis=0) / norm.ppf(1 - _BY_CHANCE)
             for segment in np.unique(segments):
@@ -299,14 +276,16 @@ class Consistency:
         return velocities, notes
 
 
-def _relative_differences(tracked: list[Tracked], motion: DopplerMotion, prior: SensorVelocities) -> Floats:
+def _relative_differences(
+    shown: Floats, covariance: Floats, motion: DopplerMotion, prior: SensorVelocities
+) -> Floats:
     """Return differences (F - 1,) of tracked steps from those by Doppler, relative to these; NaN where returns hardly observe them."""
-    poses = np.stack([found.pose for found in tracked])
-    own, shown = motion.steps[:, :3, 3], steps(poses)[:, :3, 3]
+    own = motion.steps[:, :3, 3]
     along = np.einsum("ki,ki->k", shown - own, own) / np.maximum((own**2).sum(axis=1), 1e-12)
-    priors = np.stack([prior.step_covariance(i, d) for i, d in enumerate(motion.durations_s.tolist())])
-    before = np.einsum("ki,kij,kj->k", own, priors, own)
-    left = np.einsum("ki,kij,kj->k", own, _step_covariances(tracked), own)
+    before, left = (
+        np.einsum("ki,kij,kj->k", own, each, own)
+        for each in (prior.step_covariances(motion.durations_s), covariance)
+    )
     seen = 1 - left / np.maximum(before, 1e-30)
     # Without the share of the prior.
     return np.where(seen > _LEAST_SEEN, along / np.maximum(seen, _LEAST_SEEN), np.nan)
@@ -319,167 +298,130 @@ def _step_covariances(tracked: list[Tracked]) -> Floats:
     return np.einsum("fji,fjk,fkl->fil", axes, of_steps, axes)
 
 
-def _compared(
-    scans: list[Floats],
-    poses: Floats,
-    motion: DopplerMotion,
-    along: Floats,
-    rows: Ints,
-    reversed_yaws: Floats | None,
-) -> _Pairs:
-    """Compare the returns of scans `rows` (K,) with those of the next ones, at the rotations of tracked poses.
-
-    `reversed_yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
-    """
-    scales, later = len(_SCALES), max(len(rows) // _LATER, 2)
-    gains, losses, moved, parted = [], [], [], np.full(len(rows), np.nan)
-    speeds_mps = np.linalg.norm(motion.velocities.mean_mps, axis=1)
-    slow = speeds_mps[rows] < _STILL_MPS
-    for k, i in enumerate(rows.tolist()):
-        step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
-        shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])
-        turns = [motion.steps[i, :3, :3]]
-        if reversed_yaws is not None and np.isfinite(reversed_yaws[i]):
-            turns.append(rotation(np.array([0.0, 0.0, reversed_yaws[i]])))
-        apart = np.min([log_distances(scans[i], scans[i + 1] @ turn.T, shifts_m) for turn in turns], axis=0)
-        ahead, back, still, shifted = np.split(apart, [scales, 2 * scales, 2 * scales + 1])
-        gains.append(back - ahead)
-        losses.append(shifted - still)
-        moved.append(still[0] - ahead[_SAME])
-        if slow[k : k + later + 1].all() and k + later < len(rows):
-            turn = poses[i, :3, :3].T @ poses[rows[k + later], :3, :3]
-            second = scans[rows[k + later]] @ turn.T
-            parted[k] = log_distances(scans[i], second, np.zeros((1, 3)))[0] - still[0]
-    return _Pairs(np.array(gains), np.array(losses), np.array(moved), parted, along[rows], slow)
-
-
 @dataclass(frozen=True)
 class _Pairs:
     """K pairs of scans, and how well their returns agree with hypotheses of the motion between them."""
 
-    gains: (
-        Floats  # (K, S) how much nearer returns are after scales of the Doppler's step than after the reverse
-    )
-    losses: Floats  # (K, T) how much nearer they are without a step than after shifts
+    # (K, S) how much nearer returns are after scales of the Doppler's step than after the reverse.
+    gains: Floats
+    # (K, T) how much nearer they are without a step than after shifts, of which the second half is opposite to the first.
+    losses: Floats
     moved: Floats  # (K,) how much nearer they are after the Doppler's step than without one
-    parted: Floats  # (K,) how much farther, without steps, they are from those of a scan much later. NaN at the end
     along: Floats  # (K,) relative differences of tracked steps and Doppler. NaN where returns hardly observe them
     slow: Bools  # (K,) whether there is no motion by Doppler
-    level: float = _BY_CHANCE  # significance level of a test
 
-    def select(self, rows: slice | Bools, level: float) -> _Pairs:
-        """Select pairs, to test at a level."""
-        gains, losses, moved, parted, along = (
-            column[rows] for column in (self.gains, self.losses, self.moved, self.parted, self.along)
-        )
-        return _Pairs(gains, losses, moved, parted, along, self.slow[rows], level)
+    @classmethod
+    def of(
+        cls,
+        scans: list[Floats],
+        motion: DopplerMotion,
+        along: Floats,
+        rows: Ints,
+        reversed_yaws: Floats | None,
+    ) -> _Pairs:
+        """Compare the returns of scans `rows` (K,) with those of the next ones, at the rotations of tracked poses.
+
+        `reversed_yaws` (F - 1,): those with which returns agree best after the reverse of the steps.
+        """
+        scales = len(_SCALES)
+        gains, losses, moved = [], [], []
+        for i in rows.tolist():
+            step_m = np.multiply.outer(_SCALES, motion.steps[i, :3, 3])
+            shifts_m = np.concatenate([step_m, -step_m, np.zeros((1, 3)), _SHIFTS_M])
+            turns = [motion.steps[i, :3, :3]]
+            if reversed_yaws is not None and np.isfinite(reversed_yaws[i]):
+                turns.append(rotation(np.array([0.0, 0.0, reversed_yaws[i]])))
+            apart = np.min(
+                [log_distances(scans[i], scans[i + 1] @ turn.T, shifts_m) for turn in turns], axis=0
+            )
+            ahead, back, still, shifted = np.split(apart, [scales, 2 * scales, 2 * scales + 1])
+            gains.append(back - ahead)
+            losses.append(shifted - still)
+            moved.append(still[0] - ahead[_SAME])
+        slow = np.linalg.norm(motion.velocities.mean_mps[rows], axis=1) < _STILL_MPS
+        return cls(np.array(gains), np.array(losses), np.array(moved), along[rows], slow)
+
+    def select(self, rows: slice | Bools) -> _Pairs:
+        """Select pairs."""
+        return _Pairs(*(column[rows] for column in vars(self).values()))
 
     def __len__(self) -> int:
         return len(self.slow)
 
-    def needed(self, samples: Floats, tests: int = 1) -> float:
-        """Return the least significant t value of samples (K, ...), the largest of some tests."""
-        return float(student.ppf(1 - self.level / tests, len(samples) - 1))
-
-    @property
-    def tracked(self) -> tuple[float, float]:
-        """Mean relative difference of tracked steps, and its confidence limits. Infinite ones if too few are known."""
+    def tracked(self, level: float) -> tuple[float, float]:
+        """Return the mean relative difference of tracked steps, and its confidence limits. Infinite ones if too few are known."""
         shares = self.along[np.isfinite(self.along)]
         if len(shares) < _FEWEST_STEPS:
             return 0.0, np.inf
-        return float(shares.mean()), float(self.needed(shares) * shares.std(ddof=1) / np.sqrt(len(shares)))
+        error = shares.std(ddof=1) / np.sqrt(len(shares))
+        return float(shares.mean()), float(student.ppf(1 - level, len(shares) - 1) * error)
+
+    def others(self, level: float) -> Iterator[tuple[float, float]]:
+        """Yield the evidence of other motions than that by Doppler, significant above 1, and the ratios of their speeds to its."""
+        yield -float(_significance(self.gains[:, _SAME], level)), -1.0
+        share, limit = self.tracked(level)
+        means = self.gains.mean(axis=0)
+        best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
+        # Of a radar that is too narrow, gains increase up to the end of the scales.
+        if best not in (here, 0, len(_SCALES) - 1) and abs(share) + limit >= _SAME_SCALE - 1:
+            loss = self.gains[:, best] - self.gains[:, here]
+            yield float(_significance(loss, level / len(_SCALES))), float(_SCALES[best])
+        # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
+        other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
+        gains = self.gains[np.isfinite(self.along)]
+        if other == _SAME or (len(gains) >= _FEWEST_STEPS and (gains[:, other] - gains[:, _SAME]).mean() > 0):
+            yield (abs(share) - _SAME_TRACKED) / max(limit, 1e-9), 1 + share
 
     @property
-    def doubt(self) -> float:
-        """Largest relative difference of the Doppler from a motion that the returns do not exclude."""
+    def farthest(self) -> float:
+        """Ratio of speeds to those by Doppler of the most different motion that the returns do not exclude."""
         own = self.gains[:, _SAME]
-        if _t_values(own) < self.needed(own):
-            return 2.0  # of the reverse
-        losses = own[:, None] - self.gains
-        possible = _SCALES[_t_values(losses) <= self.needed(losses)]
-        share, limit = self.tracked
-        return min(float(np.abs(possible - 1).max(initial=0)), abs(share) + limit)
+        if _significance(own, _BY_CHANCE) < 1:
+            return -1.0
+        possible = _SCALES[_significance(own[:, None] - self.gains, _BY_CHANCE) <= 1]
+        share, limit = self.tracked(_BY_CHANCE)
+        return 1 + min(float(np.abs(possible - 1).max(initial=0)), abs(share) + limit)
 
 
-# What a test of pairs finds: its t value, over the least significant one, and the ratio of the speeds.
-_Found = tuple[float, float | None]
-
-
-def _motion_unseen_by_doppler(still: _Pairs) -> _Found:
-    """Test pairs without motion by Doppler: opposite shifts agree differently, or later scans agree less and less."""
-    asymmetry = float(np.abs(_t_values(still.losses[:, _BACK] - still.losses[:, _AHEAD])).max())
-    parted = still.parted[np.isfinite(still.parted)]
-    excess = asymmetry / still.needed(still.losses, still.losses.shape[1])
-    if len(parted) >= _FEWEST_STEPS and parted.mean() > _PARTED:
-        excess = max(excess, float(_t_values(parted)) / still.needed(parted))
-    return excess, None
-
-
-def _reverse(moving: _Pairs) -> _Found:
-    own = moving.gains[:, _SAME]
-    return -float(_t_values(own)) / moving.needed(own), -1.0
-
-
-def _scale_by_gains(moving: _Pairs) -> _Found:
-    means = moving.gains.mean(axis=0)
-    best, here = int(means.argmax()), _SAME - 1 + int(means[_SAME - 1 : _SAME + 2].argmax())
-    share, limit = moving.tracked
-    # Of a radar that is too narrow, gains increase up to the end of the scales.
-    if best in (here, 0, len(_SCALES) - 1) or abs(share) + limit < _SAME_SCALE - 1:
-        return 0.0, 1.0
-    loss = moving.gains[:, best] - moving.gains[:, here]
-    return float(_t_values(loss)) / moving.needed(loss, len(_SCALES)), float(_SCALES[best])
-
-
-def _scale_by_steps(moving: _Pairs) -> _Found:
-    share, limit = moving.tracked
-    excess = (abs(share) - _SAME_TRACKED) / max(limit, 1e-9)
-    # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
-    other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
-    gains = moving.gains[np.isfinite(moving.along)]
-    confirmed = other == _SAME or (
-        len(gains) >= _FEWEST_STEPS and _t_values(gains[:, other] - gains[:, _SAME]) > 0
-    )
-    return (excess if confirmed else 0.0), 1 + share
-
-
-def _judged(pairs: _Pairs) -> tuple[Contradiction | None, list[Doubt]]:
-    """Judge Doppler by window of pairs: return the clearest contradiction, and windows with their doubt."""
+def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[OtherMotion, ...]]:
+    """Judge Doppler by window of pairs, between scans (K + 1,): return the clearest contradiction, and motions not excluded."""
     tried = list(_windows(len(pairs)))
-    found = list[tuple[bool, float, Contradiction]]()
-    doubts = list[Doubt]()
+    level = _BY_CHANCE / len(tried)
+    contradictions, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
     # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
-    moving = pairs.select(~pairs.slow, _BY_CHANCE)
-    pattern_moves = len(moving) >= _FEWEST_STEPS and _t_values(moving.moved) < moving.needed(moving.moved)
+    moving = pairs.select(~pairs.slow)
+    pattern_moves = len(moving) >= _FEWEST_STEPS and _significance(moving.moved, _BY_CHANCE) < 1
     for rows in tried:
-        window = pairs.select(rows, _BY_CHANCE / len(tried))
-        answers = list[tuple[float, float | None, bool]]()
-        still, moving = window.select(window.slow, window.level), window.select(~window.slow, window.level)
+        window, first, last = pairs.select(rows), int(scans[rows.start]), int(scans[rows.stop])
+        still, moving = window.select(window.slow), window.select(~window.slow)
+        found = list[tuple[bool, float, float | None]]()
         if len(still) >= max(_FEWEST_STEPS, _MOSTLY * len(window)):
             if pattern_moves:
-                doubts.append(Doubt(rows.start, rows.stop, None))
-            answers = [(*_motion_unseen_by_doppler(still), True)]
+                doubts.append(OtherMotion(first, last, None, confirmed=False))
+            # Opposite shifts of a stationary sensor agree equally.
+            losses, of_each = still.losses, level / len(_SHIFTS_M)
+            opposite = np.subtract(*np.split(losses, 2, axis=1))
+            found.append((True, float(np.abs(_significance(opposite, of_each)).max()), None))
             # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
             if 2 * len(window) >= len(pairs) - 1:
-                needed = still.needed(still.losses, still.losses.shape[1])
-                answers.append((2 - float(_t_values(still.losses).min()) / needed, None, False))
+                found.append((False, 2 - float(_significance(losses, of_each).min()), None))
         if len(moving) >= _FEWEST_STEPS:
-            answers += [(*test(moving), True) for test in (_reverse, _scale_by_gains, _scale_by_steps)]
-            doubt = moving.select(slice(None), _BY_CHANCE).doubt
-            if doubt > _MEASURED:
-                doubts.append(Doubt(rows.start, rows.stop, doubt))
-        found += [
-            (confirmed, excess, Contradiction(rows.start, rows.stop, ratio, confirmed))
-            for excess, ratio, confirmed in answers
-            if excess > 1
+            found += [(True, *other) for other in moving.others(level)]
+            if abs(moving.farthest - 1) > _MEASURED:
+                doubts.append(OtherMotion(first, last, moving.farthest, confirmed=False))
+        contradictions += [
+            (confirmed, evidence, OtherMotion(first, last, ratio, confirmed))
+            for confirmed, evidence, ratio in found
+            if evidence > 1
         ]
-    return (max(found, key=lambda one: one[:2])[2] if found else None), doubts
+    clearest = max(contradictions, key=lambda one: one[:2])[2] if contradictions else None
+    return clearest, tuple(doubts)
 
 
-def _t_values(samples: Floats) -> Floats:
-    """Return the means over K samples (K, ...) in standard errors."""
+def _significance(samples: Floats, level: float) -> Floats:
+    """Return the means of K samples (K, ...) over the least that is significant at a level (Student's t)."""
     errors = samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
-    return samples.mean(axis=0) / np.maximum(errors, 1e-9)
+    return samples.mean(axis=0) / np.maximum(errors, 1e-9) / student.ppf(1 - level, len(samples) - 1)
 
 
 def delay_of(
@@ -496,9 +438,7 @@ def delay_of(
     `velocities` and `runs`: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of `shown`.
     """
     # The steps by delayed Doppler explain the residuals of those by its own (J test, Davidson and MacKinnon 1981).
-    covariance = covariance + [
-        motion.velocities.step_covariance(i, d) for i, d in enumerate(motion.durations_s.tolist())
-    ]
+    covariance = covariance + motion.velocities.step_covariances(motion.durations_s)
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     own = motion.steps[:, :3, 3]
     found, last = [(np.inf, 0)], len(velocities.mean_mps) - 1

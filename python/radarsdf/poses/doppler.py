@@ -118,6 +118,10 @@ class SensorVelocities:
             between = between + 2 * self.clock_sigma_s**2 * np.outer(self.mean_mps[i], self.mean_mps[i])
         return between
 
+    def step_covariances(self, durations_s: Floats) -> Floats:
+        """Return the covariances (F - 1, 3, 3) of all steps, m²."""
+        return np.stack([self.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
+
 
 def radial_offset_mps(
     scans: Sequence[Floats], doppler_mps: Sequence[Array], velocities: SensorVelocities
@@ -184,7 +188,7 @@ class DopplerMotion(KnownMotion):
         """Build from times (F,) and approximate poses (F, 4, 4) of scans. `turns` None: those of the poses."""
         durations_s = np.diff(times_s)
         turns = step_vectors(poses)[:, 3:] if turns is None else turns
-        ways = np.stack([velocities.step_covariance(i, d) for i, d in enumerate(durations_s.tolist())])
+        ways = velocities.step_covariances(durations_s)
         shares = np.full((len(durations_s), 6), np.inf)
         shares[:, :3] = np.maximum(np.einsum("fii->fi", ways), _LEAST_STEP_M**2)
         spans = spans_of(times_s, len(times_s))
