@@ -13,7 +13,7 @@ from scipy.stats import t as student
 
 from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.doppler import ERRORS, NOT_USED, DopplerMotion, SensorVelocities, log_distances
+from radarsdf.poses.doppler import ERRORS, LEAST_M, NOT_USED, DopplerMotion, SensorVelocities, log_distances
 from radarsdf.poses.drive import Drive, track_once
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation, steps
@@ -398,10 +398,14 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
         if len(still) >= max(_FEWEST_STEPS, _MOSTLY * len(window)):
             if pattern_moves:
                 doubts.append(OtherMotion(first, last, None, confirmed=False))
-            # Opposite shifts of a stationary sensor agree equally.
             losses, of_each = still.losses, level / len(_SHIFTS_M)
             opposite = np.subtract(*np.split(losses, 2, axis=1))
-            found.append((True, float(np.abs(_significance(opposite, of_each)).max()), None))
+            # After a motion d, log distances after opposite shifts s differ by log((s + d) / (s - d)), about 2 d / s.
+            moved_m = (
+                np.abs(opposite.mean(axis=0)) * np.linalg.norm(_SHIFTS_M[: opposite.shape[1]], axis=1) / 2
+            )
+            evidence = np.where(moved_m > LEAST_M, np.abs(_significance(opposite, of_each)), 0.0)
+            found.append((True, float(evidence.max()), None))
             # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
             if 2 * len(window) >= len(pairs) - 1:
                 found.append((False, 2 - float(_significance(losses, of_each).min()), None))
@@ -410,9 +414,9 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             if abs(moving.farthest - 1) > _MEASURED:
                 doubts.append(OtherMotion(first, last, moving.farthest, confirmed=False))
         contradictions += [
-            (confirmed, evidence, OtherMotion(first, last, ratio, confirmed))
-            for confirmed, evidence, ratio in found
-            if evidence > 1
+            (confirmed, excess, OtherMotion(first, last, ratio, confirmed))
+            for confirmed, excess, ratio in found
+            if excess > 1
         ]
     clearest = max(contradictions, key=lambda one: one[:2])[2] if contradictions else None
     return clearest, tuple(doubts)

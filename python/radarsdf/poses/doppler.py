@@ -26,7 +26,8 @@ _TURNS_RAD = YAW_STEP_RAD * np.arange(-6, 7)
 _TURNS, _HALF_TURNS = (rotation(np.multiply.outer(share * _TURNS_RAD, [0.0, 0.0, 1.0])) for share in (1, 0.5))
 CLEAR = 4.0
 """Standard errors by which scans must agree better with one sign of the Doppler."""
-_LEAST_M = 0.05  # minimum distance between returns that counts, below the noise of any radar
+LEAST_M = 0.05
+"""Minimum distance between returns that counts, m, below the noise of any radar."""
 ERRORS = 3.0
 """Standard errors of a significant difference."""
 # Measured (Astyx drives): the error of a velocity exceeds that of independent returns, as does one from
@@ -223,7 +224,7 @@ class _Pair:
         first, second = self._sampled
         of_second = self._trees[0].query(second @ turn.T + shifts_m[:, None])[0]
         of_first = self._trees[1].query((first - shifts_m[:, None]) @ turn)[0]
-        return np.log(np.maximum(np.concatenate([of_second, of_first], axis=1), _LEAST_M))
+        return np.log(np.maximum(np.concatenate([of_second, of_first], axis=1), LEAST_M))
 
 
 def log_distances(first: Floats, second: Floats, shifts_m: Floats) -> Floats:
