@@ -37,7 +37,7 @@ class Agreement:
 
         `T_j_i` (H, P, 4, 4): isometries, proper or improper, from the frame of scan i to that of scan j.
         """
-        back = inverse(T_j_i)
+        back = np.asarray(np.linalg.inv(T_j_i), np.float64)
         found = np.zeros(T_j_i.shape[:2])
         for p, (i, j) in enumerate(pairs.tolist()):
             found[:, p] = 0.5 * (self._one_way(i, j, T_j_i[:, p]) + self._one_way(j, i, back[:, p]))
@@ -125,16 +125,6 @@ def relative(T_world_sensor: Floats, pairs: Ints) -> Floats:
     return between(T_world_sensor[pairs[:, 1]], T_world_sensor[pairs[:, 0]])
 
 
-def inverse(T_a_b: Floats) -> Floats:
-    """Invert isometries (…, 4, 4)."""
-    found = np.zeros_like(T_a_b)
-    transposed = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
-    found[..., :3, :3] = transposed
-    found[..., :3, 3] = -np.einsum("...ab,...b->...a", transposed, T_a_b[..., :3, 3])
-    found[..., 3, 3] = 1
-    return found
-
-
 _UNITS = {1e-3: "1/1000", 1e-2: "1/100", 0.3048: "0.3048", 1 / 0.3048: "1/0.3048", 1e2: "100", 1e3: "1000"}
 # Of radar axes (x forward, y left, z up) in a camera frame (x right, y down, z forward).
 _CAMERA_OF_RADAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -175,7 +165,11 @@ def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) ->
 
     still = np.tile(np.eye(4), (len(pairs), 1, 1))
     found = [
-        Hypothesis("poses_inverted", "the poses are inverted", relative(inverse(poses), pairs)),
+        Hypothesis(
+            "poses_inverted",
+            "the poses are inverted",
+            relative(np.asarray(np.linalg.inv(poses), np.float64), pairs),
+        ),
         Hypothesis("points_in_world_frame", "the points are in the world frame already", still),
     ]
     rotations_by_90 = Rotation.create_group("O").as_matrix().round()

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Array, Floats, Ints
 from radarsdf.checking.recording import Finding, ascending_times_s, some_scans
 from radarsdf.poses.consistency import contradiction, of_poses
 from radarsdf.poses.doppler import LEAST_MPS, NoVelocityError, SensorVelocities, radial_offset_mps
+from radarsdf.poses.rigid import rotation, step_vectors
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
 from radarsdf.scans import Scans
 
@@ -141,9 +141,6 @@ def _contradiction(words: str) -> Finding:
 
 def velocity_of_poses(T_world_sensor: Floats, times_s: Floats) -> Floats:
     """(F, 3) velocities of the sensor in its own frame at the poses (F, 4, 4), m/s, from central differences."""
-    rotations = Rotation.from_matrix(T_world_sensor[:, :3, :3])
-    half = rotations[:-1] * Rotation.from_rotvec((rotations[:-1].inv() * rotations[1:]).as_rotvec() / 2)
-    steps = np.diff(T_world_sensor[:, :3, 3], axis=0) / np.diff(times_s)[:, None]
-    between = half.inv().apply(steps)
-    found = np.concatenate([between[:1], (between[1:] + between[:-1]) / 2, between[-1:]])
-    return np.asarray(found, np.float64)
+    moves = step_vectors(T_world_sensor)
+    between = np.einsum("fji,fj->fi", rotation(moves[:, 3:] / 2), moves[:, :3]) / np.diff(times_s)[:, None]
+    return np.concatenate([between[:1], (between[1:] + between[:-1]) / 2, between[-1:]])

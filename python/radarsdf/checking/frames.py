@@ -19,7 +19,6 @@ from radarsdf.checking.agreement import (
     Hypothesis,
     choose_pairs,
     hypotheses,
-    inverse,
     pairs_apart,
     relative,
 )
@@ -84,7 +83,7 @@ def check_frames(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
     guesses = hypotheses(poses, pairs, all_axes=effort.all_axes)
     motions = relative(poses, pairs)
     scores = agreement.scores(
-        pairs, np.stack([motions, *(guess.T_j_i for guess in guesses), inverse(motions)])
+        pairs, np.stack([motions, *(guess.T_j_i for guess in guesses), relative(poses, pairs[:, ::-1])])
     )
     forwards = Comparison.of(scores[-1], scores[:1])
     in_world = not (forwards.gains[0] > _FORWARDS_GAIN and forwards.significance[0] > _MIN_SIGNIFICANCE)

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checking.agreement import MIN_RETURNS, Agreement, Comparison, relative
@@ -14,7 +13,7 @@ from radarsdf.checking.frames import FULL, Effort
 from radarsdf.checking.recording import Finding, ascending_times_s, some_points
 from radarsdf.checks import are_rigid
 from radarsdf.poses.checked_scans import median_range_m
-from radarsdf.poses.rigid import step_vectors, steps
+from radarsdf.poses.rigid import step_vectors, transform
 from radarsdf.scans import Scans
 
 # No imaging radar has most of its returns beyond the first two ranges, or within the third, at its own housing.
@@ -125,7 +124,7 @@ def check_jumps(recording: Scans, numbers: Ints, effort: Effort = FULL) -> Itera
         return
     durations = np.ones(count - 1) if times is None else np.diff(times)
     # Rotations count as the displacement of returns at a typical range.
-    motions, moved = steps(recording.poses), step_vectors(recording.poses)
+    moved = step_vectors(recording.poses)
     lever_m = np.repeat([1.0, median_range_m(some_points(recording))], 3)
     vectors = moved * lever_m / durations[:, None]
     changes = np.zeros(len(vectors))
@@ -141,7 +140,7 @@ def check_jumps(recording: Scans, numbers: Ints, effort: Effort = FULL) -> Itera
         if changes[k] * durations[k] > _LEAST_JUMP * agreement.spacing_m(k)
     ]
     suspects = sorted(sorted(suspects, key=lambda k: -changes[k])[:_JUMPS_TRIED])
-    confirmed = [k for k in suspects if _agree_without(recording, agreement, k, suspects, motions, durations)]
+    confirmed = [k for k in suspects if _agree_without(recording, agreement, k, suspects, moved, durations)]
     if confirmed:
         worst = max(confirmed, key=lambda k: changes[k])
         step_m, turn_deg = np.linalg.norm(moved[worst, :3]), np.degrees(np.linalg.norm(moved[worst, 3:]))
@@ -153,22 +152,20 @@ def check_jumps(recording: Scans, numbers: Ints, effort: Effort = FULL) -> Itera
 
 
 def _agree_without(
-    recording: Scans, agreement: Agreement, jump: int, suspects: list[int], motions: Floats, durations: Floats
+    recording: Scans, agreement: Agreement, jump: int, suspects: list[int], moved: Floats, durations: Floats
 ) -> bool:
     """Whether the scans near a step agree clearly better if it is replaced by the motion of the neighbouring steps."""
     # If that repairs the poses, the scans then agree about as well as those next to the step. Without this condition,
     # scans that observe different things would agree better wherever the replaced motion makes their fields of view overlap.
     poses = recording.poses
-    near = [k for k in range(jump - _NEAR, jump + 1 + _NEAR) if 0 <= k < len(motions) and k not in suspects]
+    near = [k for k in range(jump - _NEAR, jump + 1 + _NEAR) if 0 <= k < len(moved) and k not in suspects]
     if not near:
         return False
-    replaced = motions.copy()
+    replaced = transform(moved[:, 3:], moved[:, :3])
     for k in {jump, *(s for s in suspects if abs(s - jump) <= 1)}:
         nearest = min(near, key=lambda n: abs(n - k))
         factor = durations[k] / durations[nearest]
-        vector = Rotation.from_matrix(motions[nearest, :3, :3]).as_rotvec()
-        replaced[k, :3, :3] = Rotation.from_rotvec(factor * vector).as_matrix()
-        replaced[k, :3, 3] = factor * motions[nearest, :3, 3]
+        replaced[k] = transform(factor * moved[nearest, 3:], factor * moved[nearest, :3])
     scans = [i for i in range(jump - _NEAR + 1, jump + _NEAR + 1) if 0 <= i < len(poses)]
     scans = [i for i in scans if len(recording.points[i]) >= MIN_RETURNS]
     pairs = [(i, j) for i in scans for j in scans if i < j]

@@ -123,15 +123,14 @@ def of_poses(velocities: SensorVelocities, times_s: Floats, poses: Floats) -> tu
     shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
     clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
     times_s = times_s - clock.errors_s
-    motion, rows = DopplerMotion.by(velocities, times_s, poses), np.arange(len(times_s))
-    variance_m2 = _unevenness_m2(shown)
-    scans = np.append(np.flatnonzero(known), np.flatnonzero(known)[-1:] + 1)
-    variances = motion.shares[known, :3].mean(axis=1)
-    found = contradiction(shown[known], motion.steps[known, :3, 3], variances, scans)
+    motion, scans = DopplerMotion.by(velocities, times_s, poses), np.arange(len(times_s))
+    ends = np.append(scans[:-1][known], scans[1:][known][-1:])
+    variances_m2 = motion.shares[known, :3].mean(axis=1)
+    found = contradiction(shown[known], motion.steps[known, :3, 3], variances_m2, ends)
     if found is not None:
         return found.words("the poses"), clock
-    covariance = np.tile(variance_m2 * np.eye(3), (len(shown), 1, 1))
-    delay = delay_of(velocities, _runs(times_s), rows, motion, shown, covariance, known)
+    covariance = np.tile(_unevenness_m2(shown) * np.eye(3), (len(shown), 1, 1))
+    delay = delay_of(velocities, _runs(times_s), scans, motion, shown, covariance, known)
     return (_delayed("the poses", delay) if delay else None), clock
 
 
@@ -179,13 +178,11 @@ class Clock:
     def note(self) -> list[str]:
         """Note on errors that are corrected, or undecided."""
         if self.errors_s.any():
-            return [
-                f"Assumed: scans are evenly spaced in time; their times deviate by {1e3 * self.errors_s.std():.1f} ms, speeds do not."
-            ]
+            deviate = f"their times deviate by {1e3 * self.errors_s.std():.1f} ms, speeds do not"
+            return [f"Assumed: scans are evenly spaced in time; {deviate}."]
         if self.sigma_s:
-            return [
-                f"Assumed: times are wrong by {1e3 * self.sigma_s:.1f} ms, by which they are uneven; speeds cannot decide."
-            ]
+            wrong = f"times are wrong by {1e3 * self.sigma_s:.1f} ms, by which they are uneven"
+            return [f"Assumed: {wrong}; speeds cannot decide."]
         return []
 
 
@@ -248,8 +245,10 @@ class Consistency:
         durations_s = np.diff(drive.times_s, prepend=drive.times_s[:1])[:, None]
         for doubt in self.doubts or ():
             inside = (scans > doubt.first) & (scans <= doubt.last)
-            usual_mps = np.median(velocities[moving], axis=0)
-            speeds = usual_mps if doubt.ratio is None else (doubt.ratio - 1) * velocities
+            if doubt.ratio is None:
+                speeds = np.median(velocities[moving], axis=0)
+            else:
+                speeds = (doubt.ratio - 1) * velocities
             steps_m = inside[:, None] * durations_s * np.einsum("...ij,...j->...i", poses[:, :3, :3], speeds)
             off_m = np.cumsum(steps_m, axis=0) / norm.ppf(1 - _BY_CHANCE)
             for segment in np.unique(segments):
@@ -267,13 +266,12 @@ class Consistency:
         if self.doubts is None:
             velocities = dataclasses.replace(velocities, common_sigma=_UNKNOWN_SCALE)
             return velocities, ["Assumed: the Doppler is in m/s; too few scans with motion decide its scale."]
-        notes = []
-        if self.doubts:
-            scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
-            notes = [
-                f"Assumed: the Doppler is right; the returns of the scans {scans} do not decide its scale."
-            ]
-        return velocities, notes
+        if not self.doubts:
+            return velocities, []
+        scans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in self.doubts)
+        return velocities, [
+            f"Assumed: the Doppler is right; the returns of the scans {scans} do not decide its scale."
+        ]
 
 
 def _relative_differences(
@@ -453,9 +451,8 @@ def delay_of(
         if (count := int(used.sum())) < _FEWEST_STEPS:
             continue
         delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[at])
-        later = (
-            dataclasses.replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3]).steps[:, :3, 3]
-        )
+        turned = dataclasses.replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
+        later = turned.steps[:, :3, 3]
         scaled, left, change = (
             np.einsum("fij,fj->fi", whitening, moves)[used] for moves in (own, shown - own, later - own)
         )
