@@ -137,7 +137,6 @@ class _PeriodicView:
             self._thread.start()
 
     def show(self, poses: list[NDArray[np.float64]]) -> None:
-        """Show the current surface and the trajectory of these poses."""
         with self._lock:
             self._page.show(self._map.mesh(), np.array(poses)[:, :3, 3])
 

@@ -59,7 +59,6 @@ class Results:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value to types of JSON."""
     if hasattr(value, "tolist"):  # an array or a number of NumPy
         value = value.tolist()
     if isinstance(value, dict):

@@ -80,7 +80,6 @@ def _check_where(given: Namespace) -> None:
 
 
 def _executor(given: Namespace) -> AbstractContextManager[Executor | None]:
-    """Executor of the tasks. None: this process."""
     _check_where(given)
     if given.cluster is not None:
         memory_bytes = max(tile.memory_bytes for tile in Plan.load(given.folder).tiles)

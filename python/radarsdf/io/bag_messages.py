@@ -178,7 +178,6 @@ def _ars548(returns: Columns, invalid: Bools) -> Columns:
 
 
 def _pose(message: Any) -> Pose:
-    """Pose of a stamped message with a pose, with or without a covariance, or with a transform."""
     if hasattr(message, "transform"):
         position, rotation = message.transform.translation, message.transform.rotation
     else:

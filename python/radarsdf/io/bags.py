@@ -129,7 +129,6 @@ def _is_radar(topic: Topic) -> bool:
 
 
 def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
-    """Read the first messages of a topic."""
     with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
         peeked = list(itertools.islice(messages, _PEEKED_SCANS))
     check(peeked, f"{paths[0]}: {topic.name} has no messages that can be read{request.notes.ending()}")

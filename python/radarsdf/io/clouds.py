@@ -222,7 +222,6 @@ def has_faces(path: Path) -> bool:
 
 
 def _ply(path: Path, _: GivenColumns) -> Columns:
-    """Read the columns of the vertices."""
     import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
     # Without materials: a PLY file may name an image, which must not be opened.

@@ -117,7 +117,6 @@ _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
 
 
 def _snail_radar(folder: Path, request: Request) -> Scans:
-    """Read a sequence, such as ``data3``."""
     points = next(folder / radar for radar in _SNAIL_RADARS if (folder / radar).is_dir())
     if request.poses is None:
         path = folder / "utm50r_T_xt32.txt"

@@ -104,7 +104,6 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
-    """Permissions of the file to be replaced; None if there is none."""
     if not target.exists():
         return None
     mode = target.stat().st_mode

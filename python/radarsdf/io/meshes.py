@@ -155,7 +155,6 @@ def _glb(mesh: trimesh.Trimesh) -> bytes:
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:
-    """Encode as binary little-endian PLY with vertices in double precision."""
     scalars, colors = _scalars_and_colors(mesh)
     columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True)) | scalars
     if colors is not None:

@@ -267,7 +267,6 @@ def _pose_columns(table: Table) -> Columns:
 
 
 def _role_of(name: str) -> str:
-    """Role of a named column in a pose; empty if it has none."""
     words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
     matches = ((re.fullmatch(pattern, words), role) for pattern, role in _ROLES)
     return next((role.format(*match.groups()) for match, role in matches if match), "")

@@ -188,7 +188,6 @@ def _read(path: Path, request: recordings.Request) -> Scans:
 
 
 def _npz(path: Path, request: recordings.Request) -> Scans:
-    """Read our own file, with its poses or those passed by the user."""
     notes = request.notes
     request.refuse(f"{path} has names of columns", "columns")
     scans = read_scans(path)

@@ -33,7 +33,6 @@ def _metadata_checksum(metadata: Mapping[str, str]) -> int:
 
 
 def _checksum(array: Any) -> int:
-    """CRC-32 of an array, its type and its shape."""
     seed = zlib.crc32(f"{array.dtype} {tuple(array.shape)}".encode())
     return zlib.crc32(array.reshape(-1).view("u1"), seed)
 

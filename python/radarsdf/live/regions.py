@@ -58,7 +58,6 @@ def region_places(regions: Keys) -> Ints:
 
 
 def _keys_at(cells: Ints) -> Keys:
-    """Return the keys (N,) of cells (N, 3)."""
     # The centre of a cell of 1 m is exact in float64.
     return cell_keys(np.clip(cells, -_FARTHEST, _FARTHEST - 1) + 0.5, 1.0, 1)
 

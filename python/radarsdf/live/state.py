@@ -112,7 +112,6 @@ class GrowingState:
         return changed
 
     def _bound(self) -> None:
-        """Seal scans, or write them to the folder, to stay within the memory limit."""
         if self.max_bytes is not None and self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans for its estimate may be sealed
                 self._settle_noise()

@@ -205,7 +205,6 @@ class GrowingSurface:
         return leaf_keys, np.setxor1d(leaf_keys, before, assume_unique=True)
 
     def _average(self, regions: Keys, leaf_keys: Keys, noise: SensorNoise, num_threads: int) -> None:
-        """Recompute distances and evidence of the leaf cells in `regions`."""
         config = self._config
         near = regions_near(regions, 1)  # what influences their corners: smoothing reaches no farther
         means, normals = self._true_means(near)
@@ -228,5 +227,4 @@ class GrowingSurface:
 
 
 def _means_of(rows: Rows) -> MeanRays:
-    """Build the mean rays of leaf cells from their columns."""
     return MeanRays(**{name: rows[name] for name in MeanRays.__dataclass_fields__})

@@ -254,7 +254,6 @@ def _corner_distances(
     voxel_corners: Ints32,
     progress: bool | None = False,
 ) -> Floats32:
-    """Evaluate signed distances (K,), m, at lattice corners (K, 3)."""
     # A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
     # until it is in an occupied cell, and the distance moved is added to its absolute value.
     points = corners.astype(np.float32) * np.float32(voxel_size)

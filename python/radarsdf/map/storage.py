@@ -159,7 +159,6 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
 
 
 def _field_of(tensors: dict[str, Tensor], keys: Keys, config: FitConfig, with_intensity: bool) -> Field:
-    """Build the field with these leaf cells from the remaining tensors."""
     # On the meta device, for shapes alone: a damaged description could request networks of any size.
     with torch.device("meta"):
         if config.train:

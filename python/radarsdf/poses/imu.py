@@ -50,8 +50,6 @@ _MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
 
 @dataclass(frozen=True)
 class _ImuMotion:
-    """Integrated motion of an IMU."""
-
     times_s: Floats
     rates: Floats  # (G, 3) rad/s without bias
     turns: Floats  # (G, 3, 3) rotations to the initial frame
@@ -154,7 +152,6 @@ class _AlignmentModel:
 
     @cached_property
     def begins(self) -> NDArray[np.intp]:
-        """First scan of each window."""
         return np.searchsorted(self.window, np.arange(self.window[-1] + 1))
 
     @cached_property
@@ -191,7 +188,6 @@ class _AlignmentModel:
         return np.asarray(np.einsum("fij,fjk,fk->fi", whitening, to_radar, left - means[self.window]))
 
     def residuals(self, x: Floats) -> Floats:
-        """Return the normalised residuals of velocities and priors."""
         prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, x[13:16] / FIRST_BIAS_RAD_S]
         changes = (x[16:] - x[13:-3]) / _BIAS_CHANGE_RAD_S
         return np.concatenate([self.velocity_residuals(x).ravel(), *prior, changes])

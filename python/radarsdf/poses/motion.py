@@ -246,7 +246,6 @@ class KnownMotion(Motion):
     """Motions with known variances. Those of velocities are: learning them made errors of real drives four times larger."""
 
     def learnt(self, *_: Floats) -> Motion:
-        """Return self."""
         return self
 
 

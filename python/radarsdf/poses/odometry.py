@@ -250,7 +250,6 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
 
 
 def _summarize(segments: Ints, length_m: float, doppler: bool, inertial: Inertial) -> str:
-    """Return the verdict in words."""
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
     sentences = [f"{len(segments)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]
     if inertial.alignment is not None:

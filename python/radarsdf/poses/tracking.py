@@ -120,7 +120,6 @@ class Tracker:
             self._variances = self._estimate_variances()
 
     def _estimate_variances(self) -> list[float]:
-        """Estimate the noise of the sensor from the last scans."""
         counts = np.cumsum([len(scan) for scan, *_ in reversed(self._recent)])
         last = list(self._recent)[-max(2, int(np.searchsorted(counts, _NOISE_RETURNS, side="right"))) :]
         scans, poses, _ = zip(*last, strict=True)
@@ -129,7 +128,6 @@ class Tracker:
         return sensor_noise(surfels, rays, self.config, self.num_threads).variances
 
     def _dead_reckon(self, predicted: PredictedStep) -> Tracked:
-        """Return the predicted step."""
         pose, turn = self.last.pose @ predicted.pose(), predicted.turn.mean
         covariance = covariance_in(predicted.covariance(), self.last.pose[:3, :3])
         return Tracked(pose, covariance, 0.0, self.last.segment, turn)
@@ -228,7 +226,6 @@ def _removed_share(prior: Floats, covariance: Floats) -> float:
 
 
 def _best(scores: Floats) -> NDArray[np.intp]:
-    """Return the rows of the highest scores."""
     return np.argsort(-scores, kind="stable")[:_BEST]
 
 

@@ -47,7 +47,6 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
 
 
 def _read(path: Path, *names: str) -> dict[str, Array]:
-    """Read arrays of a part, by default all."""
     wanted = {name: _ARRAYS[name] for name in names or _ARRAYS}
     with reading(path, "a complete part of a mesh"):
         arrays = arrays_of(path, tuple(wanted))
