@@ -83,7 +83,6 @@ class Drive:
 
     @property
     def turns_slowly(self) -> bool:
-        """Whether the sensor is so fast that it hardly turns between scans."""
         return self.usual_turn_rad_s < _SLOW_TURN_RAD_S
 
     def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
@@ -127,14 +126,13 @@ def track_drive(
             # Tracking was lost. Narrow the search of the next passes.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turns = MotionPrior(usual, usual, True)
+        steady_moves = moves.learnt(move_rates, durations_s, with_errors=True)
+        steady_turns = turns.learnt(turn_rates, durations_s, with_errors=True)
         drive = dataclasses.replace(
             drive,
             turns=turns.learnt(turn_rates, durations_s),
             moves=moves.learnt(move_rates, durations_s),
-            steady=(
-                moves.learnt(move_rates, durations_s, with_errors=True),
-                turns.learnt(turn_rates, durations_s, with_errors=True),
-            ),
+            steady=(steady_moves, steady_turns),
         )
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.

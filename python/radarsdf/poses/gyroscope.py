@@ -84,10 +84,7 @@ class Gyroscope:
         return MotionRate(self.turns[i] - self.bias.mean * duration_s, covariance)
 
     def learnt(self, rates: Sequence[MotionRate | None]) -> Gyroscope:
-        """Estimate bias and noise from the rates (F - 1) of rotation between scans, rad/s, by another source. None: unknown.
-
-        Raises an UnusableGyroscopeError if they contradict the gyroscope.
-        """
+        """Estimate bias and noise from turn rates, rad/s. Raise an UnusableGyroscopeError if they contradict the gyroscope."""
         known = {i: rate for i, rate in enumerate(rates) if rate is not None and self.durations_s[i] > 0}
         if len(known) < 2:
             return self
@@ -109,10 +106,7 @@ class Gyroscope:
 def _fit_bias(
     off: Floats, durations_s: Floats, weights: Floats, before: Floats | float = 0.0
 ) -> tuple[Floats, Floats, float]:
-    """Fit a constant rate (3,) to residual rotations `off` (K, 3); return it, its information (3, 3) and the mean squared residual.
-
-    Weighted least squares; `before` is the information of a prior at 0.
-    """
+    """Fit a constant rate to rotations `off` (K, 3), with prior information `before` at 0: rate, information, mean square."""
     information = before + np.einsum("fij,f->ij", weights, durations_s**2)
     bias: Floats = np.linalg.solve(information, np.einsum("fij,fj,f->i", weights, off, durations_s))
     left = off - bias * durations_s[:, None]

@@ -23,10 +23,7 @@ _ERRORS = 3.0  # minimum agreement, standard errors
 
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
-    """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted.
-
-    Scans are numbered from `first_scan`.
-    """
+    """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted."""
     visits = list(_visits(poses[:, :3, 3], float(np.median(returns.ranges_m))))
     if not visits:
         return []

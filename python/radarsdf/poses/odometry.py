@@ -238,9 +238,8 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
         if (significance := motion_significance(pairs, motions)) < -ERRORS:
             refuse("moved", "scans agree better without any motion", doppler)
         if significance < ERRORS:
-            assumed.append(
-                "Assumed: the sensor moved as estimated; neighbouring scans agree as well without any motion."
-            )
+            what = "neighbouring scans agree as well without any motion"
+            assumed.append(f"Assumed: the sensor moved as estimated; {what}.")
     if drive.gyroscope is None and turned < _LEAST_OBSERVED_TURN:
         assumed.append(
             f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
@@ -256,8 +255,6 @@ def _summarize(segments: Ints, length_m: float, doppler: bool, inertial: Inertia
         sentences.append(inertial.alignment.words)
     begins = np.flatnonzero(np.diff(segments)) + 1
     if len(begins):
-        before = ", ".join(map(str, begins))
-        sentences.append(
-            f"The drive was lost before the scans {before}: {len(begins) + 1} segments, which do not belong together."
-        )
+        lost = f"The drive was lost before the scans {', '.join(map(str, begins))}"
+        sentences.append(f"{lost}: {len(begins) + 1} segments, which do not belong together.")
     return " ".join(sentences)

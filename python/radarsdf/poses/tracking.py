@@ -40,9 +40,7 @@ _BEST = 12  # candidates to register
 _UNRELATED = 500  # poses, for the agreement by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at an accepted pose
 _MOST_RADII = 10.0  # maximum standard deviation of a predicted translation, median ranges: beyond, candidates miss the overlap
-_MOST_RECKONED_M = (
-    1e4  # and for a new segment to begin at the dead-reckoned pose: over a day, dead reckoning is useless
-)
+_MOST_RECKONED_M = 1e4  # and for a segment to begin at the dead-reckoned pose: over a day, that is useless
 
 
 @dataclass
