@@ -162,9 +162,7 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRat
     """Compute the rates of rotation and translation, in the sensor frame, of the step from pose `before` (4, 4)."""
     back = before[:3, :3].T
     half = rotation(0.5 * now.turn).T @ back
-    of_way, of_turn = (
-        matrix @ now.covariance[rows, rows] @ matrix.T / duration_s**2
-        for matrix, rows in ((half, slice(0, 3)), (back, slice(3, 6)))
-    )
+    of_way = half @ now.covariance[:3, :3] @ half.T / duration_s**2
+    of_turn = back @ now.covariance[3:, 3:] @ back.T / duration_s**2
     translation = half @ (now.pose[:3, 3] - before[:3, 3])
     return MotionRate(now.turn / duration_s, of_turn), MotionRate(translation / duration_s, of_way)

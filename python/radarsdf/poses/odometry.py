@@ -241,10 +241,9 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
             what = "neighbouring scans agree as well without any motion"
             assumed.append(f"Assumed: the sensor moved as estimated; {what}.")
     if drive.gyroscope is None and turned < _LEAST_OBSERVED_TURN:
-        assumed.append(
-            f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
-            "trajectory make of its speed; the returns of a scan hardly measure it."
-        )
+        why = f"as {LATERAL_MPS2:.0f} m/s² across its trajectory make of its speed"
+        what = f"the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, {why}"
+        assumed.append(f"Assumed: {what}; the returns of a scan hardly measure it.")
     return assumed
 
 

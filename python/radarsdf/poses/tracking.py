@@ -52,8 +52,7 @@ class Tracked:
     agreeing: float  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
     segment: int  # number of its segment of the drive
     turn: Floats  # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn
-    # Share of the predicted variance that the returns removed, of translation and rotation, each in the least certain
-    # direction.
+    # Share of the predicted variance that the returns removed, of translation and rotation, in the least certain direction.
     observed: tuple[float, float] = (0.0, 0.0)
 
 
