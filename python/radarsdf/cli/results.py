@@ -47,10 +47,6 @@ class Results:
         """Add a line on a written file."""
         self.add(f"{what} written to {path}", out=path, **values)
 
-    def add_picture(self, path: Path) -> None:
-        """Add a line on a written picture."""
-        self.add(f"picture written to {path}", picture=path)
-
     def end(self) -> None:
         """Print the JSON object, if there is one. Non-finite numbers become null."""
         if self.json and not self._ended:

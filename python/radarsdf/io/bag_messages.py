@@ -82,8 +82,6 @@ class Pose(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message of a bag."""
-
     bag: Path
     topic: str
     message_type: str

@@ -101,8 +101,8 @@ class GrowingSurface:
         values = np.zeros(len(corners), np.float32)
         in_order = np.lexsort(cells.T[::-1])  # of the lattice
         values[cell_corners] = rows["values"][crossed][in_order]
-        placement = {"spacing": [leaf_m] * 3, "num_threads": num_threads}
-        vertices, faces = extract_cells(corners, values, cell_corners, **placement)
+        edges = [leaf_m] * 3
+        vertices, faces = extract_cells(corners, values, cell_corners, spacing=edges, num_threads=num_threads)
         of_cells = evidence.Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
         points = queries.to_local(scene, vertices + self._origin)
