@@ -80,7 +80,6 @@ def fit(given: Namespace, results: Results) -> None:
 
 
 def _add_fit(results: Results, radar_map: RadarMap) -> None:
-    """Add the numbers of returns, the losses and the estimated noise of a fit."""
     report = radar_map.report
     names = ("scans", "returns", "returns_used", "moving", "ghosts", "intensity_outliers", "leaf_cells")
     scans, returns, used, moving, ghosts, outliers, _ = (report[name] for name in names)

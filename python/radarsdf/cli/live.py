@@ -17,8 +17,8 @@ from radarsdf.cli.inputs import check_address, inputs_of, scans_or_unposed
 from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.cli.settings import load_config
-from radarsdf.io.files import check_outputs
-from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
+from radarsdf.io.files import check_outputs, checked_suffix
+from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
 from radarsdf.live.live_map import LiveMap
 from radarsdf.live.tracking import Lost
 from radarsdf.scans import Scans
@@ -47,10 +47,7 @@ def replay(
     rate: float = 1.0,
     on_scan: Callable[[Replay], None] | None = None,
 ) -> Replay:
-    """Integrate scans at `rate` times the recorded speed; 0: as fast as possible.
-
-    A scan waits until the next one arrives, and is then dropped. `on_scan` is called after each scan.
-    """
+    """Integrate scans at `rate` times the recorded speed; 0: as fast as possible. A scan is dropped once the next one arrives."""
     done, count = Replay(), len(scans.points)
     times_s = scans.times_s if scans.times_s is not None else 0.1 * np.arange(count)
     due_s = (times_s - times_s[0]) / rate if rate > 0 else np.full(count, -np.inf)
@@ -90,7 +87,7 @@ def live(given: Namespace, results: Results) -> None:
     refuse_if(not given.rate >= 0, f"--rate must be at least 0, not {given.rate}")
     out, trajectory = given.out, given.trajectory
     if trajectory is not None:
-        check_pose_suffix(trajectory)
+        checked_suffix(trajectory, POSE_SUFFIXES, "poses to write")
     check_outputs([out, trajectory], inputs_of(given))
     if given.view:
         check_address(given)
@@ -137,7 +134,6 @@ class _PeriodicView:
             self._thread.start()
 
     def show(self, poses: list[NDArray[np.float64]]) -> None:
-        """Show the current surface and the trajectory of these poses."""
         with self._lock:
             self._page.show(self._map.mesh(), np.array(poses)[:, :3, 3])
 

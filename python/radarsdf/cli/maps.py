@@ -18,8 +18,8 @@ from radarsdf.cli.results import Results
 from radarsdf.evaluation import KNNIntensity, format_metrics, intensity_metrics
 from radarsdf.io.bag_messages import is_bag
 from radarsdf.io.cloud_writing import write_cloud
-from radarsdf.io.files import check_outputs, check_regular_file
-from radarsdf.io.meshes import check_mesh_path, read_ground_truth, read_mesh, write_mesh
+from radarsdf.io.files import check_outputs, check_regular_file, checked_suffix
+from radarsdf.io.meshes import MESH_SUFFIXES, read_ground_truth, read_mesh, write_mesh
 from radarsdf.io.npz import arrays_of, write_scans
 from radarsdf.io.poses import Trajectory, pose_matrices_of, read_poses
 from radarsdf.map.map import Map
@@ -38,21 +38,16 @@ _MAX_PICTURES = 20
 def mesh(given: Namespace, results: Results) -> None:
     """Extract the mesh, write it, and draw a picture if asked for."""
     out, drawing = given.out, given.picture
-    check_mesh_path(out)
+    checked_suffix(out, MESH_SUFFIXES, "meshes")
     check_outputs([out, drawing], [given.map])
-    found = load_map(given.map).mesh(
-        given.voxel,
-        box=given.box,
-        viewpoint=given.viewpoint,
-        **mesh_limits(given),
-        progress=results.progress,
-    )
+    wanted = mesh_limits(given) | {"box": given.box, "viewpoint": given.viewpoint}
+    found = load_map(given.map).mesh(given.voxel, **wanted, progress=results.progress)
     check(len(found.faces), f"{given.map} has no surface here: nothing written")
     write_mesh(out, found)
     results.add_mesh(out, len(found.vertices), len(found.faces), Threshold.of_mesh(found.metadata))
     if drawing is not None:
         picture.save_picture(drawing, found, scalar=found.vertex_attributes.get("intensity"))
-        results.add_picture(drawing)
+        results.add(f"picture written to {drawing}", picture=drawing)
 
 
 def evaluate(given: Namespace, results: Results) -> None:
@@ -61,7 +56,9 @@ def evaluate(given: Namespace, results: Results) -> None:
     radar_map = load_map(mesh_file) if is_map(mesh_file) else None
     if radar_map is None:
         check_regular_file(mesh_file)
-    scans = scans_if(given.poses is not None or _holds_scans(truth), given)
+    has_poses = truth.suffix.lower() == ".npz" and arrays_of(truth, ["poses"])
+    are_scans = given.poses is not None or truth.is_dir() or is_bag(truth) or has_poses
+    scans = scans_if(are_scans, given)
     lacking = holdout is not None and (radar_map is None or scans is None)
     refuse_if(lacking, f"--holdout {holdout} needs a map and scans, not {mesh_file} and {truth}")
     ground_truth = scans.ground_truth if scans is not None else read_ground_truth(truth)
@@ -104,12 +101,6 @@ def add_intensity_errors(results: Results, radar_map: Map, test: Scans, train: S
     )
 
 
-def _holds_scans(path: Path) -> bool:
-    """Whether the ground truth is scans rather than points or a surface."""
-    has_poses = path.suffix.lower() == ".npz" and bool(arrays_of(path, ["poses"]))
-    return path.is_dir() or is_bag(path) or has_poses
-
-
 def render(given: Namespace, results: Results) -> None:
     """Predict scans and write them."""
     out, suffix = given.out, given.out.suffix.lower()
@@ -122,9 +113,8 @@ def render(given: Namespace, results: Results) -> None:
     check_outputs([out], [given.map])
     radar_map = load_map(given.map)
     rng = np.random.default_rng(given.seed)
-    views: Iterable[View] = (
-        radar_map.render(T, returns=given.returns, noise=given.noise, seed=rng) for T in poses
-    )
+    options = {"returns": given.returns, "noise": given.noise, "seed": rng}
+    views: Iterable[View] = (radar_map.render(pose, **options) for pose in poses)
     if suffix == ".png":
         views = list(views)  # a picture shows the whole view; other formats need only the returns
     scans = scans_of_views(view for view in views if len(view))

@@ -38,8 +38,6 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Corners(argparse.Action):
-    """Stores six numbers as a lower and an upper corner."""
-
     def __call__(self, _parser: Any, namespace: Any, values: Any, _option: Any = None) -> None:
         setattr(namespace, self.dest, [values[:3], values[3:]])
 

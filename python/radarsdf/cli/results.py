@@ -47,10 +47,6 @@ class Results:
         """Add a line on a written file."""
         self.add(f"{what} written to {path}", out=path, **values)
 
-    def add_picture(self, path: Path) -> None:
-        """Add a line on a written picture."""
-        self.add(f"picture written to {path}", picture=path)
-
     def end(self) -> None:
         """Print the JSON object, if there is one. Non-finite numbers become null."""
         if self.json and not self._ended:
@@ -59,7 +55,6 @@ class Results:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value to types of JSON."""
     if hasattr(value, "tolist"):  # an array or a number of NumPy
         value = value.tolist()
     if isinstance(value, dict):

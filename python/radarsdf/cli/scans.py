@@ -18,12 +18,12 @@ from radarsdf.cli.options import refuse_if
 from radarsdf.cli.results import Results, warn
 from radarsdf.cli.settings import load_config
 from radarsdf.extras import require
-from radarsdf.io.cloud_writing import check_cloud_path, write_cloud
+from radarsdf.io.cloud_writing import CLOUD_OUT_SUFFIXES, write_cloud
 from radarsdf.io.clouds import CLOUD_SUFFIXES
-from radarsdf.io.files import check_outputs
-from radarsdf.io.meshes import check_mesh_path, holds_mesh, read_mesh, write_mesh
+from radarsdf.io.files import check_outputs, checked_suffix
+from radarsdf.io.meshes import MESH_SUFFIXES, holds_mesh, read_mesh, write_mesh
 from radarsdf.io.npz import write_scans
-from radarsdf.io.poses import check_pose_suffix, check_pose_times, write_poses
+from radarsdf.io.poses import POSE_SUFFIXES, check_pose_times, write_poses
 from radarsdf.poses.posed import PosedScans
 from radarsdf.render.figures import save_trajectory_picture
 from radarsdf.scans import Scans
@@ -54,14 +54,12 @@ def poses(given: Namespace, results: Results) -> None:
 
     as_scans = out.suffix.lower() == ".npz"
     if not as_scans:
-        check_pose_suffix(out)
+        checked_suffix(out, POSE_SUFFIXES, "poses to write")
     check_outputs([out, picture], inputs_of(given))
     if picture is not None:
         require("matplotlib", what="pictures need")
-    times_for = None if as_scans else out
-    scans, posed = posed_scans(
-        given, load_config(given), results, refine=True, find=given.find, times_for=times_for
-    )
+    config, times_for = load_config(given), None if as_scans else out
+    scans, posed = posed_scans(given, config, results, refine=True, find=given.find, times_for=times_for)
     if as_scans:
         write_scans(out, scans)
     else:
@@ -73,7 +71,7 @@ def poses(given: Namespace, results: Results) -> None:
         given_poses = {} if posed.given is None else {"given": posed.given}
         drawn = given_poses | {"refined" if given_poses else "found": scans.poses}
         save_trajectory_picture(picture, scans.points, drawn)
-        results.add_picture(picture)
+        results.add(f"picture written to {picture}", picture=picture)
 
 
 def posed_scans(
@@ -110,10 +108,9 @@ def posed_scans(
     results.add(report["verdict"], poses=report, improved=refined.improved)
     if refined.improved:
         moved_deg, sigma_deg = math.degrees(report["moved_rad"]), math.degrees(report["sigma_rad"])
-        results.add(
-            f"they moved by {report['moved_m']:.3f} m and {moved_deg:.2f} degrees (RMS); the input's step error is "
-            f"{report['sigma_m']:.3f} m and {sigma_deg:.2f} degrees"
-        )
+        moved = f"{report['moved_m']:.3f} m and {moved_deg:.2f} degrees (RMS)"
+        error = f"{report['sigma_m']:.3f} m and {sigma_deg:.2f} degrees"
+        results.add(f"they moved by {moved}; the input's step error is {error}")
     return scans.with_poses(refined.poses), PosedScans.refined(refined, scans.poses)
 
 
@@ -122,7 +119,7 @@ def convert(given: Namespace, results: Results) -> None:
     out, folder = given.out, given.scans.resolve()
     check_outputs([out], inputs_of(given))
     if given.poses is None and holds_mesh(given.scans):
-        check_mesh_path(out)
+        checked_suffix(out, MESH_SUFFIXES, "meshes")
         scans_if(False, given)
         mesh = read_mesh(given.scans)
         write_mesh(out, mesh)
@@ -130,7 +127,7 @@ def convert(given: Namespace, results: Results) -> None:
         return
     suffix = out.suffix.lower()
     if suffix != ".npz":
-        check_cloud_path(out)
+        checked_suffix(out, CLOUD_OUT_SUFFIXES, "point clouds to write")
     among = suffix in CLOUD_SUFFIXES and folder.is_dir() and folder in out.resolve().parents
     what = "lies in the folder of the scans, where it would be read as one of them: write it elsewhere"
     check_that(not among, f"{out} {what}")

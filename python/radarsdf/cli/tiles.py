@@ -55,9 +55,8 @@ def plan(given: Namespace, results: Results) -> None:
         config=config,
         threads=1 if given.processes or given.cluster else None,
     )
-    totals = {
-        name: sum(getattr(tile, name) for tile in planned.tiles) for name in ("returns", "rays", "seconds")
-    }
+    names = ("returns", "rays", "seconds")
+    totals = {name: sum(getattr(tile, name) for tile in planned.tiles) for name in names}
     most = max(tile.memory_bytes for tile in planned.tiles)
     results.add(
         f"{len(planned.tiles)} tiles of {planned.tile_m:g} m with a halo of {planned.halo_m:g} m, "
@@ -80,7 +79,6 @@ def _check_where(given: Namespace) -> None:
 
 
 def _executor(given: Namespace) -> AbstractContextManager[Executor | None]:
-    """Executor of the tasks. None: this process."""
     _check_where(given)
     if given.cluster is not None:
         memory_bytes = max(tile.memory_bytes for tile in Plan.load(given.folder).tiles)

@@ -11,8 +11,8 @@ from radarsdf.extras import require
 from radarsdf.grids.files import check_suffix
 from radarsdf.grids.grid import save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
-from radarsdf.io.files import check_outputs
-from radarsdf.io.meshes import check_mesh_path
+from radarsdf.io.files import check_outputs, checked_suffix
+from radarsdf.io.meshes import MESH_SUFFIXES
 from radarsdf.render.figures import save_grid_picture
 from radarsdf.report.changes import write_changes_report
 from radarsdf.report.page import require_extras
@@ -26,7 +26,7 @@ def compare(given: Namespace, results: Results) -> None:
     """Compare two maps, write coloured surfaces, report changes."""
     out, report = given.out, given.report
     if out is not None:
-        check_mesh_path(out)
+        checked_suffix(out, MESH_SUFFIXES, "meshes")
     check_outputs([out, report], inputs_of(given))
     if report is not None:
         require_extras()

@@ -43,17 +43,14 @@ def write_map_server(path: Path, state: NDArray[np.int8], origin: Floats, cell_m
 def write_octomap(path: Path, state: NDArray[np.int8], origin: Floats, voxel_m: float) -> None:
     """Write states (X, Y, Z) from `origin` (3,), m, a multiple of the voxel, as OctoMap's binary octree."""
     start = np.round(origin / voxel_m)
-    wrong = (
-        f"the grid's origin, {origin}, must be a multiple of its voxels of {voxel_m:g} m, as OctoMap's are"
-    )
     even = np.abs(origin / voxel_m - start).max() <= _MOST_OFF
-    check(even, f"{wrong}: the nearest is {start * voxel_m}")
+    wanted = f"a multiple of its voxels of {voxel_m:g} m, as OctoMap's are"
+    check(even, f"the grid's origin, {origin}, must be {wanted}: the nearest is {start * voxel_m}")
     known = state >= 0
     keys = np.argwhere(known) + start.astype(np.int64) + _HALF
     inside = ((keys >= 0) & (keys < 2 * _HALF)).all()
-    check(
-        inside, f"the grid is more than {_HALF} voxels from the world's origin, the end of OctoMap's octree"
-    )
+    beyond = f"more than {_HALF} voxels from the world's origin, the end of OctoMap's octree"
+    check(inside, f"the grid is {beyond}")
     size, data = _octree(keys, np.where(state[known] == 1, _OCCUPIED, _FREE))
     header = (
         "# Octomap OcTree binary file\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"

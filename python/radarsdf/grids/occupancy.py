@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints
-from radarsdf.checks import MAX_POSITION_M, check_box, positive
+from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.grids.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from radarsdf.map.map import Map
 
@@ -81,9 +81,8 @@ def grid(radar_map: Map, box: ArrayLike, voxel_size: float = 0.2) -> Grid:
 
 def check_free_space(radar_map: Map, name: str) -> None:
     """Raise a ValueError if a map, called `name` in the message, has no free-space crossings."""
-    if not radar_map.config.returns.free_space:
-        msg = f"{name} has no free-space crossings: fit it with returns.free_space=True, the default but for quick()"
-        raise ValueError(msg)
+    remedy = "fit it with returns.free_space=True, the default but for quick()"
+    check(radar_map.config.returns.free_space, f"{name} has no free-space crossings: {remedy}")
 
 
 def _fine_grid(radar_map: Map, lower: Floats, size: float, shape: tuple[int, ...]) -> Grid:
@@ -95,9 +94,8 @@ def _fine_grid(radar_map: Map, lower: Floats, size: float, shape: tuple[int, ...
     cells = radar_map.cells_near(lower - leaf_m, upper + leaf_m)
     known = (cells.passed > 0) | cells.returns
     centres = [lower[axis] + (np.arange(shape[axis]) + 0.5) * size for axis in range(3)]
-    places = np.ix_(
-        *(np.floor((x - cells.corner[axis]) / leaf_m).astype(np.int64) for axis, x in enumerate(centres))
-    )
+    offsets_m = (x - corner for x, corner in zip(centres, cells.corner, strict=True))
+    places = np.ix_(*(np.floor(offset_m / leaf_m).astype(np.int64) for offset_m in offsets_m))
     passed, observed = cells.passed[places], cells.observed[places]
     # An unseen surface bounds the crossed space, so voxels next to unknown space are not free.
     enclosed = binary_erosion(known, np.ones((3, 3, 3)))[places] & ~cells.returns[places]
@@ -122,8 +120,8 @@ def _fine_grid(radar_map: Map, lower: Floats, size: float, shape: tuple[int, ...
         # Rays that crossed space behind a surface are false: nothing is free there.
         is_before = ndtr((_HALF_WIDTH * size - distance_m[rows]) / spread_m)
         free[rows] &= np.nan_to_num(confidence * is_before) <= _FREE_TO
-        step = max(1, round(leaf_m / size))
         planes = distance_m[rows], normals, spread_m, confidence
+        step = max(1, round(leaf_m / size))
         free &= _touched(np.stack(rows, 1), planes, shape, size, step) <= _FREE_TO
         of_rays = np.where(free[rows], probability[rows], 0)
         probability[rows] = 1 - (1 - of_surface) * (1 - of_rays)

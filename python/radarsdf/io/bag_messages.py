@@ -82,8 +82,6 @@ class Pose(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message of a bag."""
-
     bag: Path
     topic: str
     message_type: str
@@ -178,7 +176,6 @@ def _ars548(returns: Columns, invalid: Bools) -> Columns:
 
 
 def _pose(message: Any) -> Pose:
-    """Pose of a stamped message with a pose, with or without a covariance, or with a transform."""
     if hasattr(message, "transform"):
         position, rotation = message.transform.translation, message.transform.rotation
     else:

@@ -16,15 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Floats
 from radarsdf.checks import check
-from radarsdf.io.bag_messages import (
-    PATH,
-    POSE_TYPES,
-    TRANSFORM_TYPES,
-    Clock,
-    read_messages,
-    topics_of,
-    topics_with,
-)
+from radarsdf.io import bag_messages
+from radarsdf.io.bag_messages import Clock, topics_with
 from radarsdf.io.poses import (
     FIND_POSES,
     NoPoses,
@@ -174,17 +167,15 @@ def _held_corrections(slow: Trajectory, below: Trajectory, track: Track, request
 
 def transforms_in(paths: list[Path], request: Request) -> TransformTree:
     """Read the transforms of all frames in bags."""
-    return _tracks_and_tree(paths, set(), set(topics_with(TRANSFORM_TYPES, topics_of(paths))), request)[1]
+    topics = topics_with(bag_messages.TRANSFORM_TYPES, bag_messages.topics_of(paths))
+    return _tracks_and_tree(paths, set(), set(topics), request)[1]
 
 
 def poses_in_bags(paths: list[Path], request: Request, frames: list[str], preferred: str | None) -> FindPoses:
-    """Return a function from frame to poses by time; `frames` are those of the first scans, the most frequent first.
-
-    Of several sources, the topic `preferred` is used, or else the one that :func:`_choose` returns.
-    """
-    notes, wanted, topics = request.notes, request.pose_topic, topics_of(paths)
-    transforms = set(topics_with(TRANSFORM_TYPES, topics))
-    fitting = set(topics_with(POSE_TYPES, topics))
+    """Return a function from frame to poses, if possible of the topic `preferred`. `frames`: of scans, the most frequent first."""
+    notes, wanted, topics = request.notes, request.pose_topic, bag_messages.topics_of(paths)
+    transforms = set(topics_with(bag_messages.TRANSFORM_TYPES, topics))
+    fitting = set(topics_with(bag_messages.POSE_TYPES, topics))
     wants_tf = wanted in transforms or (wanted is not None and wanted.strip("/") == "tf" and bool(transforms))
     listed = ", ".join(sorted(fitting | transforms)) or "none"
     known = wanted is None or wants_tf or wanted in fitting
@@ -214,8 +205,10 @@ def _tracks_and_tree(
     """Read the poses of `pose_topics` and the transforms in one pass through the bags. Topics with a single pose are left out."""
     by_topic: dict[str, Track] = {}
     parents: dict[str, dict[str, Track]] = {}
-    for message in read_messages(paths, pose_topics | transform_topics, request.notes):
-        if message.message_type == PATH:  # each message holds the whole path so far: the last one is used
+    for message in bag_messages.read_messages(paths, pose_topics | transform_topics, request.notes):
+        if (
+            message.message_type == bag_messages.PATH
+        ):  # each holds the whole path so far: the last one is used
             by_topic.pop(message.topic, None)
         static = "static" in message.topic  # /tf_static: transforms that hold for all times
         for pose in message.content:
@@ -229,9 +222,8 @@ def _tracks_and_tree(
         options = [track for track in tracks.values() if len(track.table)]
         if options:
             wanted = (request.world_frame or "").lstrip("/")
-            edges[child] = max(
-                options, key=lambda t: (t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1))
-            )
+            ranks = [(t.parent == wanted, not t.constant, np.ptp(t.table[:, 1]).round(1)) for t in options]
+            edges[child] = options[ranks.index(max(ranks))]
         if len(options) > 1:
             request.notes.add(f"{child} has several parents in TF: {edges[child].parent} is used")
     moving = {n: track for n, track in by_topic.items() if len(np.unique(track.table[:, :2], axis=0)) > 1}
@@ -289,11 +281,12 @@ def _tree_poses(tree: TransformTree, sensor: str, request: Request) -> FindPoses
     chain = tree.chain(base)
     world = chain[-1] if request.world_frame is None else request.world_frame.lstrip("/")
     check(world in chain, f"world_frame {world} is not above {base}, whose frames are {' -> '.join(chain)}")
-    if not moving & set(chain[: chain.index(world)]):
+    below = chain[: chain.index(world)]
+    if not moving & set(below):
         msg = f"{about}: no transform between {world} and {base} moves: TF has no poses of the radar"
         raise NoPoses(msg)
     find = tree.finder(world, request)
     poses = find(base)
     check(poses, f"{about}: a transform between {world} and {base} has a single pose")
-    request.notes.add(f"poses: TF, {' -> '.join(reversed(chain[: chain.index(world) + 1]))}")
+    request.notes.add(f"poses: TF, {' -> '.join([world, *reversed(below)])}")
     return tree.attach(poses, sensor, request) if poses and request.extrinsic is not None else find

@@ -18,18 +18,8 @@ import numpy as np
 
 from radarsdf.checks import check
 from radarsdf.imu import Imu
-from radarsdf.io.bag_messages import (
-    CLOUD_TYPES,
-    IMU,
-    PACKETS,
-    Clock,
-    Message,
-    Topic,
-    is_bag,
-    read_messages,
-    topics_of,
-    topics_with,
-)
+from radarsdf.io import bag_messages
+from radarsdf.io.bag_messages import Clock, Message, Topic, is_bag, read_messages, topics_with
 from radarsdf.io.bag_poses import poses_in_bags, transforms_in
 from radarsdf.io.poses import UNPOSED, NumberedPoses, Poses, poses_of
 from radarsdf.io.recordings import FindPoses, RawScan, Request, posed, scan_poses
@@ -51,7 +41,7 @@ def read_bags(paths: list[Path], request: Request) -> Scans:
     others = ", ".join(str(path) for path in paths if not is_bag(path)) or "an empty list"
     check(paths and all(map(is_bag, paths)), f"{others} is not a bag: only bags can be read together")
     request.refuse(f"{request.notes.about}: messages have names of columns", "columns")
-    topics = topics_of(paths)
+    topics = bag_messages.topics_of(paths)
     scan_topics = _scan_topics(topics, request)
     peeked = {topic.name: _peek(paths, topic, request) for topic in scan_topics}
     counted = Counter(cloud.frame for clouds in peeked.values() for cloud in clouds)
@@ -99,14 +89,14 @@ def _user_poses(
 def _scan_topics(topics: dict[str, Topic], request: Request) -> list[Topic]:
     """Topics of the scans: those requested, or the only candidate. The others are noted."""
     about = request.notes.about
-    fitting = topics_with(CLOUD_TYPES, topics)
+    fitting = topics_with(bag_messages.CLOUD_TYPES, topics)
     for name in request.topic:
         what = f"{name} has messages {topics[name].message_type}" if name in topics else f"no topic {name}"
         check(name in fitting, f"{about}: {what}: topics with points: {_listed(fitting.values()) or 'none'}")
     if request.topic:
         return [fitting[name] for name in dict.fromkeys(request.topic)]
     check(fitting, f"{about} has no topic with points: it has {_listed(topics.values()) or 'no topics'}")
-    decoded = [t for t in fitting.values() if t.message_type != PACKETS] or list(fitting.values())
+    decoded = [t for t in fitting.values() if t.message_type != bag_messages.PACKETS] or [*fitting.values()]
     known = [topic for topic in decoded if topic.name in KNOWN_TOPICS]
     candidates = (decoded, known, [topic for topic in decoded if _is_radar(topic)])
     chosen = next((topics for topics in candidates if len(topics) == 1), [])
@@ -129,7 +119,6 @@ def _is_radar(topic: Topic) -> bool:
 
 
 def _peek(paths: list[Path], topic: Topic, request: Request) -> list[Message]:
-    """Read the first messages of a topic."""
     with closing(read_messages(paths, {topic.name}, request.notes)) as messages:
         peeked = list(itertools.islice(messages, _PEEKED_SCANS))
     check(peeked, f"{paths[0]}: {topic.name} has no messages that can be read{request.notes.ending()}")
@@ -145,7 +134,7 @@ def _raw_scans(paths: list[Path], topic: Topic, clock: Clock, request: Request) 
 
 def _imu_topic(topics: dict[str, Topic], request: Request) -> str | None:
     """Topic of the IMU: the one requested, or the only one. None if there is none, or if it is ambiguous."""
-    fitting = sorted(topics_with([IMU], topics))
+    fitting = sorted(topics_with([bag_messages.IMU], topics))
     listed = ", ".join(fitting)
     wanted, about = request.imu_topic, request.notes.about
     check(wanted in (None, *fitting), f"{about} has no inertial measurements in {wanted}: there are {listed}")

@@ -5,30 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from radarsdf.arrays import Array
-from radarsdf.checks import check, path_of
 from radarsdf.extras import require
 from radarsdf.io.clouds import LAS_INTENSITY
 from radarsdf.io.fields import SIGMA, columns_of
-from radarsdf.io.files import check_fits_float32, whole_file
+from radarsdf.io.files import check_fits_float32, checked_suffix, whole_file
 from radarsdf.scans import Columns, Scans
 
 _CSV_FORMATS = {"f8": "%.17g", "f4": "%.9g", "i4": "%d"}  # enough digits for a round trip
 _LAS_SCALE_M = 1e-4
 _LAS_FORMAT = 6  # the first of LAS 1.4, with a time
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-
-
-def check_cloud_path(path: str | PathLike[str]) -> None:
-    """Raise a ValueError unless `path` has a suffix that :func:`write_cloud` supports."""
-    known = path_of(path, "path").suffix.lower() in CLOUD_OUT_SUFFIXES
-    check(known, f"{path}: a point cloud can be written as {', '.join(CLOUD_OUT_SUFFIXES)}")
 
 
 def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
@@ -60,28 +52,25 @@ def write_cloud(path: str | PathLike[str], scans: Scans) -> int:
     ImportError
         If the format needs a library that is not installed; the message names it.
     """
-    check_cloud_path(path)
-    suffix = Path(path).suffix.lower()
+    suffix = checked_suffix(path, CLOUD_OUT_SUFFIXES, "point clouds to write")
     parts = []
     for number, scan in enumerate(scans):
         columns = columns_of(scan, scan.world_points) | {"scan": np.full(len(scan), number, np.int32)}
         parts.append(columns if scan.time_s is None else columns | {"time": np.full(len(scan), scan.time_s)})
     names = [name for name in parts[0] if name not in SIGMA and all(name in part for part in parts)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
-    columns |= {
-        name: columns[name].astype(np.float32) for name in ("intensity", "doppler") if name in columns
-    }
+    in_single = {"intensity", "doppler"}
     if suffix == ".pcd":
         check_fits_float32(path, np.stack([columns[axis] for axis in "xyz"], axis=1))
-        columns |= {axis: columns[axis].astype(np.float32) for axis in "xyz"}
+        in_single |= set("xyz")
+    columns |= {name: columns[name].astype(np.float32) for name in in_single & set(names)}
     with whole_file(path) as file:
         _WRITERS[suffix](file, records(columns))
     return len(columns["scan"])
 
 
 def _ply(file: BinaryIO, rows: Array) -> None:
-    file.write(ply_header(rows.dtype, len(rows)))
-    file.write(rows.tobytes())
+    file.write(ply_header(rows.dtype, len(rows)) + rows.tobytes())
 
 
 def _pcd(file: BinaryIO, rows: Array) -> None:

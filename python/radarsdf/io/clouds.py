@@ -92,10 +92,8 @@ def read_points(path: str | PathLike[str]) -> Floats:
     return points
 
 
-# .bin files: float32 x, y, z, intensity as in KITTI, or the columns that the user names.
-
-
 def _bin(path: Path, columns: GivenColumns) -> Columns:
+    """Read float32 x, y, z, intensity as in KITTI, or the columns that the user names."""
     if columns is None:
         check_kitti([path])
     width = columns if isinstance(columns, int) else len(columns or range(_KITTI_WIDTH))
@@ -120,10 +118,8 @@ def check_kitti(paths: Sequence[Path]) -> None:
     within = _variance(numbers, _KITTI_WIDTH)
     for width in range(3, min(21, len(numbers) // 2 + 1)):
         other, few = _variance(numbers, width), len(numbers) < _MIN_ROWS * width
-        check(
-            other >= _VARIANCE_RATIO * within or (few and other),
-            f"the numbers of the .bin files look like {width} columns, not four: {remedy}",
-        )
+        like_four = other >= _VARIANCE_RATIO * within or (few and other)
+        check(like_four, f"the numbers of the .bin files look like {width} columns, not four: {remedy}")
 
 
 def _variance(numbers: Floats32, width: int) -> float:
@@ -152,11 +148,8 @@ def _text(path: Path, columns: GivenColumns) -> Columns:
     return {name: column for name, column in zip(names, values.T, strict=True) if names.count(name) == 1}
 
 
-# PCD: pointclouds.org/documentation/tutorials/pcd_file_format.html
-
-
 def _pcd(path: Path, _: GivenColumns) -> Columns:
-    """Read the scalar fields of ascii, binary or binary_compressed files up to version 0.7."""
+    """Read the scalar fields of files up to version 0.7: pointclouds.org/documentation/tutorials/pcd_file_format.html."""
     with path.open("rb") as file:
         header = _pcd_header(file)
         body = file.read()
@@ -222,7 +215,6 @@ def has_faces(path: Path) -> bool:
 
 
 def _ply(path: Path, _: GivenColumns) -> Columns:
-    """Read the columns of the vertices."""
     import trimesh  # noqa: PLC0415 - takes long, and few files need it
 
     # Without materials: a PLY file may name an image, which must not be opened.

@@ -25,8 +25,6 @@ from radarsdf.scans import Scans
 
 
 class Dataset(NamedTuple):
-    """A published data set."""
-
     name: str
     fits: Callable[[Path], bool]  # whether a folder has its layout
     read: Callable[[Path, Request], Scans]
@@ -69,10 +67,13 @@ def _delft_radar(folder: Path) -> Path:
     return folder.resolve() / inner
 
 
+def _delft_lidar(folder: Path) -> Path:
+    return _delft_radar(folder).parents[1] / "lidar/training"
+
+
 def _view_of_delft(folder: Path, request: Request) -> Scans:
     """Read View-of-Delft, complete or only its radar folder: a calibration and a pose for each frame."""
-    radar = _delft_radar(folder)
-    lidar = radar.parents[1] / "lidar/training"
+    radar, lidar = _delft_radar(folder), _delft_lidar(folder)
     files = sorted((radar / "velodyne").glob("*.bin"), key=natural)
     request = replace(request, columns=request.columns or 7)
     if request.poses is not None:
@@ -117,7 +118,6 @@ _BODY_T_OCULII = np.array([[0.999756831, 0.020010494, -0.009265982, 0.07],
 
 
 def _snail_radar(folder: Path, request: Request) -> Scans:
-    """Read a sequence, such as ``data3``."""
     points = next(folder / radar for radar in _SNAIL_RADARS if (folder / radar).is_dir())
     if request.poses is None:
         path = folder / "utm50r_T_xt32.txt"
@@ -131,11 +131,7 @@ def _snail_radar(folder: Path, request: Request) -> Scans:
 # The first one that fits a folder is used.
 DATASETS = (
     Dataset("SNAIL-Radar", lambda f: any((f / radar).is_dir() for radar in _SNAIL_RADARS), _snail_radar),
-    Dataset(
-        "View-of-Delft",
-        lambda f: (_delft_radar(f).parents[1] / "lidar/training/pose").is_dir(),
-        _view_of_delft,
-    ),
+    Dataset("View-of-Delft", lambda f: (_delft_lidar(f) / "pose").is_dir(), _view_of_delft),
     Dataset("ColoRadar", lambda f: (f / "single_chip/pointclouds/data").exists(), _coloradar),
     Dataset("MSC-RAD4R", lambda f: (f / "3_RADAR/timestamp_radar.txt").exists(), _msc_rad4r),
 )

@@ -70,10 +70,7 @@ class Fields:
 
     @classmethod
     def of(cls, names: list[str], overrides: Mapping[str, Any] | None = None) -> Fields:
-        """Find the roles of fields by their names.
-
-        `overrides` maps roles to fields; None leaves a role out.
-        """
+        """Find the roles of fields by their names. `overrides` maps roles to fields; None leaves a role out."""
         lower = {plain_name(name)[0]: name for name in reversed(names)}
         lower |= {name.lower(): name for name in reversed(names)}
         # AzimuthAngle, azimuth_angle and Azimuth Angle are the same name.
@@ -105,13 +102,6 @@ class Fields:
         """Whether positions are given by range and angles."""
         return not set(_XYZ) <= set(self.names)
 
-    @property
-    def used(self) -> list[str]:
-        """Roles that scans need: the fields of all others may be of any kind."""
-        sigma = SIGMA if set(SIGMA) <= set(self.names) else ()
-        roles = (*(_POLAR if self.polar else _XYZ), "intensity", "doppler", *sigma)
-        return [role for role in roles if role in self.names]
-
     def factor(self, role: str) -> float:
         """Return the factor from the unit of a field to m, rad or m/s: that in its name, or else degrees by value."""
         if role not in _DIMENSIONS:
@@ -142,16 +132,17 @@ class Fields:
         if plain_name(name)[1] == "linear":
             notes.add(f"{name} is used as intensity unchanged: in dB, 10 log10, it gives a better map")
         if unused := [name for name in names if name and name not in self.names.values()]:
-            listed = ", ".join(unused)
-            notes.add(f"unused fields: {listed}; fields={{role: name}} or --field selects others")
+            notes.add(f"unused fields: {', '.join(unused)}; fields={{role: name}} or --field selects others")
 
     def scan(
         self, columns: Mapping[str, Array], T_world_sensor: Floats, time_s: float | None, notes: Notes
     ) -> Scan:
         """Build a scan of the finite returns in the columns, (N,) each. Positions are float64 if x, y or z need it, else float32."""
         values: dict[str, Array] = {}  # m, rad, m/s
+        of_sigma = SIGMA if set(SIGMA) <= set(self.names) else ()
+        optional = [role for role in ("intensity", "doppler", *of_sigma) if role in self.names]
         with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are dropped
-            for role in self.used:
+            for role in (*(_POLAR if self.polar else _XYZ), *optional):  # all others may be of any kind
                 column, factor = columns[self.names[role]], self.factor(role)
                 check(column.dtype.kind in "biuf", f"the field {self.names[role]} holds no numbers")
                 values[role] = column if factor == 1 else column * np.float64(factor)
@@ -163,13 +154,10 @@ class Fields:
                 xyz = [values[axis] for axis in _XYZ]
             in_double = not self.polar and any(part.dtype.itemsize > 4 for part in xyz)
             points = np.stack(xyz, axis=1).astype(np.float64 if in_double else np.float32)
-            intensities, doppler_mps = (
-                np.ascontiguousarray(values[role], np.float32) if role in values else None
-                for role in ("intensity", "doppler")
-            )
-            sigma = [values[role].astype(np.float32) for role in SIGMA if role in values]
-        sigmas = np.stack(sigma, axis=1) if sigma else None
-        return finite_returns(Scan(points, T_world_sensor, intensities, doppler_mps, time_s, sigmas), notes)
+            single = {role: np.ascontiguousarray(values[role], np.float32) for role in optional}
+        sigmas = np.stack([single[role] for role in of_sigma], axis=1) if of_sigma else None
+        scan = Scan(points, T_world_sensor, single.get("intensity"), single.get("doppler"), time_s, sigmas)
+        return finite_returns(scan, notes)
 
 
 def columns_of(scan: Scan, points: Array) -> Columns:

@@ -10,7 +10,7 @@ import socket
 import stat
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
@@ -35,6 +35,13 @@ def check_regular_file(path: str | PathLike[str]) -> None:
         pass
 
 
+def checked_suffix(path: str | PathLike[str], suffixes: Sequence[str], what: str) -> str:
+    """Return the suffix of a path in lower case. Raises a ValueError unless it is one of these, those of files of `what`."""
+    suffix = path_of(path, "path").suffix.lower()
+    check(suffix in suffixes, f"{path}: files of {what} end in {', '.join(suffixes)}")
+    return suffix
+
+
 @contextmanager
 def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> Iterator[None]:
     """Turn a ValueError, or one of `errors`, raised in the block into a ValueError that `path` is not `what`."""
@@ -49,10 +56,7 @@ def reading(path: str | PathLike[str], what: str, *errors: type[Exception]) -> I
 def check_outputs(
     outputs: Iterable[str | PathLike[str] | None], inputs: Iterable[str | PathLike[str] | None] = ()
 ) -> None:
-    """Raise unless each output can be written, and is neither an input nor another output.
-
-    Call it before the work. Paths that are None are ignored; links are followed.
-    """
+    """Raise, before the work, unless each output can be written, and is neither an input nor another output."""
     taken = {os.path.realpath(path): path for path in inputs if path is not None}
     for path in outputs:
         if path is None:
@@ -104,7 +108,6 @@ def whole_file(path: str | PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def _mode_to_keep(target: Path, named: str | PathLike[str]) -> int | None:
-    """Permissions of the file to be replaced; None if there is none."""
     if not target.exists():
         return None
     mode = target.stat().st_mode

@@ -15,11 +15,12 @@ _SRGB = np.arange(256) / 255
 SRGB_TO_LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)
 """(256,) linear light of each 8-bit sRGB value."""
 
-MATT: dict[str, Any] = {
-    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-    "doubleSided": True,
-}
+_ROUGH = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+MATT: dict[str, Any] = {"pbrMetallicRoughness": _ROUGH, "doubleSided": True}
 """Material that shows the colours of the vertices."""
+
+T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""(4, 4) rotation that turns z up into y up, as glTF demands."""
 
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 
@@ -52,11 +53,8 @@ def encode_glb(
         }
         for number, part in enumerate(parts)
     ]
-    primitive = {
-        "attributes": dict(zip(of_vertices, range(1, len(parts)), strict=True)),
-        "indices": 0,
-        "material": 0,
-    }
+    numbers = dict(zip(of_vertices, range(1, len(parts)), strict=True))
+    primitive = {"attributes": numbers, "indices": 0, "material": 0}
     tree = {
         "asset": {"version": "2.0"},
         "scene": 0,

@@ -13,8 +13,8 @@ from radarsdf.arrays import Bytes, Floats
 from radarsdf.checks import check, path_of, positions
 from radarsdf.io.cloud_writing import face_records, ply_header, records
 from radarsdf.io.clouds import has_faces, ply_bytes, read_points
-from radarsdf.io.files import check_fits_float32, check_regular_file, write_whole
-from radarsdf.io.glb import SRGB_TO_LINEAR, encode_glb
+from radarsdf.io.files import check_fits_float32, check_regular_file, checked_suffix, write_whole
+from radarsdf.io.glb import SRGB_TO_LINEAR, T_GLTF_WORLD, encode_glb
 from radarsdf.io.npz import TRUTH_ARRAYS, arrays_of
 from radarsdf.scans import Columns
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 MESH_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb")
 _FLOAT32_SUFFIXES = (".stl", ".glb")
-_T_GLTF_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z up becomes y up
 _SAMPLES = 1_000_000  # enough points for triangles of a building, which may be 20 m long
 
 
@@ -34,12 +33,6 @@ def holds_mesh(path: str | PathLike[str]) -> bool:
     if suffix == ".ply":
         return file.is_file() and has_faces(file)
     return suffix in MESH_SUFFIXES and not file.is_dir()
-
-
-def check_mesh_path(path: str | PathLike[str]) -> None:
-    """Raise a ValueError unless `path` has a suffix that :func:`write_mesh` supports."""
-    known = path_of(path, "path").suffix.lower() in MESH_SUFFIXES
-    check(known, f"{path}: files of meshes end in {', '.join(MESH_SUFFIXES)}")
 
 
 def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
@@ -63,8 +56,7 @@ def write_mesh(path: str | PathLike[str], mesh: trimesh.Trimesh) -> None:
     OSError
         If it cannot be written.
     """
-    check_mesh_path(path)
-    suffix = Path(path).suffix.lower()
+    suffix = checked_suffix(path, MESH_SUFFIXES, "meshes")
     if suffix in _FLOAT32_SUFFIXES:
         check_fits_float32(path, np.asarray(mesh.vertices, np.float64))
     own: dict[str, Callable[[trimesh.Trimesh], bytes]] = {".ply": _ply, ".glb": _glb}
@@ -94,10 +86,10 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
     """
     file = path_of(path, "path")
     check_regular_file(file)
-    check_mesh_path(file)
+    suffix = checked_suffix(file, MESH_SUFFIXES, "meshes")
     import trimesh  # noqa: PLC0415 - takes long
 
-    ply = file.suffix.lower() == ".ply"
+    ply = suffix == ".ply"
     try:
         source: Any = ply_bytes(file) if ply else file
         mesh: Any = trimesh.load_mesh(source, file_type="ply" if ply else None, process=False)
@@ -109,16 +101,13 @@ def read_mesh(path: str | PathLike[str]) -> trimesh.Trimesh:
         msg = f"{path} cannot be read as a mesh: {error}"
         raise ValueError(msg) from error
     check(whole, f"{path}: a triangle refers to a vertex that does not exist")
-    if file.suffix.lower() == ".glb":
-        mesh.apply_transform(_T_GLTF_WORLD.T)
+    if suffix == ".glb":
+        mesh.apply_transform(T_GLTF_WORLD.T)
     return cast("trimesh.Trimesh", mesh)
 
 
 def read_ground_truth(path: str | PathLike[str]) -> Floats:
-    """Read points (M, 3) float64, world frame, m, from a cloud or an ``.npz`` file, or sample a mesh uniformly.
-
-    The same file gives the same points. Raises the errors of :func:`radarsdf.io.read_points`.
-    """
+    """Read points (M, 3), world, m, of a cloud or ``.npz`` file, or sample a mesh: the same file gives the same points."""
     file = Path(path)
     suffix = file.suffix.lower()
     if holds_mesh(file):
@@ -151,11 +140,10 @@ def _glb(mesh: trimesh.Trimesh) -> bytes:
         attributes["COLOR_0"] = SRGB_TO_LINEAR[colors[:, :3]]
     numbers = {n: v for n, v in mesh.metadata.items() if isinstance(v, (int, float)) and np.isfinite(v)}
     check(len(mesh.faces), "the mesh has no triangle: .glb cannot hold it")
-    return encode_glb(mesh.vertices, mesh.faces, attributes, matrix=_T_GLTF_WORLD, extras=numbers)
+    return encode_glb(mesh.vertices, mesh.faces, attributes, matrix=T_GLTF_WORLD, extras=numbers)
 
 
 def _ply(mesh: trimesh.Trimesh) -> bytes:
-    """Encode as binary little-endian PLY with vertices in double precision."""
     scalars, colors = _scalars_and_colors(mesh)
     columns = dict(zip("xyz", np.asarray(mesh.vertices, np.float64).T, strict=True)) | scalars
     if colors is not None:

@@ -92,7 +92,6 @@ def read_scans(path: str | PathLike[str]) -> Scans:
 
 
 def _check_scans(arrays: Mapping[str, Array]) -> None:
-    """Raise a ValueError unless the arrays are consistent."""
     known = {"N": arrays["points"].shape[:1], "F": arrays["poses"].shape[:1]}
     for name, array in arrays.items():
         kinds = "biuf" if name == "static" else "iuf"

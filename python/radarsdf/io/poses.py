@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import are_rigid, check, check_pose, check_poses, path_of, pose_matrices, real_array
-from radarsdf.io.files import check_regular_file, reading, write_whole
+from radarsdf.io.files import check_regular_file, checked_suffix, reading, write_whole
 from radarsdf.io.npz import array_in
 from radarsdf.io.text import Table, in_seconds, read_numbers, read_table, read_text
 from radarsdf.io.units import scaled, without_unit
@@ -156,24 +156,19 @@ def pose_matrices_of(table: Floats) -> Floats:
 
 
 def trajectory_of(table: Floats, name: str, notes: Notes | None = None) -> Trajectory:
-    """Build a trajectory from rows (P, 8) of time, position and quaternion, in any order.
-
-    Of several poses at one time, the first is used. Omissions are added to `notes`.
-    """
+    """Build a trajectory from rows (P, 8) of time, position and quaternion, in any order; repeated and damaged ones are noted."""
     good = are_poses(table[:, 1:]) & np.isfinite(table[:, 0])
     missing = ~np.isfinite(table).all(axis=1) | ~table[:, 4:].any(axis=1)
     times_s, first = np.unique(table[good, 0], return_index=True)
     rows = np.flatnonzero(good)[first]
     kept = np.zeros_like(good)
     kept[rows] = True
-    what = (
-        f"of {len(table)} poses are left out: not finite, no unit quaternion, or a repeated time; the first"
-    )
-    left_out = "" if kept.all() else f"{(~kept).sum()} {what}: pose {np.argmin(kept)}"
+    why = "are left out: not finite, no unit quaternion, or a repeated time"
+    count = f"{(~kept).sum()} of {len(table)} poses"
+    left_out = "" if kept.all() else f"{count} {why}; the first: pose {np.argmin(kept)}"
     enough = len(times_s) >= 2 and 2 * (~good & ~missing).sum() < (~missing).sum()
-    check(
-        enough, f"{name} holds {len(times_s)} poses at different times; at least two are needed; {left_out}"
-    )
+    needed = "poses at different times; at least two are needed"
+    check(enough, f"{name} holds {len(times_s)} {needed}; {left_out}")
     if notes is not None and left_out:
         notes.add(f"{name}: {left_out}")
     return Trajectory(times_s, table[rows, 1:4], Rotation.from_quat(table[rows, 4:]))
@@ -267,7 +262,6 @@ def _pose_columns(table: Table) -> Columns:
 
 
 def _role_of(name: str) -> str:
-    """Role of a named column in a pose; empty if it has none."""
     words = re.sub(r"[\W_]+", " ", without_unit(name)[0]).strip()
     matches = ((re.fullmatch(pattern, words), role) for pattern, role in _ROLES)
     return next((role.format(*match.groups()) for match, role in matches if match), "")
@@ -281,10 +275,8 @@ def rigid_or_nan(poses: Array, name: str, notes: Notes) -> Floats:
         if 2 * bad.sum() > len(bad):  # the numbers are not poses at all
             check_poses(matrices)
     if bad.any():
-        notes.add(
-            f"scans left out: {bad.sum()} of {len(bad)} poses of {name} are not finite and rigid; "
-            f"the first: pose {np.argmax(bad)}"
-        )
+        what = f"{bad.sum()} of {len(bad)} poses of {name} are not finite and rigid"
+        notes.add(f"scans left out: {what}; the first: pose {np.argmax(bad)}")
     return np.where(bad[:, None, None], np.nan, matrices)
 
 
@@ -306,12 +298,6 @@ def read_calibration(path: Path) -> Floats | None:
         return None
     with reading(path, "a KITTI calibration"):
         return check_pose(np.array([*numbers, 0, 0, 0, 1], np.float64).reshape(4, 4), "Tr")
-
-
-def check_pose_suffix(path: str | PathLike[str]) -> None:
-    """Raise a ValueError for a suffix that :func:`write_poses` does not support."""
-    known = path_of(path, "path").suffix.lower() in POSE_SUFFIXES
-    check(known, f"{path} is not a supported file of poses: those end in {', '.join(POSE_SUFFIXES)}")
 
 
 def check_pose_times(path: str | PathLike[str], times_s: ArrayLike | None) -> None:
@@ -349,9 +335,8 @@ def write_poses(path: str | PathLike[str], poses: ArrayLike, times_s: ArrayLike 
     >>> print(Path("poses.tum").read_text().strip())
     12.500000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 0.000000000 1.000000000
     """
-    check_pose_suffix(path)
+    suffix = checked_suffix(path, POSE_SUFFIXES, "poses to write")
     check_pose_times(path, times_s)
-    suffix = path_of(path, "path").suffix.lower()
     matrices = check_poses(poses)
     text = io.BytesIO()
     if suffix == ".npy":

@@ -177,9 +177,8 @@ def _read(path: Path, request: recordings.Request) -> Scans:
     if dataset is not None:
         return dataset.read(path, request)
     if path.is_dir():
-        return recordings.read_files(
-            recordings.cloud_files(path, request.notes), path, request, partial(recordings.lidar_map, path)
-        )
+        files = recordings.cloud_files(path, request.notes)
+        return recordings.read_files(files, path, request, partial(recordings.lidar_map, path))
     suffix = path.suffix.lower()
     kinds = ", ".join((".npz", *BAG_SUFFIXES, *READERS))
     known = suffix == ".npz" or suffix in READERS
@@ -188,7 +187,6 @@ def _read(path: Path, request: recordings.Request) -> Scans:
 
 
 def _npz(path: Path, request: recordings.Request) -> Scans:
-    """Read our own file, with its poses or those passed by the user."""
     notes = request.notes
     request.refuse(f"{path} has names of columns", "columns")
     scans = read_scans(path)
@@ -200,13 +198,12 @@ def _npz(path: Path, request: recordings.Request) -> Scans:
         notes.add(f"the given poses are used in place of those in {path.name}, without its ground truth")
     times_s = None if scans.times_s is None else scans.times_s.tolist()
     matched, _ = recordings.scan_poses(poses, len(scans), times_s, request.extrinsic, request)
-    raw = [
+    raw_scans = [
         recordings.RawScan(partial(columns_of, s, s.points), s.time_s, f"{path}: scan {i}")
         for i, s in enumerate(scans)
     ]
     truth, imu = scans.ground_truth if own else None, scans.imu
     if imu is not None and request.R_sensor_imu is not None:
         imu = dataclasses.replace(imu, R_sensor_imu=request.R_sensor_imu)
-    return Scans.of_source(
-        recordings.posed(lambda: raw, lambda _: matched, request), notes, lambda: truth, lambda: imu
-    )
+    source = recordings.posed(lambda: raw_scans, lambda _: matched, request)
+    return Scans.of_source(source, notes, lambda: truth, lambda: imu)

@@ -134,10 +134,7 @@ def posed(
 def _scan(
     raw: RawScan, T_world_sensor: Floats, layouts: dict[tuple[str, ...], Fields], request: Request
 ) -> Scan | None:
-    """Read a scan and attach its pose; None, and counted, if it is damaged or empty.
-
-    `layouts`: roles of the columns by topic and names, which are added when they first come.
-    """
+    """Read a scan; None, and counted, if it is damaged or empty. `layouts`: roles of the columns by topic and names so far."""
     notes, scan = request.notes, None
     try:
         columns = raw.read()
@@ -185,10 +182,7 @@ def scan_poses(
 
 
 def read_files(files: list[Path], folder: Path, request: Request, truth: Truth = lambda: None) -> Scans:
-    """Read scans from files, with the poses of the request or those found in or near the folder.
-
-    Each file holds one scan.
-    """
+    """Read scans from files, one each, with the poses of the request or those found in or near the folder."""
     check(files, f"{folder} holds no scans: neither bags nor files that end in {', '.join(CLOUD_SUFFIXES)}")
     notes, poses, T_base_sensor = request.notes, request.poses, request.extrinsic
     if poses is None:

@@ -22,9 +22,8 @@ _CHECKSUMS = "crc32"  # key of the metadata: CRC-32 of each tensor by name, and 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
     """Encode tensors as a safetensors file with checksums."""
     tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
-    checksums = {"": _metadata_checksum(metadata)} | {
-        name: _checksum(t.numpy()) for name, t in tensors.items()
-    }
+    checksums = {name: _checksum(tensor.numpy()) for name, tensor in tensors.items()}
+    checksums = {"": _metadata_checksum(metadata)} | checksums
     return save(tensors, {**metadata, _CHECKSUMS: json.dumps(checksums)})
 
 
@@ -33,7 +32,6 @@ def _metadata_checksum(metadata: Mapping[str, str]) -> int:
 
 
 def _checksum(array: Any) -> int:
-    """CRC-32 of an array, its type and its shape."""
     seed = zlib.crc32(f"{array.dtype} {tuple(array.shape)}".encode())
     return zlib.crc32(array.reshape(-1).view("u1"), seed)
 
@@ -51,8 +49,8 @@ class TensorFile:
     def checksums(self) -> dict[str, int]:
         """CRC-32 by name of the array. Raises a ValueError if the metadata or the names differ from those written."""
         found: dict[str, int] = json.loads(self._stated)
-        whole = isinstance(found, dict) and set(found) == {"", *self.names}
-        whole = whole and found[""] == _metadata_checksum(self.metadata)
+        named = isinstance(found, dict) and set(found) == {"", *self.names}
+        whole = named and found[""] == _metadata_checksum(self.metadata)
         check(whole, "the checksum of its metadata is wrong")
         return found
 

@@ -13,20 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from radarsdf import checks
 from radarsdf.arrays import Floats, Keys
-from radarsdf.checks import (
-    MAX_TIME_S,
-    check,
-    check_pose,
-    check_values_of_scan,
-    instance,
-    not_negative,
-    number,
-    path_of,
-    positions,
-    real_array,
-    whole_number,
-)
+from radarsdf.checks import check, check_pose, instance
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.fitting.fit import fit
@@ -123,9 +112,9 @@ class LiveMap:
         config = FitConfig() if config is None else instance(config, FitConfig, "config")
         single = config.returns.accumulate_scans == 1
         check(single, "returns.accumulate_scans must be 1: a live map integrates single scans")
-        corner = None if origin is None else positions([np.asarray(origin)], "origin")[0]
-        most = None if max_bytes is None else whole_number(max_bytes, "max_bytes", 1)
-        place = None if folder is None else path_of(folder, "folder")
+        corner = None if origin is None else checks.positions([np.asarray(origin)], "origin")[0]
+        most = None if max_bytes is None else checks.whole_number(max_bytes, "max_bytes", 1)
+        place = None if folder is None else checks.path_of(folder, "folder")
         if place is not None:
             unlock = weakref.finalize(self, os.close, locked_folder(place))
             if hasattr(os, "register_at_fork"):  # a child process would hold the lock, too
@@ -254,12 +243,12 @@ class LiveMap:
                 come[scan_id] = scan.at(given)
             scan, again = come[scan_id], tuple(step.scan_id for step in steps[:-1])
             lattice, origin = self.config.lattice, state.origin
+            if origin is None:
+                origin = lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
             blocks = state.exchange(
                 come,
                 again,
-                origin=lattice.position(lattice.nearest_block(scan.pose[:3, 3]))
-                if origin is None
-                else origin,
+                origin=origin,
                 with_intensities=with_intensities,
                 next_id=max(state.next_id, scan_id + 1) if isinstance(scan_id, int) else state.next_id,
                 track=self._follower.track(steps) if steps else state.track.placed(scan_id, scan),
@@ -325,7 +314,8 @@ class LiveMap:
         ValueError, OSError
             If an argument is out of range, or a region cannot be written to the folder.
         """
-        middle, radius = positions([np.asarray(centre)], "centre")[0], not_negative(radius_m, "radius_m")
+        middle = checks.positions([np.asarray(centre)], "centre")[0]
+        radius = checks.not_negative(radius_m, "radius_m")
         with self._owned():
             return self._state.clear_outside(middle, radius)
 
@@ -447,13 +437,13 @@ def _checked_scan(
     scan = scans[0].copy()
     speeds, static = None, None
     if doppler_mps is not None:
-        speeds = compact(real_array(doppler_mps, "doppler_mps"))
-        check_values_of_scan(speeds, scan, "doppler_mps", 0)
+        speeds = compact(checks.real_array(doppler_mps, "doppler_mps"))
+        checks.check_values_of_scan(speeds, scan, "doppler_mps", 0)
         if config.drop_moving:
             moving = MovingReturns.of([scan], [speeds]).masks[0]
             static = ~moving if moving.any() else None
     if time_s is not None:
-        time_s = number(time_s, "time_s")
-        check(abs(time_s) <= MAX_TIME_S, f"time_s must be finite and within {MAX_TIME_S:g} s, not {time_s:g}")
+        time_s, latest = checks.number(time_s, "time_s"), checks.MAX_TIME_S
+        check(abs(time_s) <= latest, f"time_s must be finite and within {latest:g} s, not {time_s:g}")
     values_of_scan = None if values is None else values[0].copy()
     return LoggedScan(np.eye(4), compact(scan), values_of_scan, speeds, static, time_s), left_out.far

@@ -58,13 +58,12 @@ def region_places(regions: Keys) -> Ints:
 
 
 def _keys_at(cells: Ints) -> Keys:
-    """Return the keys (N,) of cells (N, 3)."""
     # The centre of a cell of 1 m is exact in float64.
     return cell_keys(np.clip(cells, -_FARTHEST, _FARTHEST - 1) + 0.5, 1.0, 1)
 
 
 class RegionTable:
-    """Table by ascending Morton keys of cells, partitioned into regions. `leaves_per_cell`: edge of a cell, leaf cells, 1 or 2."""
+    """Table by ascending Morton keys of cells, with an edge of 1 or 2 leaf cells, partitioned into regions."""
 
     def __init__(self, leaves_per_cell: int = 1, **columns: Array) -> None:
         """Create an empty table. `columns`: default row of each column."""
@@ -76,11 +75,9 @@ class RegionTable:
     def gather(self, regions: Keys | None = None) -> Rows:
         """Return the rows of ascending `regions` (R,), in the order of their keys. None: all."""
         wanted = sorted(self._parts) if regions is None else regions.tolist()
-        parts = [self._parts[region] for region in wanted if region in self._parts]
-        return {
-            name: np.concatenate([new[:0], *(part[name] for part in parts)])
-            for name, new in self._new.items()
-        }
+        empty = {name: new[:0] for name, new in self._new.items()}
+        parts = [empty, *(self._parts[region] for region in wanted if region in self._parts)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in empty}
 
     def carried(self, regions: Keys, keys: Keys) -> Rows:
         """Return rows for `keys`, all in `regions`: the existing ones, else defaults."""

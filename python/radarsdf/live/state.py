@@ -75,10 +75,7 @@ class GrowingState:
         return self.sums.num_bytes + self.log.num_bytes + surface
 
     def exchange(self, come: _Scans, gone: Iterable[ScanId], **new: Any) -> Keys:
-        """Remove and insert scans, possibly of the same ids, atomically. Return the keys of the changed blocks.
-
-        `new`: attributes to set with them.
-        """
+        """Remove and insert scans, and set `new` attributes, atomically. Return the keys of the changed blocks."""
         left = {scan_id: self.log.get(scan_id) for scan_id in gone}
         new = {"origin": self.origin, "log": self.log.exchanged(come, left)} | new
         before = {name: getattr(self, name) for name in new}
@@ -112,7 +109,6 @@ class GrowingState:
         return changed
 
     def _bound(self) -> None:
-        """Seal scans, or write them to the folder, to stay within the memory limit."""
         if self.max_bytes is not None and self.num_bytes > self.max_bytes:
             if self._noise_of == 0:  # the scans for its estimate may be sealed
                 self._settle_noise()
@@ -167,10 +163,8 @@ class GrowingState:
             blocks = np.array(sorted(self._changed), np.uint64)
         bits = REGION_BITS - BLOCK_BITS
         in_region = np.arange(1 << int(bits), dtype=np.uint64)
-        near = (
-            (np.unique(blocks >> bits) << bits)[:, None] | in_region
-        ).ravel()  # all blocks of their regions
-        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(near))
+        in_regions = (np.unique(blocks >> bits) << bits)[:, None] | in_region
+        sums = ScanSums(self.config.leaf_size_m, *self.sums.sums_of(in_regions.ravel()))
         surface.complete = False
         self._changed.clear()
         return surface, (blocks, sums, self.noise, self._num_threads), self._visibility()

@@ -23,12 +23,8 @@ from radarsdf.live.regions import REGION_BITS
 from radarsdf.returns.evidence import BLOCK_BITS
 
 ScanId = Hashable
-_KINDS = {
-    "points": "f",
-    "intensities": "f",
-    "doppler_mps": "f",
-    "is_static": "b",
-}  # arrays of a scan, and their types
+# Arrays of a scan, and their types.
+_KINDS = {"points": "f", "intensities": "f", "doppler_mps": "f", "is_static": "b"}
 
 # A file in the locked folder is used only once it is complete, so it needs no temporary one, as the state does. Writing it takes
 # 0.5 ms, a fifth of :func:`write_arrays`.
@@ -87,7 +83,6 @@ class LoggedScan:
         return sum(array.nbytes for array in self.arrays.values()) + _BYTES_OF_SCAN
 
     def at(self, pose: Floats) -> LoggedScan:
-        """Return the scan at another pose (4, 4)."""
         return replace(self, pose=pose)
 
 
@@ -190,10 +185,11 @@ class ScanLog:
         """Return a log with the oldest scans in memory written or sealed until they fit into `max_bytes`."""
         come: dict[ScanId, _OnDisk] = {}
         sealed, excess = [], self.num_bytes - max_bytes
-        in_memory = [(scan_id, scan) for scan_id, scan in self._scans.items() if isinstance(scan, LoggedScan)]
-        for scan_id, scan in in_memory:
+        for scan_id, scan in self._scans.items():
             if excess <= 0:
                 break
+            if isinstance(scan, _OnDisk):
+                continue
             excess -= scan.num_bytes
             if self.folder is None:
                 sealed.append(scan_id)

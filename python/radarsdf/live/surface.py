@@ -9,13 +9,7 @@ import numpy as np
 from radarsdf._core import CellBlocks, Encoding, VertexTable
 from radarsdf.arrays import Floats, Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.fitting.average import (
-    BAND_CELLS,
-    CELLS_SMOOTHED,
-    TRUNCATION_CELLS,
-    average_at_corners,
-    normals_at,
-)
+from radarsdf.fitting import average
 from radarsdf.live.regions import (
     NO_KEYS,
     RegionTable,
@@ -32,14 +26,7 @@ from radarsdf.map.confidence import interpolated
 from radarsdf.map.contents import WholeMap
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from radarsdf.map.mesh import Surface
-from radarsdf.returns.evidence import (
-    BLOCK_BITS,
-    Evidence,
-    ReturnsOfCells,
-    VisibilityCounts,
-    bridged,
-    evidence_sums,
-)
+from radarsdf.returns import evidence
 from radarsdf.returns.ghosts import find_ghosts
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.planes import LEAVES_PER_SURFEL, MIN_SUPPORT, Surfels, neighbour_planes
@@ -62,20 +49,15 @@ class GrowingSurface:
         self._origin = origin  # (3,) origin of the local frame, world, m
         self.complete = False  # set by the caller after :meth:`update`, so that a partial one is not used
         self._noise: SensorNoise | None = None
-        vector, number, count = (
-            np.full((1, 3), np.nan, np.float32),
-            np.zeros(1, np.float32),
-            np.zeros(1, np.uint32),
-        )
+        vector = np.full((1, 3), np.nan, np.float32)
+        number, count = np.zeros(1, np.float32), np.zeros(1, np.uint32)
         # Leaf cells with returns: mean rays and normals.
         self._leaves = RegionTable(
             points=vector, directions=vector, counts=number, scans=count, ranges_m=number, normals=vector
         )
         # Cells of surfels. Planes (centre, normal, variances) are NaN without support.
-        no_plane = np.full((1, 9), np.nan)
-        self._cells = RegionTable(
-            LEAVES_PER_SURFEL, moments=np.zeros((1, 13)), support=np.zeros(1), planes=no_plane
-        )
+        row = {"moments": np.zeros((1, 13)), "support": np.zeros(1), "planes": np.full((1, 9), np.nan)}
+        self._cells = RegionTable(LEAVES_PER_SURFEL, **row)
         self._surfels = self._surfels_of(self._cells.gather())  # surfels of all cells
         self._ghosts = NO_KEYS  # ascending keys of the surfel cells with ghosts
         self._crossed = RegionTable()  # leaf cells that rays cross near their returns
@@ -107,7 +89,7 @@ class GrowingSurface:
         changed = np.union1d(changed, self._find_normals(of_planes, num_threads))
         return self._derive_distances(changed, noise, num_threads)
 
-    def surface(self, visibility: VisibilityCounts) -> tuple[WholeMap, Surface]:
+    def surface(self, visibility: evidence.VisibilityCounts) -> tuple[WholeMap, Surface]:
         """Extract all triangles, with the evidence at their vertices. `visibility`: of all blocks."""
         num_threads = resolve_num_threads(self._config.num_threads)
         surfels, leaf_m = self._surfels, self._config.leaf_size_m
@@ -115,16 +97,16 @@ class GrowingSurface:
         rows = self.distances.gather()
         crossed = rows["crossed"]
         cells = lattice_of(rows["keys"][crossed]).astype(np.int32)
-        _, corners, of_cells = sparse_lattice(cells, num_threads=num_threads)
+        _, corners, cell_corners = sparse_lattice(cells, num_threads=num_threads)
         values = np.zeros(len(corners), np.float32)
-        values[of_cells] = rows["values"][crossed][np.lexsort(cells.T[::-1])]  # in the order of the lattice
-        vertices, faces = extract_cells(
-            corners, values, of_cells, spacing=[leaf_m] * 3, num_threads=num_threads
-        )
-        evidence = Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
+        in_order = np.lexsort(cells.T[::-1])  # of the lattice
+        values[cell_corners] = rows["values"][crossed][in_order]
+        edges = [leaf_m] * 3
+        vertices, faces = extract_cells(corners, values, cell_corners, spacing=edges, num_threads=num_threads)
+        of_cells = evidence.Evidence(rows["information"], rows["hits"], visibility.at(rows["keys"]))
         # Via world coordinates, for the same rounding as queries at the vertices of the mesh.
         points = queries.to_local(scene, vertices + self._origin)
-        columns = evidence.columns(rows["keys"], resolve_num_threads(0))
+        columns = of_cells.columns(rows["keys"], resolve_num_threads(0))
         at = interpolated(CellBlocks(rows["keys"]), columns, leaf_m, points)
         return scene, Surface.from_triangles(scene, vertices, faces, at, len(rows["keys"]))
 
@@ -132,18 +114,17 @@ class GrowingSurface:
         cell_of_plane = np.flatnonzero(rows["support"] >= MIN_SUPPORT)
         planes = [part.copy() for part in np.split(rows["planes"][cell_of_plane], 3, axis=1)]
         keys, counts = rows["keys"], rows["moments"][:, 0].copy()
-        return Surfels(
-            self._surfel_m, keys, CellBlocks(keys), counts, rows["support"], cell_of_plane, *planes
-        )
+        cells = keys, CellBlocks(keys), counts, rows["support"]
+        return Surfels(self._surfel_m, *cells, cell_of_plane, *planes)
 
     def _put_sums(self, blocks: Keys, sums: ScanSums) -> Keys:
         """Update the tables from sums. Return the keys of the leaf cells in changed blocks with returns, now or before."""
-        regions = regions_of(blocks << BLOCK_BITS)
+        regions = regions_of(blocks << evidence.BLOCK_BITS)
         either = np.union1d(self._leaves.gather(regions)["keys"], sums.keys)
         self._leaves.put(regions, self._leaves.carried(regions, sums.keys) | vars(MeanRays.of_sums(sums)))
         keys, moments = sums.merged_moments()
         self._cells.put(regions, self._cells.carried(regions, keys) | {"moments": moments})
-        return either[np.isin(either >> BLOCK_BITS, blocks)]
+        return either[np.isin(either >> evidence.BLOCK_BITS, blocks)]
 
     def _fit_planes(self, changed: Keys, num_threads: int) -> Keys:
         """Fit planes in the neighbourhood of changed cells. Return the ascending keys of their regions."""
@@ -173,7 +154,7 @@ class GrowingSurface:
         """Compute the normals of the leaf cells in these regions. Return the keys of the changed ones."""
         leaves = self._leaves.gather(regions)
         surfels = self._surfels_of(self._cells.gather(regions))
-        normals = normals_at(_means_of(leaves), surfels, num_threads)
+        normals = average.normals_at(_means_of(leaves), surfels, num_threads)
         differs = (normals != leaves["normals"]).any(axis=1)
         self._leaves.put(regions, leaves | {"normals": normals})
         return leaves["keys"][differs]
@@ -182,10 +163,11 @@ class GrowingSurface:
         """Recompute distances and evidence that depend on changed leaf cells. Return their regions, ascending."""
         # A ray contributes to the cells of its band, and via shared corners to the neighbours of the last one. Added or removed
         # cells change which rays contribute at the corners of their neighbours, and smoothing propagates these changes.
-        reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(max(TRUNCATION_CELLS, BAND_CELLS)) + 1)
+        band_cells = max(average.TRUNCATION_CELLS, average.BAND_CELLS)
+        reached = cubes_near(changed, _BLOCK_CELLS, math.ceil(band_cells) + 1)
         leaf_keys, came_or_went = self._find_leaf_cells(regions_of(reached), num_threads)
         reached = np.union1d(reached, cubes_near(came_or_went, _BLOCK_CELLS, 1))
-        smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, CELLS_SMOOTHED))
+        smoothed = regions_of(cubes_near(reached, _LARGE_CELLS, average.CELLS_SMOOTHED))
         redone = np.intersect1d(smoothed, regions_of(np.union1d(leaf_keys, came_or_went)))
         self._average(redone, leaf_keys, noise, num_threads)
         return redone
@@ -193,29 +175,29 @@ class GrowingSurface:
     def _find_leaf_cells(self, regions: Keys, num_threads: int) -> tuple[Keys, Keys]:
         """Find the leaf cells near `regions`, in which rays changed. Return them, and those that came or went, ascending."""
         rays, _ = self._true_means(regions_near(regions, 1))
-        crossed = rays.leaf_keys(self._config.leaf_size_m, self._config.metres(BAND_CELLS), num_threads)
+        band_m = self._config.metres(average.BAND_CELLS)
+        crossed = rays.leaf_keys(self._config.leaf_size_m, band_m, num_threads)
         self._crossed.put(regions, {"keys": crossed})
         # Bridges depend on medians over blocks of 32 cells, and on their two ends, which they lack at the border.
         own, around = regions_near(regions, 2), regions_near(regions, 3)
         ends, _ = self._true_means(around)
         counts, most = ends.counts.astype(np.float64), self._config.encoding.bridge_cells
-        found = bridged(self._crossed.gather(around)["keys"], ends.keys, counts, most, num_threads)
+        found = evidence.bridged(self._crossed.gather(around)["keys"], ends.keys, counts, most, num_threads)
         before = self.distances.gather(around)["keys"]
         leaf_keys = np.union1d(found[within(found, own)], before[~within(before, own)])
         return leaf_keys, np.setxor1d(leaf_keys, before, assume_unique=True)
 
     def _average(self, regions: Keys, leaf_keys: Keys, noise: SensorNoise, num_threads: int) -> None:
-        """Recompute distances and evidence of the leaf cells in `regions`."""
         config = self._config
         near = regions_near(regions, 1)  # what influences their corners: smoothing reaches no farther
         means, normals = self._true_means(near)
-        weighted = ReturnsOfCells.of_means(means, noise, config.returns)
+        weighted = evidence.ReturnsOfCells.of_means(means, noise, config.returns)
         leaf_keys = leaf_keys[within(leaf_keys, near)]
         table = VertexTable(leaf_keys, config.leaf_size_m, 1, Encoding.OCTREE, num_threads)
-        distances_m = average_at_corners(table, means, weighted, normals, config, num_threads)
+        distances_m = average.average_at_corners(table, means, weighted, normals, config, num_threads)
         own = within(leaf_keys, regions)
         values = distances_m[table.leaf_vertices()[1][own]]
-        information, hits = evidence_sums(weighted, leaf_keys[own], num_threads)
+        information, hits = evidence.evidence_sums(weighted, leaf_keys[own], num_threads)
         crossed = (values.min(axis=1, initial=np.inf) <= 0) & (values.max(axis=1, initial=-np.inf) > 0)
         rows = {"values": values, "crossed": crossed, "information": information, "hits": hits}
         self.distances.put(regions, {"keys": leaf_keys[own]} | rows)
@@ -228,5 +210,4 @@ class GrowingSurface:
 
 
 def _means_of(rows: Rows) -> MeanRays:
-    """Build the mean rays of leaf cells from their columns."""
     return MeanRays(**{name: rows[name] for name in MeanRays.__dataclass_fields__})

@@ -46,8 +46,6 @@ class WholeMap:
 
 @dataclass(frozen=True)
 class MapContents(WholeMap):
-    """The contents of a map."""
-
     field: Field  # signed distance and intensity, in the local frame
     intensity_scale: IntensityScale | None  # range of the training intensities. None without intensities
     evidence: Evidence  # evidence of a surface in each leaf cell

@@ -429,7 +429,7 @@ def _as_positions(x: Any, rows: int | None = None) -> tuple[Floats, Callable[[Ar
     world = x.detach().double().numpy() if is_tensor else real_array(x, "positions")
     if rows is not None and world.shape == (3,):
         world = np.broadcast_to(world, (rows, 3))
-    fits = (world.ndim == 2 and world.shape[1] == 3 and rows is None) or len(world) == rows
+    fits = world.ndim == 2 and world.shape[1] == 3 and rows in (None, len(world))
     check(fits, f"positions must have shape (N, 3), not {world.shape}")
     keep_double = getattr(x, "dtype", None) in (torch.float64, np.dtype(np.float64), None)
 

@@ -84,9 +84,8 @@ class Surface:
     def mesh(self, origin: Floats, limits: Limits, leaf_cells: int) -> trimesh.Trimesh:
         """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
-        return self.part(
-            origin, self.kept(limits), **counts, **self.tally.threshold(limits.min_confidence).metadata
-        )
+        threshold = self.tally.threshold(limits.min_confidence)
+        return self.part(origin, self.kept(limits), **counts, **threshold.metadata)
 
     def part(self, origin: Floats, kept: Bools, **metadata: float) -> trimesh.Trimesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
@@ -143,16 +142,10 @@ def one_for_equal(vertices: Floats, rows: Ints) -> Ints32:
     return found
 
 
-# Voxels
-
-
 def extract_triangles(
     contents: MapContents, voxel_size: float, box: Floats | None, progress: bool | None
 ) -> tuple[Floats, Ints32, int]:
-    """Triangulate the surface in voxels. `box` (2, 3), local frame, m, limits their centres.
-
-    Returns vertices (V, 3), local frame, m, faces (F, 3), and the number of leaf cells searched.
-    """
+    """Triangulate in voxels with centres in the box, local frame, m: vertices (V, 3), faces (F, 3), number of cells searched."""
     config, table, num_threads = contents.config, contents.field.table, torch.get_num_threads()
     options: dict[str, Any] = {"spacing": [voxel_size] * 3, "num_threads": num_threads}
     parts, even = per_cell(voxel_size, config.leaf_size_m)
@@ -240,9 +233,9 @@ def subdivided(cells: Array, parts: int) -> Array:
 
 
 def _check_voxels(cells: int, voxel_size: float, parts: int, even: bool, config: FitConfig) -> None:
-    if max(cells, 1) * (parts + 1) ** 3 > _MAX_VOXELS:  # so that coordinates are int32, too
-        msg = f"voxels of {voxel_size} m are too many for {cells} cells of {config.leaf_size_m} m: use larger ones"
-        raise ValueError(msg)
+    within = max(cells, 1) * (parts + 1) ** 3 <= _MAX_VOXELS  # so that coordinates are int32, too
+    too_many = f"too many for {cells} cells of {config.leaf_size_m} m: use larger ones"
+    check(within, f"voxels of {voxel_size} m are {too_many}")
     check_mesh(cells * (parts if even else parts + 1) ** 3, voxel_size, config.max_memory_bytes)
 
 
@@ -254,7 +247,6 @@ def _corner_distances(
     voxel_corners: Ints32,
     progress: bool | None = False,
 ) -> Floats32:
-    """Evaluate signed distances (K,), m, at lattice corners (K, 3)."""
     # A corner on the border of the map may be in an empty cell beyond it. It is moved towards the centre of one of its voxels
     # until it is in an occupied cell, and the distance moved is added to its absolute value.
     points = corners.astype(np.float32) * np.float32(voxel_size)

@@ -46,10 +46,7 @@ def plane(contents: MapContents, points: Floats32) -> Floats32:
 def intensity(
     contents: MapContents, points: Floats32, sensors: Floats32, *, extrapolate: bool = False
 ) -> Floats32:
-    """Predict intensities (N,), sensor units, of returns from points to sensors (N, 3), local frame, m.
-
-    NaN for ranges and elevations unlike those of all returns, unless `extrapolate`.
-    """
+    """Predict intensities (N,), sensor units; NaN for ranges and elevations unlike those of all returns, unless `extrapolate`."""
     scale, field = contents.intensity_scale, contents.field
     assert scale is not None
 

@@ -125,9 +125,8 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
     check((evidence["information"] >= 0).all(), "information is negative")
     free_space = FreeSpace(**_arrays_of("free_space", tensors))
     free_space.check()
-    view_statistics = ViewStatistics(
-        **_arrays_of("view_statistics", tensors), sigma=float(description["view_sigma"])
-    )
+    sigma = float(description["view_sigma"])
+    view_statistics = ViewStatistics(**_arrays_of("view_statistics", tensors), sigma=sigma)
     view_statistics.check(config.leaf_size_m)
     limits = description["intensity_scale"]
     scale = None if limits is None else IntensityScale.between(limits)
@@ -159,7 +158,6 @@ def contents_of(tensors: dict[str, Tensor], description: dict[str, Any]) -> MapC
 
 
 def _field_of(tensors: dict[str, Tensor], keys: Keys, config: FitConfig, with_intensity: bool) -> Field:
-    """Build the field with these leaf cells from the remaining tensors."""
     # On the meta device, for shapes alone: a damaged description could request networks of any size.
     with torch.device("meta"):
         if config.train:

@@ -116,9 +116,8 @@ class Tally:
 
     def threshold(self, min_confidence: float | None = None) -> Threshold:
         """Return the threshold of the highest expected F-score, or the expected quality at a given confidence."""
-        kept_m2, true_m2, covering = (
-            np.cumsum(values[::-1])[::-1] for values in (self.area_m2, self.true_m2, self.covering)
-        )
+        of_bins = (self.area_m2, self.true_m2, self.covering)
+        kept_m2, true_m2, covering = (np.cumsum(values[::-1])[::-1] for values in of_bins)
         precision = np.divide(true_m2, kept_m2, out=np.zeros_like(true_m2), where=kept_m2 > 0)
         coverage = covering / covering[0] if covering[0] > 0 else covering
         if min_confidence is None:

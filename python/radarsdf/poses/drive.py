@@ -83,7 +83,6 @@ class Drive:
 
     @property
     def turns_slowly(self) -> bool:
-        """Whether the sensor is so fast that it hardly turns between scans."""
         return self.usual_turn_rad_s < _SLOW_TURN_RAD_S
 
     def motions(self, tracked: Sequence[Tracked], rows: slice) -> list[Motion]:
@@ -127,14 +126,13 @@ def track_drive(
             # Tracking was lost. Narrow the search of the next passes.
             usual = np.full(3, drive.usual_turn_rad_s**2)
             turns = MotionPrior(usual, usual, True)
+        steady_moves = moves.learnt(move_rates, durations_s, with_errors=True)
+        steady_turns = turns.learnt(turn_rates, durations_s, with_errors=True)
         drive = dataclasses.replace(
             drive,
             turns=turns.learnt(turn_rates, durations_s),
             moves=moves.learnt(move_rates, durations_s),
-            steady=(
-                moves.learnt(move_rates, durations_s, with_errors=True),
-                turns.learnt(turn_rates, durations_s, with_errors=True),
-            ),
+            steady=(steady_moves, steady_turns),
         )
         if i == 0 and gyroscope is not None:
             # Rotations tracked with the gyroscope would not reveal its bias.
@@ -164,9 +162,7 @@ def rates_of(before: Floats, now: Tracked, duration_s: float) -> tuple[MotionRat
     """Compute the rates of rotation and translation, in the sensor frame, of the step from pose `before` (4, 4)."""
     back = before[:3, :3].T
     half = rotation(0.5 * now.turn).T @ back
-    of_way, of_turn = (
-        matrix @ now.covariance[rows, rows] @ matrix.T / duration_s**2
-        for matrix, rows in ((half, slice(0, 3)), (back, slice(3, 6)))
-    )
+    of_way = half @ now.covariance[:3, :3] @ half.T / duration_s**2
+    of_turn = back @ now.covariance[3:, 3:] @ back.T / duration_s**2
     translation = half @ (now.pose[:3, 3] - before[:3, 3])
     return MotionRate(now.turn / duration_s, of_turn), MotionRate(translation / duration_s, of_way)

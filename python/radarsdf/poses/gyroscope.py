@@ -84,10 +84,7 @@ class Gyroscope:
         return MotionRate(self.turns[i] - self.bias.mean * duration_s, covariance)
 
     def learnt(self, rates: Sequence[MotionRate | None]) -> Gyroscope:
-        """Estimate bias and noise from the rates (F - 1) of rotation between scans, rad/s, by another source. None: unknown.
-
-        Raises an UnusableGyroscopeError if they contradict the gyroscope.
-        """
+        """Estimate bias and noise from turn rates, rad/s. Raise an UnusableGyroscopeError if they contradict the gyroscope."""
         known = {i: rate for i, rate in enumerate(rates) if rate is not None and self.durations_s[i] > 0}
         if len(known) < 2:
             return self
@@ -109,10 +106,7 @@ class Gyroscope:
 def _fit_bias(
     off: Floats, durations_s: Floats, weights: Floats, before: Floats | float = 0.0
 ) -> tuple[Floats, Floats, float]:
-    """Fit a constant rate (3,) to residual rotations `off` (K, 3); return it, its information (3, 3) and the mean squared residual.
-
-    Weighted least squares; `before` is the information of a prior at 0.
-    """
+    """Fit a constant rate to rotations `off` (K, 3), with prior information `before` at 0: rate, information, mean square."""
     information = before + np.einsum("fij,f->ij", weights, durations_s**2)
     bias: Floats = np.linalg.solve(information, np.einsum("fij,fj,f->i", weights, off, durations_s))
     left = off - bias * durations_s[:, None]
@@ -130,8 +124,7 @@ def _check_agreement(
     # Turns that the returns hardly observe share the error of their prediction.
     unknown = float(np.sqrt(np.median(np.einsum("fii->f", covariance) / durations_s**2)))
     if contradicted or rate >= _MOST_BIAS_RAD_S + 3 * unknown:
-        msg = (
-            f"its rates differ from the turns that the returns show by {np.sqrt(square / 3):.1f} standard deviations and a bias "
-            f"of {rate:.2f} rad/s: are they in rad/s, and in the axes of the radar?"
-        )
+        off_by = f"{np.sqrt(square / 3):.1f} standard deviations and a bias of {rate:.2f} rad/s"
+        what = f"its rates differ from the turns that the returns show by {off_by}"
+        msg = f"{what}: are they in rad/s, and in the axes of the radar?"
         raise UnusableGyroscopeError(msg)

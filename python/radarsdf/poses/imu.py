@@ -50,8 +50,6 @@ _MOST_RAD_S, _MOST_MPS2 = 6.0, 30.0
 
 @dataclass(frozen=True)
 class _ImuMotion:
-    """Integrated motion of an IMU."""
-
     times_s: Floats
     rates: Floats  # (G, 3) rad/s without bias
     turns: Floats  # (G, 3, 3) rotations to the initial frame
@@ -154,7 +152,6 @@ class _AlignmentModel:
 
     @cached_property
     def begins(self) -> NDArray[np.intp]:
-        """First scan of each window."""
         return np.searchsorted(self.window, np.arange(self.window[-1] + 1))
 
     @cached_property
@@ -191,7 +188,6 @@ class _AlignmentModel:
         return np.asarray(np.einsum("fij,fjk,fk->fi", whitening, to_radar, left - means[self.window]))
 
     def residuals(self, x: Floats) -> Floats:
-        """Return the normalised residuals of velocities and priors."""
         prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, x[13:16] / FIRST_BIAS_RAD_S]
         changes = (x[16:] - x[13:-3]) / _BIAS_CHANGE_RAD_S
         return np.concatenate([self.velocity_residuals(x).ravel(), *prior, changes])
@@ -261,19 +257,17 @@ class Inertial:
         rate = float(np.median(np.linalg.norm(imu.angular_velocity, axis=1)))
         across = rate * (0.0 if velocities is None else velocities.usual_mps)
         if rate > _MOST_RAD_S or across > _MOST_MPS2:
-            return cls(None).without(
-                f"the median of its rates is {rate:.3g} rad/s, {across:.0f} m/s² across the trajectory. They may be in deg/s: "
-                "give rad/s"
-            )
+            measured = f"{rate:.3g} rad/s, {across:.0f} m/s² across the trajectory"
+            why = f"the median of its rates is {measured}. They may be in deg/s: give rad/s"
+            return cls(None).without(why)
         imu = dataclasses.replace(imu, times_s=imu.times_s - begin_s)
         if len(imu) < 2 or imu.times_s[0] > times_s[-1] or imu.times_s[-1] < 0:
             return cls(None).without("it measured before or after all scans. Are both times of one clock?")
         if velocities is not None and (found := ImuAlignment.of(imu, velocities, times_s)) is not None:
             return cls(found.gyroscope, found)
         if imu.R_sensor_imu is None:
-            return cls(None).without(
-                "its rotation on the radar is unknown, as accelerometer and Doppler do not determine it: give R_sensor_imu"
-            )
+            why = "as accelerometer and Doppler do not determine it: give R_sensor_imu"
+            return cls(None).without(f"its rotation on the radar is unknown, {why}")
         rates = np.einsum("ij,gj->gi", imu.R_sensor_imu, imu.angular_velocity)
         return cls(Gyroscope.of(rates, imu.times_s, times_s))
 
@@ -291,10 +285,7 @@ class Inertial:
 
 
 def level_poses(poses: Floats, covariance: Floats, up: Floats) -> tuple[Floats, Floats]:
-    """Rotate poses (F, 4, 4) and covariances (F, 6, 6) to a world with z up, by `up` (F, 3) in the frame of the radar.
-
-    The first position stays at the origin; the rotation is minimal.
-    """
+    """Minimally rotate poses (F, 4, 4) and covariances to a world with z up, by `up` (F, 3) in the frame of the radar."""
     now = np.einsum("fij,fj->i", poses[:, :3, :3], up)
     turn, _ = Rotation.align_vectors([[0, 0, 1.0]], [now])
     if now[2] < 0 and np.hypot(now[0], now[1]) < 1e-9 * -now[2]:

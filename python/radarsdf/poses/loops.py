@@ -23,10 +23,7 @@ _ERRORS = 3.0  # minimum agreement, standard errors
 
 
 def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_scan: int = 0) -> list[str]:
-    """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted.
-
-    Scans are numbered from `first_scan`.
-    """
+    """Return a note for each later visit of a place whose returns agree no better with earlier ones than if they are shifted."""
     visits = list(_visits(poses[:, :3, 3], float(np.median(returns.ranges_m))))
     if not visits:
         return []
@@ -54,11 +51,9 @@ def open_loops(returns: SensorReturns, poses: Floats, noise: SensorNoise, first_
             continue
         agreement = Verdict.by_groups(np.log((here + floor) / (shifted + floor)), returns.scans[rows])
         if agreement.parts >= _FEWEST_SCANS and agreement.gain < _ERRORS * agreement.error:
-            now, before = later + first_scan, earlier + first_scan
-            notes.append(
-                f"A loop is open: scans {now[0]} to {now[-1]} seem to be where scans {before[0]} to {before[-1]} were, but their "
-                f"returns agree no better there than {shift_m:.1f} m to the side."
-            )
+            now, then = (f"scans {of[0] + first_scan} to {of[-1] + first_scan}" for of in (later, earlier))
+            what = f"their returns agree no better there than {shift_m:.1f} m to the side"
+            notes.append(f"A loop is open: {now} seem to be where {then} were, but {what}.")
     return notes
 
 

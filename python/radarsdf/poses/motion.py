@@ -246,7 +246,6 @@ class KnownMotion(Motion):
     """Motions with known variances. Those of velocities are: learning them made errors of real drives four times larger."""
 
     def learnt(self, *_: Floats) -> Motion:
-        """Return self."""
         return self
 
 
@@ -266,10 +265,7 @@ class SteadyMotion(KnownMotion):
     def by(
         cls, priors: Priors, usual: Floats, times_s: Floats, poses: Floats, measured: Bools
     ) -> SteadyMotion:
-        """Build from times (F,) and approximate poses (F, 4, 4) of scans.
-
-        `usual` (2,): mean squares of rates. `measured` (6,): components of steps that other sources measure.
-        """
+        """Build from scans, mean squares of rates `usual` (2,), and the components (6,) of steps `measured` by other sources."""
         spans = spans_of(times_s, len(times_s))
         duration_s = float(np.median(np.diff(times_s)))
         shares = np.tile(np.where(measured, np.inf, 1.0), (len(spans), 1))

@@ -238,27 +238,22 @@ def _check_observed(tracked: list[Tracked], drive: Drive, notes: list[str]) -> l
         if (significance := motion_significance(pairs, motions)) < -ERRORS:
             refuse("moved", "scans agree better without any motion", doppler)
         if significance < ERRORS:
-            assumed.append(
-                "Assumed: the sensor moved as estimated; neighbouring scans agree as well without any motion."
-            )
+            what = "neighbouring scans agree as well without any motion"
+            assumed.append(f"Assumed: the sensor moved as estimated; {what}.")
     if drive.gyroscope is None and turned < _LEAST_OBSERVED_TURN:
-        assumed.append(
-            f"Assumed: the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, as {LATERAL_MPS2:.0f} m/s² across its "
-            "trajectory make of its speed; the returns of a scan hardly measure it."
-        )
+        why = f"as {LATERAL_MPS2:.0f} m/s² across its trajectory make of its speed"
+        what = f"the sensor turns by about {drive.usual_turn_rad_s:.2f} rad/s, {why}"
+        assumed.append(f"Assumed: {what}; the returns of a scan hardly measure it.")
     return assumed
 
 
 def _summarize(segments: Ints, length_m: float, doppler: bool, inertial: Inertial) -> str:
-    """Return the verdict in words."""
     sources = ["returns", *["Doppler"] * doppler, *["a gyroscope"] * (inertial.gyroscope is not None)]
     sentences = [f"{len(segments)} scans along {length_m:.1f} m were placed by {' and '.join(sources)}."]
     if inertial.alignment is not None:
         sentences.append(inertial.alignment.words)
     begins = np.flatnonzero(np.diff(segments)) + 1
     if len(begins):
-        before = ", ".join(map(str, begins))
-        sentences.append(
-            f"The drive was lost before the scans {before}: {len(begins) + 1} segments, which do not belong together."
-        )
+        lost = f"The drive was lost before the scans {', '.join(map(str, begins))}"
+        sentences.append(f"{lost}: {len(begins) + 1} segments, which do not belong together.")
     return " ".join(sentences)

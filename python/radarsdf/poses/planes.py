@@ -147,10 +147,7 @@ def common_planes(
     config: ReturnsConfig,
     num_threads: int = 0,
 ) -> tuple[CommonPlanes, SensorNoise]:
-    """Build the normal equations of poses (F, 4, 4) from returns on common planes, and the noise of the sensor.
-
-    `noise` None: estimated from these planes. `num_threads` 0: that of OpenMP.
-    """
+    """Build the normal equations of poses (F, 4, 4) from common planes, and the noise of the sensor, estimated unless given."""
     rays = returns.posed(poses)
     planes = np.full(len(rays), -1, np.int32)
     centres, normals, noises, total = [], [], [], 0

@@ -79,9 +79,8 @@ class PosedScans:
         """Build from the longest segment of odometry."""
         rows, report = found.longest_segment(), found.report
         sigmas, trajectory = pose_sigmas(found.covariance[rows]), trajectory_report(found, None, rows)
-        return cls(
-            found.poses[rows], rows, None, report["segments"], trajectory, sigmas, tuple(report["notes"])
-        )
+        segments, notes = report["segments"], tuple(report["notes"])
+        return cls(found.poses[rows], rows, None, segments, trajectory, sigmas, notes)
 
     def config(self, config: FitConfig) -> FitConfig:
         """Return `config` with the errors of the poses, unless it specifies its own."""

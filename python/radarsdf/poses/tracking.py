@@ -40,9 +40,7 @@ _BEST = 12  # candidates to register
 _UNRELATED = 500  # poses, for the agreement by chance
 _ERRORS = 3.0  # standard errors by which more returns agree at an accepted pose
 _MOST_RADII = 10.0  # maximum standard deviation of a predicted translation, median ranges: beyond, candidates miss the overlap
-_MOST_RECKONED_M = (
-    1e4  # and for a new segment to begin at the dead-reckoned pose: over a day, dead reckoning is useless
-)
+_MOST_RECKONED_M = 1e4  # and for a segment to begin at the dead-reckoned pose: over a day, that is useless
 
 
 @dataclass
@@ -54,8 +52,7 @@ class Tracked:
     agreeing: float  # share of inliers on planes of previous scans, in [0, 1]. NaN if it starts a segment
     segment: int  # number of its segment of the drive
     turn: Floats  # (3,) rotation vector of the step in the previous frame, rad; may exceed half a turn
-    # Share of the predicted variance that the returns removed, of translation and rotation, each in the least certain
-    # direction.
+    # Share of the predicted variance that the returns removed, of translation and rotation, in the least certain direction.
     observed: tuple[float, float] = (0.0, 0.0)
 
 
@@ -120,7 +117,6 @@ class Tracker:
             self._variances = self._estimate_variances()
 
     def _estimate_variances(self) -> list[float]:
-        """Estimate the noise of the sensor from the last scans."""
         counts = np.cumsum([len(scan) for scan, *_ in reversed(self._recent)])
         last = list(self._recent)[-max(2, int(np.searchsorted(counts, _NOISE_RETURNS, side="right"))) :]
         scans, poses, _ = zip(*last, strict=True)
@@ -129,7 +125,6 @@ class Tracker:
         return sensor_noise(surfels, rays, self.config, self.num_threads).variances
 
     def _dead_reckon(self, predicted: PredictedStep) -> Tracked:
-        """Return the predicted step."""
         pose, turn = self.last.pose @ predicted.pose(), predicted.turn.mean
         covariance = covariance_in(predicted.covariance(), self.last.pose[:3, :3])
         return Tracked(pose, covariance, 0.0, self.last.segment, turn)
@@ -228,7 +223,6 @@ def _removed_share(prior: Floats, covariance: Floats) -> float:
 
 
 def _best(scores: Floats) -> NDArray[np.intp]:
-    """Return the rows of the highest scores."""
     return np.argsort(-scores, kind="stable")[:_BEST]
 
 

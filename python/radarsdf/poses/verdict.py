@@ -63,10 +63,9 @@ class Verdict:
         first, agree = "The given poses are kept", "do not agree"
         if self.improved:
             first, agree = "The refined poses make a sharper map", "agree"
-        return (
-            f"{first}: returns that took no part {agree} better with those of other scans "
-            f"(their density changes by {self.gain:+.2%}, by chance and overlap alone up to {self.needed:.2%})."
-        )
+        change = f"{self.gain:+.2%}, by chance and overlap alone up to {self.needed:.2%}"
+        agreement = f"{agree} better with those of other scans (their density changes by {change})"
+        return f"{first}: returns that took no part {agreement}."
 
     @classmethod
     def of(

@@ -138,12 +138,11 @@ def save_trajectory_picture(
     """
     poses = list(trajectories.values())[-1]
     step = max(1, sum(map(len, points)) // _MAX_RETURNS)
-    world = np.concatenate(
-        [
-            np.einsum("ij,nj->ni", T[:2, :3], np.asarray(scan[::step], np.float64)) + T[:2, 3]
-            for scan, T in zip(points, poses, strict=True)
-        ]
-    )
+    placed = [
+        np.einsum("ij,nj->ni", T[:2, :3], np.asarray(scan[::step], np.float64)) + T[:2, 3]
+        for scan, T in zip(points, poses, strict=True)
+    ]
+    world = np.concatenate(placed)
     paths = {name: path[:, :2, 3] for name, path in trajectories.items()}
     positions = np.concatenate(list(paths.values()))
     low, high = np.percentile(world, [1, 99], axis=0)

@@ -36,10 +36,13 @@ def write_changes_report(
     if len(mesh.faces):
         colors = colors_of(mesh.vertex_attributes["kind"])
         vertices = np.asarray(mesh.vertices, np.float64)
-        surface = {
-            "scene": scene(vertices - vertices.mean(axis=0), mesh.faces, colors),
-            "views": views(mesh, colors),
-        }
+        local = vertices - vertices.mean(axis=0)
+        surface = {"scene": scene(local, mesh.faces, colors), "views": views(mesh, colors)}
+    rows = []
+    for number, region in enumerate(regions[:_MAX_LISTED], 1):
+        size = "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0]))
+        numbers = fixed(region.area_m2, 2), fixed(region.probability, 2)
+        rows.append((number, region.words, centre_of(region), size, *numbers))
     return write_page(
         path,
         "changes.html",
@@ -48,17 +51,7 @@ def write_changes_report(
         surface=surface,
         key=MEANING,
         regions=regions,
-        rows=[
-            (
-                number,
-                region.words,
-                centre_of(region),
-                "{:.1f} × {:.1f} × {:.1f}".format(*(region.box[1] - region.box[0])),
-                fixed(region.area_m2, 2),
-                fixed(region.probability, 2),
-            )
-            for number, region in enumerate(regions[:_MAX_LISTED], 1)
-        ],
+        rows=rows,
         kinds=[NAMES[kind] for kind in CHANGED],
         max_listed=_MAX_LISTED,
     )

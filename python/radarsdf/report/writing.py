@@ -36,10 +36,7 @@ _DURATIONS = {
 
 
 def write_report(path: str | PathLike[str], subject: Subject) -> int:
-    """Write a self-contained HTML page about a map atomically, and return its size, bytes.
-
-    Raises an ImportError if matplotlib or viser is missing, and otherwise as :meth:`Map.mesh` and ``open``.
-    """
+    """Write a self-contained HTML page about a map atomically, and return its size, bytes. Needs matplotlib and viser."""
     require_extras()
     report = subject.radar_map.report
     settings, defaults = (flat_settings(of.to_dict()) for of in (subject.radar_map.config, FitConfig()))
@@ -62,9 +59,7 @@ def write_report(path: str | PathLike[str], subject: Subject) -> int:
             (name, "–" if seconds is None else f"about {seconds:.1f} s")
             for name, seconds in itertools.zip_longest(report.get("skipped", []), report.get("skipped_s", []))
         ],
-        changed=[
-            (name, value, defaults[name]) for name, value in settings.items() if value != defaults[name]
-        ],
+        changed=[(n, value, defaults[n]) for n, value in settings.items() if value != defaults[n]],
         toml=to_toml(subject.radar_map.config),
     )
 

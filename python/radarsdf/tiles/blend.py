@@ -34,11 +34,6 @@ class Share(NamedTuple):
     weights: Floats  # (M,) weights there
     local: Floats32  # (M, 3) the positions in the frame of the tile, m
 
-    def select(self, chosen: Bools) -> Share:
-        """Restrict the share to some (M,) of its positions."""
-        rows, weights, local = self.rows[chosen], self.weights[chosen], self.local[chosen]
-        return self._replace(rows=rows, weights=weights, local=local)
-
 
 class TileBlend(Map):
     """Queries of :class:`TiledMap`: weighted averages of the tiles that know a position."""
@@ -129,7 +124,8 @@ class TileBlend(Map):
             share, owner = self._share(world, tile, rows), owners[rows]
             inside = queries.into_cells(share.contents, share.local)
             seen[rows] |= inside & ((owner == number) | (owner < 0))
-            yield share.select(inside)
+            weights, local = share.weights[inside], share.local[inside]
+            yield share._replace(rows=rows[inside], weights=weights, local=local)
 
     def _evaluate(self, query: Query, world: Floats, *others: Floats, extrapolate: bool) -> Array:
         def of_tile(share: Share) -> Array:

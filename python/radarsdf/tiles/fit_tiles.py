@@ -21,6 +21,7 @@ from radarsdf.extras import require
 from radarsdf.fitting.steps import FitInput, fit_rays
 from radarsdf.io.files import take_lock, write_whole
 from radarsdf.io.read import read
+from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.noise import NOISE_SETTINGS
 from radarsdf.scans import Scan, Scans
 from radarsdf.tiles.plan import PLAN, TILES, Plan, TileGrid, failure_path, is_done, map_path
@@ -168,9 +169,10 @@ def fit_tile(folder: str, name: str) -> None:
 
     def read() -> FitInput:
         rays, inside = read_rays(root, plan, tile)
+        limits = plan.intensity_range
         return FitInput(
             rays,
-            plan.scale,
+            None if limits is None else IntensityScale.between(limits),
             inside=inside,
             clutter_ratio=plan.clutter_ratio,
             returns_per_cell=plan.returns_per_cell,

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from radarsdf.arrays import Array, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import check, check_box, hides_bar, path_of, positive
-from radarsdf.io.files import check_outputs, reading
-from radarsdf.io.meshes import check_mesh_path, write_mesh
+from radarsdf.io.files import check_outputs, checked_suffix, reading
+from radarsdf.io.meshes import MESH_SUFFIXES, write_mesh
 from radarsdf.io.npz import arrays_of, check_arrays, write_arrays
 from radarsdf.map.confidence import EvidenceAt
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 _ON_LATTICE = 1e-4  # tolerance in voxels: vertices are at least 1e-3 from the corners of their edges
 _BYTES_PER_TRIANGLE = 28  # size in the file of a part
-_Box = Floats | None  # (2, 3) lower and upper corner, world, m
-
 
 _ARRAYS: dict[str, tuple[Any, ...]] = {
     "vertices": (np.float64, None, 3),  # world, m
@@ -47,7 +45,6 @@ _ARRAYS: dict[str, tuple[Any, ...]] = {
 
 
 def _read(path: Path, *names: str) -> dict[str, Array]:
-    """Read arrays of a part, by default all."""
     wanted = {name: _ARRAYS[name] for name in names or _ARRAYS}
     with reading(path, "a complete part of a mesh"):
         arrays = arrays_of(path, tuple(wanted))
@@ -87,7 +84,9 @@ def parts_of(
     return paths, limits, Tally.of_sums(tally)
 
 
-def _surface_in(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -> tuple[Surface, int]:
+def _surface_in(
+    city: TileBlend, tile: Tile, steps: int = 1, box: Floats | None = None
+) -> tuple[Surface, int]:
     """Surface in the leaf cells of a tile, world, m, with `steps` voxels along a cell's edge, and the number of the cells."""
     config, position = city.config, city.config.lattice.position
     voxel_m, threads = config.leaf_size_m / steps, torch.get_num_threads()
@@ -108,20 +107,19 @@ def _surface_in(city: TileBlend, tile: Tile, steps: int = 1, box: _Box = None) -
         voxels = voxels[((centres >= lower) & (centres <= upper)).all(axis=1)]
     _, corners, voxel_corners = sparse_lattice(voxels, num_threads=threads)
     distances_m, origin = city.distances_at(corners.astype(np.int64), voxel_m), position([0, 0, 0])
-    options: dict[str, Any] = {"origin": origin, "spacing": [voxel_m] * 3, "num_threads": threads}
-    vertices, faces = extract_cells(corners, distances_m, voxel_corners, **options)
+    placement: dict[str, Any] = {"origin": origin, "spacing": [voxel_m] * 3, "num_threads": threads}
+    vertices, faces = extract_cells(corners, distances_m, voxel_corners, **placement)
     evidence = city.evidence_at(vertices)
     return Surface.from_triangles(city.contents_of_any, vertices, faces, evidence, len(cells)), found
 
 
 def _cells_in(city: TileBlend, tile: Tile) -> Ints:
     """(C, 3) leaf cells in a tile, by lattice indices: those of its map, and of others with a weight there."""
-    plan = city.plan
     parts = []
-    for other in (other for other in neighbours(tile) if other in city.done):
+    for other in city.done.intersection(neighbours(tile)):  # in any order: the cells are sorted below
         cells = city.leaf_cells(other, within=tile)
-        centres = plan.config.lattice.position(cells + 0.5)
-        parts.append(cells[plan.grid.within_half_a_halo(other, centres)])
+        centres = city.config.lattice.position(cells + 0.5)
+        parts.append(cells[city.plan.grid.within_half_a_halo(other, centres)])
     return sparse_lattice(np.concatenate(parts))[0].astype(np.int64)
 
 
@@ -159,7 +157,7 @@ def export_mesh(
         content_folder(Path(path))
         parts = parts_of(city, voxel_size, progress, **limits)
         return write_tileset(city, Path(path), _separate(city, *parts))
-    check_mesh_path(path)
+    checked_suffix(path, MESH_SUFFIXES, "meshes")
     check_outputs([path])
     mesh = mesh_of(city, voxel_size, progress, **limits)
     check(len(mesh.faces) != 0, f"{city.folder} has no surface here: nothing written")
@@ -202,6 +200,5 @@ def viewed_tiles(city: TileBlend, tiles: list[Tile]) -> ViewedMap:
 
     local = vertices[used] - origin
     surface = Surface.from_triangles(city.contents_of_any, local, faces, evidence(local), cells)
-    return ViewedMap.of_surface(
-        surface, city.contents_of_any, origin, evidence, intensity if city.has_intensity else None
-    )
+    predicted = intensity if city.has_intensity else None
+    return ViewedMap.of_surface(surface, city.contents_of_any, origin, evidence, predicted)

@@ -23,7 +23,6 @@ from radarsdf.config.fit_config import FitConfig
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors
 from radarsdf.map.storage import checked_report
-from radarsdf.returns.intensities import IntensityScale
 from radarsdf.returns.sensor import Sensor
 from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN
 from radarsdf.settings import by_name, settings
@@ -144,10 +143,6 @@ class Plan:
     @cached_property
     def by_tile(self) -> dict[Tile, TilePlan]:
         return {planned.tile: planned for planned in self.tiles}
-
-    @property
-    def scale(self) -> IntensityScale | None:
-        return None if self.intensity_range is None else IntensityScale.between(self.intensity_range)
 
     @property
     def tile_cells(self) -> int:

@@ -98,8 +98,6 @@ def _chunks(scans: Iterable[Scan], together: int) -> Iterator[list[Scan]]:
 
 
 class _Planner:
-    """Consumes scans one by one, and writes the rays of each tile."""
-
     def __init__(self, folder: Path, config: FitConfig, grid: TileGrid) -> None:
         self._folder, self._config, self._grid = folder, config, grid
         self._origins: dict[Tile, Ints] = {}  # (3,) origins of the tiles' maps, leaf cells
@@ -110,7 +108,6 @@ class _Planner:
         self._with_intensities: bool | None = None
 
     def add(self, scans: list[Scan], first: int) -> None:
-        """Add consecutive scans, the first of which has the index `first`."""
         for number, scan in enumerate(scans, first):
             has = scan.intensities is not None
             alike = self._with_intensities in (None, has)
@@ -158,7 +155,6 @@ class _Planner:
             raise ValueError(msg) from error
 
     def plan(self, input_digest: str) -> Plan:
-        """Build the plan after all scans. Tiles without returns of their own are omitted."""
         tiles = []
         for tile, (returns, rays) in sorted(self._counts.items()):
             if returns == 0:
@@ -184,7 +180,6 @@ class _Planner:
         return self._completed(draft)
 
     def _intensity_range(self, tiles: list[TilePlan]) -> tuple[float, float] | None:
-        """Lowest and highest intensity without outliers."""
         if not self._with_intensities:
             return None
         low, high, plausible = self._intensities.low, self._intensities.high, self._intensities.plausible()

@@ -53,9 +53,8 @@ class TiledMap(TileBlend):
 
     def __repr__(self) -> str:
         kind = "surface and reflectance" if self.has_intensity else "surface"
-        return (
-            f"TiledMap({kind}, {len(self.tiles)} of {len(self.plan.tiles)} tiles of {self.plan.tile_m:g} m)"
-        )
+        count = f"{len(self.tiles)} of {len(self.plan.tiles)} tiles"
+        return f"TiledMap({kind}, {count} of {self.plan.tile_m:g} m)"
 
     def __reduce__(self) -> tuple[Callable[..., TiledMap], tuple[Any, ...]]:
         return partial(TiledMap, memory_bytes=self.memory_bytes), (str(self.folder),)
@@ -186,14 +185,9 @@ class TiledMap(TileBlend):
 
     @cached_property
     def report(self) -> dict[str, Any]:
-        """Counts, noise of the sensor, skipped parts of the method, and seconds, over all fits.
-
-        `missing_tiles`: names.
-        """
+        """Counts, noise of the sensor, skipped parts of the method, seconds, and names of missing tiles, over all fits."""
         reports = [report_of(self.folder, tile) for tile in self.tiles]
-        timed = [
-            name for name, value in reports[0].items() if name.endswith("_s") and isinstance(value, float)
-        ]
+        timed = [n for n, value in reports[0].items() if n.endswith("_s") and isinstance(value, float)]
         return {
             "tiles": len(reports),
             "missing_tiles": list(self.missing),

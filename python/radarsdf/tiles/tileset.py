@@ -14,13 +14,12 @@ import trimesh
 from radarsdf.arrays import Floats, Ints32
 from radarsdf.checks import check
 from radarsdf.io.files import check_outputs, write_whole
-from radarsdf.products import turned
+from radarsdf.io.glb import MATT, T_GLTF_WORLD, encode_glb
 from radarsdf.tiles.blend import TileBlend
 
 # Viewers open a node when its error exceeds about 16 pixels: here, at less than about three times its edge.
 _ERROR_OF_EDGE = 1 / 16
-# glTF has y up and 3D Tiles z: viewers rotate each file by 90 degrees about x. This is the inverse.
-_GLTF_TILE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_GREY = MATT["pbrMetallicRoughness"] | {"baseColorFactor": [0.784, 0.784, 0.784, 1.0]}
 
 
 def content_folder(path: Path) -> Path:
@@ -45,17 +44,20 @@ def write_tileset(city: TileBlend, path: Path, meshes: Iterable[tuple[Floats, In
             continue
         name, origin = f"{planned.name}.glb", city.config.lattice.position(planned.origin_cells)
         local = vertices - origin
-        write_whole(folder / name, _glb(local, faces))
+        normals = {"NORMAL": trimesh.Trimesh(local, faces, process=False).vertex_normals}
+        # Viewers turn y up into z up, which 3D Tiles have.
+        material = MATT | {"pbrMetallicRoughness": _GREY}
+        data = encode_glb(local, faces, normals, material=material, matrix=T_GLTF_WORLD)
+        write_whole(folder / name, data)
         T_world_tile = np.eye(4)
         T_world_tile[:3, 3] = origin
-        children.append(
-            {
-                "boundingVolume": _box(local),
-                "geometricError": 0.0,
-                "content": {"uri": quote(f"{folder.name}/{name}")},
-                "transform": T_world_tile.T.ravel().tolist(),  # column-major
-            }
-        )
+        child = {
+            "boundingVolume": _box(local),
+            "geometricError": 0.0,
+            "content": {"uri": quote(f"{folder.name}/{name}")},
+            "transform": T_world_tile.T.ravel().tolist(),  # column-major
+        }
+        children.append(child)
         corners += [vertices.min(axis=0), vertices.max(axis=0)]
         count += len(vertices), len(faces)
     check(children, "no tile has a triangle, so there is nothing to write")
@@ -71,17 +73,6 @@ def write_tileset(city: TileBlend, path: Path, meshes: Iterable[tuple[Floats, In
     write_whole(path, json.dumps(described, allow_nan=False).encode())
     num_vertices, num_faces = count.tolist()
     return num_vertices, num_faces
-
-
-def _glb(local: Floats, faces: Ints32) -> bytes:
-    of_trimesh: Any = trimesh.visual  # incompletely typed
-    material = of_trimesh.material.PBRMaterial(
-        baseColorFactor=[200, 200, 200, 255], metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
-    )
-    visual = of_trimesh.TextureVisuals(material=material)
-    mesh = trimesh.Trimesh(turned(local, _GLTF_TILE), faces, visual=visual, process=False)
-    data: Any = mesh.export(file_type="glb", include_normals=True)
-    return bytes(data)
 
 
 def _box(points: Floats) -> dict[str, Any]:

@@ -16,8 +16,6 @@ _MARGIN = 1.08
 
 
 class CameraPose(NamedTuple):
-    """A camera pose."""
-
     position: Floats  # (3,) m
     look_at: Floats  # (3,) m, centre of the orbit of the user's rotations
 

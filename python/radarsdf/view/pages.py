@@ -24,9 +24,8 @@ _SURFACE_COLOR, _PATH_COLOR = (150, 160, 170), (0, 190, 255)
 _MAX_VERTICES = 500_000
 _MAX_LISTED = 12  # changes
 _NOTES = {"unseen": ": not observed by the other map", "gone": ": of the earlier map"}
-MEANING = {
-    NAMES[kind] + _NOTES.get(NAMES[kind], ""): color for kind, color in sorted(COLORS.items(), reverse=True)
-}
+_NAMED_COLORS = [(NAMES[kind], color) for kind, color in sorted(COLORS.items(), reverse=True)]
+MEANING = {name + _NOTES.get(name, ""): color for name, color in _NAMED_COLORS}
 """sRGB colour of each kind of change."""
 
 
@@ -54,9 +53,8 @@ class GrowingView(Page):
             set_initial_camera(server, framing_pose(vertices - self._origin))
         local, faces = (vertices - self._origin).astype(np.float32), np.asarray(mesh.faces, np.uint32)
         with server.atomic():
-            server.scene.add_mesh_simple(
-                "/surface", local, faces, color=_SURFACE_COLOR, side="double", flat_shading=True
-            )
+            style = {"color": _SURFACE_COLOR, "side": "double", "flat_shading": True}
+            server.scene.add_mesh_simple("/surface", local, faces, **style)
             if len(path) > 1:
                 add_path(server, "/path", path - self._origin, _PATH_COLOR)
 
@@ -76,9 +74,8 @@ class ChangesView(Page):
         set_initial_camera(server, framing_pose(local))
         data = glb(local, mesh.faces, colors)
         server.scene.add_glb("/surface", data, cast_shadow=False, receive_shadow=False)
-        rows = {
-            centre_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in regions[:_MAX_LISTED]
-        }
+        listed = regions[:_MAX_LISTED]
+        rows = {centre_of(region): f"{region.words}, {region.area_m2:.1f} m²" for region in listed}
         server.gui.add_html(key(MEANING))
         server.gui.add_html(paragraph(changes.report["alignment"]))
         server.gui.add_html(table(rows) if rows else paragraph("Nothing changed."))

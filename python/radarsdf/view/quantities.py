@@ -75,12 +75,8 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     }
     for name, (label, values) in of_vertices.items():
         scale = Scale(0.0, 1.0) if name == "confidence" else Scale.of(values)
-        found[name] = Quantity(label, _lookup(values), scale)
+        found[name] = Quantity(label, lambda rows, _, values=values: values[rows], scale)  # type: ignore[misc]
     return found
-
-
-def _lookup(values: Array) -> Callable[[Ints, Position], Array]:
-    return lambda rows, _: values[rows]
 
 
 def legend(quantity: Quantity) -> str:

@@ -204,19 +204,15 @@ class Canvas:
 
 
 class ScanClouds:
-    """The sensor's path, and the returns of one scan, measured and predicted.
-
-    `scale`: that of measured intensities. `text`: element for a sentence about the current scan.
-    """
+    """The sensor's path, and the returns of one scan, measured in the colours of `scale` and predicted; `text` describes it."""
 
     def __init__(self, server: Any, radar_map: Map, scans: Scans, scale: Scale | None, text: Any) -> None:
         self._server, self._map, self._scans = server, radar_map, list(scans)
         self._scale, self._text = scale, text
         self._shown: int | None = None
-        path = add_path(
-            server, "/scans/path", scans.poses[:, :3, 3] - radar_map.origin, SCAN_COLORS["trajectory"]
-        )
-        self.nodes: dict[str, Any] = {"trajectory": path}
+        path = scans.poses[:, :3, 3] - radar_map.origin
+        line = add_path(server, "/scans/path", path, SCAN_COLORS["trajectory"])
+        self.nodes: dict[str, Any] = {"trajectory": line}
         self.show(0)
 
     def sensor(self, index: int) -> Position:

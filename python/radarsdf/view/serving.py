@@ -33,10 +33,7 @@ def require_viser() -> None:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Port to listen on: `port`, or if it is None, the first free one from 8080.
-
-    Raises an OSError if none is free or the host is not an address of this machine: viser would wait forever.
-    """
+    """Return `port`, or the first free one from 8080. Raise an OSError if there is none, for which viser would wait forever."""
     candidates = range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED)
     if port is not None:
         candidates = range(whole_number(port, "--port", 0, 65535), port + 1)
@@ -55,7 +52,6 @@ def free_port(host: str, port: int | None) -> int:
 
 def start_server(host: str, port: int) -> Any:
     """Start a `viser.ViserServer` that answers only its own pages. Warns if other machines can reach it."""
-    require_viser()
     import viser  # noqa: PLC0415
 
     addresses = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)

@@ -75,11 +75,7 @@ class ShownSurface:
 
 
 def spread_evenly(points: Floats, count: int, edge_m: float) -> tuple[Ints, Ints, float]:
-    """Choose at most `count` evenly spread points of (N, 3), m: the nearest to the mean of each cube of a grid.
-
-    Returns the chosen rows (M,), the index in M that represents each point (N,), and the edge of the cubes, m. The search
-    begins at `edge_m`, the spacing of the points.
-    """
+    """Choose at most `count` of points (N, 3), the nearest to each cube's mean: rows, the one of each point, and spacing, m."""
     if len(points) <= count:
         everything = np.arange(len(points))
         return everything, everything, edge_m
@@ -97,10 +93,7 @@ def spread_evenly(points: Floats, count: int, edge_m: float) -> tuple[Ints, Ints
 
 
 def thinned(mesh: trimesh.Trimesh, max_vertices: int, edge_m: float) -> tuple[trimesh.Trimesh, float]:
-    """Thin a mesh with too many vertices: cluster them in cubes, and keep one with its attributes per cube.
-
-    Returns the mesh and its vertex spacing, m, which is `edge_m` if it was not thinned.
-    """
+    """Thin a mesh to `max_vertices`, one with its attributes per cube of a grid; return it and its vertex spacing, m."""
     import trimesh  # noqa: PLC0415 - slow
 
     vertices: Any = mesh.vertices

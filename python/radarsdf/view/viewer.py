@@ -65,7 +65,6 @@ class Viewer(Page):
         super().stop()
 
     def _fill(self, scans: Scans | None) -> None:
-        """Add all elements to the page."""
         server, radar_map, surface = self._server, self._map, self.surface
         origin = radar_map.origin
         path = np.zeros((0, 3)) if scans is None else scans.poses[:, :3, 3] - origin
@@ -124,7 +123,6 @@ class Viewer(Page):
         return tab
 
     def _add_scans(self, tab: Any, scans: Scans) -> ScanClouds:
-        """Add the returns of scans, and controls to choose a scan and its elements."""
         gui = self._server.gui
         scale = self.quantities["intensity"].scale if self._map.has_intensity else None
         colors: dict[str, Any] = {**SCAN_COLORS, "measured": scale or SCAN_COLORS["measured"]}
@@ -213,7 +211,6 @@ class Viewer(Page):
         self._describe(self._painter.newest)
 
     def _describe(self, state: State) -> None:
-        """Show the map's values at the clicked point, for the sensor of a state."""
         if self._clicked is None:
             return
         x, sensor = self._clicked[None], np.array(state.sensor)
