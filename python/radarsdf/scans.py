@@ -171,7 +171,6 @@ class Scans:
         return scans
 
     def __iter__(self) -> Iterator[Scan]:
-        """Iterate over the scans."""
         if self._arrays is None:
             return self._read()
         return (self._scan(i) for i in range(len(self.points)))
@@ -302,7 +301,6 @@ class Scans:
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
 
     def _read_once(self) -> None:
-        """Read the poses and times unless they are known."""
         if self._poses is None and self._source is not None:
             for _ in self._read():
                 pass

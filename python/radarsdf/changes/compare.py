@@ -148,7 +148,6 @@ def _quick_config(config: FitConfig) -> FitConfig:
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
-    """Surface of one map with the evidence of both."""
     vertices = own_map.to_common(own_map.vertices)
     own = own_map.evidence(vertices)
     other = other_map.evidence(vertices, own.normals)
@@ -193,7 +192,6 @@ def _reflectance_changed(
 
 
 def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
-    """Keep the triangles in a box (2, 3), world of the earlier map, m."""
     within = ((surface.vertices >= box[0]) & (surface.vertices <= box[1])).all(axis=1)
     used, faces = renumbered(len(within), surface.faces[within[surface.faces].all(axis=1)])
     of_vertices = {name: values[used] for name, values in vars(surface).items() if name != "faces"}
@@ -203,7 +201,6 @@ def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
 def _check_common(
     sides: Sequence[Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, alignment: Alignment
 ) -> None:
-    """Raise a ValueError if the maps do not fit together."""
     # Maps in wrong frames still agree about the ground and level floors, so level and steep surfaces are tested separately;
     # and on both sides, since a place may have been cleared.
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)

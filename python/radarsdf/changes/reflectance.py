@@ -25,7 +25,6 @@ class _Means:
     variances: Floats  # (K,) from the number of returns per mean
 
     def select(self, chosen: Bools) -> _Means:
-        """Return the chosen ones (K,)."""
         return _Means(self.points[chosen], self.values[chosen], self.variances[chosen])
 
     def near(self, x: Floats, reach_m: float) -> tuple[Floats, Floats, Floats, Floats]:

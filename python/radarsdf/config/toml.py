@@ -54,7 +54,6 @@ def to_toml(config: FitConfig) -> str:
 
 
 def _settings(group: Any) -> list[tuple[str, Any, str]]:
-    """Name, value and description of each setting."""
     described = {name: field.description or "" for name, field in group.__pydantic_fields__.items()}
     return [(name, getattr(group, name), " ".join(text.split())) for name, text in described.items()]
 

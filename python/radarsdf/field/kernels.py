@@ -267,7 +267,6 @@ class _MLP(torch.autograd.Function):
 
 
 def _views(num_layers: int, tensors: Sequence[Tensor]) -> tuple[list[Any], list[Any], list[Any]]:
-    """Return inputs, weights and biases as views for the core."""
     layers, inputs = tensors[: 2 * num_layers], tensors[2 * num_layers :]
     return [rows_view(x) for x in inputs], [view(w) for w in layers[::2]], [view(b) for b in layers[1::2]]
 

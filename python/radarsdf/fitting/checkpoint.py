@@ -110,7 +110,6 @@ class Checkpoint:
 
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:
-    """Return a digest of the arrays of the scans that the training uses."""
     digest = hashlib.blake2b(repr(scale).encode(), digest_size=16)
     for array in (rays.origin, rays.points, rays.directions, rays.ranges_m, rays.intensities):
         digest.update(b"-" if array is None else array.data if array.flags.c_contiguous else array.tobytes())

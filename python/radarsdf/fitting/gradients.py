@@ -177,7 +177,6 @@ class CoreGradients(GradientBackend):
 
 
 def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
-    """Return weights and biases of a network's layers, as views of their memory."""
     values = [kernels.view(parameter) for parameter in network.parameters()]
     return values[::2], values[1::2]
 

@@ -246,7 +246,6 @@ def _spread(count: int, of: int) -> Ints:
 
 
 def draw_seed(generator: torch.Generator) -> int:
-    """Draw a seed for the core's random numbers."""
     return int(torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator))
 
 

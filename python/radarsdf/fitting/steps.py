@@ -227,7 +227,6 @@ def _report(
     schedule: Schedule,
     config: FitConfig,
 ) -> dict[str, Any]:
-    """Return the report of the map before the training."""
     cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
     sizes = {"returns": len(learnt), "cells": cells, "rows": rows}
     skipped: list[tuple[str, float | None]] = []

@@ -132,8 +132,6 @@ class LossHistory:
 
 @dataclass(frozen=True)
 class _Stage:
-    """Stage of the training."""
-
     name: str
     losses: Losses
     iterations: int
@@ -221,7 +219,6 @@ class Training:
         return state
 
     def _parts(self) -> Iterable[tuple[str, Any]]:
-        """Yield the stateful parts by name."""
         yield from (("history", self.history), ("backend", self._backend), ("sampler", self._sampler))
         if self._rows is not None:
             yield "rows", self._rows
@@ -285,7 +282,6 @@ class Training:
         return stages
 
     def _batch(self) -> Batch:
-        """Draw a batch of the sdf stage."""
         return self._sampler.batch(self._backend.num_parts(self._schedule.batch_size))
 
     def _labelled_batch(self) -> Batch:
@@ -367,7 +363,6 @@ class Training:
 def _move_networks(
     found: Gradients, optimisers: list[Optimiser], share: float, pool: ThreadPool | None = None
 ) -> None:
-    """Update the networks by the gradients."""
     total = iter(found.by_parameters)
     for optimiser in optimisers:
         optimiser.learning_rate = share * optimiser.full_rate

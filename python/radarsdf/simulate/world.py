@@ -225,7 +225,6 @@ class Terrain(Primitive):
         return self.level_m + np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes
 
     def _slope(self, xy: Floats) -> Floats:
-        """Gradient (N, 2) of the height."""
         return (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves
 
     def _normals(self, xy: Floats) -> Floats:
