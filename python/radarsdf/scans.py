@@ -312,13 +312,12 @@ class Scans:
         return self._arrays
 
 
-def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
+def scans_in_memory(scans: Sequence[Scan]) -> Scans:
     """Collect scans, with the arrays that all of them have."""
     times_s = _all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
         times_s=None if times_s is None else np.array(times_s, np.float64),
-        imu=imu,
         **_arrays_of(scans),
     )
 

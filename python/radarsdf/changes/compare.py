@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -119,20 +118,15 @@ def compare(
     appeared = _classify(sides[1], odds[1], share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
-    report: dict[str, Any] = {
-        "alignment": alignment.words,
-        "intensity_offset": None,
-        "reflectance": differences,
-    }
+    offset, words = None, differences
     if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
         appeared = _reflectance_changed(appeared, differences, np.concatenate(changed))
-        report["intensity_offset"] = differences.offset
-        report["reflectance"] = (
-            f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
-        )
+        offset = differences.offset
+        words = f"All returns of the later drive are {offset:+.1f} stronger, sensor units."
     if corners is not None:
         gone, appeared = _crop(corners, gone), _crop(corners, appeared)
+    report = {"alignment": alignment.words, "intensity_offset": offset, "reflectance": words}
     return Changes(gone, appeared, alignment.T_before_after, report | areas_of(gone, appeared))
 
 

@@ -41,7 +41,7 @@ class GridField(Field):
 
     def plane(self, points: Tensor) -> Tensor:
         values = kernels.view(self.distances_m)
-        return torch.from_numpy(self.table.trilinear(values, kernels.view(points), kernels.threads()))
+        return torch.from_numpy(self.table.trilinear(values, kernels.view(points), torch.get_num_threads()))
 
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
         # The closed form is unbounded; intensities beyond the range of the returns were never measured.

@@ -140,9 +140,8 @@ class _Fit:
         given, config, num_threads = read(), self.config, self.pool.num_threads
         check_extent(given.rays, config)
         check_fit(given.rays, config, given.inside)
-        saved, path = None, self.checkpoint
-        if path is not None:
-            saved = Checkpoint(path, given.rays, given.scale, config)
+        path = self.checkpoint
+        saved = None if path is None else Checkpoint(path, given.rays, given.scale, config)
         self._lap("prepare_s")
 
         surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)

@@ -188,8 +188,7 @@ class Training:
             self._optimisers["features"] = Adam(field.cells.parameters(), training.learning_rate)
         self._optimisers["sdf"] = of_network(field.sdf_network.parameters(), training.learning_rate)
         if network is not None:
-            rate = training.intensity_learning_rate
-            self._optimisers["intensity"] = of_network(network.parameters(), rate)
+            self._optimisers["intensity"] = of_network(network.parameters(), training.intensity_learning_rate)
 
     def _sampler_of(self, rays: Rays) -> RaySampler:
         unit = None
