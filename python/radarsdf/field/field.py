@@ -42,12 +42,13 @@ class Field(nn.Module, ABC):
             (gradient,) = torch.autograd.grad(sdf.sum(), points)
         return torch.cat([sdf.detach()[:, None], gradient], 1)
 
-    @abstractmethod
     def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
         """Return intensities (N,), scaled to about [0, 1], of returns from points (N, 3), local frame, m.
 
         `directions` (N, 3): unit vectors from the sensor; `ranges_m` (N,): distances from it.
         """
+        # The closed form is unbounded; intensities beyond the range of the returns were never measured.
+        return self._closed_form(points, directions, ranges_m).clamp(0, 1)
 
     def occupied(self, points: Tensor) -> Tensor:
         """Return a mask (N,) of the points (N, 3), local frame, m, in occupied leaf cells."""
@@ -66,5 +67,4 @@ class Field(nn.Module, ABC):
         """Return the contribution (N,) of :attr:`reflectance` to the intensity."""
         if self.reflectance is None:
             return torch.zeros_like(ranges_m)
-        found = self.reflectance.at(points.numpy(), directions.numpy(), ranges_m.numpy(), 1)
-        return torch.from_numpy(found)
+        return torch.from_numpy(self.reflectance.at(points.numpy(), directions.numpy(), ranges_m.numpy(), 1))

@@ -43,10 +43,6 @@ class GridField(Field):
         values = kernels.view(self.distances_m)
         return torch.from_numpy(self.table.trilinear(values, kernels.view(points), torch.get_num_threads()))
 
-    def intensity(self, points: Tensor, directions: Tensor, ranges_m: Tensor) -> Tensor:
-        # The closed form is unbounded; intensities beyond the range of the returns were never measured.
-        return self._closed_form(points, directions, ranges_m).clamp(0, 1)
-
     def corner_distances_m(self) -> Floats32:
         return np.asarray(self.distances_m.detach().numpy())
 

@@ -199,8 +199,7 @@ class AutogradGradients(GradientBackend):
 
     def _num_seen(self, samples: Samples) -> int:
         """Return the number of leading samples that the intensity network sees."""
-        in_free_space = self._config.training.intensity_in_free_space
-        return len(samples.points) if in_free_space else samples.num_labelled
+        return len(samples.points) if self._config.training.intensity_in_free_space else samples.num_labelled
 
     def _of_part(self, losses: Losses, part: tuple[Samples, list[Tensor] | None]) -> Gradients:
         """Differentiate one part: samples, and dropout factors of the encoding of those that the network sees."""
@@ -239,8 +238,7 @@ class AutogradGradients(GradientBackend):
         if count == 0:
             return predicted.sum()
         # Weight of this mean in that of the whole batch.
-        in_free_space = self._config.training.intensity_in_free_space
-        share = samples.share if in_free_space else samples.labelled_share
+        share = samples.share if self._config.training.intensity_in_free_space else samples.labelled_share
         return intensity_loss(predicted, labels) * share
 
 

@@ -195,8 +195,7 @@ class Training:
         if self._scale is not None and rays.intensities is not None:
             unit = torch.from_numpy(self._scale.to_unit(rays.intensities))
         size, neighbours = self._schedule.batch_size, self._schedule.neighbours
-        threads = self._pool.num_threads
-        return RaySampler(rays, self._config, size, self._generator, neighbours, unit, threads)
+        return RaySampler(rays, self._config, size, self._generator, neighbours, unit, self._pool.num_threads)
 
     def _draw_from_all_returns(self) -> None:
         if self._later is not None:

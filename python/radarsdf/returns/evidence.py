@@ -149,8 +149,7 @@ def usual_information(information: Floats32, leaf_keys: Keys, num_threads: int =
     first, weights = np.flatnonzero(begins), information.astype(np.float64)
     sums = np.add.reduceat(np.stack([weights, weights**2], axis=1), first) if len(first) else np.zeros((0, 2))
     near = CellBlocks(pairs[first]).neighbour_sums(pairs[first], sums, 1.0, num_threads)
-    usual: Floats32 = (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32)
-    return usual.take(np.cumsum(begins) - 1)
+    return (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32).take(np.cumsum(begins) - 1)
 
 
 _AT_ONCE = 1 << 20  # leaf cells: float64 sums of all would be the peak of a large fit's memory

@@ -44,8 +44,7 @@ def find_ghosts(
     weights = rays.counts if isinstance(rays, MeanRays) else None
 
     def count(rows: Ints32, of: Bools, size: int) -> Floats:
-        counted = np.bincount(rows[of], None if weights is None else weights[of], size)
-        return counted.astype(np.float64)
+        return np.bincount(rows[of], None if weights is None else weights[of], size).astype(np.float64)
 
     flat = np.flatnonzero(surfels.is_flat())
     if isinstance(rays, MeanRays):

@@ -86,7 +86,7 @@ class Rays:
     def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> Rays:
         """Select rays by a slice, a mask (N,) or row indices (M,), in this order."""
         rows = part if isinstance(part, slice) or part.dtype != np.bool_ else np.flatnonzero(part)
-        columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
+        columns: dict[str, Any] = {n: getattr(self, n) for n in _COLUMNS if getattr(self, n) is not None}
         if isinstance(rows, slice):
             chosen = {name: np.ascontiguousarray(column[rows]) for name, column in columns.items()}
         else:  # `take` with row indices needs a third of the time of indexing with them or a mask

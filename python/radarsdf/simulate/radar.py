@@ -174,8 +174,7 @@ class RadarSensor:
 
         Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m.
         """
-        hit = hits.primitive >= 0
-        range_m = np.where(hit, hits.range_m, 1.0)
+        range_m = np.where(hits.primitive >= 0, hits.range_m, 1.0)
         echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
         return self.gain_db + echo - self.range_loss_db * np.log10(range_m)
 
