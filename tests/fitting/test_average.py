@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.field.grid_field import GridField
+from radarsdf.field.field import GridField
 from radarsdf.fitting import closed_form
 from radarsdf.fitting.surface_returns import SurfaceReturns
 from radarsdf.returns.planes import Surfels

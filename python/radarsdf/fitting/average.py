@@ -8,7 +8,7 @@ import torch
 from radarsdf._core import VertexTable
 from radarsdf.arrays import Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.grid_field import GridField
+from radarsdf.field.field import GridField
 from radarsdf.returns.evidence import ReturnsOfCells
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.sums import MeanRays

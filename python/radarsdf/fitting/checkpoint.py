@@ -73,9 +73,8 @@ class Checkpoint:
         expected: dict[str, Tensor] = training.state()
         try:
             with open_tensors(self._path) as file:
-                if (names := set(file.names)) != set(expected):
-                    msg = f"{sorted(names ^ set(expected))!s:.100} are missing or unexpected"
-                    raise ValueError(msg)
+                differing = sorted(set(file.names) ^ set(expected))
+                check(not differing, f"{differing!s:.100} are missing or unexpected")
                 state = {name: file.array(name).clone() for name in expected}
             for name, value in state.items():
                 wanted = expected[name]

@@ -88,10 +88,10 @@ class Rays:
         rows = part if isinstance(part, slice) or part.dtype != np.bool_ else np.flatnonzero(part)
         columns: dict[str, Any] = {n: getattr(self, n) for n in _COLUMNS if getattr(self, n) is not None}
         if isinstance(rows, slice):
-            chosen = {name: np.ascontiguousarray(column[rows]) for name, column in columns.items()}
+            columns = {name: np.ascontiguousarray(column[rows]) for name, column in columns.items()}
         else:  # `take` with row indices needs a third of the time of indexing with them or a mask
-            chosen = {name: column.take(rows, axis=0) for name, column in columns.items()}
-        return dataclasses.replace(self, **chosen)
+            columns = {name: column.take(rows, axis=0) for name, column in columns.items()}
+        return dataclasses.replace(self, **columns)
 
     def in_c_order(self) -> tuple[Floats32, Floats32, Floats32]:
         points, directions = np.ascontiguousarray(self.points), np.ascontiguousarray(self.directions)
