@@ -69,7 +69,8 @@ def positions(values: ArrayLike, name: str) -> Floats:
     """Convert to finite positions (N, 3), m, in C order."""
     points: Floats = np.ascontiguousarray(real_array(values, name))
     check(points.ndim == 2 and points.shape[1] == 3, f"{name} must be (N, 3), not {points.shape}")
-    check((np.abs(points) <= MAX_POSITION_M).all(), f"{name} must be finite, and within {MAX_POSITION_M:g} m")
+    within = (np.abs(points) <= MAX_POSITION_M).all()
+    check(within, f"{name} must be finite, and within {MAX_POSITION_M:g} m")
     return points
 
 
@@ -141,7 +142,8 @@ def usable_poses(poses: ArrayLike, num_scans: int | None = None) -> tuple[Floats
     rows, known = np.arange(len(rigid)), np.flatnonzero(rigid)
     at = np.clip(rows, known[0], known[-1])
     filled = np.tile(np.eye(4), (len(rigid), 1, 1))
-    filled[:, :3, :3] = Slerp(known, Rotation.from_matrix(T_world_sensor[known, :3, :3]))(at).as_matrix()
+    rotations = Slerp(known, Rotation.from_matrix(T_world_sensor[known, :3, :3]))
+    filled[:, :3, :3] = rotations(at).as_matrix()
     for axis in range(3):
         filled[:, axis, 3] = np.interp(at, known, T_world_sensor[known, axis, 3])
     return np.where(rigid[:, None, None], T_world_sensor, filled), rigid
@@ -152,12 +154,13 @@ def are_rigid(poses: Floats) -> Bools:
     rotation = poses[:, :3, :3]
     with np.errstate(all="ignore"):  # non-finite matrices are not rigid
         rotation_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        return (
+        rigid: Bools = (
             (np.abs(poses) <= MAX_POSITION_M).all(axis=(1, 2))
             & (rotation_error < _MAX_ROTATION_ERROR)
             & (np.linalg.det(rotation) > 0)
             & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
         )
+    return rigid
 
 
 def instance(value: Any, kind: type[_Kind], name: str) -> _Kind:

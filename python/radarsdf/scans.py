@@ -306,7 +306,6 @@ class Scans:
                 pass
 
     def _loaded(self) -> dict[str, list[Array] | None]:
-        """Arrays of all scans, read from their files at the first call."""
         if self._arrays is None:
             self._arrays = _arrays_of(list(self._read()))
         return self._arrays

@@ -78,7 +78,6 @@ class PlacedMap:
 
     @property
     def leaf_m(self) -> float:
-        """Edge of a leaf cell, m."""
         return self.radar_map.config.leaf_size_m
 
     @property

@@ -268,7 +268,6 @@ class Training:
                 raise KeyboardInterrupt
 
     def _stages(self) -> list[_Stage]:
-        """Return the sdf stage, and the intensity stage if it has iterations."""
         joint = "intensity" in self._optimisers
         optimisers, shared = list(self._optimisers.values()), self._schedule.joint_iterations
         losses: Losses = "joint" if joint else "sdf"

@@ -71,7 +71,6 @@ def sensor_velocity(
     measured = speeds[rows]
 
     def residuals(velocities: Floats) -> Floats:
-        """Return the residuals (K, M) of the measured speeds for velocities (K, 3)."""
         off: Floats = measured - product(velocities, away_columns)
         return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
 

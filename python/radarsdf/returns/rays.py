@@ -183,8 +183,7 @@ def check_scans(
         if num_rows == len(scan):
             left_out.empty.append(i)
         scans.append(np.where(returns[:, None], scan, 0.0) if num_rows else scan)
-    if not scans:
-        check_scan_shapes([])
+    check_scan_shapes(scans)
     if intensities is None:
         return scans, None, left_out
     values = [
