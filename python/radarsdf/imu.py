@@ -31,7 +31,6 @@ class Imu:
     """(3, 3) rotation from the axes of the IMU to those of the radar. None: unknown."""
 
     def __post_init__(self) -> None:
-        """Validate the arrays."""
         count = np.shape(self.times_s)[:1] or ("G",)
         shapes = {"times_s": count, "angular_velocity": (*count, 3), "specific_force": (*count, 3)}
         for name, shape in shapes.items():

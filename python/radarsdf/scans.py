@@ -171,7 +171,6 @@ class Scans:
         return scans
 
     def __iter__(self) -> Iterator[Scan]:
-        """Iterate over the scans."""
         if self._arrays is None:
             return self._read()
         return (self._scan(i) for i in range(len(self.points)))
@@ -302,25 +301,22 @@ class Scans:
         self._times_s = None if None in times_s else np.array(times_s, np.float64)
 
     def _read_once(self) -> None:
-        """Read the poses and times unless they are known."""
         if self._poses is None and self._source is not None:
             for _ in self._read():
                 pass
 
     def _loaded(self) -> dict[str, list[Array] | None]:
-        """Arrays of all scans, read from their files at the first call."""
         if self._arrays is None:
             self._arrays = _arrays_of(list(self._read()))
         return self._arrays
 
 
-def scans_in_memory(scans: Sequence[Scan], imu: Imu | None = None) -> Scans:
+def scans_in_memory(scans: Sequence[Scan]) -> Scans:
     """Collect scans, with the arrays that all of them have."""
     times_s = _all_or_none([scan.time_s for scan in scans])
     return Scans(
         poses=np.stack([np.asarray(scan.T_world_sensor, np.float64) for scan in scans]),
         times_s=None if times_s is None else np.array(times_s, np.float64),
-        imu=imu,
         **_arrays_of(scans),
     )
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 from radarsdf._core import CellBlocks, CellSet, Encoding, VertexTable, cell_keys, vertex_areas
-from radarsdf.field.grid_field import GridField
+from radarsdf.field.field import GridField
 from radarsdf.map.marching_cubes import extract_cells, sparse_lattice
 from scipy.linalg import lstsq
 from scipy.spatial import cKDTree

@@ -5,7 +5,7 @@ import pytest
 import torch
 from radarsdf._core import CellSet, Encoding
 from radarsdf.field import kernels
-from radarsdf.field.grid_field import GridField
+from radarsdf.field.field import GridField
 from radarsdf.field.neural_field import VertexFeatures
 
 LEAF_M = 0.2

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
-from radarsdf.field.grid_field import GridField
+from radarsdf.field.field import GridField
 from radarsdf.fitting import closed_form
 from radarsdf.fitting.surface_returns import SurfaceReturns
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import prepare
-from radarsdf.returns.weights import Weights
 from scipy.spatial import cKDTree
 
 from ..conftest import ground_and_wall
@@ -54,7 +53,7 @@ def test_one_function_weighs_returns(monkeypatch):
 
     def only_near(counts, ranges_m, noise):
         near = np.where(ranges_m < higher, counts, counts * np.float32(1e-3))
-        return Weights(near, near / noise.variances_m2(ranges_m))
+        return near, near / noise.variances_m2(ranges_m)
 
     monkeypatch.setattr("radarsdf.returns.evidence.weights_of", only_near)
     after = fit(points, poses)

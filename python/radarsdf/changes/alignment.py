@@ -190,7 +190,6 @@ def _gauss_newton(before: PlacedMap, surface: _Surface, pose: Floats) -> tuple[F
 
 
 def _transformed(points: Floats, pose: Floats) -> Floats:
-    """Transform points (N, 3) by a pose (4, 4)."""
     return turned(points, pose[:3, :3]) + pose[:3, 3]
 
 

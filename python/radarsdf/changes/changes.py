@@ -185,7 +185,6 @@ class Changes:
 
 
 def areas_of(*surfaces: ChangedSurface) -> dict[str, Any]:
-    """Areas of surfaces, for a report."""
     kinds, areas_m2 = (np.concatenate(of) for of in zip(*(s.of_faces() for s in surfaces), strict=True))
     return {
         "areas_m2": {NAMES[kind]: float(areas_m2[kinds == kind].sum()) for kind in CHANGED},

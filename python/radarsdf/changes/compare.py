@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -119,20 +118,15 @@ def compare(
     appeared = _classify(sides[1], odds[1], share, APPEARED)
     _check_common(sides, [gone.kind, appeared.kind], errors, alignment)
     differences = Differences.of(earlier, later)
-    report: dict[str, Any] = {
-        "alignment": alignment.words,
-        "intensity_offset": None,
-        "reflectance": differences,
-    }
+    offset, words = None, differences
     if isinstance(differences, Differences):
         changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
         appeared = _reflectance_changed(appeared, differences, np.concatenate(changed))
-        report["intensity_offset"] = differences.offset
-        report["reflectance"] = (
-            f"All returns of the later drive are {differences.offset:+.1f} stronger, sensor units."
-        )
+        offset = differences.offset
+        words = f"All returns of the later drive are {offset:+.1f} stronger, sensor units."
     if corners is not None:
         gone, appeared = _crop(corners, gone), _crop(corners, appeared)
+    report = {"alignment": alignment.words, "intensity_offset": offset, "reflectance": words}
     return Changes(gone, appeared, alignment.T_before_after, report | areas_of(gone, appeared))
 
 
@@ -148,7 +142,6 @@ def _quick_config(config: FitConfig) -> FitConfig:
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
-    """Surface of one map with the evidence of both."""
     vertices = own_map.to_common(own_map.vertices)
     own = own_map.evidence(vertices)
     other = other_map.evidence(vertices, own.normals)
@@ -193,7 +186,6 @@ def _reflectance_changed(
 
 
 def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
-    """Keep the triangles in a box (2, 3), world of the earlier map, m."""
     within = ((surface.vertices >= box[0]) & (surface.vertices <= box[1])).all(axis=1)
     used, faces = renumbered(len(within), surface.faces[within[surface.faces].all(axis=1)])
     of_vertices = {name: values[used] for name, values in vars(surface).items() if name != "faces"}
@@ -203,7 +195,6 @@ def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
 def _check_common(
     sides: Sequence[Side], kinds: Sequence[NDArray[np.int8]], errors: Errors, alignment: Alignment
 ) -> None:
-    """Raise a ValueError if the maps do not fit together."""
     # Maps in wrong frames still agree about the ground and level floors, so level and steep surfaces are tested separately;
     # and on both sides, since a place may have been cleared.
     seen = sum(int((of_side != UNSEEN).sum()) for of_side in kinds)

@@ -78,7 +78,6 @@ class PlacedMap:
 
     @property
     def leaf_m(self) -> float:
-        """Edge of a leaf cell, m."""
         return self.radar_map.config.leaf_size_m
 
     @property
@@ -93,8 +92,7 @@ class PlacedMap:
     def nearest(self, x: Floats) -> tuple[Floats, Ints, Floats]:
         """Distances to the vertices nearest to places (N, 3), world of the map, their rows, and distances from their planes."""
         near_m, rows = self._tree.query(x)
-        away = x - self.vertices[rows]
-        return near_m, rows, np.einsum("ni,ni->n", away, self.normals[rows])
+        return near_m, rows, np.einsum("ni,ni->n", x - self.vertices[rows], self.normals[rows])
 
     def to_own(self, x: Floats) -> Floats:
         """Transform places (N, 3) from the common frame to the world of the map."""

@@ -25,7 +25,6 @@ class _Means:
     variances: Floats  # (K,) from the number of returns per mean
 
     def select(self, chosen: Bools) -> _Means:
-        """Return the chosen ones (K,)."""
         return _Means(self.points[chosen], self.values[chosen], self.variances[chosen])
 
     def near(self, x: Floats, reach_m: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -101,8 +100,7 @@ class Differences:
         within = []
         for number, day in enumerate(days):
             rest = day.intensities - expected[number][of_day == number]
-            of_own = _Means(day.points, rest, day.sigma**2 / day.counts)
-            within.append(of_own.select(np.isfinite(rest)))
+            within.append(_Means(day.points, rest, day.sigma**2 / day.counts).select(np.isfinite(rest)))
         width = max(scale.high - scale.low for scale in scales if scale is not None)
         return cls(between, within, offset, PLACE_CELLS * leaf_m, width)
 

@@ -21,15 +21,7 @@ _WIDTH = 100  # columns of a comment
 
 
 def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
-    """Read settings from a TOML file, as :meth:`FitConfig.override` takes them.
-
-    Raises
-    ------
-    ValueError
-        If the file is not TOML.
-    OSError
-        If it cannot be read.
-    """
+    """Read settings from a TOML file, as :meth:`FitConfig.override` takes them. A ValueError: the file is not TOML."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:  # RecursionError: lists in lists without end
@@ -54,7 +46,6 @@ def to_toml(config: FitConfig) -> str:
 
 
 def _settings(group: Any) -> list[tuple[str, Any, str]]:
-    """Name, value and description of each setting."""
     described = {name: field.description or "" for name, field in group.__pydantic_fields__.items()}
     return [(name, getattr(group, name), " ".join(text.split())) for name, text in described.items()]
 

@@ -153,7 +153,6 @@ def confidence_metrics(confidence: ArrayLike, is_true: ArrayLike) -> dict[str, A
 
 
 def _paired(a: ArrayLike, name_a: str, b: ArrayLike, name_b: str) -> tuple[Floats, Floats]:
-    """Convert two arguments to arrays (N,)."""
     first, second = real_array(a, name_a), real_array(b, name_b)
     fits = first.ndim == 1 and first.shape == second.shape
     check(fits, f"{name_a} {first.shape} and {name_b} {second.shape} must both be (N,)")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from radarsdf._core import cell_keys
-from radarsdf.arrays import Bools, Floats, Ints
+from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check, check_box, positions, whole_number
 from radarsdf.threads import resolve_num_threads
 
@@ -198,8 +198,7 @@ def _triangles(mesh: trimesh.Trimesh) -> tuple[Floats, Ints]:
 def _in_box(points: Floats, corners: Floats | None) -> Floats:
     if corners is None:
         return points
-    inside: Bools = ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
-    return points[inside]
+    return points[((points >= corners[0]) & (points <= corners[1])).all(axis=1)]
 
 
 def _sample_blocks(vertices: Floats, faces: Ints, corners: Floats | None, samples: int) -> Iterator[Floats]:

@@ -87,7 +87,6 @@ def trajectory_metrics(
 
 
 def _with_positions(poses: Floats, true: Floats) -> Floats:
-    """Align the poses (F, 4, 4) by the rigid motion that fits the positions."""
     from_middle, from_middle_true = (x[:, :3, 3] - x[:, :3, 3].mean(axis=0) for x in (poses, true))
     whole = np.eye(4)
     whole[:3, :3] = nearest_rotation(np.einsum("fi,fj->ij", from_middle_true, from_middle))

@@ -138,7 +138,6 @@ class NeuralField(Field):
         if share > 0:
             assert self.intensity_network is not None
             unit += share * self.intensity_network(self.geometry(points), directions, ranges_m)
-        # The closed form is unbounded; intensities beyond the training range were never measured.
         return unit if closed is None else unit.clamp(0, 1)
 
 

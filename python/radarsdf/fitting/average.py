@@ -8,7 +8,7 @@ import torch
 from radarsdf._core import VertexTable
 from radarsdf.arrays import Floats32, Keys
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.grid_field import GridField
+from radarsdf.field.field import GridField
 from radarsdf.returns.evidence import ReturnsOfCells
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.sums import MeanRays
@@ -51,8 +51,7 @@ def normals_at(rays: MeanRays, surfels: Surfels, num_threads: int) -> Floats32:
     flat, normals = np.flatnonzero(plane >= 0), -rays.directions
     normals[flat] = surfels.normals.take(plane.take(flat), axis=0)
     # A surfel with returns from both sides of a thin wall faces only one side.
-    away = np.einsum("ij,ij->i", normals, rays.directions) > 0
-    normals[away] *= -1
+    normals[np.einsum("ij,ij->i", normals, rays.directions) > 0] *= -1
     return normals
 
 

@@ -73,9 +73,8 @@ class Checkpoint:
         expected: dict[str, Tensor] = training.state()
         try:
             with open_tensors(self._path) as file:
-                if (names := set(file.names)) != set(expected):
-                    msg = f"{sorted(names ^ set(expected))!s:.100} are missing or unexpected"
-                    raise ValueError(msg)
+                differing = sorted(set(file.names) ^ set(expected))
+                check(not differing, f"{differing!s:.100} are missing or unexpected")
                 state = {name: file.array(name).clone() for name in expected}
             for name, value in state.items():
                 wanted = expected[name]
@@ -110,7 +109,6 @@ class Checkpoint:
 
 
 def _digest(rays: Rays, scale: IntensityScale | None) -> str:
-    """Return a digest of the arrays of the scans that the training uses."""
     digest = hashlib.blake2b(repr(scale).encode(), digest_size=16)
     for array in (rays.origin, rays.points, rays.directions, rays.ranges_m, rays.intensities):
         digest.update(b"-" if array is None else array.data if array.flags.c_contiguous else array.tobytes())

@@ -41,8 +41,7 @@ def closed_form(
 
     def network(points: Floats32, directions: Floats32, ranges_m: Floats32) -> Floats32:
         columns = np.column_stack([points, directions, np.clip(ranges_m, *range_limits_m)])
-        unit = evaluate(lambda x: field.intensity(x[:, :3], x[:, 3:6], x[:, 6]), columns)
-        return unit.clip(0, 1)
+        return evaluate(lambda x: field.intensity(x[:, :3], x[:, 3:6], x[:, 6]), columns).clip(0, 1)
 
     unit = np.nan_to_num(scale.to_unit(rays.intensities), copy=False, nan=0.5)
     ask = network if config.trains_intensity else None

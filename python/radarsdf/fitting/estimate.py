@@ -123,7 +123,6 @@ def estimate_rays(rays: Rays, config: FitConfig, inside: Bools | None = None) ->
 
 
 def _estimate(rays: Rays, config: FitConfig, returns: int, with_returns: int) -> Estimate:
-    """Estimate a map of a number of `returns` in `with_returns` leaf cells."""
     sparse = with_returns / returns
     of_dense, of_sparse = _CELLS if config.train else _CELLS_AVERAGED
     cells = round(with_returns * (of_dense + of_sparse * sparse**3))

@@ -129,7 +129,8 @@ class CoreGradients(GradientBackend):
             sigma_m=field.sigma_m,
             intensity_in_free_space=config.training.intensity_in_free_space,
         )
-        self._located: Ints32 | None = None
+        self._located = np.zeros((0, field.cells.table.num_levels), np.int32)
+        self._interpolated_grad = np.zeros((0, field.cells.interpolated_dim), np.float32)
         self._by_sdf = [torch.from_numpy(gradient) for gradient in self._loss.sdf_gradients]
         self._by_intensity = [torch.from_numpy(gradient) for gradient in self._loss.intensity_gradients]
 
@@ -137,7 +138,11 @@ class CoreGradients(GradientBackend):
         return min(max(batch_size // _PART, 1), _MOST_PARTS)
 
     def of(self, losses: Losses, batch: Batch, meanwhile: Callable[[], _Result]) -> tuple[Gradients, _Result]:
-        cells, pool, touched = self._field.cells, self._pool.core_threads, self._touched_by(batch)
+        cells, pool, count = self._field.cells, self._pool.core_threads, len(batch.points)
+        if len(self._located) != count:  # buffers, which the next batch of this size reuses
+            self._located = np.empty((count, cells.table.num_levels), np.int32)
+            self._interpolated_grad = np.empty((count, cells.interpolated_dim), batch.points.dtype)
+        touched = Touched(batch.points, self._located, self._interpolated_grad)
         names = ("points", "sdf_m", "parts")
         arguments: dict[str, Any] = {name: getattr(batch, name) for name in names} | {"pool": pool}
         if losses != "intensity":
@@ -167,17 +172,8 @@ class CoreGradients(GradientBackend):
         cells.table.scatter(batch.points, touched.located, touched.gradient, by_features.numpy(), pool)
         return Gradients(found, [by_features, *networks], None), result
 
-    def _touched_by(self, batch: Batch) -> Touched:
-        """Return buffers for the cells of a batch and their gradients, reused by the next batch of this size."""
-        count, cells = len(batch.points), self._field.cells
-        if self._located is None or len(self._located) != count:
-            self._located = np.empty((count, cells.table.num_levels), np.int32)
-            self._interpolated_grad = np.empty((count, cells.interpolated_dim), batch.points.dtype)
-        return Touched(batch.points, self._located, self._interpolated_grad)
-
 
 def _layers(network: nn.Module) -> tuple[list[np.ndarray[Any, Any]], list[np.ndarray[Any, Any]]]:
-    """Return weights and biases of a network's layers, as views of their memory."""
     values = [kernels.view(parameter) for parameter in network.parameters()]
     return values[::2], values[1::2]
 
@@ -203,8 +199,7 @@ class AutogradGradients(GradientBackend):
 
     def _num_seen(self, samples: Samples) -> int:
         """Return the number of leading samples that the intensity network sees."""
-        in_free_space = self._config.training.intensity_in_free_space
-        return len(samples.points) if in_free_space else samples.num_labelled
+        return len(samples.points) if self._config.training.intensity_in_free_space else samples.num_labelled
 
     def _of_part(self, losses: Losses, part: tuple[Samples, list[Tensor] | None]) -> Gradients:
         """Differentiate one part: samples, and dropout factors of the encoding of those that the network sees."""
@@ -243,8 +238,7 @@ class AutogradGradients(GradientBackend):
         if count == 0:
             return predicted.sum()
         # Weight of this mean in that of the whole batch.
-        in_free_space = self._config.training.intensity_in_free_space
-        share = samples.share if in_free_space else samples.labelled_share
+        share = samples.share if self._config.training.intensity_in_free_space else samples.labelled_share
         return intensity_loss(predicted, labels) * share
 
 

@@ -27,8 +27,7 @@ def occupied_cells(
     else:
         keys = surface.means.leaf_keys(config.leaf_size_m, config.metres(BAND_CELLS), num_threads)
         of_cells = ReturnsOfCells.of_means(surface.means, noise, returns)
-    bridges = config.encoding.bridge_cells
-    return bridged(keys, of_cells.keys, of_cells.counts, bridges, num_threads), of_cells
+    return bridged(keys, of_cells.keys, of_cells.counts, config.encoding.bridge_cells, num_threads), of_cells
 
 
 def near_leaf_keys(rays: Rays, config: FitConfig, num_threads: int) -> Keys:

@@ -22,19 +22,14 @@ _STATE_DIM, _LAST_STEP = 8, 5
 
 
 class Optimiser(ABC):
-    """Base class. `learning_rate` applies to the next step, `full_rate` is the initial one."""
+    """Base class. `learning_rate` applies to the next step, `full_rate` is the initial one.
+
+    The method `state` returns all that the next steps depend on, except the parameters, without copying.
+    """
 
     def __init__(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
         self.parameters = list(parameters)
         self.full_rate = self.learning_rate = learning_rate
-
-    @abstractmethod
-    def state(self) -> dict[str, Tensor]:
-        """Return all that the next steps depend on, except the parameters, without copying."""
-
-    @abstractmethod
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore a :meth:`state`. Raise a ValueError if it is invalid for these parameters."""
 
     @abstractmethod
     def step(self, gradients: Sequence[Tensor], pool: ThreadPool | None = None) -> None:
@@ -155,9 +150,8 @@ class RowAdam:
     def restore(self, state: dict[str, Tensor]) -> None:
         count, last_step = int(state["step_count"]), state["states"][:, _LAST_STEP]
         first, last = (int(last_step.min()), int(last_step.max())) if last_step.numel() else (0, 0)
-        if not 0 <= first <= last <= count:
-            msg = f"a row cannot have moved after step {count}"  # the core does not check it
-            raise ValueError(msg)
+        # The core does not check it.
+        check(0 <= first <= last <= count, f"a row cannot have moved after step {count}")
         self._states.copy_(state["states"])
         self._states[:, _LAST_STEP + 1 :] = 0  # the core indexes by the next number
         self.step_count = count

@@ -199,11 +199,6 @@ def _in_morton_order(
     return rows
 
 
-def share(count: int, part: int, parts: int) -> int:
-    """Return the size of the `part`-th of `parts` of `count` items."""
-    return count * (part + 1) // parts - count * part // parts
-
-
 @dataclass(frozen=True)
 class _Layout:
     """Layout of the B samples of a batch, each uniform on a segment of its ray: by part, near samples first."""
@@ -225,7 +220,7 @@ class _Layout:
         chosen = np.zeros(num_near, np.bool_)
         chosen[_spread(num_labelled, num_near)] = True
         of_kinds = [near_rays[chosen], near_rays[~chosen], free_rays]
-        shares = [[share(len(kind), part, parts) for part in range(parts)] for kind in of_kinds]
+        shares = [np.diff(np.arange(parts + 1) * len(kind) // parts).tolist() for kind in of_kinds]
         sizes = [size for part in zip(*shares, strict=True) for size in part]
         kinds = np.repeat(np.tile([0, 1, 2], parts), sizes)
         number = kinds.argsort(kind="stable").argsort().astype(np.int32)
@@ -246,7 +241,6 @@ def _spread(count: int, of: int) -> Ints:
 
 
 def draw_seed(generator: torch.Generator) -> int:
-    """Draw a seed for the core's random numbers."""
     return int(torch.empty((), dtype=torch.int64, device="cpu").random_(generator=generator))
 
 

@@ -140,9 +140,8 @@ class _Fit:
         given, config, num_threads = read(), self.config, self.pool.num_threads
         check_extent(given.rays, config)
         check_fit(given.rays, config, given.inside)
-        saved, path = None, self.checkpoint
-        if path is not None:
-            saved = Checkpoint(path, given.rays, given.scale, config)
+        path = self.checkpoint
+        saved = None if path is None else Checkpoint(path, given.rays, given.scale, config)
         self._lap("prepare_s")
 
         surface = SurfaceReturns.of(given.rays, config, num_threads, given.inside, given.sums)
@@ -227,7 +226,6 @@ def _report(
     schedule: Schedule,
     config: FitConfig,
 ) -> dict[str, Any]:
-    """Return the report of the map before the training."""
     cells, rows, with_intensity = len(field.table.leaf_keys()), field.table.num_rows, given.scale is not None
     sizes = {"returns": len(learnt), "cells": cells, "rows": rows}
     skipped: list[tuple[str, float | None]] = []

@@ -55,7 +55,6 @@ class _Cells(NamedTuple):
 def _cells_of(
     rays: Rays, config: FitConfig, sums: ScanSums | None, by_return: bool, num_threads: int
 ) -> _Cells:
-    """Sum the returns in cells, unless `sums` are known."""
     leaves = None
     if sums is None:
         leaves = ReturnCells.of(rays, config.leaf_size_m, num_threads)

@@ -132,8 +132,6 @@ class LossHistory:
 
 @dataclass(frozen=True)
 class _Stage:
-    """Stage of the training."""
-
     name: str
     losses: Losses
     iterations: int
@@ -190,16 +188,14 @@ class Training:
             self._optimisers["features"] = Adam(field.cells.parameters(), training.learning_rate)
         self._optimisers["sdf"] = of_network(field.sdf_network.parameters(), training.learning_rate)
         if network is not None:
-            rate = training.intensity_learning_rate
-            self._optimisers["intensity"] = of_network(network.parameters(), rate)
+            self._optimisers["intensity"] = of_network(network.parameters(), training.intensity_learning_rate)
 
     def _sampler_of(self, rays: Rays) -> RaySampler:
         unit = None
         if self._scale is not None and rays.intensities is not None:
             unit = torch.from_numpy(self._scale.to_unit(rays.intensities))
         size, neighbours = self._schedule.batch_size, self._schedule.neighbours
-        threads = self._pool.num_threads
-        return RaySampler(rays, self._config, size, self._generator, neighbours, unit, threads)
+        return RaySampler(rays, self._config, size, self._generator, neighbours, unit, self._pool.num_threads)
 
     def _draw_from_all_returns(self) -> None:
         if self._later is not None:
@@ -221,7 +217,6 @@ class Training:
         return state
 
     def _parts(self) -> Iterable[tuple[str, Any]]:
-        """Yield the stateful parts by name."""
         yield from (("history", self.history), ("backend", self._backend), ("sampler", self._sampler))
         if self._rows is not None:
             yield "rows", self._rows
@@ -273,7 +268,6 @@ class Training:
                 raise KeyboardInterrupt
 
     def _stages(self) -> list[_Stage]:
-        """Return the sdf stage, and the intensity stage if it has iterations."""
         joint = "intensity" in self._optimisers
         optimisers, shared = list(self._optimisers.values()), self._schedule.joint_iterations
         losses: Losses = "joint" if joint else "sdf"
@@ -285,7 +279,6 @@ class Training:
         return stages
 
     def _batch(self) -> Batch:
-        """Draw a batch of the sdf stage."""
         return self._sampler.batch(self._backend.num_parts(self._schedule.batch_size))
 
     def _labelled_batch(self) -> Batch:
@@ -367,7 +360,6 @@ class Training:
 def _move_networks(
     found: Gradients, optimisers: list[Optimiser], share: float, pool: ThreadPool | None = None
 ) -> None:
-    """Update the networks by the gradients."""
     total = iter(found.by_parameters)
     for optimiser in optimisers:
         optimiser.learning_rate = share * optimiser.full_rate

@@ -17,8 +17,7 @@ from typing_extensions import TypedDict
 from radarsdf.arrays import Array, Keys
 from radarsdf.checks import check
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.field.field import Field
-from radarsdf.field.grid_field import GridField
+from radarsdf.field.field import Field, GridField
 from radarsdf.field.neural_field import NeuralField
 from radarsdf.io.files import check_regular_file, reading, write_whole
 from radarsdf.io.tensors import open_tensors, tensor_bytes

@@ -14,7 +14,6 @@ from radarsdf.config.groups import ReturnsConfig
 from radarsdf.returns.noise import SensorNoise
 from radarsdf.returns.rays import Rays
 from radarsdf.returns.sums import MeanRays, ReturnCells, merged_keys
-from radarsdf.returns.weights import weights_of
 
 CELLS_OF_SURFACE = 9
 """Approximate number of cells that a plane crosses in a 3 × 3 × 3 neighbourhood."""
@@ -59,6 +58,15 @@ class Evidence:
         """Return information, hits, visibility and :func:`usual_information` of each leaf cell, (C, 4)."""
         usual = usual_information(self.information, leaf_keys, num_threads)
         return np.stack([self.information, self.hits, self.visibility, usual], 1, dtype=np.float32)
+
+
+def weights_of(counts: Floats32, ranges_m: Floats32, noise: SensorNoise) -> tuple[Floats32, Floats32]:
+    """Return the weights of groups of `counts` (M,) returns with about the same range (M,), m.
+
+    The first is their weight in averages of distances. The second, in smoothing, evidence and uncertainty, is
+    1 / variance of the position, m⁻².
+    """
+    return counts, counts / noise.variances_m2(ranges_m)
 
 
 @dataclass(frozen=True)
@@ -141,8 +149,7 @@ def usual_information(information: Floats32, leaf_keys: Keys, num_threads: int =
     first, weights = np.flatnonzero(begins), information.astype(np.float64)
     sums = np.add.reduceat(np.stack([weights, weights**2], axis=1), first) if len(first) else np.zeros((0, 2))
     near = CellBlocks(pairs[first]).neighbour_sums(pairs[first], sums, 1.0, num_threads)
-    usual: Floats32 = (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32)
-    return usual.take(np.cumsum(begins) - 1)
+    return (near[:, 1] / np.maximum(near[:, 0], 1e-30)).astype(np.float32).take(np.cumsum(begins) - 1)
 
 
 _AT_ONCE = 1 << 20  # leaf cells: float64 sums of all would be the peak of a large fit's memory

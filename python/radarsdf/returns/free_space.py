@@ -99,8 +99,7 @@ def unpacked(planes: Keys) -> Bytes:
     """Unpack bit planes to (B, 8, 8, 8) cells: the number of crossing scans, plus 8 where there are returns."""
     bits = np.unpackbits(planes.astype("<u8").view(np.uint8), axis=-1, bitorder="little")
     weights = np.array([1, 2, 4, 8], np.uint8)[:, None]
-    cells: Bytes = (bits * weights).sum(axis=1, dtype=np.uint8)
-    return cells[:, _MORTON]
+    return (bits * weights).sum(axis=1, dtype=np.uint8)[:, _MORTON]
 
 
 _PLACES = np.ravel_multi_index(tuple((lattice_of(_INSIDE) % BLOCK_CELLS).T), (BLOCK_CELLS,) * 3)

@@ -44,8 +44,7 @@ def find_ghosts(
     weights = rays.counts if isinstance(rays, MeanRays) else None
 
     def count(rows: Ints32, of: Bools, size: int) -> Floats:
-        counted = np.bincount(rows[of], None if weights is None else weights[of], size)
-        return counted.astype(np.float64)
+        return np.bincount(rows[of], None if weights is None else weights[of], size).astype(np.float64)
 
     flat = np.flatnonzero(surfels.is_flat())
     if isinstance(rays, MeanRays):
@@ -54,9 +53,18 @@ def find_ghosts(
         first = first_crossed(surfels, flat, rays, noise, num_threads)
     passed = np.zeros(len(surfels.keys))
     passed[surfels.cell_of_plane[flat]] = count(first, first >= 0, len(flat))
-    opaque = are_opaque(surfels, flat, passed, num_threads)
-    behind = are_behind(surfels, flat[opaque], first >= 0, rays, noise, num_threads)
-    return mostly_behind(surfels, count(cell_of_ray, behind, len(surfels.keys)), num_threads)
+    # Ghosts lie behind surfaces that stop most rays.
+    cells = surfels.cell_of_plane[flat]
+    passed_near = surfels.blocks.neighbour_sums(
+        surfels.keys[cells], passed[:, None], NEIGHBOUR_WEIGHT, num_threads
+    )[:, 0]
+    opaque = flat[surfels.support[cells] / (surfels.support[cells] + passed_near) > _MIN_OPACITY]
+    behind, crossing = first >= 0, np.flatnonzero(first >= 0)
+    crossed = first_crossed(surfels, opaque, rays.select(crossing), noise, num_threads, beyond_returns=False)
+    behind[crossing] = crossed >= 0
+    columns = np.stack([count(cell_of_ray, behind, len(surfels.keys)), surfels.counts], 1)
+    sums = surfels.blocks.neighbour_sums(surfels.keys, columns, 1.0, num_threads)
+    return sums[:, 0] > _MIN_SHARE * sums[:, 1]
 
 
 def _first_crossed_near_sample(
@@ -118,34 +126,3 @@ def first_crossed(
         _SIGMAS,
         num_threads,
     )
-
-
-def are_opaque(surfels: Surfels, planes: Ints, passed: Floats, num_threads: int = 0) -> Bools:
-    """Return a mask (P,) of `planes` (rows of flat surfels) that stop most rays. `passed` (C,): first crossings by cell."""
-    cells = surfels.cell_of_plane[planes]
-    support = surfels.support[cells]
-    passed_near = surfels.blocks.neighbour_sums(
-        surfels.keys[cells], np.ascontiguousarray(passed[:, None]), NEIGHBOUR_WEIGHT, num_threads
-    )[:, 0]
-    return support / (support + passed_near) > _MIN_OPACITY
-
-
-def are_behind(
-    surfels: Surfels,
-    planes: Ints,
-    crosses: Bools,
-    rays: Rays | MeanRays,
-    noise: SensorNoise,
-    num_threads: int = 0,
-) -> Bools:
-    """Return a mask (N,) of rays that end behind `planes` (rows of opaque surfels). `crosses` (N,): rays that cross a flat one."""
-    behind, chosen = crosses.copy(), rays.select(np.flatnonzero(crosses))
-    behind[crosses] = first_crossed(surfels, planes, chosen, noise, num_threads, beyond_returns=False) >= 0
-    return behind
-
-
-def mostly_behind(surfels: Surfels, behind: Floats, num_threads: int = 0) -> Bools:
-    """Return a mask (C,) of cells in whose neighbourhood most returns lie behind a surface; `behind` (C,) counts them."""
-    columns = np.stack([behind, surfels.counts], 1)
-    sums = surfels.blocks.neighbour_sums(surfels.keys, columns, 1.0, num_threads)
-    return sums[:, 0] > _MIN_SHARE * sums[:, 1]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -72,7 +71,6 @@ def sensor_velocity(
     measured = speeds[rows]
 
     def residuals(velocities: Floats) -> Floats:
-        """Return the residuals (K, M) of the measured speeds for velocities (K, 3)."""
         off: Floats = measured - product(velocities, away_columns)
         return off if interval_mps is None else off - interval_mps * np.round(off / interval_mps)
 
@@ -102,8 +100,7 @@ def _most_agreed(
     away: Floats, measured: Floats, residuals: Callable[[Floats], Floats], interval_mps: float | None
 ) -> Floats:
     """Return the velocity (3,) with the most inliers among random draws of three returns (RANSAC)."""
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(0, len(measured), (_DRAWS, 3))
+    drawn = np.random.default_rng(0).integers(0, len(measured), (_DRAWS, 3))
     speeds = measured[drawn]
     if interval_mps is not None:
         speeds = np.concatenate([speeds + fold * interval_mps for fold in _FOLDS])
@@ -250,6 +247,5 @@ def checked_doppler(scans: list[Array], doppler_mps: Sequence[ArrayLike]) -> lis
 def rays_as_measured(scans: Scans, config: FitConfig) -> Rays:
     """Return rays of the static returns within the ranges of a fit, without accumulating scans. Intensity outliers are NaN."""
     static = StaticReturns.of(scans.points, scans.intensities, scans.doppler_mps, config.returns)
-    nearest_m, farthest_m = config.returns.min_range_m, config.returns.max_range_m
-    options: dict[str, Any] = {"min_range_m": nearest_m, "max_range_m": farthest_m}
+    options = config.preparation | {"accumulate_scans": 1, "lattice": None}
     return prepare(static.points, scans.poses, static.intensities, **options)

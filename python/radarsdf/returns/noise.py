@@ -109,8 +109,7 @@ def sensor_noise(surfels: Surfels, rays: Rays, config: ReturnsConfig, num_thread
 
 def variances_across(rays: Rays, rows: Ints, normals: Floats, noise: SensorNoise) -> Floats:
     """Return the variances (M,) of the returns in `rows` (M,) across planes with `normals` (M, 3), m²."""
-    shares = _shares(rays, rows, normals)
-    return np.einsum("k,kn->n", np.array(noise.variances), shares)
+    return np.einsum("k,kn->n", np.array(noise.variances), _shares(rays, rows, normals))
 
 
 def _shares(rays: Rays, rows: Ints, normals: Floats) -> Floats:

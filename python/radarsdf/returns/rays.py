@@ -30,6 +30,7 @@ from radarsdf.returns.sampling import hashes
 
 _LOG = logging.getLogger("radarsdf.returns")
 _HASHED_PER_M, _LAST_BITS = 64.0, np.uint64(0xFFFFFF)  # resolution of hashes, and bits beyond it
+_COLUMNS = ("points", "directions", "ranges_m", "intensities", "scans")
 _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repeat some
 
 # At equal received power the radar cross section grows with the fourth power of the range: a return at 100 times the median
@@ -84,22 +85,13 @@ class Rays:
 
     def select(self, part: slice | Bools | NDArray[np.integer[Any]]) -> Rays:
         """Select rays by a slice, a mask (N,) or row indices (M,), in this order."""
-        rows = part
-        if isinstance(part, np.ndarray) and part.dtype == np.bool_:
-            rows = np.flatnonzero(part)
-
-        def chosen(array: Array) -> Array:
-            # `take` with row indices needs a third of the time of indexing with them or a mask.
-            return array[rows] if isinstance(rows, slice) else array.take(rows, axis=0)
-
-        return dataclasses.replace(
-            self,
-            points=chosen(self.points),
-            directions=np.ascontiguousarray(chosen(self.directions)),
-            ranges_m=np.ascontiguousarray(chosen(self.ranges_m)),
-            intensities=None if self.intensities is None else chosen(self.intensities),
-            scans=np.ascontiguousarray(chosen(self.scans)),
-        )
+        rows = part if isinstance(part, slice) or part.dtype != np.bool_ else np.flatnonzero(part)
+        columns: dict[str, Any] = {n: getattr(self, n) for n in _COLUMNS if getattr(self, n) is not None}
+        if isinstance(rows, slice):
+            columns = {name: np.ascontiguousarray(column[rows]) for name, column in columns.items()}
+        else:  # `take` with row indices needs a third of the time of indexing with them or a mask
+            columns = {name: column.take(rows, axis=0) for name, column in columns.items()}
+        return dataclasses.replace(self, **columns)
 
     def in_c_order(self) -> tuple[Floats32, Floats32, Floats32]:
         points, directions = np.ascontiguousarray(self.points), np.ascontiguousarray(self.directions)
@@ -191,8 +183,7 @@ def check_scans(
         if num_rows == len(scan):
             left_out.empty.append(i)
         scans.append(np.where(returns[:, None], scan, 0.0) if num_rows else scan)
-    if not scans:
-        check_scan_shapes([])
+    check_scan_shapes(scans)
     if intensities is None:
         return scans, None, left_out
     values = [

@@ -186,7 +186,6 @@ def _pair(values: Any, name: str) -> tuple[float, float]:
 
 
 def _limits(values: Floats) -> tuple[float, float]:
-    """Return robust lower and upper limits."""
     low, high = np.quantile(values, [_STRAY, 1 - _STRAY])
     if low == high:  # very few returns
         low -= 1e-3 * max(abs(low), 1e-3)

@@ -47,8 +47,6 @@ def merged_keys(keys: Keys) -> Keys:
 
 @dataclass(frozen=True)
 class ReturnCells:
-    """Cells with returns."""
-
     keys: Keys  # (C,) Morton keys of the cells, ascending
     blocks: CellBlocks  # lookup of the row of a cell by its key
     cell_of_ray: Ints32  # (N,) row of each return's cell

@@ -130,7 +130,6 @@ class RadarSensor:
 
     @property
     def _least_db(self) -> float:
-        """The lowest intensity."""
         return self.threshold_db if self.floor_db is None else max(self.floor_db, self.threshold_db)
 
     def scan(self, scene: Scene, T_world_sensor: Floats, seed: int = 0, frame: int = 0) -> SimulatedScan:
@@ -175,8 +174,7 @@ class RadarSensor:
 
         Origins are (3,) or (N, 3), and directions (N, 3) unit vectors of the rays, world frame, m.
         """
-        hit = hits.primitive >= 0
-        range_m = np.where(hit, hits.range_m, 1.0)
+        range_m = np.where(hits.primitive >= 0, hits.range_m, 1.0)
         echo = scene.echo_db(origins + range_m[:, None] * directions, directions, hits)
         return self.gain_db + echo - self.range_loss_db * np.log10(range_m)
 
@@ -196,8 +194,7 @@ class RadarSensor:
         hits = rays.hits
         noiseless = self.echo_power_db(scene, rays.origin, rays.directions, hits)
         power = noiseless + _speckle_db(scene.material_values(hits, "looks", 1.0), rng)
-        rows = hits.range_m >= self.min_range_m
-        rows &= hits.primitive >= 0
+        rows = (hits.primitive >= 0) & (hits.range_m >= self.min_range_m)
         return _Echoes(hits.range_m[rows], rays.angles[rows], power[rows], noiseless[rows])
 
     def _ghosts(self, scene: Scene, rays: _Rays, rng: np.random.Generator) -> _Echoes:
@@ -223,14 +220,12 @@ class RadarSensor:
         return _Echoes(path, angles[rows], power + _speckle_db(looks, rng))
 
     def _sidelobes(self, surface: _Echoes, rng: np.random.Generator) -> _Echoes:
-        """Repeat some echoes of surfaces at false elevations."""
         rows = np.flatnonzero(rng.random(len(surface.range_m)) < self.sidelobe_share)
         angles = surface.angles[rows]
         angles[:, 1] = np.arcsin(rng.uniform(-1, 1, size=len(rows)) * np.sin(self.sidelobe_fov_rad / 2))
         return _Echoes(surface.range_m[rows], angles, surface.power_db[rows])
 
     def _clutter(self, angles: Floats, range_m: Floats, rng: np.random.Generator) -> _Echoes:
-        """Weak false returns near the sensor, and anywhere along a beam in front of its surface."""
         beam = rng.integers(len(angles), size=rng.poisson(self.clutter_per_scan))
         free = np.minimum(range_m[beam], self.max_range_m)
         anywhere = free * rng.uniform(0.05, 0.95, size=len(beam))
@@ -263,7 +258,6 @@ class RadarSensor:
         return _Echoes(np.sqrt(x**2 + y**2 + z**2), angles, power)
 
     def _measure(self, echoes: _Echoes, kind: Origin, rng: np.random.Generator) -> SimulatedScan:
-        """Add sensor noise, apply the detection threshold, quantise and clip the intensities."""
         noise = rng.standard_normal((len(echoes.range_m), 4))
         # Returns that noise lifts above the threshold count as if at it.
         excess_db = np.maximum(echoes.power_db - self.threshold_db, 0.0)

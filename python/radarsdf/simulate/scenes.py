@@ -60,18 +60,15 @@ class Site:
         return here + side * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
     def building(self, xy: Floats, yaw: float) -> bool:
-        """Add a building of concrete or brick, 9 to 16 m long."""
         material = vary(self.rng, materials.CONCRETE if self.rng.random() < 0.5 else materials.BRICK)
         size = self.rng.uniform([9, 6, 5], [16, 9, 9])
         return self._block(xy, yaw + self.rng.normal(0, 0.15), size, material)
 
     def wall(self, xy: Floats, yaw: float) -> bool:
-        """Add a free-standing wall, 1.4 to 2.6 m high."""
         size = self.rng.uniform([5, 0.25, 1.4], [12, 0.4, 2.6])
         return self._block(xy, yaw + self.rng.normal(0, 0.15), size, vary(self.rng, materials.CONCRETE))
 
     def hedge(self, xy: Floats, yaw: float) -> bool:
-        """Add a hedge along a road, 1 to 2 m high."""
         size = self.rng.uniform([4, 0.7, 1.0], [14, 1.2, 2.0])
         return self._block(xy, yaw + self.rng.normal(0, 0.05), size, vary(self.rng, materials.TREE))
 
@@ -115,7 +112,6 @@ class Site:
         return float(self.terrain.height(xy[None])[0])
 
     def reserve(self, circles: list[tuple[float, float, float]]) -> bool:
-        """Reserve circles if all of them are free; return whether they were."""
         old, new = np.array(self._taken).reshape(-1, 3), np.array(circles)
         gap = np.linalg.norm(old[:, None, :2] - new[None, :, :2], axis=2) - old[:, None, 2] - new[None, :, 2]
         if (gap < 0).any():
@@ -138,7 +134,6 @@ class Site:
         self.solids.append(Box(np.array([*xy, bottom + size[2] / 2]), size / 2, yaw, material))
 
     def add_pole(self, xy: Floats, radius_m: float, height_m: float, material: Material) -> bool:
-        """Add a pole with this height above the ground, and return True."""
         base = np.array([*xy, self._ground(xy) - _BURIED_M])
         self.solids.append(Pole(base, radius_m, height_m + _BURIED_M, material))
         return True
@@ -345,8 +340,6 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
 
 
 def _lane(length_m: float, sway_m: float, wave_m: float, phase: float) -> Path:
-    """A lane along x that meanders as a sine."""
-
     def path(u: Floats) -> Floats:
         x = length_m * u
         return np.stack([x, sway_m * np.sin(2 * np.pi * x / wave_m + phase)], axis=1)

@@ -225,7 +225,6 @@ class Terrain(Primitive):
         return self.level_m + np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes
 
     def _slope(self, xy: Floats) -> Floats:
-        """Gradient (N, 2) of the height."""
         return (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves
 
     def _normals(self, xy: Floats) -> Floats:
@@ -244,8 +243,7 @@ class Terrain(Primitive):
         dz = directions[:, 2]
         closing = np.linalg.norm(directions[:, :2], axis=1) * steepest - dz
         # Rays from above the highest crest start at its height.
-        above = origins[:, 2] > top
-        start = np.where(above, (origins[:, 2] - top) / np.maximum(-dz, 1e-9), 0.0)
+        start = np.where(origins[:, 2] > top, (origins[:, 2] - top) / np.maximum(-dz, 1e-9), 0.0)
         t, before = start, start.copy()
         hit = np.zeros(len(t), dtype=bool)
         active = np.flatnonzero(start <= max_range_m)
