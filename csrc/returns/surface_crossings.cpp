@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <limits>
 #include <stdexcept>
 
 #include "lattice/cell_walk.hpp"
@@ -14,7 +13,8 @@ namespace {
 
 constexpr float kSlack = 0.25F;                 // cells: planes of neighbours do not exactly meet at their common face
 constexpr double kBlockEdge = 1 << kBlockBits;  // cells
-constexpr double kNever = std::numeric_limits<double>::infinity();
+// Consecutive ones, after which a ray steps by blocks again: no fewer than the cells of a block that a line crosses.
+constexpr int kEmptyCells = 3 * (1 << kBlockBits) - 2;
 
 // Cells of a block, by axis, with coordinates from the first to the second index on.
 using Slabs = std::array<std::array<std::array<std::uint64_t, 4>, 4>, 3>;
@@ -35,20 +35,6 @@ constexpr Slabs kSlabs = slabs_of_block();
 // A ray in cells.
 struct Line {
   double position[3], cells_per_m[3];  // of its end
-
-  // Whether it enters the cell by `until_m`, in the block; distances at which it enters and leaves it.
-  bool enters(const CellWalk& block, int part, double until_m, double& enters_m, double& leaves_m) const {
-    enters_m = -kNever, leaves_m = kNever;
-    for (int axis = 0; axis < 3; ++axis) {
-      const int inside = (part >> axis & 1) | (part >> (axis + 2) & 2), ahead = cells_per_m[axis] >= 0 ? 1 : 0;
-      const double m_per_cell = cells_per_m[axis] != 0 ? 1 / cells_per_m[axis] : kNever;
-      const double behind = kBlockEdge * block.coordinate(axis) + inside + 1 - ahead - position[axis];
-      const double in_m = behind * m_per_cell, out_m = (behind + 2 * ahead - 1) * m_per_cell;
-      if (in_m > enters_m) enters_m = in_m;
-      if (out_m < leaves_m) leaves_m = out_m;
-    }
-    return enters_m <= leaves_m && enters_m <= until_m;
-  }
 
   // Cells of a block that may hold parts of the ray from begin_m to end_m, and others.
   std::uint64_t cells_near(const CellWalk& block, double begin_m, double end_m) const {
@@ -86,27 +72,24 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
   // Upper bound of crossings along a ray, from its end, at any angle of incidence: see below.
   const double last_m = slack_m - margin_m - sigmas * noise.range_m;
 
-  // Distance at which ray i enters a cell of the block where it crosses the plane of its surfel, and ends well behind
-  // it; otherwise kNever.
-  const auto crosses = [&](std::int64_t i, const Surfel& surfel, const Line& line, const CellWalk& block, int part) {
+  // Whether ray i crosses the surfel's plane between begin_m and end_m from its end, and ends well behind it.
+  const auto crosses = [&](std::int64_t i, const Surfel& surfel, double begin_m, double end_m) {
     const float *p = points + 3 * i, *d = directions + 3 * i, *n = surfel.normal, *c = surfel.centre;
     const float cosine = -(n[0] * d[0] + n[1] * d[1] + n[2] * d[2]);
     const float depth_m = -(n[0] * (p[0] - c[0]) + n[1] * (p[1] - c[1]) + n[2] * (p[2] - c[2]));
-    if (!(cosine > 0) || depth_m <= margin_m) return kNever;
+    if (!(cosine > 0) || depth_m <= margin_m) return false;
     const double at_m = -depth_m / cosine;
-    double enters_m, leaves_m;
-    if (!line.enters(block, part, last_m, enters_m, leaves_m)) return kNever;
-    if (at_m < std::max(enters_m, -double{ranges_m[i]}) - slack_m || at_m > leaves_m + slack_m) return kNever;
+    if (at_m < begin_m - slack_m || at_m > end_m + slack_m) return false;
     float off_m2 = 0;
     for (int axis = 0; axis < 3; ++axis) {
       const float off_m = p[axis] + static_cast<float>(at_m) * d[axis] - c[axis];
       off_m2 += off_m * off_m;
     }
-    if (off_m2 > surfel.reach * surfel.reach) return kNever;
+    if (off_m2 > surfel.reach * surfel.reach) return false;
     const float along = noise.range_m * cosine, across = noise.angle_rad * ranges_m[i];
     const float variance =
         along * along + across * across * (1 - cosine * cosine) + surfel.thickness * surfel.thickness;
-    return depth_m > margin_m + sigmas * std::sqrt(variance) ? enters_m : kNever;
+    return depth_m > margin_m + sigmas * std::sqrt(variance);
   };
 
   constexpr std::int64_t kRays = 1 << 12;  // per task: few, so that a long traversal can be interrupted
@@ -119,7 +102,8 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
       bool inside = range_m > 0;
       for (int axis = 0; axis < 3; ++axis) inside = inside && std::abs(points[3 * i + axis]) + range_m < limit_m;
       if (!inside || -range_m > last_m) continue;
-      // Most of the way is empty: only blocks with surfels near the ray, in regions with surfels, are searched.
+      // Most of the way is empty: only where regions and blocks hold surfels nearby is the ray followed from cell to
+      // cell.
       Line line;
       for (int axis = 0; axis < 3; ++axis) {
         line.position[axis] = points[3 * i + axis] / cell_size_m_;
@@ -147,20 +131,23 @@ void SurfelMap::first_crossings(const float* points, const float* directions, co
           }
         }
         const double leaves_m = block.leaves_m();
-        const Occupancy& cells = rows.block(block.key());
-        std::uint64_t near = cells.mask;
-        if (near != 0) near &= line.cells_near(block, begin_m, std::min(leaves_m, last_m));
-        double first_m = kNever;
-        for (; near != 0; near &= near - 1) {
-          const int part = lowest_bit(near);
-          const std::int32_t row = cells.row(static_cast<std::uint64_t>(part));
-          const double enters_m = crosses(i, surfels_[static_cast<std::size_t>(row)], line, block, part);
-          if (enters_m >= first_m) continue;
-          first_m = enters_m;
-          crossed[i] = row;
+        const std::uint64_t cells = rows.block(block.key()).mask;
+        if (cells != 0 && (cells & line.cells_near(block, begin_m, std::min(leaves_m, last_m))) != 0) {
+          int on_end = 0;
+          for (CellWalk cell = walk(0); cell.inside(); cell.next()) {
+            const double end_m = cell.leaves_m();
+            const std::int32_t row = rows.row(cell.key());
+            on_end = row < 0 ? on_end + 1 : 0;
+            if (on_end > kEmptyCells) break;
+            if (row >= 0 && crosses(i, surfels_[static_cast<std::size_t>(row)], begin_m, end_m)) {
+              crossed[i] = row;
+              break;
+            }
+            begin_m = end_m;
+          }
         }
         begin_m = std::max(begin_m, leaves_m);
-        block.next();
+        while (block.inside() && block.leaves_m() <= begin_m) block.next();
       }
     }
   });
