@@ -9,6 +9,7 @@ from radarsdf import FitConfig
 from radarsdf.io import Imu
 from radarsdf.poses.checked_scans import CheckedScans
 from radarsdf.poses.consistency import Consistency
+from radarsdf.poses.doppler import sign_significance
 from radarsdf.poses.drive import Drive
 from radarsdf.poses.gyroscope import Gyroscope, UnusableGyroscopeError
 from radarsdf.poses.motion import MotionRate
@@ -70,7 +71,8 @@ def test_the_scale_of_the_doppler_is_estimated(factor):
     motion = measured_motion(yard, seed=2)
     speeds = [factor * speeds for speeds in motion.doppler_mps]
     checked = CheckedScans.of(yard.points, speeds, motion.times_s)
-    drive = Drive(checked.scans, checked.times_s, checked.velocities, None)
+    _, yaws = sign_significance(checked.scans, checked.velocities, checked.times_s)
+    drive = Drive(checked.scans, checked.times_s, checked.velocities, None, yaws=yaws)
     tests = Consistency.of_returns(drive, FitConfig(num_threads=1), 1)
     assert (tests.contradicted is None) == (factor == 1)
     assert factor == 1 or tests.contradicted.ratio * factor == pytest.approx(1, abs=0.08)
