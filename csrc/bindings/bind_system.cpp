@@ -4,7 +4,6 @@
 #endif
 
 #include <exception>
-#include <memory>
 
 #include "bindings/arrays.hpp"
 #include "bindings/held_thread_pool.hpp"
@@ -13,7 +12,6 @@
 #include "kernels/fourier_kernels.hpp"
 #include "lattice/cell.hpp"
 #include "util/instruction_set.hpp"
-#include "util/kept_memory.hpp"
 #include "util/parallel.hpp"
 #include "util/random_bytes.hpp"
 
@@ -75,14 +73,6 @@ void bind_system(py::module_& m) {
       .def(
           "finish", [](HeldThreadPool& pool) { pool.finish([](ThreadPool& own) { own.finish(); }); },
           "Joins the threads until all tasks that were started are complete.");
-  struct Block {
-    std::unique_ptr<KeptMemory> memory;
-  };
-  py::class_<Block>(m, "KeptMemory", "A ``with`` block in which freed memory stays with the process for reuse.")
-      .def(py::init<>())
-      .def("__enter__", [](Block& block) { block.memory = std::make_unique<KeptMemory>(); })
-      .def("__exit__",
-           [](Block& block, const py::object&, const py::object&, const py::object&) { block.memory.reset(); });
   m.def(
       "random_bytes",
       [](std::uint64_t seed, std::int64_t rows, std::int64_t columns) {

@@ -19,7 +19,6 @@ __all__: list[str] = [
     "FEATURE_DIM",
     "FieldLoss",
     "GrowingSums",
-    "KeptMemory",
     "LocalPlanes",
     "MAX_FREQUENCIES",
     "MAX_LEVELS",
@@ -83,14 +82,6 @@ class ThreadPool:
         """
         Joins the threads until all tasks that were started are complete.
         """
-
-class KeptMemory:
-    """
-    A ``with`` block in which freed memory stays with the process for reuse.
-    """
-    def __enter__(self) -> None: ...
-    def __exit__(self, arg0: typing.Any, arg1: typing.Any, arg2: typing.Any) -> None: ...
-    def __init__(self) -> None: ...
 
 class CellSet:
     """

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 
-from radarsdf._core import KeptMemory
 from radarsdf.arrays import Bools, Ints, Keys
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.field.field import Field
@@ -70,7 +69,7 @@ def fit_rays(
     """Fit a map to the input that `read` returns. See :func:`radarsdf.fit`, also for errors."""
     try:
         # A map created in inference mode could not compute gradients later.
-        with torch.inference_mode(mode=False), KeptMemory(), ThreadPool(config.num_threads) as pool:
+        with torch.inference_mode(mode=False), ThreadPool(config.num_threads) as pool:
             contents, stop = _Fit(config, progress, checkpoint, pool, {}).run(read)
     except KeyboardInterrupt as interruption:
         raise Interrupted(None) from interruption

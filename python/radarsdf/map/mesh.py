@@ -13,7 +13,7 @@ import torch
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import KeptMemory, vertex_areas
+from radarsdf._core import vertex_areas
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
@@ -106,9 +106,8 @@ def extract_mesh(
     check(voxel_size <= MAX_POSITION_M, f"voxel_size must be at most {MAX_POSITION_M:g} m, not {voxel_size}")
     limits = Limits.of(voxel_size, **wanted)
     local_box = None if box is None else check_box(box) - contents.origin
-    with KeptMemory():
-        surface = Surface.of(contents, voxel_size, local_box, progress)
-        return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
+    surface = Surface.of(contents, voxel_size, local_box, progress)
+    return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
 
 
 def with_intensities(mesh: trimesh.Trimesh, intensities: Array, scale: IntensityScale) -> trimesh.Trimesh:
