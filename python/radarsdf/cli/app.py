@@ -68,12 +68,16 @@ def _run(words: list[str]) -> int:
 
 
 def _function_of(command: str) -> _Function:
-    """Import the function of a command, which takes long for all but one."""
+    """Import the function of a command: two need little, all others the same modules, which take long."""
     if command == "config":
         from radarsdf.cli.settings import config
 
         return config
-    from radarsdf.cli import fits, info, live, maps, pages, scans, tiles, uses
+    if command == "info":
+        from radarsdf.cli.info import info
+
+        return info
+    from radarsdf.cli import fits, live, maps, pages, scans, tiles, uses
 
     functions: dict[str, _Function] = {
         "demo": fits.demo,
@@ -89,7 +93,6 @@ def _function_of(command: str) -> _Function:
         "compare": uses.compare,
         "grid": uses.grid,
         "convert": scans.convert,
-        "info": info.info,
         "tiles run": tiles.run,
         "tiles plan": tiles.plan,
         "tiles fit": tiles.fit,
