@@ -166,9 +166,7 @@ class Clock:
         if used.sum() < _FEWEST_STEPS or uneven_s.std() < _EVEN * np.median(durations_s):
             return cls(np.zeros(len(times_s)))
         missing_s = missing_s[used] - np.median(missing_s[used])
-        share = float((uneven_s * missing_s).sum() / (uneven_s**2).sum())
-        scores = uneven_s * (missing_s - share * uneven_s)
-        error = float(np.sqrt((scores**2).sum() * used.sum() / (used.sum() - 1)) / (uneven_s**2).sum())
+        share, error, _ = _slope(uneven_s, missing_s)
         needed = student.ppf(1 - _BY_CHANCE, used.sum() - 1) * error
         if share > needed:
             return cls(min(share, 1.0) * errors_s, float(min(needed, 1.0) * errors_s.std()))
@@ -426,6 +424,16 @@ def _significance(samples: Floats, level: float) -> Floats:
     return samples.mean(axis=0) / np.maximum(errors, 1e-9) / student.ppf(1 - level, len(samples) - 1)
 
 
+def _slope(x: Floats, y: Floats) -> tuple[float, float, Floats]:
+    """Regress y on x, (K,) or (K, 3), without intercept; return the slope, its standard error, and the residuals."""
+    # Errors of the components of a step depend on each other: cluster-robust, with as many degrees of freedom as steps less one.
+    count, square = len(x), max(float((x**2).sum()), 1e-12)
+    slope = float((x * y).sum()) / square
+    left = y - slope * x
+    scores = (x * left).reshape(count, -1).sum(axis=1)
+    return slope, float(np.sqrt((scores**2).sum() * count / (count - 1)) / square), left
+
+
 def delay_of(
     velocities: SensorVelocities,
     runs: Ints,  # of scans without a gap
@@ -460,12 +468,7 @@ def delay_of(
         left, change = (
             v - scaled * (v * scaled).sum() / max((scaled**2).sum(), 1e-12) for v in (left, change)
         )
-        square = max(float((change**2).sum()), 1e-12)
-        share = float((left * change).sum()) / square
-        remaining = left - share * change
-        # Errors of the components of a step depend on each other: cluster-robust, with as many degrees of freedom as steps less one.
-        scores = (change * remaining).sum(axis=1)
-        error = np.sqrt((scores**2).sum() * count / (count - 1)) / square
+        share, error, remaining = _slope(change, left)
         needed = student.ppf(1 - _BY_CHANCE / (2 * _MOST_LATE), count - 1)
         if share > needed * error and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))

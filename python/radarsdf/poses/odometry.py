@@ -130,33 +130,28 @@ def odometry(
         msg = "times_s are missing: the time of each scan, s"
         raise ValueError(msg)
     checked.check_intervals()
-    times_s, velocities, sign = checked.times_s, checked.velocities, 1
+    times_s, velocities, sign, yaws = checked.times_s, checked.velocities, 1, None
     if velocities is not None:
-        significance, yaws = sign_significance(checked.scans, velocities, times_s)
+        significance, both = sign_significance(checked.scans, velocities, times_s)
         if significance < -CLEAR:
-            sign, yaws, velocities = -1, yaws[::-1], velocities.scaled(-1.0)
+            sign, both, velocities = -1, both[::-1], velocities.scaled(-1.0)
+        yaws = both if turns_fast(both[0]) else None
     if imu is None and isinstance(points, Scans):
         imu = points.imu
     limits, notes = config.returns, [*checked.notes]
     with ThreadPool(config.num_threads) as pool:
         scans = [scan[within_ranges(scan, limits.min_range_m, limits.max_range_m)] for scan in checked.scans]
-        drive, consistency = Drive(scans, times_s, velocities, None), None
+        drive = Drive(scans, times_s, velocities, None, yaws=yaws)
+        consistency = Consistency.of_returns(drive, config, pool.num_threads)
         if velocities is not None:
-            drive = dataclasses.replace(drive, yaws=yaws if turns_fast(yaws[0]) else None)
-            consistency = Consistency.of_returns(drive, config, pool.num_threads)
             velocities, tested = consistency.applied(velocities)
             notes += tested
             if velocities is not None and (clock := consistency.clock) is not None:
                 times_s, notes = times_s - clock.errors_s, [*notes, *clock.note]
                 velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
         inertial = Inertial.of(imu, velocities, times_s, checked.begin_s)
-        drive = dataclasses.replace(
-            drive,
-            times_s=times_s,
-            velocities=velocities,
-            gyroscope=inertial.gyroscope,
-            yaws=None if velocities is None else drive.yaws,
-        )
+        yaws = None if velocities is None else yaws
+        drive = Drive(scans, times_s, velocities, inertial.gyroscope, yaws=yaws)
         try:
             drive, tracked = track_drive(drive, config, pool.num_threads, progress)
         except UnusableGyroscopeError as why:
@@ -168,7 +163,7 @@ def odometry(
         segments = np.array([found.segment for found in tracked])
         poses, covariance, loops = _estimate_jointly(drive, tracked, segments, config, pool.num_threads)
         notes += loops
-        if consistency is not None and velocities is not None:
+        if velocities is not None:
             covariance = consistency.widened(poses, covariance, segments, drive)
         if inertial.alignment is not None:
             poses, covariance = level_poses(poses, covariance, inertial.alignment.up)
