@@ -40,10 +40,8 @@ def first(drive, count, *given, **named):
 
     `drive` is a function of `radarsdf.simulate`. Scans that are not used are not simulated.
     """
-    scan, nothing = (
-        RadarSensor.scan,
-        SimulatedScan(np.zeros((0, 3), np.float32), *np.zeros((3, 0), np.float32)),
-    )
+    scan = RadarSensor.scan
+    nothing = SimulatedScan(np.zeros((0, 3), np.float32), *np.zeros((3, 0), np.float32))
 
     def begun(sensor, scene, T_world_sensor, seed=0, frame=0):
         return scan(sensor, scene, T_world_sensor, seed, frame) if frame < count else nothing

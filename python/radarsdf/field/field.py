@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -98,11 +97,11 @@ class GridField(Field):
         return torch.where(inside, torch.lerp(values[:, 0], values[:, 1], z), 0.0)
 
     def plane(self, points: Tensor) -> Tensor:
-        values = kernels.view(self.distances_m)
-        return torch.from_numpy(self.table.trilinear(values, kernels.view(points), torch.get_num_threads()))
+        values, x = self.corner_distances_m(), kernels.view(points)
+        return torch.from_numpy(self.table.trilinear(values, x, torch.get_num_threads()))
 
     def corner_distances_m(self) -> Floats32:
-        return np.asarray(self.distances_m.detach().numpy())
+        return kernels.view(self.distances_m)
 
     @cached_property
     def _corners_of_cells(self) -> Tensor:

@@ -206,10 +206,8 @@ def _tracks_and_tree(
     by_topic: dict[str, Track] = {}
     parents: dict[str, dict[str, Track]] = {}
     for message in bag_messages.read_messages(paths, pose_topics | transform_topics, request.notes):
-        if (
-            message.message_type == bag_messages.PATH
-        ):  # each holds the whole path so far: the last one is used
-            by_topic.pop(message.topic, None)
+        if message.message_type == bag_messages.PATH:
+            by_topic.pop(message.topic, None)  # each holds the whole path so far: the last one is used
         static = "static" in message.topic  # /tf_static: transforms that hold for all times
         for pose in message.content:
             tracks, key = by_topic, message.topic

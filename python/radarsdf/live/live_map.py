@@ -233,7 +233,7 @@ class LiveMap:
         state = self._state
         with self._owned():
             scan_id = state.next_id if scan_id is None else scan_id
-            check(not scan_id in state.log, f"the map has a scan {scan_id!r} already: remove or move it")
+            check(scan_id not in state.log, f"the map has a scan {scan_id!r} already: remove or move it")
             with_intensities = scan.intensities is not None
             alike = state.with_intensities in (None, with_intensities)
             check(alike, "either all scans have intensities, or none has")

@@ -185,7 +185,7 @@ class _AlignmentModel:
         weights = np.einsum("fji,fjk,fkl->fil", to_radar, information, to_radar)
         sums = np.add.reduceat(np.einsum("fij,fj->fi", weights, left), self.begins)
         means = np.linalg.solve(np.add.reduceat(weights, self.begins), sums[..., None])[..., 0]
-        return np.asarray(np.einsum("fij,fjk,fk->fi", whitening, to_radar, left - means[self.window]))
+        return np.einsum("fij,fjk,fk->fi", whitening, to_radar, left - means[self.window])
 
     def residuals(self, x: Floats) -> Floats:
         prior = [x[:3] / np.pi, x[6:9] / _FORCE_BIAS, x[9:12] / _LEVER_M, x[13:16] / FIRST_BIAS_RAD_S]

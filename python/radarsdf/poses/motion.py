@@ -95,7 +95,7 @@ def way(turn: Floats, begin_mps: Floats, end_mps: Floats, duration_s: float | Fl
     and linearly changing velocity."""
     middle = np.einsum("...ij,...j->...i", rotation(0.5 * turn), 0.5 * (begin_mps + end_mps))
     end = np.einsum("...ij,...j->...i", rotation(turn), end_mps)
-    return np.asarray(duration_s / 6 * (begin_mps + 4 * middle + end))
+    return duration_s / 6 * (begin_mps + 4 * middle + end)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class PredictedStep:
         # Derivative of the translation by the turn: about that of its second half.
         swept = -skew((self.duration_s / 2 * rotation(turn) @ self.end_mps)[None])[0]
         both = np.concatenate([swept, np.eye(3)])
-        covariance = np.asarray(both @ self.turn.covariance @ both.T)
+        covariance = both @ self.turn.covariance @ both.T
         covariance[:3, :3] += self.translation_covariance
         return covariance
 
@@ -160,7 +160,7 @@ def step_variances(poses: Floats, diagonal: Floats, below: Floats) -> Floats:
     first, second = _jacobians(poses)
     blocks = ((first, diagonal[:-1], first), (second, diagonal[1:], second), (second, 2 * below, first))
     variances = np.sum([np.einsum("fai,fij,faj->fa", *block) for block in blocks], axis=0)
-    return np.asarray(np.maximum(variances, _LEAST_RAD**2))  # of a weak prior, blocks cancel
+    return np.maximum(variances, _LEAST_RAD**2)  # of a weak prior, blocks cancel
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def reduction(spread: Floats, errors: Floats) -> Floats:
     kept = np.sqrt(np.maximum(1 - shares, 0.0))
     into = np.einsum("...ij,...jk->...ik", axes * root, turned)
     back = np.einsum("...ij,...jk->...ik", white, turned)
-    return np.asarray(np.einsum("...ij,...j,...kj->...ik", into, kept, back))
+    return np.einsum("...ij,...j,...kj->...ik", into, kept, back)
 
 
 def plane_cell_m(scans: Sequence[Floats], leaf_size_m: float) -> float:

@@ -32,7 +32,7 @@ def pose_sigmas(covariance: Floats) -> tuple[float, float]:
 def _sigmas(covariance: Floats) -> Floats:
     """Return standard deviations (F, 2) of positions, m, and rotations, rad, root mean square of the three axes."""
     variances = np.einsum("fii->fi", covariance).reshape(-1, 2, 3).mean(axis=2)
-    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def trajectory_report(

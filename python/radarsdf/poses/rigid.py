@@ -55,12 +55,12 @@ def aligned(poses: Floats, reference: Floats) -> Floats:
     turns = np.einsum("fij,fkj->fik", reference[:, :3, :3], poses[:, :3, :3])
     whole = np.eye(4)
     whole[:3, :3] = Rotation.from_matrix(turns).mean().as_matrix()
-    return np.asarray(np.einsum("ij,fjk->fik", placed(whole, poses, reference), poses))
+    return np.einsum("ij,fjk->fik", placed(whole, poses, reference), poses)
 
 
 def turned_by(poses: Floats, others: Floats) -> Floats:
     """Return the angles (F,) between the rotations of two sets of poses (F, 4, 4), rad."""
-    return np.asarray(Rotation.from_matrix(between(poses, others)[:, :3, :3]).magnitude())
+    return Rotation.from_matrix(between(poses, others)[:, :3, :3]).magnitude()
 
 
 def moved_by(before: Floats, after: Floats) -> dict[str, float]:
@@ -75,14 +75,14 @@ def nearest_rotation(matrix: Floats) -> Floats:
     """Return the nearest rotation (3, 3) to a matrix, not a reflection; for Σ b aᵀ, the one that best maps a to b (Kabsch)."""
     u, _, vt = np.linalg.svd(matrix)
     signs = [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))]
-    return np.asarray(np.einsum("ij,j,jk->ik", u, signs, vt))
+    return np.einsum("ij,j,jk->ik", u, signs, vt)
 
 
 def covariance_in(covariance: Floats, R: Floats) -> Floats:
     """Rotate covariances (..., 6, 6) of translations and rotation vectors by R (3, 3)."""
     whole = np.zeros((6, 6))
     whole[:3, :3] = whole[3:, 3:] = R
-    return np.asarray(np.einsum("ij,...jk,lk->...il", whole, covariance, whole))
+    return np.einsum("ij,...jk,lk->...il", whole, covariance, whole)
 
 
 def skew(vectors: Floats) -> Floats:
@@ -94,7 +94,7 @@ def skew(vectors: Floats) -> Floats:
 
 def rotation(vector: Floats) -> Floats:
     """Convert rotation vectors (3,) or (N, 3), rad, to matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def transform(turn: Floats, translation: Floats) -> Floats:
@@ -114,4 +114,4 @@ def rotation_vector(matrix: Floats, near: Floats | None = None) -> Floats:
     angle = np.linalg.norm(found, axis=-1, keepdims=True)
     axis = found / np.where(angle > 0, angle, 1.0)
     whole_turns = np.round((np.einsum("...i,...i->...", axis, near)[..., None] - angle) / (2 * np.pi))
-    return np.asarray(found + 2 * np.pi * whole_turns * axis)
+    return found + 2 * np.pi * whole_turns * axis

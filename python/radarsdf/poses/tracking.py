@@ -230,7 +230,7 @@ def _apart_m(poses: Floats, pose: Floats, radius_m: float) -> Floats:
     """Return upper bounds (K,) of the displacement, m, of a return at range `radius_m` between poses (K, 4, 4) and `pose`."""
     off = increments(np.broadcast_to(pose, poses.shape), poses)
     moved_m, turned_rad = (np.linalg.norm(of, axis=1) for of in (off[:, :3], off[:, 3:]))
-    return np.asarray(moved_m + radius_m * turned_rad)
+    return moved_m + radius_m * turned_rad
 
 
 def thin(scan: Floats, most: int) -> Floats:

@@ -124,13 +124,13 @@ def _gains(
     floor = float(np.median(densities[0]))
     if floor == 0:  # the scans do not overlap
         return np.zeros(len(held))
-    return np.asarray(np.log((densities[1] + floor) / (densities[0] + floor)))
+    return np.log((densities[1] + floor) / (densities[0] + floor))
 
 
 def density(distances_m: Floats, variances_m2: Floats) -> Floats:
     """Return normal densities of errors of these lengths, up to a factor."""
     with np.errstate(under="ignore"):
-        return np.asarray(np.exp(-0.5 * distances_m**2 / variances_m2) / variances_m2**1.5)
+        return np.exp(-0.5 * distances_m**2 / variances_m2) / variances_m2**1.5
 
 
 def median_apart_m(distances_m: Floats, others: Bools) -> float:
@@ -154,4 +154,4 @@ def _crowding(held: SensorReturns, used: SensorReturns, before: Floats, after: F
         in_cell = np.asarray(table.sum(axis=1)).ravel()[of_held]
         counts.append(in_cell - np.asarray(table[of_held, held.scans]).ravel())
     floor = max(float(np.median(counts[0])), 1.0)
-    return np.asarray(np.log((counts[1] + floor) / (counts[0] + floor)))
+    return np.log((counts[1] + floor) / (counts[0] + floor))

@@ -29,12 +29,9 @@ _TILINGS = 4  # two have 1 to 2 % more error, eight 0 to 1 % less
 _SHRINKAGE = 4.0  # 3 to 10 differ by less than 1 %
 _ROUNDS = 2  # four are no better
 # More returns are grouped by place and view: a third of the time of cell means, and 0.2 to 0.8 % more error. A network,
-# evaluated for each group, takes longer than means and has smaller residuals, so its groups are larger.
+# evaluated for each group, takes longer than means and has smaller residuals, so its groups are larger. Kinds of cells, as above.
 _MOST_RETURNS = 50_000
-_GROUPS, _GROUPS_ASKED = (
-    np.array([[1.5, 0.2, 0.1]]),
-    np.array([[2.5, 0.25, 0.12]]),
-)  # kinds of cells, as above
+_GROUPS, _GROUPS_ASKED = np.array([[1.5, 0.2, 0.1]]), np.array([[2.5, 0.25, 0.12]])
 _CORRELATION = 0.1  # intra-group correlation: the effective number of n returns is n / (1 + 0.1 (n - 1))
 _LEAST_MEAN = 0.005  # smallest stored mean, share of the intensity range. A third are smaller and useless
 

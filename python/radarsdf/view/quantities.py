@@ -62,7 +62,7 @@ def quantities_of(radar_map: Map, surface: ShownSurface, sensor: Position) -> di
     vertices, found = surface.vertices, {}
 
     def intensity(rows: Ints, sensor: Position) -> Array:
-        return np.asarray(radar_map.intensity(vertices[rows], np.array(sensor)))
+        return radar_map.intensity(vertices[rows], np.array(sensor))
 
     if radar_map.has_intensity:
         some = np.arange(0, len(vertices), max(1, len(vertices) // _SAMPLES))
