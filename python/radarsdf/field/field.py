@@ -97,7 +97,7 @@ class GridField(Field):
         return torch.where(inside, torch.lerp(values[:, 0], values[:, 1], z), 0.0)
 
     def plane(self, points: Tensor) -> Tensor:
-        values, x = self.corner_distances_m(), kernels.view(points)
+        values, x = kernels.view(self.distances_m), kernels.view(points)
         return torch.from_numpy(self.table.trilinear(values, x, torch.get_num_threads()))
 
     def corner_distances_m(self) -> Floats32:
