@@ -142,7 +142,7 @@ def _refine(told: Told) -> str:
 
 
 def _live(told: Told) -> str:
-    live, placed, error, lost = radarsdf.LiveMap(), [], 0.0, 0
+    live, placed, notes, lost = radarsdf.LiveMap(), [], (), 0
     for i in range(FRAMES):
         try:
             done = live.integrate(
@@ -152,6 +152,7 @@ def _live(told: Told) -> str:
             lost += 1
             continue
         placed.append((i, done.scan_id))
+        notes = done.notes
     if len(placed) < 3:
         return f"refused ({lost} lost)"
     poses = np.stack([live.pose(scan_id) for _, scan_id in placed])
@@ -159,7 +160,7 @@ def _live(told: Told) -> str:
     error = float(errors_m(poses, told.scans.poses[rows]).max())
     length = float(np.linalg.norm(np.diff(told.scans.poses[rows, :3, 3], axis=0), axis=1).sum())
     fine = error < max(0.3, SHARE * length)
-    marked = lost > 0 or bool(getattr(live, "notes", ()))
+    marked = lost > 0 or len(notes) > 0
     verdict = ("noted" if marked else "right") if fine else "marked" if marked else "WRONG"
     return f"{verdict} {error:.2f}m of {length:.0f}, {lost} lost"
 

@@ -48,7 +48,7 @@ class Clock:
     def integrate(self, _points, pose, _intensities, *, time_s, **_named):
         self.taken.append((round(self.now_s - 100, 9), round(time_s, 9)))
         self.now_s += self.integration_s
-        return type("Done", (), {"pose": pose, "moved": ()})
+        return type("Done", (), {"pose": pose, "moved": (), "notes": ()})
 
 
 @pytest.mark.parametrize(

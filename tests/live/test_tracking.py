@@ -1,5 +1,7 @@
 """Scans without poses are placed at their true poses, or rejected."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import radarsdf
@@ -10,6 +12,8 @@ from radarsdf.poses.doppler import SensorVelocities
 from radarsdf.poses.rigid import aligned
 from radarsdf.poses.tracking import begin_segment
 from radarsdf.returns.moving import SensorVelocity
+
+from scenes.kinds import KINDS
 
 from ..poses.drift import first, thinned
 
@@ -118,6 +122,21 @@ def test_unobservable_motion_along_a_wall_is_rejected():
     speeds = [rng.uniform(-20, 20, len(scan)) for scan in scans.points]
     with pytest.raises(Lost, match="The Doppler is not used"):
         follow(speeds)
+
+
+def test_doppler_that_returns_do_not_decide_is_assumed_and_noted(drive):
+    """A tunnel, whose returns look alike after each step, and a moving radar whose Doppler is zero."""
+    tunnel = thinned(first(KINDS["tunnel"], 9, seed=12, frames=20), 4)
+    motion = radarsdf.simulate.measured_motion(tunnel, seed=12)
+    live = LiveMap(SETTINGS)
+    assert follow(live, tunnel, motion, range(9)).notes
+    assert rms_m(live, tunnel.poses) < 0.5
+    scans, motion = drive
+    live = LiveMap(SETTINGS)
+    assert not follow(live, scans, motion, range(9)).notes
+    assert follow(LiveMap(SETTINGS), scans, motion, range(2)).notes  # not compared yet
+    stationary = dataclasses.replace(motion, doppler_mps=[0 * speeds for speeds in motion.doppler_mps])
+    assert follow(LiveMap(SETTINGS), scans, stationary, range(9)).notes
 
 
 def test_a_stationary_sensor_leaves_the_doppler_sign_undetermined(drive):

@@ -37,6 +37,7 @@ class Replay:
     seconds: list[float] = field(default_factory=list)
     dropped: list[int] = field(default_factory=list)  # the map was not ready
     lost: list[int] = field(default_factory=list)  # tracking failed for these scans without poses
+    notes: tuple[str, ...] = ()  # what the pose of the last scan assumes
 
 
 def replay(
@@ -74,6 +75,7 @@ def replay(
         done.seconds.append(time.perf_counter() - started)
         done.rows.append(i)
         done.poses.append(found.pose)
+        done.notes = found.notes
         for k, row in enumerate(done.rows):
             if row in found.moved:
                 done.poses[k] = live.pose(row)
@@ -142,7 +144,7 @@ def _add_rates(results: Results, done: Replay, scans: int) -> None:
     check(done.rows, "no scan was integrated into the map")
     in_map, dropped, lost = len(done.rows), len(done.dropped), len(done.lost)
     line = f"{in_map} of {scans} scans in the map, {dropped} dropped, {lost} lost"
-    results.add(line, scans=in_map, dropped=dropped, lost=lost)
+    results.add("\n".join([line, *done.notes]), scans=in_map, dropped=dropped, lost=lost, notes=done.notes)
     hertz = in_map / max(sum(done.seconds), 1e-9)
     p50, p99, worst = np.percentile(done.seconds, [50, 99, 100])
     results.add(

@@ -48,6 +48,8 @@ class Integrated:
     """Earlier scans with re-estimated poses, since the motion was not observable before; see :meth:`LiveMap.pose`."""
     far: int = 0
     """Number of returns at more than 100 times the median range, such as sentinels, which are left out."""
+    notes: tuple[str, ...] = ()
+    """What the pose of a tracked scan assumes of the Doppler, which the returns so far neither confirm nor contradict."""
 
 
 class LiveMap:
@@ -253,8 +255,9 @@ class LiveMap:
                 next_id=max(state.next_id, scan_id + 1) if isinstance(scan_id, int) else state.next_id,
                 track=self._follower.track(steps) if steps else state.track.placed(scan_id, scan),
             )
+            notes = self._follower.doubts(steps[-1]) if steps else ()
         moving = 0 if scan.is_static is None else int((~scan.is_static).sum())
-        return Integrated(scan_id, scan.pose.copy(), blocks, moving, again, far)
+        return Integrated(scan_id, scan.pose.copy(), blocks, moving, again, far, notes)
 
     def remove(self, scan_id: ScanId) -> Keys:
         """Remove a scan. The map is then bit-identical to one that never saw it.

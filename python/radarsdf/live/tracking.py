@@ -25,6 +25,7 @@ from radarsdf.poses.doppler import (
     NoVelocityError,
     SensorVelocities,
     sign_significance,
+    turns_fast,
     upright,
 )
 from radarsdf.poses.drive import LEAST_OBSERVED, Drive, rates_of, track_drive
@@ -40,6 +41,7 @@ _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 # Least share of the returns that agree while the sign of the Doppler is open: a wrong one places scans metres off.
 _LEAST_AGREEING = 0.1
 _JUDGED = 24  # last scans whose Doppler is compared with the returns
+_NOT_COMPARED = f"Assumed: the Doppler is right; it is compared with the returns once {_START} scans moved."
 _PARTED = 3  # last scans that suggest this by agreeing less than those before
 _PULLED = 0.1  # relative difference of the motion by returns and by Doppler that suggests it
 _LEAST_GAIN, _LEAST_STEP_M = 1e-5, 0.1  # of a step whose difference is known
@@ -108,6 +110,7 @@ class Follower:
     config: FitConfig
     _judged_s: float = -np.inf  # time of the scan whose Doppler was last compared with the returns
     _patience: int = _START // 2  # scans until the next comparison
+    _doubts: tuple[str, ...] = (_NOT_COMPARED,)  # of the last comparison
     _complete: bool = False  # False while the attributes below change, or if that was interrupted
     _steps: deque[Step] = field(default_factory=lambda: deque(maxlen=_STEPS))
     _rates: deque[tuple[MotionRate, MotionRate]] = field(default_factory=lambda: deque(maxlen=_STEPS - 1))
@@ -144,9 +147,7 @@ class Follower:
         if (leap_mps := self._leap_mps(new)) is not None:
             msg = f"{NOT_USED}: its velocity changes by {leap_mps:.1f} m/s, far more than before: give the pose of the scan"
             raise Lost(msg)
-        if (contradicted := self._contradicted(found[-1])) is not None:
-            msg = f"{contradicted} Give the poses of this scan and the next ones, or leave their Doppler out"
-            raise Lost(msg)
+        self._judge(found[-1])
         return found
 
     def _leap_mps(self, new: Step) -> float | None:
@@ -161,37 +162,46 @@ class Follower:
         fast = leap_mps > _FASTEST_MPS2 * (times_s[-1] - times_s[-2])
         return leap_mps if fast and changes[-1] > _LEAP * usual else None
 
-    def _contradicted(self, new: Step) -> str | None:
-        """Return why the returns exclude the Doppler of the last scans, if they do."""
+    def doubts(self, step: Step) -> tuple[str, ...]:
+        """Return what its pose assumes of the Doppler."""
+        return () if step.given or step.velocity is None else self._doubts
+
+    def _judge(self, new: Step) -> None:
+        """Compare the Doppler of the last scans with the returns, if due. Raise Lost if these exclude it."""
         steps = [*self._steps, new]
         without = [i for i, step in enumerate(steps) if step.velocity is None or step.given]
         steps = steps[max(without, default=-1) + 1 :][-_JUDGED:]
         count, since = len(steps), sum(step.time_s > self._judged_s for step in steps)
         if count < _START or since < self._patience:
-            return None
+            return
         pulls = np.array([step.pull for step in steps if np.isfinite(step.pull)])[-_START:]
         agreeing = np.array([step.found.agreeing for step in steps])
         pulled = len(pulls) == _START and abs(pulls.mean()) > _PULLED + ERRORS * pulls.std() / np.sqrt(_START)
         parted = np.median(agreeing[-_PARTED:]) < 0.5 * np.median(agreeing[1:-_PARTED])
         due = count in (_START, 2 * _START)
-        if not (due or pulled or parted):
-            return None
+        if not (due or pulled or parted or self._doubts):
+            return
         # Tracking of sparse scans often differs from right Doppler: of such scans, ever fewer are compared.
         self._judged_s, self._patience = new.time_s, self._patience * (1 if due else 2)
-        times_s = np.array([step.time_s for step in steps])
+        scans, times_s = [step.scan for step in steps], np.array([step.time_s for step in steps])
         points, speeds = zip(*((one.logged.points, one.logged.doppler_mps) for one in steps), strict=True)
         try:
             velocities = SensorVelocities.of(points, speeds, times_s).scaled(new.sign or 1.0)
         except NoVelocityError:
-            return None
-        drive = Drive([step.scan for step in steps], times_s, velocities, None)
+            return
+        _, yaws = sign_significance(scans, velocities, times_s)
+        drive = Drive(scans, times_s, velocities, None, yaws=yaws if turns_fast(yaws[0]) else None)
         tested = Consistency.of_returns(drive, self.config, self.config.num_threads)
         trusted, notes = tested.applied(velocities)
-        undecided = tested.contradicted is not None and not tested.contradicted.confirmed
-        if trusted is None and not undecided:
+        begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
+        if trusted is None and (other := tested.contradicted) is not None and not other.confirmed:
+            notes = [f"Assumed: the Doppler is right; {other.words('the returns')}."]
+        elif trusted is None:
             self._judged_s = -np.inf  # the next scans are judged, too
-            return notes[-1]
-        return None
+            give = "Give the poses of this scan and the next ones, or leave their Doppler out"
+            msg = f"{notes[-1]} {begin} {give}"
+            raise Lost(msg)
+        self._doubts = tuple(f"{note} {begin}" for note in notes)
 
     def track(self, found: list[Step]) -> Track:
         """Return the track that continues with the scans returned by :meth:`seek`."""
@@ -325,10 +335,12 @@ class Follower:
 
         if velocities is not None:
             evidence, yaws = sign_significance(drive.scans, velocities.scaled(sign or 1.0), drive.times_s)
-            # Until the sign is clear, the scans are placed by the likelier one, and re-estimated.
+            # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Without returns that tell it, as
+            # in a tunnel, this one is assumed: each comparison with the returns then states the doubt.
             likelier = sign or int(np.sign(evidence))
             yaws = yaws[int(evidence < 0)]
-            sign = sign or (likelier if abs(evidence) > CLEAR else 0)
+            decided = abs(evidence) > CLEAR or len(steps) == _START
+            sign = sign or (likelier if decided else 0)
             # By the prior alone, a vehicle that turns by 13 degrees between the first scans would be lost.
             durations_s = np.diff(drive.times_s)
             rates = [
