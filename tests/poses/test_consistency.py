@@ -7,7 +7,8 @@ import pytest
 import radarsdf
 from radarsdf.live.tracking import Lost
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.consistency import Clock, Consistency, contradiction, of_poses
+from radarsdf.poses.consistency import Consistency
+from radarsdf.poses.displacements import Clock, compare_with_poses, contradiction
 from radarsdf.poses.doppler import sign_significance, turns_fast
 from radarsdf.poses.drive import Drive
 from radarsdf.simulate import measured_motion
@@ -127,9 +128,9 @@ def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(fault):
 
 def test_doppler_of_other_scans_contradicts_given_poses(street, motion):
     velocities = CheckedScans.of(street.points, motion.doppler_mps, motion.times_s).velocities
-    assert of_poses(velocities, motion.times_s, street.poses)[0] is None
+    assert compare_with_poses(velocities, motion.times_s, street.poses)[0] is None
     late = dataclasses.replace(velocities, mean_mps=velocities.mean_mps[np.maximum(np.arange(20) - 3, 0)])
-    assert "3 scans later" in of_poses(late, motion.times_s, street.poses)[0]
+    assert "3 scans later" in compare_with_poses(late, motion.times_s, street.poses)[0]
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.0, -1.0, 1.2])

@@ -8,7 +8,7 @@ import numpy as np
 
 from radarsdf.arrays import Array, Floats, Ints
 from radarsdf.checking.recording import Finding, ascending_times_s, some_scans
-from radarsdf.poses.consistency import contradiction, of_poses
+from radarsdf.poses.displacements import compare_with_poses, contradiction
 from radarsdf.poses.doppler import LEAST_MPS, NoVelocityError, SensorVelocities, radial_offset_mps
 from radarsdf.poses.rigid import rotation, step_vectors
 from radarsdf.returns.moving import MIN_DOPPLER_RETURNS, SensorVelocity, sensor_velocities
@@ -128,7 +128,7 @@ def _compared_in_block(recording: Scans, times_s: Floats, sign: float, *, known:
     if offset_mps := radial_offset_mps(points, speeds, velocities):
         evidence = f"{sign * offset_mps:+.2f} m/s are added to the Doppler of all returns."
         yield Finding("doppler_offset", "warning", evidence)
-    contradicted, clock = of_poses(velocities, times_s[rows], recording.poses[rows])
+    contradicted, clock = compare_with_poses(velocities, times_s[rows], recording.poses[rows])
     if contradicted is not None and not known:
         yield _contradiction(contradicted)
     if contradicted is None and clock.note:

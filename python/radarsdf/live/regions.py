@@ -9,14 +9,13 @@ import numpy as np
 
 from radarsdf._core import cell_keys
 from radarsdf.arrays import Array, Bools, Ints, Keys
-from radarsdf.returns.sums import lattice_of
+from radarsdf.returns.sums import MAX_CELLS_FROM_ORIGIN, lattice_of
 
 Rows = dict[str, Array]
 
 REGION_CELLS = 64  # leaf cells along the edge of a region
 REGION_BITS = np.uint64(18)  # bits of a leaf cell's Morton key below those of its region
 NO_KEYS = np.zeros(0, np.uint64)
-_FARTHEST = 1_000_000  # farthest cell along each axis that has a key
 
 
 def steps_near(reach: int) -> Ints:
@@ -59,7 +58,7 @@ def region_places(regions: Keys) -> Ints:
 
 def _keys_at(cells: Ints) -> Keys:
     # The centre of a cell of 1 m is exact in float64.
-    return cell_keys(np.clip(cells, -_FARTHEST, _FARTHEST - 1) + 0.5, 1.0, 1)
+    return cell_keys(np.clip(cells, -MAX_CELLS_FROM_ORIGIN, MAX_CELLS_FROM_ORIGIN - 1) + 0.5, 1.0, 1)
 
 
 class RegionTable:

@@ -28,15 +28,15 @@ from radarsdf.poses.doppler import (
     turns_fast,
     upright,
 )
-from radarsdf.poses.drive import LEAST_OBSERVED, Drive, rates_of, track_drive
+from radarsdf.poses.drive import LEAST_OBSERVED, MOVES, TURNS, Drive, rates_of, track_drive
 from radarsdf.poses.motion import MotionRate, PredictedStep
+from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation_vector
 from radarsdf.poses.tracking import WINDOW, Tracked, Tracker, begin_segment
 from radarsdf.returns.moving import SensorVelocity, sensor_velocities
-from radarsdf.returns.planes import LEAVES_PER_SURFEL
 
 _STEPS = 100  # steps from which the motion prior is learnt
-_START = 8  # scans of the initialisation, re-estimated jointly after 2, 4 and 8 scans
+_START = 8  # scans of the initialisation, re-estimated after 2, 4 and 8 with motion, or after each while the sign is open
 _KNOWN_STEPS = 2  # previous steps that make an initialisation unnecessary
 # Least share of the returns that agree while the sign of the Doppler is open: a wrong one places scans metres off.
 _LEAST_AGREEING = 0.1
@@ -189,8 +189,9 @@ class Follower:
             velocities = SensorVelocities.of(points, speeds, times_s).scaled(new.sign or 1.0)
         except NoVelocityError:
             return
-        _, yaws = sign_significance(scans, velocities, times_s)
-        drive = Drive(scans, times_s, velocities, None, yaws=yaws if turns_fast(yaws[0]) else None)
+        fast = turns_fast(np.array([step.found.turn[2] for step in steps[1:]]))
+        yaws = sign_significance(scans, velocities, times_s)[1] if fast else None
+        drive = Drive(scans, times_s, velocities, None, yaws=yaws)
         tested = Consistency.of_returns(drive, self.config, self.config.num_threads)
         trusted, notes = tested.applied(velocities)
         begin = f"Scan 0 of these is that at {times_s[0]:.6f} s."
@@ -233,8 +234,6 @@ class Follower:
 
     def _begin(self, steps: Sequence[Step]) -> None:
         """Reset to the state after only these scans."""
-        size_m = LEAVES_PER_SURFEL * self.config.leaf_size_m
-        self._tracker = Tracker(size_m, self.config.returns, self.config.num_threads)
         self._steps.clear()
         self._rates.clear()
         for i, step in enumerate(steps):
@@ -246,6 +245,9 @@ class Follower:
             turn = rotation_vector(before.found.pose[:3, :3].T @ found.pose[:3, :3], found.turn)
             step = dataclasses.replace(step, found=dataclasses.replace(found, turn=turn))
             self._rates.append(rates_of(before.found.pose, step.found, step.time_s - before.time_s))
+        else:
+            cell_m = plane_cell_m([step.scan], self.config.leaf_size_m)
+            self._tracker = Tracker(cell_m, self.config.returns, self.config.num_threads)
         self._steps.append(step)
         if planes:
             self._tracker.add(step.scan, step.found)
@@ -263,15 +265,14 @@ class Follower:
         """Register a scan from the previous one."""
         steps = [*list(self._steps)[-2:], new]
         durations_s = np.diff([step.time_s for step in self._steps])[-len(self._rates) :]
-        usual = Drive([], np.zeros(0), None, None)
         turns, moves = ([rates[k] for rates in self._rates] for k in (0, 1))
         drive = Drive(
             [step.scan for step in steps],
             np.array([step.time_s for step in steps]),
             self._velocities(steps, sign),
             None,
-            usual.turns.learnt(turns, durations_s),
-            usual.moves.learnt(moves, durations_s),
+            TURNS.learnt(turns, durations_s),
+            MOVES.learnt(moves, durations_s),
         )
         turn, move = self._rates[-1] if self._rates else (None, None)
         expected = drive.predict(len(steps) - 1, turn, move)

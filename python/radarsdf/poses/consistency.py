@@ -1,9 +1,8 @@
-"""Consistency of Doppler and times with the motion that returns or poses show, by window of scans."""
+"""Consistency of Doppler and times with the returns of a drive, by window of scans."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -13,16 +12,23 @@ from scipy.stats import t as student
 
 from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.config.fit_config import FitConfig
-from radarsdf.poses.doppler import ERRORS, LEAST_M, NOT_USED, DopplerMotion, SensorVelocities, log_distances
+from radarsdf.poses.displacements import (
+    BY_CHANCE,
+    FEWEST_STEPS,
+    MOST_LATE,
+    Clock,
+    OtherMotion,
+    delay_of,
+    delayed_words,
+    runs_of,
+    windows_of,
+)
+from radarsdf.poses.doppler import LEAST_M, NOT_USED, DopplerMotion, SensorVelocities, log_distances
 from radarsdf.poses.drive import Drive, track_once
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation, steps
 from radarsdf.poses.tracking import Tracked, Tracker
 
-_BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
-_FEWEST_STEPS = 6  # of a window
-# Relative difference of speeds that axes and scale of a radar and given poses may have, ten times that of two motorway radars.
-_SAME_SPEED = 0.03
 _PAIRS = 48  # maximum number of pairs of scans to compare
 _DELAYED = 24  # steps to compare with delayed ones
 _COMPARED_M = 1.5  # minimum motion between them: of less, the noise of the returns hides a tenth
@@ -39,149 +45,9 @@ _SHIFTS_M = np.concatenate(
 _SAME_SCALE = 1.1
 _MEASURED = 0.2  # relative difference from the Doppler beyond which confidence limits leave its scale open
 _UNKNOWN_SCALE = 0.5  # standard deviation of the scale without evidence: half or twice the speed
-_MOST_LATE = 10  # scans
-_SAME_RESIDUALS = 1.25  # ratio of squared residuals up to which a delay does not matter
-_EVEN = 1e-3  # unevenness of times that does not matter, share of an interval
-_LEAST_STEP_M = 0.1  # minimum motion in a step that reveals its duration
 _MOSTLY = 0.8  # share of steps without motion by Doppler from which on returns must confirm it
 _LEAST_SEEN = 0.5  # share of a step's prior variance that the returns remove, if their difference counts
 _STILL_MPS = 0.1  # slower Doppler, in which compensation for ego motion leaves only noise, tells no direction
-
-
-@dataclass(frozen=True)
-class OtherMotion:
-    """Motion in a window of scans that another source shows, or does not exclude, instead of that by Doppler."""
-
-    first: int  # scan
-    last: int
-    ratio: float | None  # of its speeds to those by Doppler. None: Doppler shows no motion
-    confirmed: bool = True  # by the other source. Else this source observes neither motion nor its absence
-
-    def words(self, source: str) -> str:
-        """Describe in words, without a full stop."""
-        scans = f"from scan {self.first} to {self.last}"
-        if self.ratio is None:
-            return f"{scans}, it shows no motion, which {source} do not confirm"
-        return f"{scans}, {source} show {self.ratio:.2f} times its speeds"
-
-
-def _runs(times_s: Floats) -> Ints:
-    """Number (F,) the runs of scans without a gap."""
-    durations_s = np.diff(times_s)
-    return np.append(0, np.cumsum(durations_s > 2 * np.median(durations_s)))
-
-
-def _windows(count: int) -> Iterator[slice]:
-    """Yield all steps, their halves, quarters and so on, of at least `_FEWEST_STEPS`."""
-    parts = 1
-    while count // parts >= _FEWEST_STEPS:
-        edges = np.linspace(0, count, parts + 1).astype(int).tolist()
-        yield from (slice(a, b) for a, b in itertools.pairwise(edges))
-        parts *= 2
-
-
-def contradiction(
-    shown_m: Floats, doppler_m: Floats, variances_m2: Floats, scans: Ints
-) -> OtherMotion | None:
-    """Test displacements (K, 3) of steps by another source and by Doppler, with variances (K,) of a component of the latter.
-
-    In each window, the mean difference along the longer ones is compared with its standard error (Student's t). `scans` (K + 1,):
-    those between which the steps are.
-    """
-    all_weights = 1 / (variances_m2 + _unevenness_m2(shown_m))  # the other source has errors, too
-    worst, found, tried = 0.0, None, list(_windows(len(shown_m)))
-    for rows in tried:
-        shown, doppler, weights = shown_m[rows], doppler_m[rows], all_weights[rows]
-        # Along the longer displacements: those of Doppler without ego motion, or of a stationary sensor, have no direction.
-        longer = shown if (shown**2).sum() >= (doppler**2).sum() else doppler
-        lengths = np.linalg.norm(longer, axis=1)
-        information = (weights * lengths**2).sum()
-        if information < 3 * ERRORS**2 * len(shown):
-            continue
-        along = np.einsum("ki,ki->k", shown - doppler, longer) / np.maximum(lengths, 1e-9)
-        total = (weights * lengths).sum()
-        share = float((weights * along).sum() / total)
-        spread = weights * (along - share * lengths)
-        error = float(np.sqrt((spread**2).sum() * len(shown) / (len(shown) - 1)) / total)
-        needed = student.ppf(1 - _BY_CHANCE / (2 * len(tried)), len(shown) - 1) * error
-        if abs(share) <= max(needed, ERRORS / np.sqrt(information)) + _SAME_SPEED:
-            continue
-        if (excess := abs(share) - needed) > worst:
-            by_doppler, by_other = (
-                float((weights * np.einsum("ki,ki->k", moves, longer)).sum()) for moves in (doppler, shown)
-            )
-            ratio = by_other / by_doppler if abs(by_doppler) > 0.05 * abs(by_other) else None
-            worst, found = excess, OtherMotion(int(scans[rows.start]), int(scans[rows.stop]), ratio)
-    return found
-
-
-def of_poses(velocities: SensorVelocities, times_s: Floats, poses: Floats) -> tuple[str | None, Clock]:
-    """Test velocities and times (F,) against given poses (F, 4, 4).
-
-    Return the clearest contradiction in words that go on "the Doppler is wrong: ", and errors of the times.
-    """
-    shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
-    clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
-    times_s = times_s - clock.errors_s
-    motion, scans = DopplerMotion.by(velocities, times_s, poses), np.arange(len(times_s))
-    ends = np.append(scans[:-1][known], scans[1:][known][-1:])
-    variances_m2 = motion.shares[known, :3].mean(axis=1)
-    found = contradiction(shown[known], motion.steps[known, :3, 3], variances_m2, ends)
-    if found is not None:
-        return found.words("the poses"), clock
-    covariance = np.tile(_unevenness_m2(shown) * np.eye(3), (len(shown), 1, 1))
-    delay = delay_of(velocities, _runs(times_s), scans, motion, shown, covariance, known)
-    return (_delayed("the poses", delay) if delay else None), clock
-
-
-def _unevenness_m2(shown_m: Floats) -> float:
-    """Return the variance of a component of steps (K, 3): where the sensor moves evenly, second differences have six times it."""
-    return float(np.median(np.diff(shown_m, 2, axis=0) ** 2) / 6) if len(shown_m) > 2 else 0.0
-
-
-def _delayed(source: str, delay: int) -> str:
-    return f"{source} agree with that of {abs(delay)} scans {'later' if delay > 0 else 'earlier'}"
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Errors of the times of scans."""
-
-    errors_s: Floats  # (F,) to subtract
-    sigma_s: float = 0.0  # standard deviation where it is undecided whether times or firing are uneven
-
-    @classmethod
-    def of(cls, times_s: Floats, shown_m: Floats, doppler_m: Floats, known: Bools) -> Clock:
-        """Compare times (F,) with those of a radar that fires evenly: which explain the steps (F - 1, 3) that another source shows?"""
-        durations_s, errors_s = np.diff(times_s), np.zeros(len(times_s))
-        runs = _runs(times_s)
-        for run in np.unique(runs):
-            rows = np.flatnonzero(runs == run)
-            if len(rows) > _FEWEST_STEPS:
-                errors_s[rows] = times_s[rows] - np.polyval(np.polyfit(rows, times_s[rows], 1), rows)
-        squares = np.maximum((doppler_m**2).sum(axis=1), 1e-12)
-        missing_s = np.einsum("ki,ki->k", shown_m - doppler_m, doppler_m) / squares * durations_s
-        used = known & (np.diff(runs) == 0) & (squares > _LEAST_STEP_M**2)
-        uneven_s = -np.diff(errors_s)[used]
-        if used.sum() < _FEWEST_STEPS or uneven_s.std() < _EVEN * np.median(durations_s):
-            return cls(np.zeros(len(times_s)))
-        missing_s = missing_s[used] - np.median(missing_s[used])
-        share, error, _ = _slope(uneven_s, missing_s)
-        needed = student.ppf(1 - _BY_CHANCE, used.sum() - 1) * error
-        if share > needed:
-            return cls(min(share, 1.0) * errors_s, float(min(needed, 1.0) * errors_s.std()))
-        return cls(np.zeros(len(times_s)), float(errors_s.std()) if share + needed > 1 else 0.0)
-
-    @property
-    def note(self) -> list[str]:
-        """Note on errors that are corrected, or undecided."""
-        if self.errors_s.any():
-            deviate = f"their times deviate by {1e3 * self.errors_s.std():.1f} ms, speeds do not"
-            return [f"Assumed: scans are evenly spaced in time; {deviate}."]
-        if self.sigma_s:
-            wrong = f"times are wrong by {1e3 * self.sigma_s:.1f} ms, by which they are uneven"
-            return [f"Assumed: {wrong}; speeds cannot decide."]
-        return []
 
 
 @dataclass(frozen=True)
@@ -197,10 +63,10 @@ class Consistency:
     def of_returns(cls, drive: Drive, config: FitConfig, num_threads: int) -> Consistency:
         """Compare scans, tracked with velocities that are hardly known; without enough of them, nothing is known."""
         durations_s, velocities = np.diff(drive.times_s), drive.velocities
-        if velocities is None or len(durations_s) < _FEWEST_STEPS:
+        if velocities is None or len(durations_s) < FEWEST_STEPS:
             return cls()
         lengths_m = np.linalg.norm(velocities.mean_mps[:-1], axis=1) * durations_s
-        most_apart = max(len(lengths_m) // (2 * _FEWEST_STEPS), 1)
+        most_apart = max(len(lengths_m) // (2 * FEWEST_STEPS), 1)
         every = int(np.clip(_COMPARED_M / max(np.median(lengths_m), 1e-9), 1, most_apart))
         rows = np.arange(0, len(durations_s) + 1, every)
         compared, times_s = velocities.select(rows), drive.times_s[rows]
@@ -211,8 +77,8 @@ class Consistency:
         yaws = drive.yaws if every == 1 else None
         tracked, _ = track_once(Drive(scans, times_s, free, None, yaws=yaws), tracker)
         seen = np.array([len(scan) > 0 for scan in scans])
-        usable = (np.diff(_runs(times_s)) == 0) & seen[1:] & seen[:-1]
-        if usable.sum() < _FEWEST_STEPS:
+        usable = (np.diff(runs_of(times_s)) == 0) & seen[1:] & seen[:-1]
+        if usable.sum() < FEWEST_STEPS:
             return cls()
         followed = usable & (np.diff([found.segment for found in tracked]) == 0)
         poses = np.stack([found.pose for found in tracked])
@@ -223,16 +89,16 @@ class Consistency:
         rows_of_pairs = rows_of_pairs[:: -(-len(rows_of_pairs) // _PAIRS)]
         pairs = _Pairs.of(scans, motion, along, rows_of_pairs, None if yaws is None else yaws[1])
         delay = 0
-        if every <= _MOST_LATE:
+        if every <= MOST_LATE:
             # The fastest steps: of slow ones, errors of the returns seem delays.
             lengths_m, count = np.linalg.norm(own, axis=1) * usable, min(_DELAYED, len(usable))
             begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
             fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
-            delay = delay_of(velocities, _runs(drive.times_s), rows, motion, shown, covariance, fastest)
+            delay = delay_of(velocities, runs_of(drive.times_s), rows, motion, shown, covariance, fastest)
         shown = own * (1 + np.nan_to_num(along)[:, None])
         clock = Clock.of(times_s, shown, own, np.isfinite(along)) if every == 1 else None
         found, doubts = _judged(pairs, rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)])
-        known = found is not None or (~pairs.slow).sum() >= _FEWEST_STEPS
+        known = found is not None or (~pairs.slow).sum() >= FEWEST_STEPS
         return cls(delay, found, clock, doubts if known else None)
 
     def widened(self, poses: Floats, covariance: Floats, segments: Ints, drive: Drive) -> Floats:
@@ -248,7 +114,7 @@ class Consistency:
             else:
                 speeds = (doubt.ratio - 1) * velocities
             steps_m = inside[:, None] * durations_s * np.einsum("...ij,...j->...i", poses[:, :3, :3], speeds)
-            off_m = np.cumsum(steps_m, axis=0) / norm.ppf(1 - _BY_CHANCE)
+            off_m = np.cumsum(steps_m, axis=0) / norm.ppf(1 - BY_CHANCE)
             for segment in np.unique(segments):
                 rows = np.flatnonzero(segments == segment)
                 off = off_m[rows] - off_m[rows[len(rows) // 2]]
@@ -260,7 +126,7 @@ class Consistency:
         if self.contradicted is not None:
             return None, [f"{NOT_USED}: {self.contradicted.words('the returns')}."]
         if self.delay:
-            return None, [f"{NOT_USED}: {_delayed('the returns', self.delay)}. Give each scan its own."]
+            return None, [f"{NOT_USED}: {delayed_words('the returns', self.delay)}. Give each scan its own."]
         if self.doubts is None:
             velocities = dataclasses.replace(velocities, common_sigma=_UNKNOWN_SCALE)
             return velocities, ["Assumed: the Doppler is in m/s; too few scans with motion decide its scale."]
@@ -347,7 +213,7 @@ class _Pairs:
     def tracked(self, level: float) -> tuple[float, float]:
         """Return the mean relative difference of tracked steps, and its confidence limits. Infinite ones if too few are known."""
         shares = self.along[np.isfinite(self.along)]
-        if len(shares) < _FEWEST_STEPS:
+        if len(shares) < FEWEST_STEPS:
             return 0.0, np.inf
         error = shares.std(ddof=1) / np.sqrt(len(shares))
         return float(shares.mean()), float(student.ppf(1 - level, len(shares) - 1) * error)
@@ -365,33 +231,33 @@ class _Pairs:
         # Tracking of sparse scans may follow a pattern that moves with the sensor: the gains decide.
         other = int(np.abs(np.log(_SCALES / max(1 + share, _SCALES[0]))).argmin())
         gains = self.gains[np.isfinite(self.along)]
-        if other == _SAME or (len(gains) >= _FEWEST_STEPS and (gains[:, other] - gains[:, _SAME]).mean() > 0):
+        if other == _SAME or (len(gains) >= FEWEST_STEPS and (gains[:, other] - gains[:, _SAME]).mean() > 0):
             yield (abs(share) - _SAME_TRACKED) / max(limit, 1e-9), 1 + share
 
     @property
     def farthest(self) -> float:
         """Ratio of speeds to those by Doppler of the most different motion that the returns do not exclude."""
         own = self.gains[:, _SAME]
-        if _significance(own, _BY_CHANCE) < 1:
+        if _significance(own, BY_CHANCE) < 1:
             return -1.0
-        possible = _SCALES[_significance(own[:, None] - self.gains, _BY_CHANCE) <= 1]
-        share, limit = self.tracked(_BY_CHANCE)
+        possible = _SCALES[_significance(own[:, None] - self.gains, BY_CHANCE) <= 1]
+        share, limit = self.tracked(BY_CHANCE)
         return 1 + min(float(np.abs(possible - 1).max(initial=0)), abs(share) + limit)
 
 
 def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[OtherMotion, ...]]:
     """Judge Doppler by window of pairs, between scans (K + 1,): return the clearest contradiction, and motions not excluded."""
-    tried = list(_windows(len(pairs)))
-    level = _BY_CHANCE / len(tried)
+    tried = list(windows_of(len(pairs)))
+    level = BY_CHANCE / len(tried)
     contradictions, doubts = list[tuple[bool, float, OtherMotion]](), list[OtherMotion]()
     # In a tunnel, the pattern of the returns moves with the sensor, and confirms that a moving one stands still.
     moving = pairs.select(~pairs.slow)
-    pattern_moves = len(moving) >= _FEWEST_STEPS and _significance(moving.moved, _BY_CHANCE) < 1
+    pattern_moves = len(moving) >= FEWEST_STEPS and _significance(moving.moved, BY_CHANCE) < 1
     for rows in tried:
         window, first, last = pairs.select(rows), int(scans[rows.start]), int(scans[rows.stop])
         still, moving = window.select(window.slow), window.select(~window.slow)
         found = list[tuple[bool, float, float | None]]()
-        if len(still) >= max(_FEWEST_STEPS, _MOSTLY * len(window)):
+        if len(still) >= max(FEWEST_STEPS, _MOSTLY * len(window)):
             if pattern_moves:
                 doubts.append(OtherMotion(first, last, None, confirmed=False))
             losses, of_each = still.losses, level / len(_SHIFTS_M)
@@ -405,7 +271,7 @@ def _judged(pairs: _Pairs, scans: Ints) -> tuple[OtherMotion | None, tuple[Other
             # Stationary for a part of the drive, sparse scans of a slow sensor cannot confirm it.
             if 2 * len(window) >= len(pairs) - 1:
                 found.append((False, 2 - float(_significance(losses, of_each).min()), None))
-        if len(moving) >= _FEWEST_STEPS:
+        if len(moving) >= FEWEST_STEPS:
             found += [(True, *other) for other in moving.others(level)]
             if abs(moving.farthest - 1) > _MEASURED:
                 doubts.append(OtherMotion(first, last, moving.farthest, confirmed=False))
@@ -422,54 +288,3 @@ def _significance(samples: Floats, level: float) -> Floats:
     """Return the means of K samples (K, ...) over the least that is significant at a level (Student's t)."""
     errors = samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
     return samples.mean(axis=0) / np.maximum(errors, 1e-9) / student.ppf(1 - level, len(samples) - 1)
-
-
-def _slope(x: Floats, y: Floats) -> tuple[float, float, Floats]:
-    """Regress y on x, (K,) or (K, 3), without intercept; return the slope, its standard error, and the residuals."""
-    # Errors of the components of a step depend on each other: cluster-robust, with as many degrees of freedom as steps less one.
-    count, square = len(x), max(float((x**2).sum()), 1e-12)
-    slope = float((x * y).sum()) / square
-    left = y - slope * x
-    scores = (x * left).reshape(count, -1).sum(axis=1)
-    return slope, float(np.sqrt((scores**2).sum() * count / (count - 1)) / square), left
-
-
-def delay_of(
-    velocities: SensorVelocities,
-    runs: Ints,  # of scans without a gap
-    rows: Ints,
-    motion: DopplerMotion,
-    shown: Floats,
-    covariance: Floats,
-    followed: Bools,
-) -> int:
-    """Return the delay, scans, of the Doppler with which steps (K, 3) by another source agree best, if significantly; else 0.
-
-    `velocities` and `runs`: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of `shown`.
-    """
-    # The steps by delayed Doppler explain the residuals of those by its own (J test, Davidson and MacKinnon 1981).
-    covariance = covariance + motion.velocities.step_covariances(motion.durations_s)
-    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-    own = motion.steps[:, :3, 3]
-    found, last = [(np.inf, 0)], len(velocities.mean_mps) - 1
-    for delay in set(range(-_MOST_LATE, _MOST_LATE + 1)) - {0}:
-        at = np.clip(rows + delay, 0, last)
-        known = (at == rows + delay) & (runs[at] == runs[rows])
-        used = followed & known[:-1] & known[1:]
-        if (count := int(used.sum())) < _FEWEST_STEPS:
-            continue
-        delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[at])
-        turned = dataclasses.replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
-        later = turned.steps[:, :3, 3]
-        scaled, left, change = (
-            np.einsum("fij,fj->fi", whitening, moves)[used] for moves in (own, shown - own, later - own)
-        )
-        # Without the part that a wrong scale explains.
-        left, change = (
-            v - scaled * (v * scaled).sum() / max((scaled**2).sum(), 1e-12) for v in (left, change)
-        )
-        share, error, remaining = _slope(change, left)
-        needed = student.ppf(1 - _BY_CHANCE / (2 * _MOST_LATE), count - 1)
-        if share > needed * error and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
-            found.append((float((remaining**2).sum()) / count, delay))
-    return min(found)[1]

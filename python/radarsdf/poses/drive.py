@@ -22,8 +22,8 @@ from radarsdf.poses.tracking import Tracked, Tracker
 _PASSES = 3
 # Initial priors, replaced by the drive's own rates after the first pass. With 1 rad/s, the first steps of sparse real
 # scans were wrong by up to 9 degrees.
-_TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
-_MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
+TURNS = MotionPrior(np.full(3, 0.3**2), np.full(3, 0.3**2), True)
+MOVES = MotionPrior(np.full(3, 5.0**2), np.full(3, 2.0**2), False)
 # Minimum share of a step's prior variance that the returns must remove if nothing else measures the translation. Below half,
 # the prior is more informative. Simulated walls: 0.08 and 0.10; all other scenes, seeds 81 and 82, and real drives: 0.58 to 0.95.
 LEAST_OBSERVED = 0.5
@@ -43,11 +43,11 @@ class Drive:
     times_s: Floats
     velocities: SensorVelocities | None
     gyroscope: Gyroscope | None
-    turns: MotionPrior = _TURNS  # in the sensor frame
-    moves: MotionPrior = _MOVES
+    turns: MotionPrior = TURNS  # in the sensor frame
+    moves: MotionPrior = MOVES
     # The same for the joint estimate. Tracked rates are damped where returns hardly measure them, and so are priors of their means:
     # a sparse simulated radar rolled half as much as it did. Tracking keeps those, which limit its searches.
-    steady: Priors = _MOVES, _TURNS
+    steady: Priors = MOVES, TURNS
     # (2, F - 1) rough yaws between scans of a sensor that turns fast, for the sign of the Doppler and its reverse. NaN if unknown.
     yaws: Floats | None = None
 
@@ -75,7 +75,7 @@ class Drive:
     @property
     def usual_turn_rad_s(self) -> float:
         """Prior standard deviation of the turn rate, given the velocities, rad/s."""
-        usual = float(np.sqrt(_TURNS.usual[0]))
+        usual = float(np.sqrt(TURNS.usual.max()))
         if self.velocities is None:
             return usual
         speed_mps = np.sqrt((self.velocities.mean_mps**2).sum(axis=1).mean())

@@ -17,15 +17,14 @@ from radarsdf.checks import MISSING_POSES, hides_bar, instance, usable_poses
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.config.groups import ReturnsConfig
 from radarsdf.poses.checked_scans import CheckedScans
-from radarsdf.poses.consistency import of_poses
+from radarsdf.poses.displacements import compare_with_poses
 from radarsdf.poses.doppler import NOT_USED, DopplerMotion
 from radarsdf.poses.loops import open_loops
 from radarsdf.poses.motion import Motion, step_variances, unsteadiness
-from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes
+from radarsdf.poses.planes import PlaneGrid, SensorReturns, common_planes, plane_cell_m
 from radarsdf.poses.rigid import aligned, increments, moved, moved_by, steps
 from radarsdf.poses.verdict import Verdict, held_out
 from radarsdf.returns.noise import SensorNoise
-from radarsdf.returns.planes import LEAVES_PER_SURFEL
 from radarsdf.returns.rays import LeftOut
 from radarsdf.scans import Scans
 from radarsdf.threads import ThreadPool
@@ -150,7 +149,7 @@ def refine_poses(
     if velocities is not None and times_s is not None:
         if (velocities.mean_mps[:-1] * steps(given)[:, :3, 3]).sum() < 0:
             velocities = velocities.scaled(-1.0)
-        contradicted, clock = of_poses(velocities, times_s, given)
+        contradicted, clock = compare_with_poses(velocities, times_s, given)
         notes += clock.note
         if contradicted is None:
             velocities = dataclasses.replace(velocities, clock_sigma_s=clock.sigma_s)
@@ -159,7 +158,7 @@ def refine_poses(
             notes.append(
                 f"{NOT_USED}: {contradicted}. If it is right, leave the poses out: radarsdf.odometry"
             )
-    cell_m = LEAVES_PER_SURFEL * config.leaf_size_m
+    cell_m = plane_cell_m(scans, config.leaf_size_m)
     with ThreadPool(config.num_threads) as pool:
         held = held_out(len(returns), config.seed)
         used = returns.select(~held)

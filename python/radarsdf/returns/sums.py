@@ -9,7 +9,6 @@ import numpy as np
 
 from radarsdf._core import CellBlocks, CellSet, cell_keys, count_scans, mean_rays, merge_sums, sum_returns
 from radarsdf.arrays import Bools, Counts32, Floats, Floats32, Ints, Ints32, Keys
-from radarsdf.checks import check
 from radarsdf.returns.rays import Rays
 
 MAX_CELLS_FROM_ORIGIN = 1_000_000
@@ -70,8 +69,6 @@ class ReturnCells:
 UPPER = [(i, j) for i in range(3) for j in range(i, 3)]
 """Axes of the upper-triangular products of coordinates, in order."""
 
-_COUNT = 0
-
 
 @dataclass(frozen=True)
 class ScanSums:
@@ -98,27 +95,9 @@ class ScanSums:
         scans = count_scans(cells.cell_of_ray, rays.scans, len(cells.keys), num_threads)
         return cls(leaf_size_m, cells.keys, sums, scans)
 
-    def __add__(self, other: ScanSums) -> ScanSums:
-        return self._with(other, 1)
-
-    def __sub__(self, other: ScanSums) -> ScanSums:
-        return self._with(other, -1)
-
-    def _with(self, other: ScanSums, sign: int) -> ScanSums:
-        check(self.leaf_size_m == other.leaf_size_m, "sums over cells of different sizes cannot be added")
-        keys = np.union1d(self.keys, other.keys)
-        sums = np.zeros((len(keys), self.sums.shape[1]), np.int64)
-        scans = np.zeros(len(keys), np.int64)
-        for part, factor in ((self, 1), (other, sign)):
-            rows = np.searchsorted(keys, part.keys)
-            sums[rows] += factor * part.sums
-            scans[rows] += factor * part.scans.astype(np.int64)
-        kept = sums[:, _COUNT] != 0
-        return ScanSums(self.leaf_size_m, keys[kept], sums[kept], scans[kept].astype(np.uint32))
-
     @property
     def counts(self) -> Floats:
-        return self.sums[:, _COUNT].astype(np.float64)
+        return self.sums[:, 0].astype(np.float64)
 
     def merged_moments(self) -> tuple[Keys, Floats]:
         """Return the keys (P,), ascending, of the cells twice as large, and sums (P, 13) over their returns.
