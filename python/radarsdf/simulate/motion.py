@@ -129,10 +129,8 @@ def measured_imu(
         Rotation from the axes of the IMU to those of the sensor. Default: the identity.
     lever_m : three floats
         Position of the sensor in the axes of the IMU, m.
-    gyroscope_bias_rad_s : three floats
-        Bias of the rates, rad/s.
-    seed : int
-        Seed of all random numbers.
+    gyroscope_bias_rad_s, seed
+        As for :func:`measured_motion`.
 
     Returns
     -------

@@ -141,7 +141,7 @@ class Site:
 
 def along_path(
     terrain: Terrain,
-    path: Callable[[Floats], Floats],
+    path: Path,
     frames: int,
     *,
     height_m: float,
@@ -235,17 +235,8 @@ def hugin(seed: int = 0, frames: int | None = None) -> Simulation:
 def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
     """Simulate a sparse and noisy radar on a lap in a sports court with hoops, posts, cars and buildings round it.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of layout, path and noise.
-    frames : int, optional
-        Number of scans, always along the whole lap. Default: 120, with 80,000 to 100,000 returns.
-
-    Returns
-    -------
-    Simulation
-        Intensities are clipped to 0 to 36 dB, as of an Oculii Eagle. There are clutter and ghosts.
+    Arguments and result are those of :func:`hugin`. The default of 120 scans gives 80,000 to 100,000 returns. Intensities are
+    clipped to 0 to 36 dB, as of an Oculii Eagle. There are clutter and ghosts.
     """
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.08, materials.ASPHALT)
@@ -275,18 +266,9 @@ def oculii(seed: int = 0, frames: int | None = None) -> Simulation:
 def wall(seed: int = 0, frames: int | None = None) -> Simulation:
     """Simulate an arc of 10 m radius round a corner reflector on a wall, for view dependence. Some walls have windows.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of layout, path and noise.
-    frames : int, optional
-        Number of scans, between -80 and 80 degrees from the normal of the wall. Default: 90.
-
-    Returns
-    -------
-    Simulation
-        Intensities are 80 to 133 dB, as of a Hugin A4. The front of the wall is the plane x = 0. The reflector is at
-        y = 0 and is the last of `scene.solids`.
+    Arguments and result are those of :func:`hugin`, with 90 scans by default, between -80 and 80 degrees from the normal of the
+    wall. Intensities are 80 to 133 dB, as of a Hugin A4. The front of the wall is the plane x = 0. The reflector is at y = 0
+    and is the last of `scene.solids`.
     """
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, 0.05, materials.GRASS)
@@ -317,17 +299,8 @@ def astyx(seed: int = 0, frames: int | None = None) -> Simulation:
     The radar is tuned to four drives of the Astyx HiRes2019 dataset; ``docs/simulation.md`` lists the figures. The world is a
     similar street, not a copy.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of layout, path and noise.
-    frames : int, optional
-        Number of scans, always along the whole path: four seconds at 5 to 10 m/s. Default: 20.
-
-    Returns
-    -------
-    Simulation
-        Intensities are 45 to 102 dB, as of an Astyx HiRes 2019. There are clutter, ghosts and side lobes.
+    Arguments and result are those of :func:`hugin`, with 20 scans by default, along a path of four seconds at 5 to 10 m/s.
+    Intensities are 45 to 102 dB, as of an Astyx HiRes 2019. There are clutter, ghosts and side lobes.
     """
     rng = generator(seed, _LAYOUT)
     terrain = Terrain.random(rng, rng.uniform(0.05, 0.3), materials.GRASS)

@@ -106,10 +106,8 @@ def simulate(scene: Scene, sensor: RadarSensor, poses: Floats, *, name: str, see
 
     Parameters
     ----------
-    scene : Scene
-        The world.
-    sensor : RadarSensor
-        The radar.
+    scene, sensor : Scene, RadarSensor
+        The world, and the radar.
     poses : (F, 4, 4) float64
         T_world_sensor, m.
     name : str

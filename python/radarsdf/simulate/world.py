@@ -197,21 +197,9 @@ class Terrain(Primitive):
 
     @classmethod
     def random(cls, rng: np.random.Generator, roughness_m: float, material: Material) -> Terrain:
-        """Draw rolling ground of five octaves with two waves each, from about 40 m down to 2.5 m long.
+        """Draw rolling ground of mean height 0: five octaves with two waves each, from about 40 m down to 2.5 m long.
 
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Source of lengths, headings and phases.
-        roughness_m : float
-            Amplitude of the longest waves, m. Each halving of the wavelength divides the amplitude by 2.5.
-        material : Material
-            Material of the ground.
-
-        Returns
-        -------
-        Terrain
-            Ground with mean height 0.
+        `roughness_m` is the amplitude of the longest waves, m. Each halving of the wavelength divides the amplitude by 2.5.
         """
         octave = np.repeat(np.arange(5), 2)
         length = 40.0 / 2.0**octave * rng.uniform(0.8, 1.25, size=10)
@@ -299,18 +287,12 @@ class Hits(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A static world.
-
-    Parameters
-    ----------
-    solids : sequence of Primitive
-        Boxes, poles and reflectors. They may overlap and extend below the ground.
-    terrain : Terrain, optional
-        The ground. None: there is no ground.
-    """
+    """A static world."""
 
     solids: Sequence[Primitive]
+    """Boxes, poles and reflectors. They may overlap and extend below the ground."""
     terrain: Terrain | None = None
+    """The ground. None: there is no ground."""
 
     @property
     def parts(self) -> list[Primitive]:
