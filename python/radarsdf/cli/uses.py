@@ -8,7 +8,6 @@ from radarsdf.changes.compare import compare as compare_maps
 from radarsdf.cli.inputs import check_address, inputs_of, is_map, load_map, scans_if
 from radarsdf.cli.results import Results, until_stopped
 from radarsdf.extras import require
-from radarsdf.grids.files import check_suffix
 from radarsdf.grids.grid import save_arrays
 from radarsdf.grids.occupancy import grid as grid_of
 from radarsdf.io.files import check_outputs, checked_suffix
@@ -71,12 +70,11 @@ def compare(given: Namespace, results: Results) -> None:
 def grid(given: Namespace, results: Results) -> None:
     """Build the grid, write its files, and draw a picture if asked for."""
     out, heights = given.out, given.heights
-    flat = [path for path in out if path.suffix == ".yaml"]
+    flat = [path for path in out if path.suffix.lower() == ".yaml"]
     for path in out:
-        check_suffix(path, ".npz", ".bt", ".yaml")
-    for arrays_path in (given.distances, given.costmap):
-        if arrays_path is not None:
-            check_suffix(arrays_path, ".npz")
+        checked_suffix(path, (".npz", ".bt", ".yaml"), "grids")
+    for arrays_path in filter(None, (given.distances, given.costmap)):
+        checked_suffix(arrays_path, (".npz",), "arrays of a grid")
     if given.picture is not None:
         require("matplotlib", what="pictures need")
     pgm = [path.with_suffix(".pgm") for path in flat]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from radarsdf.arrays import Floats, Ints
 from radarsdf.checks import check
-from radarsdf.io.files import check_outputs, write_whole
+from radarsdf.io.files import check_outputs, checked_suffix, write_whole
 
 _PIXELS = np.array([254, 0, 205], np.uint8)  # grey values of map_saver for free, occupied and unknown
 _LEVELS = 16  # depth of OctoMap's octree
@@ -18,14 +18,9 @@ _MOST_OFF = 0.01  # tolerance for rounding of the origin, voxels
 _FREE, _OCCUPIED, _INNER = 1, 2, 3
 
 
-def check_suffix(path: Path, *suffixes: str) -> None:
-    """Raise a ValueError if `path` has another suffix."""
-    check(path.suffix in suffixes, f"{path} must end in {', '.join(suffixes)}")
-
-
 def write_map_server(path: Path, state: NDArray[np.int8], origin: Floats, cell_m: float) -> None:
     """Write states (X, Y) from `origin` (2,), m, as ``NAME.yaml``, which is `path`, and ``NAME.pgm``."""
-    check_suffix(path, ".yaml")
+    checked_suffix(path, (".yaml",), "map_server")
     image = path.with_suffix(".pgm")
     check_outputs([path, image])
     rows = np.ascontiguousarray(_PIXELS[state].T[::-1])  # image rows are in descending order of y

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +14,8 @@ from pydantic import Field
 
 from radarsdf.arrays import Bools, Floats, Floats32
 from radarsdf.checks import check, number, path_of, real_array
-from radarsdf.grids.files import check_suffix, write_map_server, write_octomap
+from radarsdf.grids.files import write_map_server, write_octomap
+from radarsdf.io.files import checked_suffix
 from radarsdf.io.npz import write_arrays
 from radarsdf.settings import settings
 
@@ -79,19 +81,9 @@ class FlatGrid:
     """(X, Y) -1: unknown, 0: free, 1: occupied."""
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the grid in the format of ROS's map_server.
+        """Write the grid in the format of ROS's map_server: ``NAME.yaml``, which is `path`, and the image ``NAME.pgm``.
 
-        Parameters
-        ----------
-        path : path-like
-            ``NAME.yaml``. The image is written next to it as ``NAME.pgm``.
-
-        Raises
-        ------
-        ValueError
-            For another suffix.
-        OSError
-            If a file cannot be written.
+        Raises a ValueError for another suffix, an OSError if a file cannot be written.
         """
         write_map_server(path_of(path, "path"), self.state, self.origin, self.cell_size)
 
@@ -139,38 +131,17 @@ class Grid:
         return np.equal(self.state, UNKNOWN)
 
     def centres(self, which: Bools | None = None) -> Floats:
-        """Compute the centres of voxels.
+        """Return the centres (N, 3) float64, world, m, of the voxels in the mask `which` (X, Y, Z), such as :attr:`free`.
 
-        Parameters
-        ----------
-        which : (X, Y, Z) ndarray of bool, optional
-            Bools of the voxels, such as :attr:`free`. Default: all.
-
-        Returns
-        -------
-        (N, 3) ndarray of float64
-            World, m, in C order of the voxels.
+        They are in C order of the voxels. By default, those of all voxels.
         """
         voxels = np.argwhere(np.ones(self.shape, bool) if which is None else which)
         return self.origin + (voxels + 0.5) * self.voxel_size
 
     def at(self, x: ArrayLike) -> NDArray[np.int8]:
-        """Look up the state of the voxels that contain positions.
+        """Return the :attr:`state` (N,) int8 of the voxels that contain positions `x` (N, 3), world, m.
 
-        Parameters
-        ----------
-        x : (N, 3) array_like
-            World, m.
-
-        Returns
-        -------
-        (N,) ndarray of int8
-            Values of :attr:`state`; unknown outside the grid, and at non-finite positions.
-
-        Raises
-        ------
-        ValueError
-            If `x` is not (N, 3).
+        It is unknown outside the grid, and at non-finite positions. Raises a ValueError for another shape.
         """
         positions = real_array(x, "positions")
         rows = positions.ndim == 2 and positions.shape[1] == 3
@@ -182,13 +153,7 @@ class Grid:
         return found
 
     def distances(self) -> DistanceField:
-        """Compute Euclidean distances to occupied voxels, and to voxels that are not free; exact between centres.
-
-        Returns
-        -------
-        DistanceField
-            Arrays (X, Y, Z) of float32, m.
-        """
+        """Compute Euclidean distances to occupied voxels, and to voxels that are not free; exact between centres."""
         from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
         def to_nearest(others: Bools, beyond: bool) -> Floats32:
@@ -204,18 +169,7 @@ class Grid:
         return DistanceField(occupied_m, to_nearest(self.free, True), error_m)
 
     def costmap(self, wheels: Wheels | None = None) -> Costmap:
-        """Compute heights of the ground, and costs for a vehicle.
-
-        Parameters
-        ----------
-        wheels : Wheels, optional
-            Limits of the vehicle. Default: those of a car.
-
-        Returns
-        -------
-        Costmap
-            Arrays (X, Y): heights and clearance, m, slopes, rad, and costs from 0 to 100.
-        """
+        """Compute heights of the ground, and costs for a vehicle with these limits; by default, those of a car."""
         wheels = Wheels() if wheels is None else wheels
         height, clearance = self._ground()
         # A column with walls alone has no ground, but cannot be entered.
@@ -285,12 +239,10 @@ class Grid:
         OSError
             If the file cannot be written.
         """
-        target = path_of(path, "path")
-        check_suffix(target, ".npz", ".bt")
-        if target.suffix == ".npz":
-            write_arrays(target, vars(self), compressed=True)
+        if checked_suffix(path, (".npz", ".bt"), "grids") == ".npz":
+            write_arrays(path, vars(self), compressed=True)
         else:
-            write_octomap(target, self.state, self.origin, self.voxel_size)
+            write_octomap(Path(path), self.state, self.origin, self.voxel_size)
 
     def _z(self) -> Floats:
         """Return the heights (Z,) of the voxels' centres, world, m."""
@@ -320,10 +272,8 @@ class Grid:
 
 def save_arrays(path: str | PathLike[str], grid: Grid, found: Costmap | DistanceField) -> None:
     """Write costs or distances of a grid to an ``.npz``, by name, with its `origin` and `voxel_size`."""
-    target = path_of(path, "path")
-    check_suffix(target, ".npz")
-    of_grid: dict[str, ArrayLike] = {"origin": grid.origin, "voxel_size": grid.voxel_size}
-    write_arrays(target, of_grid | vars(found), compressed=True)
+    checked_suffix(path, (".npz",), "arrays of a grid")
+    write_arrays(path, {"origin": grid.origin, "voxel_size": grid.voxel_size, **vars(found)}, compressed=True)
 
 
 def _planes(height: Floats32, size: float) -> tuple[Floats32, Floats32]:
