@@ -7,6 +7,7 @@ import os
 import sys
 from argparse import Namespace
 from collections.abc import Callable
+from importlib import import_module
 from typing import TypeAlias
 
 from radarsdf.cli.commands import COMMANDS, TILE_STEPS, steps
@@ -17,6 +18,15 @@ _Function: TypeAlias = Callable[[Namespace, Results], int | None]
 
 # Errors with a message for the user. Every other error is a bug and keeps its traceback.
 _ERRORS = (ValueError, OSError, ImportError, FloatingPointError, MemoryError)
+# Modules of the commands that are not in one of their own name.
+_MODULES = {
+    **dict.fromkeys(("demo", "fit"), "fits"),
+    **dict.fromkeys(("check", "poses", "convert"), "scans"),
+    **dict.fromkeys(("mesh", "eval", "render"), "maps"),
+    **dict.fromkeys(("view", "report"), "pages"),
+    **dict.fromkeys(("compare", "grid"), "uses"),
+    "config": "settings",
+}
 
 
 def run(words: list[str]) -> int:
@@ -68,38 +78,11 @@ def _run(words: list[str]) -> int:
 
 
 def _function_of(command: str) -> _Function:
-    """Import the function of a command: two need little, all others the same modules, which take long."""
-    if command == "config":
-        from radarsdf.cli.settings import config
-
-        return config
-    if command == "info":
-        from radarsdf.cli.info import info
-
-        return info
-    from radarsdf.cli import fits, live, maps, pages, scans, tiles, uses
-
-    functions: dict[str, _Function] = {
-        "demo": fits.demo,
-        "check": scans.check,
-        "fit": fits.fit,
-        "mesh": maps.mesh,
-        "poses": scans.poses,
-        "live": live.live,
-        "view": pages.view,
-        "report": pages.report,
-        "eval": maps.evaluate,
-        "render": maps.render,
-        "compare": uses.compare,
-        "grid": uses.grid,
-        "convert": scans.convert,
-        "tiles run": tiles.run,
-        "tiles plan": tiles.plan,
-        "tiles fit": tiles.fit,
-        "tiles mesh": tiles.mesh,
-        "tiles status": tiles.status,
-    }
-    return functions[command]
+    """Import the function of a command. Each imports only what it needs, which may take long."""
+    name, _, step = command.partition(" ")
+    module = import_module(f"radarsdf.cli.{_MODULES.get(name, name)}")
+    found: _Function = getattr(module, step or ("evaluate" if name == "eval" else name))
+    return found
 
 
 def message_of(error: Exception) -> str:
