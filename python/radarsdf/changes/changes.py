@@ -99,17 +99,9 @@ class Changes:
     common offset of intensities in words, or why they were not compared; `intensity_offset`, sensor units, or None."""
 
     def regions(self, min_area_m2: float = 0.0) -> list[Region]:
-        """List the connected components of changes.
+        """List the connected components of changes of at least `min_area_m2`, m², largest first.
 
-        Parameters
-        ----------
-        min_area_m2 : float
-            Omit smaller regions, m².
-
-        Returns
-        -------
-        list of Region
-            Largest first. Each consists of faces of one kind, on one of the two surfaces.
+        Each consists of faces of one kind, on one of the two surfaces.
         """
         found = []
         for surface, kinds in (
@@ -139,12 +131,9 @@ class Changes:
     def mesh(self) -> trimesh.Trimesh:
         """Combine the later surface with the faces of the earlier one that are gone or moved, with colours.
 
-        Returns
-        -------
-        trimesh.Trimesh
-            World of the earlier map, m. Green: appeared, vermilion: gone, orange: moved, purple: changed reflectance, grey:
-            same, light grey: unseen. ``vertex_attributes`` (V,) are `kind`, `probability`, `moved_m` and
-            `intensity_change` of :class:`ChangedSurface`.
+        The mesh is in the world of the earlier map, m. Green: appeared, vermilion: gone, orange: moved, purple: changed
+        reflectance, grey: same, light grey: unseen. Its ``vertex_attributes`` (V,) are `kind`, `probability`, `moved_m` and
+        `intensity_change` of :class:`ChangedSurface`.
         """
         import trimesh  # noqa: PLC0415 - slow to import
 
@@ -165,20 +154,7 @@ class Changes:
         return mesh
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the mesh of :meth:`mesh` to a file atomically.
-
-        Parameters
-        ----------
-        path : path-like
-            The suffix selects the format, as for :func:`radarsdf.io.write_mesh`.
-
-        Raises
-        ------
-        ValueError
-            For another suffix.
-        OSError
-            If the file cannot be written.
-        """
+        """Write the mesh of :meth:`mesh` by :func:`radarsdf.io.write_mesh`, with its formats and errors."""
         from radarsdf.io.meshes import write_mesh  # noqa: PLC0415 - as above
 
         write_mesh(path_of(path, "path"), self.mesh())

@@ -99,7 +99,14 @@ def compare(
     corners = None if box is None else check_box(box)
     check_free_space(before, "before")
     if not isinstance(after, Map):
-        after = fit(after, poses, intensities, config=_quick_config(before.config), progress=progress)
+        names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
+        config = FitConfig.quick(
+            leaf_size_m=before.config.leaf_size_m,
+            num_threads=before.config.num_threads,
+            max_memory_bytes=before.config.max_memory_bytes,
+            returns={"free_space": True} | {name: getattr(before.config.returns, name) for name in names},
+        )
+        after = fit(after, poses, intensities, config=config, progress=progress)
     elif poses is not None or intensities is not None:
         msg = "poses and intensities belong to new scans: a map has its own"
         raise ValueError(msg)
@@ -120,25 +127,21 @@ def compare(
     differences = Differences.of(earlier, later)
     offset, words = None, differences
     if isinstance(differences, Differences):
-        changed = [surface.vertices[surface.kind > SAME] for surface in (gone, appeared)]
-        appeared = _reflectance_changed(appeared, differences, np.concatenate(changed))
+        changed = np.concatenate([surface.vertices[surface.kind > SAME] for surface in (gone, appeared)])
+        same = appeared.kind == SAME
+        change, of_change = differences.probability(appeared.vertices, same, changed)
+        appeared = replace(
+            appeared,
+            kind=np.where(of_change > _PROBABLE, REFLECTANCE_CHANGED, appeared.kind).astype(np.int8),
+            probability=np.maximum(appeared.probability, of_change.astype(np.float32)),
+            intensity_change=change.astype(np.float32),
+        )
         offset = differences.offset
         words = f"All returns of the later drive are {offset:+.1f} stronger, sensor units."
     if corners is not None:
         gone, appeared = _crop(corners, gone), _crop(corners, appeared)
     report = {"alignment": alignment.words, "intensity_offset": offset, "reflectance": words}
     return Changes(gone, appeared, alignment.T_before_after, report | areas_of(gone, appeared))
-
-
-def _quick_config(config: FitConfig) -> FitConfig:
-    names = ("min_range_m", "max_range_m", "pose_sigma_m", "pose_sigma_rad")
-    same = {name: getattr(config.returns, name) for name in names}
-    return FitConfig.quick(
-        leaf_size_m=config.leaf_size_m,
-        num_threads=config.num_threads,
-        max_memory_bytes=config.max_memory_bytes,
-        returns={"free_space": True, **same},
-    )
 
 
 def _side(own_map: PlacedMap, other_map: PlacedMap, alignment: Alignment) -> Side:
@@ -170,19 +173,6 @@ def _classify(side: Side, odds: tuple[Floats, Floats, Floats], share: float, los
     moved_m = np.where(kinds == MOVED, towards, np.nan).astype(np.float32)
     unknown = np.full(len(kinds), np.nan, np.float32)
     return ChangedSurface(side.vertices, side.faces, kinds, probability.astype(np.float32), moved_m, unknown)
-
-
-def _reflectance_changed(
-    surface: ChangedSurface, differences: Differences, changed: Floats
-) -> ChangedSurface:
-    """Mark vertices of the later surface that changed only in reflectance, away from places (C, 3) that `changed` otherwise."""
-    change, reflectance_changed = differences.probability(surface.vertices, surface.kind == SAME, changed)
-    return replace(
-        surface,
-        kind=np.where(reflectance_changed > _PROBABLE, REFLECTANCE_CHANGED, surface.kind).astype(np.int8),
-        probability=np.maximum(surface.probability, reflectance_changed.astype(np.float32)),
-        intensity_change=change.astype(np.float32),
-    )
 
 
 def _crop(box: Floats, surface: ChangedSurface) -> ChangedSurface:
