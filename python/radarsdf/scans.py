@@ -229,22 +229,9 @@ class Scans:
         return list(self._notes.lines)
 
     def select(self, frames: Ints | Sequence[int]) -> Scans:
-        """Select scans by index. All scans are read.
+        """Select K scans by their indices `frames` (K,), in this order. All scans are read.
 
-        Parameters
-        ----------
-        frames : (K,) integer ndarray, or sequence of int
-            Indices of scans, in the order of the result. Negative ones count from the end.
-
-        Returns
-        -------
-        Scans
-            K scans, with the same ground truth and IMU.
-
-        Raises
-        ------
-        IndexError
-            If an index is out of range.
+        Negative indices count from the end. Ground truth and IMU stay the same. Raises an IndexError if one is out of range.
         """
         scans = self.with_poses(self.poses[frames])
         scans._arrays = {name: chosen(arrays, frames) for name, arrays in self._loaded().items()}
@@ -252,19 +239,9 @@ class Scans:
         return scans
 
     def with_poses(self, poses: Floats, *, other_world: bool = False) -> Scans:
-        """Replace the poses. All scans are read.
+        """Return the same scans with poses (F, 4, 4) float64 T_world_sensor, m. All scans are read.
 
-        Parameters
-        ----------
-        poses : (F, 4, 4) float64 ndarray
-            T_world_sensor, m.
-        other_world : bool
-            Whether the poses are in another world frame than the ground truth, which is then dropped.
-
-        Returns
-        -------
-        Scans
-            The same scans with these poses.
+        `other_world`: whether these are in another world frame than the ground truth, which is then dropped.
         """
         self._loaded()
         scans = copy(self)

@@ -161,11 +161,8 @@ class FitConfig:
         The fit takes a fraction of the time; the map's file is larger. Intensities are fitted in closed form. Mesh the map with
         voxels of the size of a leaf cell: smaller ones show no more detail.
 
-        Parameters
-        ----------
-        **changes
-            Further settings, as for :meth:`override`, which also lists the errors. ``returns={"free_space": True}`` keeps what
-            :func:`radarsdf.grid` and :func:`radarsdf.compare` need.
+        `changes` are further settings, as for :meth:`override`, which also lists the errors. ``returns={"free_space": True}``
+        keeps what :func:`radarsdf.grid` and :func:`radarsdf.compare` need.
         """
         return cls().override(**QUICK).override(**changes)
 
@@ -174,11 +171,7 @@ class FitConfig:
         """Return the settings of 3QFPI as published, for comparisons.
 
         For a mesh as published, call ``mesh(min_confidence=0, max_uncertainty=math.inf, min_component_triangles=300)``.
-
-        Parameters
-        ----------
-        **changes
-            Further settings, as for :meth:`override`, which also lists the errors.
+        `changes` are further settings, as for :meth:`override`, which also lists the errors.
         """
         return cls().override(**PAPER).override(**changes)
 
@@ -215,15 +208,7 @@ class FitConfig:
     def from_dict(cls, values: Mapping[str, Any]) -> FitConfig:
         """Build a configuration from nested dicts, such as those of :meth:`to_dict` or a TOML file.
 
-        Parameters
-        ----------
-        values : mapping
-            Settings by name; a mapping for each group. Missing ones keep their defaults.
-
-        Raises
-        ------
-        ValueError
-            If `values` is not a mapping of names; for an unknown setting, or a value of the wrong type or out of range.
+        Missing settings keep their defaults. Raises the errors of :meth:`override`, and a ValueError for anything but a mapping.
         """
         return cls().override(**by_name(values, "the settings"))
 

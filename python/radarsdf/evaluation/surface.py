@@ -134,18 +134,9 @@ def surface_metrics(
 
 
 def format_metrics(metrics: Mapping[str, Any]) -> str:
-    """Format metrics as a few aligned lines of text.
+    """Format the result of `surface_metrics` or `intensity_metrics` as a few aligned lines of text.
 
-    Parameters
-    ----------
-    metrics : dict
-        Result of `surface_metrics` or `intensity_metrics`.
-
-    Returns
-    -------
-    str
-        Lines without a trailing newline. Surface errors are in centimetres and ratios in percent, as in the paper's
-        tables; intensity errors are in sensor units.
+    Surface errors are in centimetres and ratios in percent, as in the paper's tables; intensity errors are in sensor units.
 
     Examples
     --------

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from radarsdf.map.view import View, ViewedMap
 
-
 Query = Callable[..., Array]
 
 
@@ -73,14 +72,7 @@ class Map(ABC):
         return answer(self._evaluate(queries.signed_distance, world, extrapolate=extrapolate))
 
     def gradient(self, x: Any, *, extrapolate: bool = False) -> Any:
-        """Compute the gradient of the signed distance.
-
-        Parameters
-        ----------
-        x : (N, 3) array_like or Tensor
-            World, m.
-        extrapolate : bool
-            As for :meth:`sdf`.
+        """Compute the gradient of the signed distance; the arguments are those of :meth:`sdf`.
 
         Returns
         -------
@@ -92,28 +84,15 @@ class Map(ABC):
         return answer(self._evaluate(queries.plane, world, extrapolate=extrapolate)[:, 1:])
 
     def observed(self, x: Any) -> Any:
-        """Test whether positions lie in or on the border of a leaf cell, near returns or in a small gap between them.
+        """Test whether positions `x` (N, 3) lie in or on the border of a leaf cell, near returns or in a small gap between them.
 
-        Parameters
-        ----------
-        x : (N, 3) array_like or Tensor
-            World, m.
-
-        Returns
-        -------
-        (N,) ndarray of bool or Tensor
-            False where :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
+        Where the result, (N,) bool, is False, :meth:`sdf`, :meth:`gradient` and :meth:`intensity` are NaN.
         """
         world, answer = _as_positions(x)
         return answer(self._observed(world))
 
     def uncertainty(self, x: Any) -> Any:
-        """Estimate the standard error of the surface's position, from the noise of the returns near each position.
-
-        Parameters
-        ----------
-        x : (N, 3) array_like or Tensor
-            World, m.
+        """Estimate the standard error of the surface's position, from the noise of the returns near positions `x` (N, 3).
 
         Returns
         -------
@@ -128,12 +107,7 @@ class Map(ABC):
         return answer(uncertainty(self.contents_of_any, self.evidence_at(world)))
 
     def confidence(self, x: Any) -> Any:
-        """Estimate the probability of a surface, from the returns near each position and the scans that reached it.
-
-        Parameters
-        ----------
-        x : (N, 3) array_like or Tensor
-            World, m.
+        """Estimate the probability of a surface, from the returns near positions `x` (N, 3) and the scans that reached them.
 
         Returns
         -------
@@ -312,15 +286,7 @@ class Map(ABC):
     def save(self, path: str | PathLike[str]) -> None:
         """Write the map to a safetensors file. After :func:`radarsdf.load`, all results are bit-identical.
 
-        Parameters
-        ----------
-        path : path-like
-            An existing file is replaced only once the new one is complete.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
+        An existing file is replaced only once the new one is complete. Raises an OSError if the file cannot be written.
         """
 
     @property

@@ -300,14 +300,12 @@ class Scene:
         return [*self.solids, *([self.terrain] if self.terrain is not None else [])]
 
     def raycast(self, origins: ArrayLike, directions: ArrayLike, max_range_m: float) -> Hits:
-        """Find the first hit of each ray, exact to about 1e-9 m.
+        """Find the first hit of each ray within `max_range_m`, exact to about 1e-9 m.
 
         Parameters
         ----------
-        origins : (N, 3) or (3,) array_like
-            Origins of the rays, world, m.
-        directions : (N, 3) array_like
-            Unit vectors, world.
+        origins, directions : (N, 3) array_like
+            Origins, world, m, or one origin (3,), and unit vectors, world.
         max_range_m : float
             Farther hits are ignored, m.
 
@@ -335,18 +333,10 @@ class Scene:
         return Hits(np.where(primitive >= 0, nearest, np.inf), normals, primitive)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Compute signed distances to the union of all parts.
+        """Compute signed distances (N,) float64, m, of points (N, 3), world, m, to the union of all parts.
 
-        Parameters
-        ----------
-        points : (N, 3) array_like
-            World, m.
-
-        Returns
-        -------
-        (N,) ndarray of float64
-            m, positive in free space. Metres above rough ground they may be too large; inside overlapping solids,
-            the absolute value may be too small.
+        They are positive in free space. Metres above rough ground they may be too large; inside overlapping solids, the
+        absolute value may be too small.
         """
         p = np.asarray(points, dtype=np.float64)
         best = np.full(len(p), np.inf)

@@ -140,17 +140,9 @@ class TiledMap(TileBlend):
     def threshold(
         self, voxel_size: float = VOXEL_M, *, progress: bool | None = None, **limits: Any
     ) -> Threshold:
-        """Expected precision and coverage of a mesh, computed per tile without a mesh of the whole map.
+        """Compute the confidence threshold of :meth:`mesh` for the same arguments, and the shares in its ``metadata``.
 
-        Parameters
-        ----------
-        voxel_size, progress, **limits
-            As for :meth:`mesh`; also its `box`.
-
-        Returns
-        -------
-        Threshold
-            The confidence threshold of :meth:`mesh`, and the shares in its ``metadata``.
+        They are computed per tile, without a mesh of the whole map.
         """
         from radarsdf.tiles.mesh import parts_of  # noqa: PLC0415 - as above
 
@@ -158,17 +150,9 @@ class TiledMap(TileBlend):
         return tally.threshold(wanted.min_confidence)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Copy the plan and the maps of finished tiles to a new folder for :func:`radarsdf.load`.
+        """Copy the plan and the maps of finished tiles, without their rays, to a new folder for :func:`radarsdf.load`.
 
-        Parameters
-        ----------
-        path : path-like
-            The folder. The rays of the tiles are not copied.
-
-        Raises
-        ------
-        OSError
-            If the folder exists, or cannot be written.
+        Raises an OSError if the folder exists, or cannot be written.
         """
         folder = path_of(path, "path")
         folder.mkdir()
