@@ -118,10 +118,7 @@ def _las(compressed: bool, file: BinaryIO, rows: Array) -> None:
 def records(columns: Columns) -> Array:
     """(N,) one record per row of the columns, of which there must be at least one."""
     dtype = np.dtype([(name, array.dtype.newbyteorder("<")) for name, array in columns.items()])
-    rows = np.zeros(len(next(iter(columns.values()))), dtype)
-    for name, array in columns.items():
-        rows[name] = array
-    return rows
+    return np.rec.fromarrays(list(columns.values()), dtype).view(dtype, np.ndarray)
 
 
 def face_records(faces: NDArray[np.integer[Any]]) -> Array:
