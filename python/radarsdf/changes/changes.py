@@ -149,8 +149,7 @@ class Changes:
             mesh.vertex_attributes[name] = np.concatenate(
                 [getattr(self.after, name), getattr(self.before, name)[used]]
             )
-        colors = colors_of(np.asarray(mesh.vertex_attributes["kind"], np.int8))
-        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
+        mesh.visual.vertex_colors = colors_of(mesh.vertex_attributes["kind"])
         return mesh
 
     def save(self, path: str | PathLike[str]) -> None:

@@ -41,7 +41,7 @@ class Results:
         """Add a written mesh, its confidence threshold and the expected effect of that."""
         line = f"{vertices} vertices and {triangles} triangles"
         self.add_file(line, path, vertices=vertices, triangles=triangles)
-        self.add(str(threshold), **threshold.metadata)
+        self.add(str(threshold), **vars(threshold))
 
     def add_file(self, what: str, path: Path, **values: Any) -> None:
         """Add a line on a written file."""

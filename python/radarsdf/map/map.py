@@ -17,6 +17,7 @@ from radarsdf.arrays import Array, Bools, Floats
 from radarsdf.checks import MAX_POSITION_M, check, check_pose, instance, real_array
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
+from radarsdf.map.colors import intensity_colors
 from radarsdf.map.confidence import EvidenceAt, confidence, uncertainty
 from radarsdf.map.contents import MapContents
 from radarsdf.map.free_space import CellsInBox, free_space_odds
@@ -211,8 +212,6 @@ class Map(ABC):
         MemoryError
             If the voxels need more memory than ``config.max_memory_bytes``, or than the system has left.
         """
-        from radarsdf.map.mesh import with_intensities  # noqa: PLC0415 - trimesh is slow to import
-
         scale = self.intensity_scale
         if viewpoint is not None:
             check(scale, "a viewpoint needs a map with intensities; this one was fitted without")
@@ -229,8 +228,10 @@ class Map(ABC):
         )
         if viewpoint is None or scale is None:
             return mesh
-        vertices = np.array(mesh.vertices, np.float64)
-        return with_intensities(mesh, self.intensity(vertices, sensor_position), scale)
+        values = self.intensity(np.array(mesh.vertices, np.float64), sensor_position).astype(np.float32)
+        mesh.vertex_attributes["intensity"] = values
+        mesh.visual.vertex_colors = intensity_colors(values, scale.low, scale.high)
+        return mesh
 
     def render(
         self,

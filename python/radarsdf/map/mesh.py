@@ -18,13 +18,11 @@ from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints, Ints32
 from radarsdf.checks import MAX_POSITION_M, check, check_box, positive
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.map import queries
-from radarsdf.map.colors import intensity_colors
 from radarsdf.map.confidence import EvidenceAt, evidence, probabilities, uncertainty
 from radarsdf.map.contents import MapContents, WholeMap
 from radarsdf.map.marching_cubes import extract_cells, mesh_components, sparse_lattice
 from radarsdf.map.threshold import Limits, Tally
 from radarsdf.memory import check_mesh
-from radarsdf.returns.intensities import IntensityScale
 
 _MAX_VOXELS = 2**30  # duplicates included. Lattice coordinates and rows of corners are int32
 # Leaf cells. A cell is skipped if all its corners are farther than this from the surface, on the same side. Measured on
@@ -85,7 +83,7 @@ class Surface:
         """Build the mesh within the limits in the world frame. `leaf_cells`: number in the whole map."""
         counts = {"leaf_cells": leaf_cells, "leaf_cells_searched": self.cells_searched}
         threshold = self.tally.threshold(limits.min_confidence)
-        return self.part(origin, self.kept(limits), **counts, **threshold.metadata)
+        return self.part(origin, self.kept(limits), **counts, **vars(threshold))
 
     def part(self, origin: Floats, kept: Bools, **metadata: float) -> trimesh.Trimesh:
         """Build the mesh of the faces in the mask `kept` (F,), in the world frame."""
@@ -108,15 +106,6 @@ def extract_mesh(
     local_box = None if box is None else check_box(box) - contents.origin
     surface = Surface.of(contents, voxel_size, local_box, progress)
     return surface.mesh(contents.origin, limits, len(contents.evidence.visibility))
-
-
-def with_intensities(mesh: trimesh.Trimesh, intensities: Array, scale: IntensityScale) -> trimesh.Trimesh:
-    """Add intensities (V,), sensor units, and their colours to the vertices of a mesh."""
-    values = intensities.astype(np.float32)
-    mesh.vertex_attributes["intensity"] = values
-    colors = intensity_colors(values, scale.low, scale.high)
-    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
-    return mesh
 
 
 def with_all(good: Bools, faces: Ints32) -> Bools:

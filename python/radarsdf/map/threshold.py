@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,10 +69,6 @@ class Threshold:
     @classmethod
     def of_mesh(cls, metadata: Mapping[str, Any]) -> Threshold:
         return cls(**{name: metadata[name] for name in cls.__dataclass_fields__})
-
-    @property
-    def metadata(self) -> dict[str, float]:
-        return asdict(self)
 
     def __str__(self) -> str:
         return (
