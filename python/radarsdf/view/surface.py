@@ -38,19 +38,10 @@ class ShownSurface:
     spacing_m: float  # spacing of vertices: the voxel edge, or more if the mesh was thinned
 
     @classmethod
-    def of(
-        cls,
-        radar_map: Map,
-        voxel_size: float,
-        *,
-        max_vertices: int,
-        box: ArrayLike | None = None,
-        progress: bool | None = None,
-        **limits: Any,
-    ) -> ShownSurface:
-        """Mesh a map, and thin the mesh to `max_vertices`. `limits`: as `Map.mesh`. Raises a ValueError without a surface."""
+    def of(cls, radar_map: Map, voxel_size: float, *, max_vertices: int, **wanted: Any) -> ShownSurface:
+        """Mesh a map, and thin the mesh to `max_vertices`. `wanted`: of `Map.mesh`. Raises a ValueError without a surface."""
         whole_number(max_vertices, "max_vertices", _MIN_VERTICES)
-        mesh: Any = radar_map.mesh(voxel_size, box=box, progress=progress, **limits)
+        mesh: Any = radar_map.mesh(voxel_size, **wanted)
         threshold = Threshold.of_mesh(mesh.metadata)
         mesh, spacing_m = thinned(mesh, max_vertices, voxel_size)
         check(len(mesh.vertices), "the map has no surface here")

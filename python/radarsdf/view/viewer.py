@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Floats
 from radarsdf.map.map import Map
@@ -26,7 +25,7 @@ class Viewer(Page):
     """Serves a map, and scans to browse, in the browser until it is stopped.
 
     During a drag of the sensor, 30,000 vertices are recoloured; all of them are when it ends. The page computes in
-    float32 in the map's local frame, but displays world coordinates. `voxel_size`, `box`, `progress`, `limits`: as for
+    float32 in the map's local frame, but displays world coordinates. `voxel_size` and `wanted` are arguments of
     :meth:`Map.mesh`, with its errors.
     """
 
@@ -36,18 +35,14 @@ class Viewer(Page):
         scans: Scans | None = None,
         *,
         voxel_size: float = 0.1,
-        box: ArrayLike | None = None,
         max_vertices: int = 500_000,
         host: str = "127.0.0.1",
         port: int | None = None,
-        progress: bool | None = None,
-        **limits: Any,
+        **wanted: Any,
     ) -> None:
         super().__init__(host, port)
         self._map = radar_map
-        self.surface = ShownSurface.of(
-            radar_map, voxel_size, max_vertices=max_vertices, box=box, progress=progress, **limits
-        )
+        self.surface = ShownSurface.of(radar_map, voxel_size, max_vertices=max_vertices, **wanted)
         self._start()
         try:
             self._fill(scans)
