@@ -108,24 +108,8 @@ class Scans:
 
     Iteration yields one :class:`Scan` after another. Scans of :func:`radarsdf.io.read` are read from their files while they
     are iterated, so memory is bounded by one scan; `points`, `intensities`, `doppler_mps` and `sigmas` read all of them
-    and cache them. `poses`, `times_s` and ``len()`` read the files once, and keep no points.
-
-    Parameters
-    ----------
-    points : sequence of F arrays
-        (N_i, 3) each, sensor frame, m.
-    poses : (F, 4, 4) ndarray
-        T_world_sensor, m.
-    intensities : sequence of F arrays, optional
-        (N_i,) each, sensor units. None if the sensor does not measure them.
-    ground_truth : (M, 3) ndarray, optional
-        Lidar points, world frame, m.
-    doppler_mps, sigmas : sequence of F arrays, optional
-        As `Scan.doppler_mps` and `Scan.sigma`.
-    times_s : (F,) ndarray, optional
-        Times of the scans, s.
-    imu : Imu, optional
-        IMU data of the recording.
+    and cache them. `poses`, `times_s` and ``len()`` read the files once, and keep no points. The arguments of the constructor
+    have the names, shapes and units of the properties.
     """
 
     def __init__(
