@@ -13,18 +13,10 @@ from radarsdf.cli.commands import overview
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command. An error is printed as one line on standard error.
+    """Run one command, by default of ``sys.argv``, and return the exit status. An error is printed as one line on standard error.
 
-    Parameters
-    ----------
-    arguments
-        The words after ``radarsdf``. None: those of ``sys.argv``.
-
-    Returns
-    -------
-    int
-        The exit status: 0 on success, 1 if the command failed or a check found an error, 2 if the command line is
-        wrong, 130 if Ctrl-C stopped it.
+    The status is 0 on success, 1 if the command failed or a check found an error, 2 if the command line is wrong, 130 if
+    Ctrl-C stopped it.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words in ([], ["--help"], ["-h"]):

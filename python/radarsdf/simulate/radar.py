@@ -133,22 +133,11 @@ class RadarSensor:
         return self.threshold_db if self.floor_db is None else max(self.floor_db, self.threshold_db)
 
     def scan(self, scene: Scene, T_world_sensor: Floats, seed: int = 0, frame: int = 0) -> SimulatedScan:
-        """Scan a scene once.
+        """Scan a scene once, from a pose T_world_sensor (4, 4) float64, m.
 
-        Parameters
-        ----------
-        scene : Scene
-            The world.
-        T_world_sensor : (4, 4) ndarray of float64
-            Pose of the sensor, m.
-        seed, frame : int
-            Seed of the simulation and index of the scan, which determine all random numbers.
-
-        Returns
-        -------
-        SimulatedScan
-            The N returns: `points` (N, 3) float32, sensor frame, m; `intensities` and `noiseless_intensities` (N,) float32,
-            dB; `origin_kind` (N,) int8, codes of `Origin`.
+        `seed` and `frame`, the index of the scan, determine all random numbers. The result has N returns: `points` (N, 3)
+        float32, sensor frame, m; `intensities` and `noiseless_intensities` (N,) float32, dB; `origin_kind` (N,) int8, codes of
+        `Origin`.
         """
         angles = self._beam_angles(generator(seed, frame, _BEAMS))
         R, origin = T_world_sensor[:3, :3], T_world_sensor[:3, 3]
