@@ -50,7 +50,7 @@ From 3D radar scans to a surface and a reflectance map, on a CPU.
 
 {lists}
 
-radarsdf COMMAND --help lists the options of a command, radarsdf --version prints the version."""
+radarsdf COMMAND --help lists the options of a command; radarsdf --version prints the version."""
 
 
 def steps() -> str:

@@ -83,6 +83,7 @@ _FLAG: _Kind = {"action": "store_true"}
 _SWITCH: _Kind = {"action": argparse.BooleanOptionalAction}
 _FILE: _Kind = {"type": Path, "metavar": "FILE"}
 _OUT: _Kind = _FILE | {"required": True}
+_FOLDER: _Kind = _FILE | {"metavar": "FOLDER"}
 _PATH: _Kind = {"type": Path}
 _MAYBE: _Kind = _PATH | {"nargs": "?"}
 _COUNT: _Kind = {"type": int, "metavar": "N"}
@@ -96,15 +97,15 @@ _BOX: _Kind = {"type": float, "nargs": 6, "action": _Corners, "metavar": ("X0", 
 OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option: "fit -o"
     "map": (_PATH, "the map: .safetensors of radarsdf fit, or the folder of radarsdf tiles"),
     "info map": (_MAYBE, "also report the contents of this map"),
-    "what": (_PATH, "a mesh, or a map"),
+    "what": (_PATH | {"metavar": "map|mesh"}, "a map, or a mesh"),
     "folder": (_PATH, "the folder written by radarsdf tiles plan"),
 
     "scans": (_PATH, "the scans: .npz of radarsdf, a folder of point clouds, a ROS bag, or the folder of a data set"),
     "view scans": (_MAYBE, "scans to browse, as for radarsdf fit"),
     "report scans": (_MAYBE, "the scans of the map, as for radarsdf fit"),
-    "eval scans": (_PATH, ("the ground truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
+    "eval scans": (_PATH | {"metavar": "truth"}, ("the ground truth: lidar points (.ply, .pcd, .las, .laz, .npy, .npz, .csv, .xyz, .txt, .bin), a surface "
                    "(.ply, .obj, .off, .stl, .glb), or scans as for radarsdf fit, with lidar points or with --holdout")),
-    "compare scans": (_PATH, "the later map, or later scans, as for radarsdf fit"),
+    "compare scans": (_PATH | {"metavar": "later"}, "the later map, or later scans, as for radarsdf fit"),
     "convert scans": (_PATH, "the scans, as for radarsdf fit; or a mesh: .ply, .obj, .off, .stl, .glb"),
     "poses": (_MAYBE, "file of poses, if the scans have none: TUM, KITTI, 4 x 4 matrices"),
     "--extrinsic": (_FILE, "T_base_sensor, 4 x 4, if the poses are those of another frame than the sensor's"),
@@ -112,15 +113,16 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "--pose-topic": (_NAME, "in a bag: the topic of the poses"),
     "--imu-topic": (_NAME, "in a bag: the topic of the IMU, used to estimate poses"),
     "--imu-rotation": (_FILE, "R_sensor_imu, 3 x 3; default: from the bag, or estimated"),
-    "--field": (_NAMES | {"metavar": "ROLE=NAME"}, "field for a role: x, y, z, intensity or doppler; may be repeated"),
-    "--columns": (_NAME, "in files without a header: number of columns, or their names, such as x,y,z,intensity,doppler"),
+    "--field": (_NAMES | {"metavar": "ROLE=NAME"},
+                "field for a role: x, y, z, range, azimuth, elevation, intensity or doppler; may be repeated"),
+    "--columns": (_NAME | {"metavar": "N|NAMES"}, "in files without a header: number of columns, or their names, such as x,y,z,intensity,doppler"),
     "--max-gap": (_FLOAT | {"metavar": "S", "default": 0.5}, "longest gap between poses to interpolate; default: 0.5 s"),
     "--world-frame": (_NAME, "in a bag with TF: the world frame"),
     "--stamps": ({"choices": ("header", "record")}, "in a bag: clock of the scans"),
 
     "fit -o": (_FILE, "the map to write, .safetensors"),
     "live -o": (_FILE, "the map to write at the end, .safetensors"),
-    "mesh -o": (_OUT, "the mesh to write: .ply, .obj, .stl, .glb"),
+    "mesh -o": (_OUT, "the mesh to write: .ply, .obj, .off, .stl, .glb"),
     "poses -o": (_OUT, "the poses to write: .tum (with times), .kitti, .npy; or .npz: the scans with these poses"),
     "report -o": (_OUT, "the page to write, .html"),
     "render -o": (_OUT, ".npz, scans for radarsdf fit; .ply, points in the world frame; .png, a picture"),
@@ -129,22 +131,22 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
                 ".yaml and .pgm for ROS's map_server")),
     "convert -o": (_OUT, (".npz: the scans with their poses; .ply, .pcd, .las, .laz, .npy, .csv: all returns in the world "
                    "frame, with intensity, doppler, index and time of the scan; or a mesh")),
-    "demo -o": (_FILE | {"default": Path("radarsdf_demo")}, "the folder to write; default: radarsdf_demo"),
+    "demo -o": (_FOLDER | {"default": Path("radarsdf_demo")}, "the folder to write; default: radarsdf_demo"),
     "tiles mesh -o": (_FILE, "mesh to write; .json for 3D Tiles; default: mesh.ply in the folder"),
-    "-o": (_OUT, "the folder to write"),
+    "-o": (_FOLDER | {"required": True}, "the folder to write"),
 
     "--quiet": (_FLAG, "hide progress bars"),
     "--json": (_FLAG, "print the results as one JSON object, lengths in m; everything else goes to standard error"),
     "--paper": (_FLAG, "use the published settings: slower, for comparison"),
-    "--quick": (_FLAG, "average distances instead of training: under a second, no free space; mesh with --voxel 0.2"),
+    "--quick": (_FLAG, "average distances instead of training: takes under a second, keeps no free space; mesh with --voxel 0.2"),
     "--config": (_FILE, "read settings from this TOML file; radarsdf config prints all of them"),
     "--set": (_NAMES | {"metavar": "NAME=VALUE"}, "change a setting, such as training.sdf_iterations=200; may be repeated"),
     "--voxel": (_FLOAT | {"default": 0.1}, "edge length of a voxel; default: 0.1 m"),
     "grid --voxel": (_FLOAT | {"default": 0.2}, "edge length of a voxel; default: 0.2 m"),
     "--min-confidence": (_FLOAT | {"metavar": "P"},
                          "leave out surface below this, 0 to 1; default: maximises the expected F-score"),
-    "--max-uncertainty": (_FLOAT, "leave out surface with a standard error above this"),
-    "--min-component": (_COUNT | {"dest": "min_component_triangles"}, "leave out smaller components, in triangles; default: 30, fewer for large voxels"),
+    "--max-uncertainty": (_FLOAT, "leave out surface with a standard error above this; default: no limit"),
+    "--min-component": (_COUNT | {"dest": "min_component_triangles"}, "leave out components of fewer triangles; default: 30, fewer for large voxels"),
     "--host": ({"default": "127.0.0.1"}, ("address to listen on; default: 127.0.0.1, this machine alone; with 0.0.0.0, "
                "anyone who can reach this machine sees the map")),
     "--port": ({"type": int}, "port to listen on; default: 8080, or the next free one"),
@@ -162,6 +164,7 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "--dry-run": (_FLAG, "only estimate memory and time"),
     "--checkpoint": (_FILE, "save the state of the fit here periodically, and resume from it"),
     "--report": (_FILE, "also write a page, .html: pictures, errors, plots"),
+    "compare --report": (_FILE, "also write a page, .html: pictures and the regions that changed"),
     "--viewpoint": (_POINT, "colour the mesh by the intensity seen from this position, world frame, m"),
     "--picture": (_FILE, "also draw a picture, .png"),
     "--find": (_FLAG, "ignore the poses of the scans: estimate them from returns and Doppler"),
@@ -175,14 +178,14 @@ OPTIONS: dict[str, tuple[_Kind, str]] = {  # by option, or by command and option
     "--returns": (_FLOAT | {"metavar": "N"}, "returns per scan; default: as the map's sensor"),
     "--noise": (_FLAG, "add the noise of the sensor"),
     "--seed": (_COUNT | {"default": 0}, "seed of the noise"),
-    "--align": (_SWITCH | {"default": True}, "align the later map if this brings its surface nearer to the earlier one"),
+    "--align": (_SWITCH | {"default": True}, "align the later map if the surfaces show an offset between the frames"),
     "--min-area": (_FLOAT | {"metavar": "M2", "default": 0.1}, "smallest region to list; default: 0.1 m2"),
     "--heights": ({"type": float, "nargs": 2, "default": (0.3, 2.0), "metavar": ("LOW", "HIGH")},
                   "range of heights above the ground that the .yaml map covers, m; default: 0.3 2.0"),
     "--distances": (_FILE, "also write the Euclidean distance field of the grid, as .npz"),
     "--costmap": (_FILE, "also write heights, slopes, steps and traversal costs, as .npz"),
     "--tile-size": (_FLOAT, "edge of a tile; default: 512 leaf cells"),
-    "--halo": (_FLOAT, "margin of returns around a tile that are fitted, too"),
+    "--halo": (_FLOAT, "margin of returns around a tile that are fitted, too; default: 64 leaf cells"),
     "--tile": (_NAMES, "only the tile of this name; may be repeated"),
     "--processes": (_COUNT, "worker processes; each fits one tile at a time"),
     "--cluster": ({"metavar": "ADDRESS"}, "address of the dask.distributed scheduler, such as tcp://host:8786"),
