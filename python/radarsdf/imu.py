@@ -15,10 +15,8 @@ from radarsdf.checks import are_rigid, check, real_array
 class Imu:
     """G measurements of an inertial measurement unit, in its own axes.
 
-    Raises
-    ------
-    ValueError
-        If arrays are not finite, their shapes are inconsistent, times do not ascend, or `R_sensor_imu` is not a rotation.
+    Construction raises a ValueError for arrays that are not finite or of inconsistent shapes, times that do not ascend, and an
+    `R_sensor_imu` that is not a rotation.
     """
 
     times_s: Floats

@@ -63,13 +63,8 @@ def _from_mapping(group: Any) -> Callable[[Any], Any]:
 class FitConfig:
     """The settings of a fit. The defaults are the best ones measured; :meth:`paper` is 3QFPI as published.
 
-    The settings that are changed most often are at the top. The others are in groups; a group can be given as
-    a dict.
-
-    Raises
-    ------
-    ValueError
-        At construction: for an unknown setting, or a value of the wrong type or out of range.
+    The settings that are changed most often are at the top. The others are in groups; a group can be given as a dict.
+    Construction raises a ValueError for an unknown setting, or a value of the wrong type or out of range.
 
     Examples
     --------

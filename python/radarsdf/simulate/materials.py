@@ -20,11 +20,7 @@ class Material:
 
     The echo of a surface at the incidence angle θ is ``reflectivity_db`` + 10·log10(lobe), where lobe is the sum of a
     diffuse lobe cos²θ and a specular lobe exp(-θ²/2w²), weighted by ``specular``. It is 1 at normal incidence.
-
-    Raises
-    ------
-    ValueError
-        If a value is outside the range in its comment.
+    Construction raises a ValueError for a value outside the range in its comment.
     """
 
     name: str

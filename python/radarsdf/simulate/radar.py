@@ -89,10 +89,7 @@ class RadarSensor:
     places from scan to scan, like reflections in a static world; ghosts of mirroring surfaces; and echoes in the side
     lobes of the antenna, with the range and azimuth of a surface and a random elevation.
 
-    Raises
-    ------
-    ValueError
-        If a value is negative, a share exceeds 1, or a value is outside the range in its comment.
+    Construction raises a ValueError for a value outside its range.
     """
 
     azimuth_fov_rad: Annotated[float, Field(gt=0, le=2 * np.pi)] = 1.92  # full width, centred on x [rad]
