@@ -85,7 +85,7 @@ def test_the_version(capsys):
         (["mesh", "map", "-o", "mesh", "--box", "1"], "--box"),
         (["mesh", "map", "-o", "mesh", "--voxel", "x"], "--voxel"),
         (["view", "map", "--port", "x"], "--port"),
-        (["eval", "mesh"], "scans"),
+        (["eval", "mesh"], "truth"),
         (["demo", "--scene", "moon"], "moon"),
         (["demo", "--frames", "1"], "--frames"),
         (["render", "map", "-o", "a.jpg", "--pose", "1", "2", "3"], ".npz, .ply, .png"),

@@ -144,7 +144,7 @@ class Changes:
         used, lost = renumbered(len(self.before.vertices), lost)
         vertices = np.concatenate([self.after.vertices, self.before.vertices[used]])
         faces = np.concatenate([self.after.faces, lost + np.int32(len(self.after.vertices))])
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        mesh: Any = trimesh.Trimesh(vertices, faces, process=False)
         for name in ("kind", "probability", "moved_m", "intensity_change"):
             mesh.vertex_attributes[name] = np.concatenate(
                 [getattr(self.after, name), getattr(self.before, name)[used]]

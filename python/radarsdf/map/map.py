@@ -218,7 +218,7 @@ class Map(ABC):
             sensor_position = real_array(viewpoint, "viewpoint")
             is_position = sensor_position.shape == (3,) and (np.abs(sensor_position) <= MAX_POSITION_M).all()
             check(is_position, f"viewpoint must be one position (3,), finite and within {MAX_POSITION_M:g} m")
-        mesh = self._surface_mesh(
+        mesh: Any = self._surface_mesh(
             voxel_size,
             box=box,
             progress=progress,

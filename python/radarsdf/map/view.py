@@ -229,10 +229,10 @@ def _beams(sensor: Sensor) -> tuple[Floats, Floats]:
     counts = [int((high - low) / step) + 1 for (low, high), step in zip(limits, steps, strict=True)]
     while counts[0] * counts[1] > _MAX_BEAMS:
         counts = [max(1, count // 2) for count in counts]
-    azimuth, elevation = (
-        low + (np.arange(n) + 0.5) * ((high - low) / n) for (low, high), n in zip(limits, counts, strict=True)
-    )
-    return azimuth, elevation
+    (first, last), (lowest, highest) = limits
+    azimuth = first + (np.arange(counts[0]) + 0.5) * ((last - first) / counts[0])
+    elevation = lowest + (np.arange(counts[1]) + 0.5) * ((highest - lowest) / counts[1])
+    return np.asarray(azimuth, np.float64), np.asarray(elevation, np.float64)
 
 
 def _first_surface(
