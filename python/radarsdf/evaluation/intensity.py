@@ -202,24 +202,9 @@ class KNNIntensity:
         return cls(points, sensors, values, candidates=candidates, k=k)
 
     def predict(self, x: ArrayLike, sensor_positions: ArrayLike) -> Floats:
-        """Predict the intensity of returns.
+        """Predict the intensities (M,) float64, sensor units, at points (M, 3) for sensor positions (M, 3) or (3,), world, m.
 
-        Parameters
-        ----------
-        x : (M, 3) array_like
-            Points, world frame, m.
-        sensor_positions : (M, 3) or (3,) array_like
-            Position of the sensor for each point, world frame, m.
-
-        Returns
-        -------
-        (M,) float64
-            Intensities, sensor units, defined everywhere: far from all returns, those of the nearest returns.
-
-        Raises
-        ------
-        ValueError, TypeError
-            If a shape is wrong, a value is not finite, or a point lies at the sensor itself.
+        They are defined everywhere: far from all returns, they are those of the nearest returns. Raises the errors of the class.
         """
         points, directions = _rays(x, sensor_positions)
         predicted = np.zeros(len(points))
