@@ -18,7 +18,7 @@ _MAX_SEED = 2**48  # generators have 64-bit seeds, and each fit uses MAX_THREADS
 _Length = Annotated[float, Field(gt=0, le=1e6)]  # m: a cell of 1000 km is a mistake
 
 QUICK: dict[str, Any] = {"train": False, "returns": {"free_space": False}}
-"""What :meth:`FitConfig.quick` changes: stage 1 only, and nothing kept for grids and comparisons."""
+"""What :meth:`FitConfig.quick` changes: no training, and nothing kept for grids and comparisons."""
 
 PAPER: dict[str, Any] = {
     "returns": {
@@ -84,8 +84,8 @@ class FitConfig:
     max_memory_bytes: Annotated[int, Field(ge=1, lt=2**63)] | None = None
     """Memory limit, bytes; a fit or mesh that needs more raises a MemoryError. None: what the system has available."""
     train: bool = True
-    """Whether to train a field (stage 2). If not, the surface is the smoothed average of the rays (stage 1), intensities
-    come from the closed-form model, and of the groups only `returns` (except `onto_planes`) and `encoding.bridge_cells` apply."""
+    """Whether to train a field. If not, the surface is the smoothed average of the rays, intensities come from the
+    closed-form model, and of the groups only `returns` (except `onto_planes`) and `encoding.bridge_cells` apply."""
     returns: Annotated[ReturnsConfig, BeforeValidator(_from_mapping(ReturnsConfig))] = ReturnsConfig()
     """Which returns are used, and how they are cleaned."""
     encoding: Annotated[EncodingConfig, BeforeValidator(_from_mapping(EncodingConfig))] = EncodingConfig()
@@ -151,7 +151,7 @@ class FitConfig:
 
     @classmethod
     def quick(cls, **changes: Any) -> FitConfig:
-        """Return the settings for stage 1 only: distances averaged over the rays and smoothed, not trained.
+        """Return the settings without training: distances averaged over the rays and smoothed, not trained.
 
         The fit takes a fraction of the time; the map's file is larger. Intensities are fitted in closed form. Mesh the map with
         voxels of the size of a leaf cell: smaller ones show no more detail.

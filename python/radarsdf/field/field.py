@@ -1,4 +1,4 @@
-"""Fields: signed distance, its gradient, and intensity, at points of the local frame; and the field of stage 1."""
+"""Fields: signed distance, its gradient, and intensity, at points of the local frame; and the averaged field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The field of stage 2: encodings and networks, with widths set by the configuration."""
+"""The trained field: encodings and networks, with widths set by the configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage 1, without training: smoothed averages of signed distances at the corners of leaf cells."""
+"""The surface without training: smoothed averages of signed distances at the corners of leaf cells."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from radarsdf.returns.planes import Surfels
 from radarsdf.returns.sums import MeanRays
 
 BAND_CELLS = 2.0
-"""Reach of the map of stage 1 along a ray, before and behind its return, leaf cells."""
+"""Reach of the average along a ray, before and behind its return, leaf cells."""
 TRUNCATION_CELLS = 3.0
 """Truncation distance, and reach of a ray before and behind its return, leaf cells (VDBFusion: 3 voxels). Measured: 4 and 5
 are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real ones."""

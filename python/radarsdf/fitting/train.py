@@ -1,4 +1,4 @@
-"""Stage 2: training of a field. First the surface, then reflectance on the frozen surface."""
+"""Training of a field. First the surface, then reflectance on the frozen surface."""
 
 from __future__ import annotations
 
