@@ -35,9 +35,11 @@ struct Sum {
     return *this;
   }
 
-  std::int8_t side() const {
-    if (in_front >= kCertainInFront && kPassed * in_front > weight) return kInFront;
-    if (behind >= kCertainBehind && 2 * std::uint64_t{behind} > weight && kNoise * positive <= weight) return kBehind;
+  std::int8_t side(std::uint64_t weight_of_return) const {
+    if (in_front >= kCertainInFront * weight_of_return && kPassed * in_front > weight) return kInFront;
+    if (behind >= kCertainBehind * weight_of_return && 2 * std::uint64_t{behind} > weight &&
+        kNoise * positive <= weight)
+      return kBehind;
     return 0;
   }
 };
@@ -106,7 +108,7 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
       for (const LargeVector<Sum>& sums : groups) total += sums[row];
       const double weight = static_cast<double>(total.weight) * static_cast<double>(quanta);
       distances_m[row] = total.weight > 0 ? static_cast<float>(static_cast<double>(total.distance) / weight) : 0;
-      sides[row] = total.side();
+      sides[row] = total.side(rays.weight_of_return);
     }
   });
 }

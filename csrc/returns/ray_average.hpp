@@ -13,6 +13,7 @@ struct AveragedRays {
   const float* normals;     ///< (count, 3), of the surface there, unit, towards the sensor
   const float* weights;     ///< (count), integers, with a sum below 2^32 at a vertex
   std::int64_t count;
+  std::uint32_t weight_of_return = 1;  ///< to which numbers of returns below refer
 };
 
 // Side of the surface on which a vertex certainly lies.

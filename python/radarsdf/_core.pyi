@@ -191,9 +191,10 @@ class VertexTable:
         weights: numpy.typing.NDArray[numpy.float32],
         truncation_m: typing.SupportsFloat | typing.SupportsIndex,
         num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+        weight_of_return: typing.SupportsInt | typing.SupportsIndex = 1,
     ) -> tuple[numpy.typing.NDArray[numpy.float32], numpy.typing.NDArray[numpy.int8]]:
         """
-        For an octree, mean signed distance of each vertex, (num_rows,) float32, m, to planes through `points` (N, 3) with `normals` (N, 3). The mean is over rays along `directions` (N, 3) that cross leaf cells of the vertex within `truncation_m` of their points, one term per cell; all float32, local frame. Also the sides of the vertices, (num_rows,) int8: 1 if many rays passed it, -1 if it lies in unobserved space behind many returns, else 0.
+        For an octree, mean signed distance of each vertex, (num_rows,) float32, m, to planes through `points` (N, 3) with `normals` (N, 3). The mean is over rays along `directions` (N, 3) that cross leaf cells of the vertex within `truncation_m` of their points, one term per cell; all float32, local frame. `weights` (N,) are integers. Also the sides of the vertices, (num_rows,) int8: 1 if many rays passed it, -1 if it lies in unobserved space behind many returns, else 0.
         """
     def begin_adam_step(
         self,

@@ -52,7 +52,7 @@ def test_one_function_weighs_returns(monkeypatch):
     before = fit(points, poses)
 
     def only_near(counts, ranges_m, noise):
-        near = np.where(ranges_m < higher, 1000 * counts, counts)
+        near = np.where(ranges_m < higher, 1000 * counts, 0.25 * counts)
         return near, near / noise.variances_m2(ranges_m)
 
     monkeypatch.setattr("radarsdf.returns.evidence.weights_of", only_near)
