@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import os
 import pickle
 import resource
 import warnings
@@ -132,27 +131,3 @@ def test_a_map_that_describes_more_than_it_holds(tmp_path, group, name, value):
     path.write_bytes(with_config(group, **{name: value}))
     with pytest.raises(ValueError, match=r"map\.safetensors is not a complete"):
         radarsdf.load(path)
-
-
-@pytest.mark.parametrize("read", [radarsdf.load, read_scans])
-def test_what_is_no_file(tmp_path, read):
-    path = tmp_path / "map.npz"
-    path.write_bytes(b"")
-    with pytest.raises(ValueError, match=r"map\.npz is not a complete"):
-        read(path)
-    path.unlink()
-    path.mkdir()  # a map may be a folder
-    with pytest.raises(ValueError if read is radarsdf.load else OSError, match=r"map\.npz"):
-        read(path)
-    path.rmdir()
-    path.symlink_to(path)
-    with pytest.raises(OSError, match=r"map\.npz"):
-        read(path)
-    path.unlink()
-    path.symlink_to(tmp_path / "nothing")
-    with pytest.raises(FileNotFoundError, match=r"map\.npz"):
-        read(path)
-    path.unlink()
-    os.mkfifo(path)  # without a writer
-    with pytest.raises(ValueError, match=r"map\.npz is not a regular file"):
-        read(path)
