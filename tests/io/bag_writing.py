@@ -30,15 +30,7 @@ _NANOSECONDS = 10**9
 
 
 class BagWriter:
-    """A bag that is written, message by message.
-
-    Parameters
-    ----------
-    path : Path
-        The bag: a file for ROS 1, a folder for ROS 2.
-    kind : {"ros1", "sqlite3", "mcap"}
-        Its format.
-    """
+    """A bag of a kind of `KINDS` that is written message by message: a file for ROS 1, a folder for ROS 2."""
 
     def __init__(self, path: Path, kind: str) -> None:
         self.ros1 = kind == "ros1"

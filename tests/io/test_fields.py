@@ -7,23 +7,24 @@ from radarsdf.io import read
 from radarsdf.io.fields import Fields
 from radarsdf.scans import Notes
 
+# Fields of doppler and intensity, and all fields, of each sensor.
 CLOUDS = {
-    "Sensrad Hugin": ["x", "y", "z", "range", "doppler", "power"],
-    "Oculii Eagle": ["Doppler", "Range", "Power", "Alpha", "Beta", "x", "y", "z", "rangeAccu", "aziAccu", "eleAccu",
-                     "dopplerAccu", "recoveredSpeed", "denoiseFlag"],
-    "ARS548, nebula": ["x", "y", "z", "azimuth", "azimuth_std", "elevation", "elevation_std", "range", "range_std",
-                       "range_rate", "range_rate_std", "rcs", "ambiguity_flag"],
-    "ARS548, SNAIL-Radar": ["x", "y", "z", "doppler", "intensity", "range_std", "azimuth_std", "elevation_std",
-                            "doppler_std"],
-    "ARS548, HKUST RIO": ["range", "azimuth", "elevation", "velocity", "rcs", "rangeSTD", "azimuthSTD", "elevationSTD",
-                          "velocitySTD"],
-    "smartmicro": ["x", "y", "z", "radial_speed", "power", "rcs", "noise", "snr", "azimuth_angle", "elevation_angle",
-                   "range"],
-    "TI ti_mmwave": ["x", "y", "z", "intensity", "velocity"],
-    "TI reve": ["x", "y", "z", "snr_db", "noise_db", "v_doppler_mps"],
-    "radar_msgs/RadarScan": ["range", "azimuth", "elevation", "doppler_velocity", "amplitude"],
-    "View-of-Delft": ["x", "y", "z", "RCS", "v_r", "v_r_compensated", "time"],
-    "TJ4DRadSet": ["X", "Y", "Z", "V_r", "Range", "Power", "Alpha", "Beta"],
+    "Sensrad Hugin": ("doppler", "power", "x y z range doppler power"),
+    "Oculii Eagle": ("doppler", "power", ("Doppler Range Power Alpha Beta x y z rangeAccu aziAccu eleAccu "
+        "dopplerAccu recoveredSpeed denoiseFlag")),
+    "ARS548, nebula": ("range_rate", "rcs", ("x y z azimuth azimuth_std elevation elevation_std range range_std "
+        "range_rate range_rate_std rcs ambiguity_flag")),
+    "ARS548, SNAIL-Radar": ("doppler", "intensity", ("x y z doppler intensity range_std azimuth_std elevation_std "
+        "doppler_std")),
+    "ARS548, HKUST RIO": ("velocity", "rcs", ("range azimuth elevation velocity rcs rangeSTD azimuthSTD elevationSTD "
+        "velocitySTD")),
+    "smartmicro": ("radial_speed", "power", ("x y z radial_speed power rcs noise snr azimuth_angle elevation_angle "
+        "range")),
+    "TI ti_mmwave": ("velocity", "intensity", "x y z intensity velocity"),
+    "TI reve": ("v_doppler_mps", "snr_db", "x y z snr_db noise_db v_doppler_mps"),
+    "radar_msgs/RadarScan": ("doppler_velocity", "amplitude", "range azimuth elevation doppler_velocity amplitude"),
+    "View-of-Delft": ("v_r", "rcs", "x y z RCS v_r v_r_compensated time"),
+    "TJ4DRadSet": ("v_r", "power", "X Y Z V_r Range Power Alpha Beta"),
 }  # fmt: skip
 
 
@@ -31,26 +32,12 @@ def scan_of(fields, columns):
     return fields.scan(columns, np.eye(4), None, Notes())
 
 
-ROLES = {
-    "Sensrad Hugin": ("doppler", "power"),
-    "Oculii Eagle": ("doppler", "power"),
-    "ARS548, nebula": ("range_rate", "rcs"),
-    "ARS548, SNAIL-Radar": ("doppler", "intensity"),
-    "ARS548, HKUST RIO": ("velocity", "rcs"),
-    "smartmicro": ("radial_speed", "power"),
-    "TI ti_mmwave": ("velocity", "intensity"),
-    "TI reve": ("v_doppler_mps", "snr_db"),
-    "radar_msgs/RadarScan": ("doppler_velocity", "amplitude"),
-    "View-of-Delft": ("v_r", "rcs"),
-    "TJ4DRadSet": ("v_r", "power"),
-}
-
-
 @pytest.mark.parametrize("name", CLOUDS)
 def test_fields_of_sensors(name):
-    for names in (CLOUDS[name], CLOUDS[name][::-1], [n.upper() for n in CLOUDS[name]]):
+    *roles, fields = CLOUDS[name]
+    for names in (fields.split(), fields.split()[::-1], fields.upper().split()):
         by_role = {role: field.lower() for role, field in Fields.of(names).names.items()}
-        assert (by_role["doppler"], by_role["intensity"]) == ROLES[name]
+        assert [by_role["doppler"], by_role["intensity"]] == roles
         assert ("sigma_range" in by_role) == (name in ("Oculii Eagle",) or name.startswith("ARS548"))
 
 
@@ -75,12 +62,11 @@ def test_overrides():
 
 def test_deviations():
     ones = np.ones(2)
-    names = CLOUDS["Oculii Eagle"]
+    names = CLOUDS["Oculii Eagle"][2].split()
     cloud = scan_of(Fields.of(names), dict.fromkeys(names, ones))
-    assert_allclose(
-        cloud.sigma, [[1, np.deg2rad(1), np.deg2rad(1)]] * 2, rtol=1e-6
-    )  # in degrees, like its angles
-    names = CLOUDS["ARS548, nebula"]
+    # In degrees, like its angles.
+    assert_allclose(cloud.sigma, [[1, np.deg2rad(1), np.deg2rad(1)]] * 2, rtol=1e-6)
+    names = CLOUDS["ARS548, nebula"][2].split()
     assert_array_equal(scan_of(Fields.of(names), dict.fromkeys(names, ones)).sigma, np.ones((2, 3)))
 
 
@@ -152,10 +138,8 @@ LEFT = np.array([[1, 1, 0]]) * 10 / np.sqrt(2)
             "scalar_Range scalar_Azimuth_Angle scalar_Elevation_Angle\n10 0.78539816339745 0",
             "rad by their values",
         ),
-        (
-            "range azimuth elevation\n10 0.78539816339745 0\n1 6.2 0.1",
-            "rad by their values",
-        ),  # from 0 to a turn
+        # From 0 to a turn.
+        ("range azimuth elevation\n10 0.78539816339745 0\n1 6.2 0.1", "rad by their values"),
     ],
 )
 def test_units_of_angles(text, said):

@@ -6,6 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from radarsdf.io import read
 from radarsdf.io.clouds import read_columns
 
+from ..conftest import pose
+
 START_S = 1706001766.0
 TURN_LEFT = np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # by 90 degrees about z, qx qy qz qw
 STRAIGHT = np.array([0, 0, 0, 1.0])
@@ -62,13 +64,6 @@ def stamp(time_s):
     return f"{START_S + time_s:.9f}.pcd"
 
 
-def pose(position, R_world_sensor):
-    T_world_sensor = np.eye(4)
-    T_world_sensor[:3, :3] = R_world_sensor
-    T_world_sensor[:3, 3] = position
-    return T_world_sensor
-
-
 @pytest.fixture
 def posed(tmp_path):
     """Three scans; the base moves 1 m along x and turns left by 90 degrees in 0.4 s."""
@@ -90,12 +85,7 @@ def test_posed_folder(posed):
     assert_array_equal(scans.points[1], [[7, 8, 9]])
     assert_array_equal(np.concatenate(scans.intensities), [70, 80, 90, 75.5])
     assert scans.ground_truth is None
-    c = np.sqrt(0.5)
-    expected = [
-        pose([10, 0, 1], np.eye(3)),
-        pose([10.5, 0, 1], [[c, -c, 0], [c, c, 0], [0, 0, 1]]),
-        pose([11, 0, 1], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
-    ]
+    expected = [pose([10, 0, 1]), pose([10.5, 0, 1], np.pi / 4), pose([11, 0, 1], np.pi / 2)]
     assert_allclose(scans.poses, expected, atol=2e-6)  # of 1.7e9 s, float64 resolves 0.2 microseconds
 
 
@@ -192,7 +182,7 @@ def test_notes_and_labels_next_to_scans_are_not_scans(tmp_path):
 def test_poses_with_numbers_belong_to_the_scans_of_these_numbers(tmp_path, width):
     for i in (1, 2, 5):
         (tmp_path / f"{i:010d}.csv").write_text("x,y,z\n5,0,0\n")
-    rows = {i: pose([i, 0, 0], np.eye(3)).ravel()[:width] for i in (1, 2, 4, 5, 6)}
+    rows = {i: pose([i, 0, 0]).ravel()[:width] for i in (1, 2, 4, 5, 6)}
     table = tmp_path / "k.txt"
     table.write_text("".join(f"{i} {' '.join(map(str, row))}\n" for i, row in rows.items()))
     assert read(tmp_path, table).poses[:, 0, 3].tolist() == [1, 2, 5]

@@ -48,16 +48,6 @@ def test_kitti_with_calibration(tmp_path):
         read_poses(path, Notes())
 
 
-@pytest.mark.parametrize("separator", [" ", ", ", ","])
-def test_tum(tmp_path, separator):
-    rows = [[10, 1, 2, 3, 0, 0, 0, 1], [10.2, 2, 2, 3, 0, 0, 1, 0]]
-    header = "timestamp,x,y,z,qx,qy,qz,qw\n" if "," in separator else "# time x y z\n"
-    (tmp_path / "a.tum").write_text(header + "\n".join(separator.join(map(str, row)) for row in rows))
-    trajectory = read_poses(tmp_path / "a.tum", Notes())
-    assert isinstance(trajectory, Trajectory)
-    assert_allclose(trajectory.pose_at(10.1, 0.5), pose([1.5, 2, 3], np.pi / 2), atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -133,9 +123,8 @@ def test_units_of_matrices(tmp_path):
     (tmp_path / "a.txt").write_text(
         "# t[min] east[mm] north[mm] up[mm] a b c d\n1 2000 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n"
     )
-    found = read_poses(
-        tmp_path / "a.txt", Notes()
-    )  # names without a role: the columns of TUM, in these units
+    # Names without a role: the columns of TUM, in these units.
+    found = read_poses(tmp_path / "a.txt", Notes())
     assert (found.times_s.tolist(), found.positions[0].tolist()) == ([60, 120], [2, 0, 0])
 
 
