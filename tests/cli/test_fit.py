@@ -1,8 +1,6 @@
 """``radarsdf fit`` and ``demo``: the map, the printed report, and failures to write."""
 
 import re
-import shutil
-import tempfile
 
 import numpy as np
 import pytest
@@ -83,23 +81,6 @@ def test_errors_of_a_fit_exit_with_one_line(scans_file, tmp_path, capsys, monkey
         ([scans_file, *out, "--report", "map.safetensors"], "same file"),
     ):
         assert named in refusal(capsys, tmp_path, "fit", *words)
-
-
-@pytest.fixture
-def broken_folder(tmp_path, monkeypatch):
-    """A folder that is removed after the fit, and the temporary folder."""
-    out, spare = tmp_path / "out", tmp_path / "spare"
-    out.mkdir()
-    spare.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(spare))
-    save = radarsdf.RadarMap.save
-
-    def remove_and_save(radar_map, path):
-        shutil.rmtree(out, ignore_errors=True)
-        save(radar_map, path)
-
-    monkeypatch.setattr(radarsdf.RadarMap, "save", remove_and_save)
-    return out, spare
 
 
 def test_the_map_of_an_interrupted_fit_is_written(scans_file, tmp_path, monkeypatch, capsys):

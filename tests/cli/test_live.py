@@ -5,8 +5,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import radarsdf
-from radarsdf.cli.live import Replay, _add_rates, _PeriodicView, replay
-from radarsdf.cli.results import Results
+from radarsdf.cli.live import Replay, _PeriodicView, replay
 from radarsdf.io.npz import write_scans
 from radarsdf.scans import Scans
 
@@ -72,16 +71,6 @@ def test_scans_are_replayed_in_time_and_dropped_if_late(monkeypatch, rate, integ
 
 def test_scans_without_poses_need_times(recording, capsys):
     assert "times" in refusal(capsys, recording, "live", recording / "scans.npz", "--find")
-
-
-def test_rates_are_scans_per_second(capsys):
-    _add_rates(Results(), Replay([0, 1, 2, 4], [], [0.01, 0.02, 0.03, 0.06], [3], []), 5)
-    assert capsys.readouterr().out.splitlines() == [
-        "4 of 5 scans in the map, 1 dropped, 0 lost",
-        "a scan took 25.0 ms (median), 59.1 ms (99th percentile), 60.0 ms (worst): 33 scans per second",
-    ]
-    with pytest.raises(ValueError, match="no scan was integrated"):
-        _add_rates(Results(), Replay(), 5)
 
 
 def test_the_page_shows_the_surface_periodically():

@@ -47,20 +47,6 @@ def test_a_report_of_a_map_and_scans(map_file, scans_file, tmp_path, capsys):
     assert "same file" in refusal(capsys, tmp_path, "report", map_file, scans_file, "-o", scans_file)
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--port", 70000], "port"),
-        (["--host", "192.0.2.1"], "--host"),
-        (["--box", 900, 900, 900, 901, 901, 901], "no surface"),
-        (["absent.npz"], "absent.npz"),
-    ],
-)
-def test_unusable_views_are_rejected(map_file, tmp_path, capsys, words, named):
-    pytest.importorskip("viser", reason="the extra view is not installed")
-    assert named in refusal(capsys, tmp_path, "view", map_file, *words, "--no-open", "--quiet")
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="sends the signal of Ctrl-C")
 def test_it_serves_until_ctrl_c(map_file, scans_file):
     pytest.importorskip("viser", reason="the extra view is not installed")
