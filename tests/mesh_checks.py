@@ -21,11 +21,6 @@ def torus(n):
     return np.hypot(np.hypot(x, y) - 0.6, z) - 0.25
 
 
-def gyroid(n):
-    x, y, z = (2 * np.pi * a for a in grid(n))
-    return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
-
-
 def noise(seed, shape=(14, 15, 40), dtype=np.float32):
     return np.random.default_rng(seed).normal(size=shape).astype(dtype)
 

@@ -83,9 +83,8 @@ def test_sums_over_the_returns_of_a_cell():
 
 def test_medians_of_blocks():
     rng = np.random.default_rng(0)
-    keys = np.unique(
-        keys_of(rng.integers(-40, 40, (60_000, 3)))
-    )  # several tasks, and blocks across their ends
+    # Several tasks, and blocks across their ends.
+    keys = np.unique(keys_of(rng.integers(-40, 40, (60_000, 3))))
     values, block = rng.integers(0, 9, len(keys)).astype(float), keys >> np.uint64(9)
     values[block == block[100]] = 0
     medians = block_medians(keys, values, 3, 1)
@@ -150,17 +149,6 @@ def test_principal_axes_equal_lapack():
     for num_threads in (1, 3):
         again = principal_axes(matrices, num_threads)
         assert all(x.tobytes() == y.tobytes() for x, y in zip(again, (values, vectors), strict=True))
-
-
-def test_axes_of_matrices_that_are_not_finite_are_nan():
-    matrices = np.stack([np.eye(3)] * 3)
-    matrices[1, 0, 2] = np.nan
-    values, vectors = principal_axes(matrices)
-    assert np.isnan(values[1]).all()
-    assert np.isnan(vectors[1]).all()
-    assert (values[[0, 2]] == 1).all()
-    with pytest.raises(ValueError, match="shape"):
-        principal_axes(np.zeros((2, 3)))
 
 
 LEAF_M = 0.2

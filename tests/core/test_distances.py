@@ -81,9 +81,8 @@ def system(table, points, normals, information):
 def test_iterations_converge_to_the_least_squares_solution():
     table, rough, *planes = scene(count=150, half_m=0.8)
     matrix, targets = system(table, *planes)
-    least = lstsq(matrix, targets, lapack_driver="gelsy")[
-        0
-    ]  # NumPy's takes singular values, ten times as long
+    # NumPy's takes singular values, ten times as long.
+    least = lstsq(matrix, targets, lapack_driver="gelsy")[0]
 
     def sum_of_squares(distances):
         return np.square(matrix @ distances - targets).sum()
@@ -290,19 +289,9 @@ def test_the_same_bits_for_any_number_of_threads():
     for num_threads in (2, 3, 8):
         again = table.average_rays(*rays, 0.6, num_threads=num_threads)
         assert (again[0].tobytes(), again[1].tobytes()) == (one.tobytes(), sides.tobytes())
-    backwards = [
-        np.ascontiguousarray(a[::-1]) for a in rays
-    ]  # another order of sums, and no ray lost between groups
+    # Another order of sums, and no ray lost between groups.
+    backwards = [np.ascontiguousarray(a[::-1]) for a in rays]
     np.testing.assert_allclose(table.average_rays(*backwards, 0.6)[0], one, atol=1e-5)
-
-
-@pytest.mark.parametrize("weight", [0.5, 2.25, -1, np.nan, np.inf])
-def test_weights_are_numbers_of_returns(weight):
-    rays = some_rays(20)
-    table = VertexTable(keys_along(rays[0], rays[1], 0.4), LEAF_M, 1, Encoding.OCTREE)
-    rays[3][7] = weight
-    with pytest.raises(ValueError, match="weights"):
-        table.average_rays(*rays, 0.6)
 
 
 def test_sides_need_many_rays_in_front_and_more_behind():
@@ -385,23 +374,6 @@ def test_cells_near_the_surface_have_corners_near_it_or_on_both_sides():
     unknown = np.isnan(distances_m[field.table.leaf_vertices()[1]]).any(axis=1)
     assert unknown.any()
     assert not unknown[field.table.cells_near_surface(distances_m, 0.0)].any()
-
-
-def test_a_surface_needs_corners_in_space_and_cells_that_exist():
-    field = grid_field([[0, 0, 0]])
-    flat = VertexTable(field.table.leaf_keys(), EDGE_M, 1, Encoding.TRI_QUADTREE)
-    none, limits = np.zeros(0, np.int32), ([0] * 3, [1] * 3)
-    with pytest.raises(ValueError, match="octree"):
-        flat.surface(np.zeros(flat.num_rows, np.float32), none, 2, 0.1, *limits)
-    with pytest.raises(ValueError, match="octree"):
-        flat.cells_near_surface(np.zeros(flat.num_rows, np.float32), 0.0)
-    with pytest.raises(ValueError, match="distances_m"):
-        field.table.surface(np.zeros(3, np.float32), none, 2, 0.1, *limits)
-    with pytest.raises(ValueError, match="parts"):
-        field.table.surface(field.corner_distances_m(), none, 0, 0.1, *limits)
-    for wrong in (-1, 1):
-        with pytest.raises(ValueError, match="cell"):
-            field.table.surface(field.corner_distances_m(), np.array([wrong], np.int32), 2, 0.1, *limits)
 
 
 def test_areas_at_vertices_are_thirds_of_the_triangles():

@@ -148,14 +148,3 @@ def test_extreme_logits_and_empty_batches_are_finite(rays, stage):
     found = made.gradients(CoreGradients, stage, optimiser="adam")
     assert set(found.losses.values()) == {0.0}
     assert not any(p.any() for p in found.by_parameters)
-
-
-def test_nan_propagates(rays):
-    made = make_batch(rays)
-    made.batch.sdf_m[3] = float("nan")
-    assert np.isnan(made.gradients(CoreGradients, "sdf").losses["sdf"])
-    made.batch.sdf_m[3] = 0
-    made.batch.of_ray[2, _core.RAY_RANGE] = float("nan")
-    losses = made.gradients(CoreGradients, "joint").losses
-    assert np.isnan(losses["intensity"])
-    assert np.isfinite(losses["sdf"])

@@ -15,7 +15,6 @@ from ..mesh_checks import (
     directed_edges,
     euler_characteristic,
     grid,
-    gyroid,
     has_single_cycle_links,
     noise,
     normals,
@@ -56,28 +55,6 @@ def test_closed_surfaces_have_the_exact_size_and_topology(field, exact_area, exa
     assert np.abs(distance).max() < h**2
 
 
-def test_gyroid_is_manifold_and_lies_on_the_surface():
-    n = 64
-    h = 2 / (n - 1)
-    vertices, faces = marching_cubes(gyroid(n), spacing=[h] * 3, origin=[-1] * 3)
-    border = vertices[single_edges(faces)]
-    assert (np.abs(border) == 1).any(axis=2).all()
-    assert has_single_cycle_links(faces, len(vertices)).all()
-    x, y, z = (2 * np.pi * vertices).T
-    value = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
-    assert np.abs(value).max() < 0.04
-    gradient = np.stack(
-        [
-            np.cos(x) * np.cos(y) - np.sin(z) * np.sin(x),
-            np.cos(y) * np.cos(z) - np.sin(x) * np.sin(y),
-            np.cos(z) * np.cos(x) - np.sin(y) * np.sin(z),
-        ],
-        axis=1,
-    )
-    towards_larger = (normals(vertices, faces) * gradient[faces].mean(axis=1)).sum(axis=1)
-    assert (towards_larger > 0).mean() > 0.999  # slivers next to samples may be tilted
-
-
 @pytest.mark.parametrize("pattern", range(256))
 def test_each_pattern_is_closed_in_any_neighbourhood(pattern):
     rng = np.random.default_rng(pattern)
@@ -112,43 +89,6 @@ def test_dense_and_sparse_equal_the_reference(volume, masked):
     assert same_mesh(dense, sparse)
 
 
-def test_holes_of_a_mask_are_the_only_borders():
-    volume = np.pad(noise(8, (12, 12, 36)), 1, constant_values=5)
-    mask = np.ones(volume.shape, dtype=bool)
-    mask[4:7, 5:8, 20:30] = False
-    mask[9, 3, 2] = False
-    for kwargs in ({"mask": mask}, {}):
-        field = volume if kwargs else np.where(mask, volume, np.nan)
-        vertices, faces = marching_cubes(field, **kwargs)
-        open_edges = single_edges(faces)
-        assert len(open_edges) > 50
-        assert on_border(vertices, open_edges, cells_in_use(volume, mask)).all()
-        assert np.unique(faces).size == len(vertices)
-        centres = np.floor(vertices[faces].mean(axis=1)).astype(int)
-        assert cells_in_use(volume, mask)[tuple(centres.T)].all()
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_infinite_samples_count_by_sign(dtype):
-    volume = np.where(sphere(20) > 0, np.inf, -np.inf).astype(dtype)
-    vertices, faces = marching_cubes(volume)
-    assert np.isfinite(vertices).all()
-    assert (np.sort(vertices % 1, axis=1) == (0, 0, 0.5)).all()
-    assert len(single_edges(faces)) == 0
-    one_sided, same_faces = marching_cubes(np.where(volume > 0, dtype(1), volume))
-    assert np.array_equal(faces, same_faces)
-    assert np.isfinite(one_sided).all()
-    far = np.abs(one_sided - np.rint(one_sided)).max(axis=1)
-    assert far == pytest.approx(1e-3)  # next to the finite sample
-
-
-@pytest.mark.parametrize(("value", "is_positive"), [(1.0, False), (np.nextafter(1.0, 2), True)])
-def test_only_samples_above_the_level_are_positive(value, is_positive):
-    volume = np.zeros((2, 2, 2))
-    volume[0, 0, 0] = value
-    assert (len(marching_cubes(volume, 1.0)[1]) == 1) == is_positive
-
-
 def test_float32_volumes_are_compared_with_the_level_in_float64():
     third = np.float32(0.1)  # larger than 0.1
     volume = np.zeros((2, 2, 2), dtype=np.float32)
@@ -156,16 +96,6 @@ def test_float32_volumes_are_compared_with_the_level_in_float64():
     assert len(marching_cubes(volume, 0.1)[1]) == 1
     assert len(marching_cubes(volume, float(third))[1]) == 0
     assert len(marching_cubes(-volume, -float(third))[1]) == 1
-
-
-@pytest.mark.parametrize(
-    "shape", [(0, 0, 0), (0, 5, 5), (5, 5, 0), (1, 1, 1), (1, 9, 9), (9, 1, 9), (9, 9, 1)]
-)
-def test_volumes_without_a_cell_give_an_empty_mesh(shape):
-    mask = np.ones(shape, dtype=bool)
-    for vertices, faces in (marching_cubes(np.zeros(shape)), marching_cubes(np.zeros(shape), mask=mask)):
-        assert vertices.shape == (0, 3)
-        assert faces.shape == (0, 3)
 
 
 def test_one_corner_of_one_cell():
@@ -223,12 +153,9 @@ def test_types_of_samples(dtype, kept):
     [
         ({"volume": np.zeros((3, 3))}, ValueError, "three axes"),
         ({"volume": np.zeros((3, 3, 3), dtype=complex)}, TypeError, "real"),
-        ({"volume": np.full((3, 3, 3), "a")}, TypeError, "real"),
         ({"level": np.nan}, ValueError, "level"),
-        ({"level": np.inf}, ValueError, "level"),
         ({"spacing": (1, 1)}, ValueError, "spacing"),
         ({"spacing": (1, 0, 1)}, ValueError, "spacing"),
-        ({"spacing": (1, np.inf, 1)}, ValueError, "spacing"),
         ({"origin": (0, np.nan, 0)}, ValueError, "origin"),
         ({"mask": np.ones((3, 3, 2), dtype=bool)}, ValueError, "mask"),
         ({"mask": np.ones((3, 3, 3))}, TypeError, "mask"),
@@ -283,21 +210,6 @@ def check(volume, level, mask=None):
 def test_worst_volumes_give_manifolds(volume, level, data):
     mask = data.draw(st.none() | hnp.arrays(np.bool_, volume.shape))
     check(volume, level, mask)
-
-
-@pytest.mark.parametrize(("field", "characteristic"), [(sphere, 2), (torus, 0)])
-@pytest.mark.parametrize(
-    "spacing", [(1, 1, 1), (1e-3, 1.0, 1e3), (1e-150, 1e-140, 1e-145), (1e100, 1e90, 1e95)]
-)
-def test_topology_of_any_spacing(field, characteristic, spacing):
-    n = 24
-    vertices, faces = marching_cubes(field(n).astype(np.float32), spacing=spacing)
-    assert euler_characteristic(vertices, faces) == characteristic
-    assert len(single_edges(faces)) == 0
-    assert has_single_cycle_links(faces, len(vertices)).all()
-    unit, same_faces = marching_cubes(field(n).astype(np.float32))
-    assert np.array_equal(faces, same_faces)
-    np.testing.assert_allclose(vertices / spacing, unit, rtol=1e-15)
 
 
 def test_positions_beyond_float64_are_rejected():
