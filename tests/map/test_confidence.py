@@ -1,10 +1,8 @@
 """The probability of a mapped surface: from information, hits, visibility counts, and statistics of all returns."""
 
-import copy
 import dataclasses
 import itertools
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -122,18 +120,6 @@ def test_usual_information_is_that_of_most_returns_nearby():
         near = information[(np.abs(pairs - pairs[i]) <= 1).all(axis=1)].astype(np.float64)
         assert found[i] == pytest.approx((near**2).sum() / near.sum(), rel=1e-5)
     assert len(usual_information(information[:0], keys[:0])) == 0
-
-
-def test_evidence_is_prepared_once_for_a_map(radar_map, monkeypatch):
-    calls, columns = [], Evidence.columns
-    monkeypatch.setattr(Evidence, "columns", lambda *given: calls.append(0) or columns(*given))
-    x = radar_map.origin + np.random.default_rng(0).uniform(-10, 10, (100, 3))
-    for copied in (pickle.loads(pickle.dumps(radar_map)), copy.deepcopy(radar_map)):
-        calls.clear()
-        for name in ("confidence", "uncertainty", "confidence"):
-            np.testing.assert_array_equal(getattr(copied, name)(x), getattr(radar_map, name)(x))
-            np.testing.assert_array_equal(getattr(copied, name)(x[:3]), getattr(copied, name)(x)[:3])
-        assert len(calls) <= 2  # of the copy, and of the map
 
 
 def test_places_have_the_evidence_of_their_cells(radar_map):

@@ -1,12 +1,12 @@
 """Meshes of the plane z = 0 and the wall x = 20: position, orientation and extent."""
 
+import dataclasses
 import functools
 
 import numpy as np
 import pytest
 import radarsdf
 from radarsdf.map.colors import intensity_colors
-from radarsdf.map.contents import MapContents
 from radarsdf.map.marching_cubes import mesh_components
 from radarsdf.map.mesh import _corner_distances, crossed
 from radarsdf.map.radar_map import RadarMap
@@ -21,19 +21,7 @@ LEAF_M = 0.2
 
 
 def moved(radar_map, origin):
-    return RadarMap(
-        MapContents(
-            field=radar_map.field,
-            origin=radar_map.origin + np.asarray(origin),
-            intensity_scale=radar_map.intensity_scale,
-            config=radar_map.config,
-            evidence=radar_map.evidence,
-            clutter_ratio=radar_map.clutter_ratio,
-            returns_per_cell=radar_map._contents.returns_per_cell,
-            sensor=radar_map.sensor,
-            report={},
-        )
-    )
+    return RadarMap(dataclasses.replace(radar_map._contents, origin=radar_map.origin + np.asarray(origin)))
 
 
 @pytest.fixture(scope="module")
@@ -198,8 +186,8 @@ def test_vertices_carry_the_confidence_of_their_place(sharp_map, mesh, tmp_path)
         *(("voxel_size", size) for size in (0, np.nan, 1e13)),
         *(("box", box) for box in ([[0, 0, 0]], [[1, 0, 0], [0, 1, 1]], [[0, 0, 0], [1e13] * 3])),
         *(("viewpoint", place) for place in ([1, 2], [np.nan, 0, 0], [1e13, 0, 0])),
-        *(("min_confidence", limit) for limit in (-0.1, 1.1, np.nan)),
-        *(("max_uncertainty", limit) for limit in (-0.1, np.nan)),
+        *(("min_confidence", limit) for limit in (-0.001, 1.001, np.nan)),
+        *(("max_uncertainty", limit) for limit in (-0.001, np.nan)),
         ("min_component_triangles", -1),
     ],
 )

@@ -1,14 +1,10 @@
 """Queries of a map: array types, chunks and threads."""
 
-import threading
-import weakref
-
 import numpy as np
 import pytest
 import radarsdf
 import torch
 from radarsdf.field.neural_field import NeuralField
-from radarsdf.map.contents import Deferred
 
 SENSOR = np.array([0.5, 0.0, 1.5])
 
@@ -37,21 +33,6 @@ def queries(radar_map):
 @pytest.fixture(params=["sdf", "gradient", "observed", "intensity"])
 def query(request, sharp_map):
     return request.param, queries(sharp_map)[request.param]
-
-
-def test_results_have_the_array_type_of_the_arguments(query):
-    name, function = query
-    x = near_surface(50)
-    shape = (50, 3) if name == "gradient" else (50,)
-    for dtype, torch_dtype in ((np.float32, torch.float32), (np.float64, torch.float64)):
-        array, tensor = function(x.astype(dtype)), function(torch.from_numpy(x.astype(dtype)))
-        assert type(array) is np.ndarray
-        assert type(tensor) is torch.Tensor
-        assert array.shape == tuple(tensor.shape) == shape
-        assert array.dtype == (np.bool_ if name == "observed" else dtype)
-        assert tensor.dtype == (torch.bool if name == "observed" else torch_dtype)
-        np.testing.assert_array_equal(array, tensor.numpy())
-        assert not tensor.requires_grad
 
 
 def test_sensor_positions_broadcast(sharp_map):
@@ -99,29 +80,6 @@ def test_a_nan_point_does_not_affect_others(query):
         assert np.isnan(answer[4]).any()
 
 
-def test_concurrent_queries_equal_sequential_ones(sharp_map):
-    sizes = [10, 9_000, 500, 20_000]
-    inputs = [near_surface(size, seed) for seed, size in enumerate(sizes)]
-    expected = [{name: f(x) for name, f in queries(sharp_map).items()} for x in inputs]
-    failures = []
-    start = threading.Barrier(len(inputs))
-
-    def work(i):
-        start.wait()
-        for _ in range(4):
-            for name, function in queries(sharp_map).items():
-                answer = function(inputs[i])
-                if not np.allclose(answer, expected[i][name], atol=2e-4, equal_nan=True):
-                    failures.append((i, name))
-
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(inputs))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not failures
-
-
 @pytest.mark.parametrize("extrapolate", [False, True])
 def test_distances_and_gradients_in_one_call(sharp_map, extrapolate):
     x = np.concatenate([near_surface(9_000), [[np.nan, 0, 0], [1e12, 0, 0]]])
@@ -161,20 +119,3 @@ def test_repr_has_the_size_of_map_and_file(scene, sharp_map, tmp_path):
     assert 0 < names < 5000  # with checksums of all arrays
     config = radarsdf.FitConfig(training={"sdf_iterations": 1, "batch_size": 64})
     assert repr(radarsdf.fit(scene.points, scene.poses, config=config)).startswith("RadarMap(surface, ")
-
-
-def test_a_deferred_part_is_computed_once_and_then_lets_go_of_its_input():
-    class Rays:
-        computed = 0
-
-        def part(self):
-            Rays.computed += 1
-            return Rays.computed
-
-    rays = Rays()
-    alive, part = weakref.ref(rays), Deferred(rays.part)
-    del rays
-    assert Rays.computed == 0
-    assert alive() is not None
-    assert [part(), part()] == [1, 1]
-    assert alive() is None

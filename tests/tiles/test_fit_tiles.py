@@ -12,27 +12,11 @@ import radarsdf
 from radarsdf import FitConfig
 from radarsdf.io import Scan
 from radarsdf.io.files import take_lock
-from radarsdf.map import storage
 from radarsdf.tiles.fit_tiles import plan_tiles, run_fits
 from radarsdf.tiles.plan import Plan, map_path
 
+from .cluster import bits_of
 from .conftest import CONFIG, TILE_M
-
-
-def maps_of(folder):
-    """All tensors of all tiles."""
-    plan = Plan.load(folder)
-    return {
-        tile.name: storage.parts_of(storage.load_contents(map_path(folder, tile)))[0] for tile in plan.tiles
-    }
-
-
-def assert_same_bits(one, two):
-    assert one.keys() == two.keys()
-    for name in one:
-        assert one[name].keys() == two[name].keys()
-        for part, tensor in one[name].items():
-            assert tensor.equal(two[name][part]), (name, part)
 
 
 def tiles_of(drive, out, **arguments):
@@ -80,9 +64,8 @@ def test_trained_tiles(drive, tmp_path):
     assert city.missing == {}
     points = np.concatenate([scan.world_points for scan in some])
     points = points[whole.observed(points) & city.observed(points)]
-    assert (
-        np.median(np.abs(city.sdf(points) - whole.sdf(points))) < 0.05
-    )  # of different networks after few iterations
+    # Of different networks after few iterations.
+    assert np.median(np.abs(city.sdf(points) - whole.sdf(points))) < 0.05
 
 
 def test_resuming_keeps_finished_tiles_and_changes_no_bit(drive, folder, tmp_path):
@@ -96,7 +79,7 @@ def test_resuming_keeps_finished_tiles_and_changes_no_bit(drive, folder, tmp_pat
     city = tiles_of(drive, again)
     assert city.missing == {}
     assert {tile.name: map_path(again, tile).stat().st_mtime_ns for tile in plan.tiles[2:]} == others
-    assert_same_bits(maps_of(folder), maps_of(again))
+    assert bits_of(folder) == bits_of(again)
 
 
 def test_a_failed_tile_is_named_and_the_others_continue(drive, tmp_path):
@@ -128,7 +111,7 @@ def test_a_killed_worker_loses_only_its_tile(drive, folder, tmp_path):
     city = tiles_of(drive, tmp_path / "city", executor=Broken())
     assert city.missing == {"0_0": "killed"}
     assert tiles_of(drive, tmp_path / "city").missing == {}
-    assert_same_bits(maps_of(folder), maps_of(tmp_path / "city"))
+    assert bits_of(folder) == bits_of(tmp_path / "city")
 
 
 def test_another_plan_is_rejected(drive, folder):
@@ -144,10 +127,8 @@ def test_another_plan_is_rejected(drive, folder):
 
 
 def test_one_process_at_a_time_plans_a_folder(drive, folder, tmp_path):
-    out, lock = (
-        tmp_path / "city",
-        take_lock(folder / "plan.lock", "planned"),
-    )  # a folder with a plan is unlocked
+    # A folder with a plan is unlocked.
+    out, lock = (tmp_path / "city", take_lock(folder / "plan.lock", "planned"))
     os.close(lock)
     out.mkdir()
     lock = take_lock(out / "plan.lock", "planned")

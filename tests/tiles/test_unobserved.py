@@ -55,6 +55,7 @@ def test_unobserved_places_are_nan(any_map, kind, dtype):
     found = answers(any_map, kind(NOWHERE.astype(dtype)))
     for name, answer in found.items():
         assert isinstance(answer, type(kind(NOWHERE)))
+        assert not getattr(answer, "requires_grad", False)
         values = np.asarray(answer)
         assert values.dtype == (np.bool_ if name == "observed" else dtype)
         assert len(values) == len(NOWHERE)
