@@ -19,6 +19,7 @@ from radarsdf.evaluation import (
 from radarsdf.poses.rigid import moved
 from radarsdf.simulate import drifted
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from ..poses.drift import trajectory
 
@@ -125,12 +126,6 @@ def test_f_score_ignores_outliers_and_f_score_all_counts_them():
     assert m["f_score_all"] == pytest.approx(2 * 0.25 / 1.25, abs=0.01)
 
 
-def test_the_same_arguments_give_the_same_numbers():
-    truth = bumpy().vertices + 0.1
-    one, again = (surface_metrics(bumpy(), truth, samples=20_000) for _ in range(2))
-    assert one == again
-
-
 @pytest.mark.parametrize("flip", [False, True], ids=["wound", "some triangles flipped"])
 def test_angles_of_a_cube(flip):
     cube = trimesh.creation.box((1.0, 1.0, 1.0))
@@ -164,7 +159,6 @@ def test_angles_without_a_distribution_are_none_not_nan():
     [
         (trimesh.Trimesh(), grid(step=1.0), {}, "no surface"),
         (plane(), np.zeros((0, 3)), {}, "no ground-truth points"),
-        (plane(), grid(step=1.0), {"box": [[9, 9, 9], [10, 10, 10]]}, "points in the box"),
         (plane(9.0), grid(step=1.0), {"box": [[0, 0, -1], [4, 4, 1]]}, "no surface in the box"),
         (plane(), grid(step=1.0)[:, :2], {}, r"ground_truth must be \(N, 3\)"),
         (plane(), np.full((3, 3), np.nan), {}, "finite"),
@@ -293,6 +287,20 @@ def test_long_trajectories_have_kitti_segments():
     assert ratio == pytest.approx(counts @ angles / counts.sum(), rel=0.01)
 
 
+def test_errors_of_a_drift_are_root_mean_squares():
+    true = trajectory(200)
+    found = drifted(true, 0.03, 0.004, 7)
+    metrics = trajectory_metrics(found, true, align="none")
+    apart, steps = np.linalg.inv(true) @ found, [np.linalg.inv(p[:-1]) @ p[1:] for p in (true, found)]
+    for name, errors in (("absolute", apart), ("step", np.linalg.inv(steps[0]) @ steps[1])):
+        angles = Rotation.from_matrix(errors[:, :3, :3]).magnitude()
+        assert metrics[f"{name}_m"] == pytest.approx(np.sqrt((errors[:, :3, 3] ** 2).sum(axis=1).mean()))
+        assert metrics[f"{name}_rad"] == pytest.approx(np.sqrt((angles**2).mean()))
+    brought = trajectory_metrics(WHOLE @ found, true)["absolute_m"]
+    assert brought == pytest.approx(trajectory_metrics(found, true)["absolute_m"])
+    assert brought < metrics["absolute_m"]
+
+
 def test_one_pose_has_no_steps():
     metrics = trajectory_metrics(np.eye(4)[None], np.eye(4)[None])
     assert (metrics["step_m"], metrics["relative_ratio"], metrics["length_m"]) == (0, None, 0)
@@ -304,30 +312,6 @@ def test_wrong_arguments_are_refused():
         trajectory_metrics(poses, poses, align="scale")
     with pytest.raises(ValueError, match="poses"):
         trajectory_metrics(poses[:3], poses)
-
-
-def test_errors_equal_those_of_evo():
-    metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed: pip install evo")
-    PoseTrajectory3D = pytest.importorskip("evo.core.trajectory").PoseTrajectory3D
-    true = trajectory(200)
-    found = WHOLE @ drifted(true, 0.03, 0.004, 7)
-    stamps = np.arange(200.0)
-    reference = PoseTrajectory3D(poses_se3=list(true), timestamps=stamps)
-    raw, brought = (PoseTrajectory3D(poses_se3=list(found), timestamps=stamps) for _ in range(2))
-    brought.align(reference)
-    ours = trajectory_metrics(found, true)
-
-    def of_evo(metric, estimate):
-        metric.process_data((reference, estimate))
-        return metric.get_statistic(metrics.StatisticsType.rmse)
-
-    relations = (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad)
-    for relation, absolute, step in zip(
-        relations, ("absolute_m", "absolute_rad"), ("step_m", "step_rad"), strict=True
-    ):
-        assert ours[absolute] == pytest.approx(of_evo(metrics.APE(relation), brought), rel=1e-6)
-        rpe = metrics.RPE(relation, delta=1, delta_unit=metrics.Unit.frames)
-        assert ours[step] == pytest.approx(of_evo(rpe, raw), rel=1e-6)
 
 
 def drawn(count=100_000, seed=0):
@@ -405,11 +389,9 @@ def test_bins_of_few_points_are_ignored_by_the_maximum_gap():
     [
         (uncertainty_metrics, (np.zeros(30), np.ones(31)), "uncertainty_m"),
         (uncertainty_metrics, (np.zeros(30), -np.ones(30)), "uncertainty_m"),
-        (uncertainty_metrics, (np.full(30, -np.inf), np.ones(30)), "error_m"),
         (uncertainty_metrics, (np.full(30, np.nan), np.ones(30)), "0 points are too few"),
         (confidence_metrics, ([0.5], [True, False]), "is_true"),
         (confidence_metrics, ([1.5], [True]), "confidence"),
-        (confidence_metrics, ([0.5], [np.nan]), "is_true"),
         (confidence_metrics, ([np.nan], [True]), "confidence"),
     ],
 )
