@@ -15,10 +15,8 @@ from radarsdf.render import picture
 
 from .poses.drift import first, thinned
 
-_SCANS = {
-    "hugin": (12, 2),
-    "oculii": (84, 4),
-}  # and every second return; enough to determine the axes of an IMU
+# Number of scans, and the step between kept returns: enough to determine the axes of an IMU.
+_SCANS = {"hugin": (12, 2), "oculii": (84, 4)}
 
 
 def shorten(set_attribute: Callable[[Any, str, Any], None]) -> None:

@@ -18,29 +18,6 @@ def refuses(function, *arguments, kind=ValueError):
     return True
 
 
-@pytest.mark.parametrize(
-    ("function", "good", "bad"),
-    [(checks.positive, [5e-324, 3], [0, -1, np.inf, np.nan]),
-     (checks.not_negative, [0, 0.0, 7], [-5e-324, np.inf, np.nan]),
-     (checks.number, [-np.inf, 0, np.inf], [np.nan])],
-)  # fmt: skip
-def test_numbers(function, good, bad):
-    assert [function(value, "name") for value in good] == good
-    assert all(refuses(function, value, "name") for value in bad)
-    assert refuses(function, [1.0], "name")
-
-
-def test_whole_numbers_and_flags():
-    assert [checks.whole_number(value, "name", 1, 3) for value in (1, np.int32(3))] == [1, 3]
-    assert all(refuses(checks.whole_number, value, "name", 1, 3) for value in (0, 4))
-    assert checks.whole_number(2**63 - 1, "name", 0) == 2**63 - 1
-    assert refuses(checks.whole_number, 2**63, "name", 0)
-    assert all(refuses(checks.whole_number, v, "name", 0, kind=TypeError) for v in (True, np.True_, 1.0))
-    assert checks.flag(np.False_, "name") is False
-    assert refuses(checks.flag, 1, "name", kind=TypeError)
-    assert [checks.hides_bar(value) for value in (None, True, False)] == [None, False, True]
-
-
 def test_positions_and_boxes():
     np.testing.assert_array_equal(checks.positions([[1e12, -1e12, 0]], "name"), [[1e12, -1e12, 0]])
     for wrong in ([[FAR, 0, 0]], [[0, -FAR, 0]], [[0, np.nan, 0]], [[0, 0]], [0, 0, 0]):

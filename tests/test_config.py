@@ -17,7 +17,6 @@ from radarsdf.config.fit_config import flat_settings
 from radarsdf.lattice import WorldLattice
 from radarsdf.settings import first_wrong
 
-GROUPS = ("returns", "encoding", "networks", "training")
 TINY, LARGE = sys.float_info.min, 1e300
 MAX_COUNT, MAX_SAMPLES, MAX_WIDTH = 2**31 - 1, 2**24, 4096
 
@@ -157,27 +156,6 @@ def test_messages(values, message):
         with pytest.raises(ValidationError) as caught:
             make(**values)
         assert first_wrong(caught.value) == message
-
-
-@pytest.mark.parametrize("values", [[1], None, "seed", [("seed", 1)], {1: 2}, {None: {}}, {("seed",): 1}])
-def test_mappings_must_have_string_keys(values):
-    with pytest.raises(ValueError, match="the settings must be a mapping of names"):
-        FitConfig.from_dict(values)
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_groups_are_groups(group):
-    other = FitConfig().encoding if group != "encoding" else FitConfig().training
-    for value in (None, 1, "a", [], other, FitConfig()):
-        with pytest.raises(ValueError, match=group):
-            FitConfig(**{group: value})
-    assert FitConfig(**{group: {}}) == FitConfig()
-    assert FitConfig(**{group: getattr(FitConfig(), group)}) == FitConfig()
-
-
-def test_settings_are_keyword_arguments():
-    with pytest.raises(ValidationError):
-        FitConfig(0.2)
 
 
 def test_override_changes_only_the_named_settings():
