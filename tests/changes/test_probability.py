@@ -62,9 +62,8 @@ def test_free_space_crossings_are_beta_binomial():
         hits, passes = other.hits[i] / 2, other.passes[i] / 2  # of scans: in two cells each
         same = evidence(hits, passes, beta(own.hits[i] / 2 + 0.5, own.passes[i] / 2 + 0.5))
         expected = np.log(evidence(hits, passes, beta(0.5, 0.5)) / same)
-        assert found == pytest.approx(
-            min(expected, 0) if i == 2 else expected, abs=1e-3
-        )  # more hits: no change
+        # More hits: no change.
+        assert found == pytest.approx(min(expected, 0) if i == 2 else expected, abs=1e-3)
 
 
 def evidence(distance_m, normals=None, confidence=1.0):

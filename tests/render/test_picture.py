@@ -133,18 +133,6 @@ def test_without_matplotlib_the_error_names_what_to_install(tmp_path, monkeypatc
         save_picture(tmp_path / "map.png", square((0.0, 0.0, 0.0)))
 
 
-def test_inputs_that_cannot_be_drawn_are_rejected():
-    mesh = square((0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="no triangles"):
-        render(trimesh.Trimesh())
-    with pytest.raises(ValueError, match="colors must be"):
-        render(mesh, np.zeros((3, 3), np.uint8))
-    with pytest.raises(ValueError, match="viewpoint"):
-        render(mesh, viewpoint=(0.0, 0.0))
-    with pytest.raises(ValueError, match="one value per vertex"):
-        save_picture("unused.png", mesh, scalar=[1.0])
-
-
 def test_the_last_trajectory_places_the_returns(tmp_path):
     pytest.importorskip("matplotlib", reason="the extra plot is not installed")
     from matplotlib.image import imread  # noqa: PLC0415

@@ -43,11 +43,6 @@ def test_volumetric_points_are_thinned_to_the_nearest_to_each_cube_mean():
     assert len(np.unique(cells, axis=0)) == len(rows)
 
 
-def test_a_map_without_a_surface_here(sharp_map):
-    with pytest.raises(ValueError, match="no surface here"):
-        ShownSurface.of(sharp_map, 0.2, max_vertices=1000, box=[[90, 90, 90], [91, 91, 91]], progress=False)
-
-
 def test_a_vertex_without_uncertainty_is_shown_unless_the_uncertainty_is_limited():
     uncertainty_m = np.array([0.1, np.nan, 0.3], np.float32)
     confidence = np.array([0.2, 0.5, 0.9], np.float32)

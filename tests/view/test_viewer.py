@@ -188,9 +188,8 @@ def status_of(viewer, *headers):
 def test_requests_of_other_pages_are_rejected(viewer):
     host = f"Host: localhost:{viewer.port}"
     assert status_of(viewer, host) == 200
-    assert (
-        status_of(viewer, f"Host: evil.example:{viewer.port}") == 403
-    )  # a name that resolves to this machine
+    # A name that resolves to this machine.
+    assert status_of(viewer, f"Host: evil.example:{viewer.port}") == 403
     assert status_of(viewer, host, "Origin: http://evil.example") == 403
     upgrade = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
                "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==")  # fmt: skip
