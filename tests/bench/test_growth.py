@@ -11,7 +11,6 @@ from bench.changes import Change, areas, recalls
 from bench.growth.fits import map_errors
 from bench.growth.street import street
 from bench.instructions import by_object, faults
-from bench.speed import packages_of
 
 
 @pytest.mark.parametrize(
@@ -102,11 +101,3 @@ def test_counts_above_the_limit_are_named():
         *expected,
         "a step depends on the number of returns",
     ]
-
-
-def test_a_checkout_without_a_core_is_rejected(tmp_path):
-    with pytest.raises(ValueError, match="neither a wheel nor a checkout"):
-        packages_of(tmp_path, tmp_path / "out")
-    (tmp_path / "python" / "radarsdf").mkdir(parents=True)
-    (tmp_path / "python" / "radarsdf" / "_core.so").touch()
-    assert packages_of(tmp_path, tmp_path / "out") == tmp_path / "python"

@@ -162,9 +162,8 @@ def test_calibration_has_all_parts(tmp_path):
 
 
 def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
-    few = {
-        "training": {"sdf_iterations": 3, "intensity_iterations": 3, "batch_size": 512}
-    }  # enough to differ
+    # Enough to differ.
+    few = {"training": {"sdf_iterations": 3, "intensity_iterations": 3, "batch_size": 512}}
     monkeypatch.setattr("scenes.scene.QUICK", few)
     neighbours, *ours = run(tmp_path, "intensity", "wall", "--base", "default", "--repetitions", "2")[1][
         "rows"
@@ -175,9 +174,8 @@ def test_intensity_ablation_views_and_poses(tmp_path, monkeypatch):
     rows = run(tmp_path, "ablation", "wall", "--repetitions", "1")[1]["rows"]
     assert len({row["mae"] for row in rows}) == len(rows) == 4  # each variant really changes the fit
     table, values = run(tmp_path, "views", "wall", "--base", "default", "--frames", "8")
-    assert (
-        len(values["rows"]) == 8
-    )  # with and without direction, measured and noiseless, at the reflector and elsewhere
+    # With and without direction, measured and noiseless, at the reflector and elsewhere.
+    assert len(values["rows"]) == 8
     assert "### wall, at the reflector" in table
     rows = run(tmp_path, "poses", "wall", "--repetitions", "1", "--frames", "6", "--samples", "3e3")[1][
         "rows"

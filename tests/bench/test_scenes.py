@@ -38,13 +38,6 @@ def test_every_nth_subsamples_the_simulation(wall):
     assert_array_equal(third.simulation.noiseless_intensities[1], wall.simulation.noiseless_intensities[3])
 
 
-@pytest.mark.parametrize("spec", ["hugo", "scans.csv", "absent.npz"])
-def test_paths_that_are_no_scenes_are_rejected(spec, tmp_path):
-    (tmp_path / "scans.csv").touch()
-    with pytest.raises(ValueError, match=r"hugin.*\.npz"):
-        load_scene(spec if spec == "hugo" else str(tmp_path / spec))
-
-
 def scans_with_lidar(frames):
     """Each scan has points 2 m, 10 m and 70 m ahead; lidar points are near them and elsewhere."""
     poses = np.tile(np.eye(4), (frames, 1, 1))

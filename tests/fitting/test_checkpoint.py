@@ -174,12 +174,6 @@ class TestOtherFiles:
         self.rewrite(path, version="9.9.9")
         self.refused(scene, path, "was written by radarsdf '9.9.9'")
 
-    @pytest.mark.parametrize("cut", [9, 0.3, 0.9, 0.999])
-    def test_cut_short(self, scene, path, cut):
-        data = path.read_bytes()
-        path.write_bytes(data[: cut if isinstance(cut, int) else int(cut * len(data))])
-        self.refused(scene, path, "is not a")
-
     @staticmethod
     def rewrite(path, tensors=None, **identity):
         with open_tensors(path) as file:

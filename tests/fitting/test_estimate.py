@@ -2,7 +2,6 @@
 
 import sys
 
-import numpy as np
 import pytest
 import radarsdf
 from radarsdf import FitConfig
@@ -67,14 +66,6 @@ def test_the_quick_bound_is_an_upper_bound(scene):
         estimate.check_fit(rays, config.override(max_memory_bytes=enough))
         with pytest.raises(MemoryError):
             estimate.check_fit(rays, config.override(max_memory_bytes=enough - 1))
-
-
-def test_input_rejected_by_fit_is_rejected_by_estimate(scene):
-    for function in (radarsdf.fit, radarsdf.estimate):
-        with pytest.raises(ValueError, match="are not within a million cells"):
-            function(scene.points, scene.poses, scene.intensities, config=FitConfig(leaf_size_m=1e-9))
-        with pytest.raises(ValueError, match="no scans"):
-            function([], np.zeros((0, 4, 4)))
 
 
 def test_a_dry_run_prints_and_writes_nothing(scene, tmp_path, capsys, monkeypatch):

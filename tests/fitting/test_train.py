@@ -1,7 +1,5 @@
 """Losses of a training: their history, detection of divergence, and the partition of batches."""
 
-import math
-
 import numpy as np
 import pytest
 import radarsdf
@@ -9,7 +7,7 @@ import torch
 from radarsdf import FitConfig
 from radarsdf.fitting import schedule as fitting_schedule
 from radarsdf.fitting import train
-from radarsdf.fitting.gradients import AutogradGradients, CoreGradients, sdf_loss
+from radarsdf.fitting.gradients import CoreGradients, sdf_loss
 from radarsdf.fitting.sampling import RaySampler
 from radarsdf.fitting.schedule import Schedule
 from radarsdf.fitting.train import LossHistory
@@ -89,40 +87,6 @@ def test_excessive_finite_predictions_are_a_divergence(rate):
 
 def test_the_default_reconstructs_the_walls():
     assert min(free_and_solid(fitted(CASES["default"], 200)[0])) > 0.9
-
-
-STAGES = {  # one iteration: a step of Adam amplifies rounding errors
-    "joint": {},
-    "joint in free space": {"intensity_in_free_space": True},
-}
-
-
-@pytest.mark.parametrize("autograd", [False, True])
-@pytest.mark.parametrize("batch_size", [1, 5])
-@pytest.mark.parametrize("stage", STAGES)
-def test_the_loss_of_a_small_batch_does_not_depend_on_the_threads(
-    scene, monkeypatch, autograd, batch_size, stage
-):
-    """With parts of different sizes, or empty ones, the loss is the mean over the whole batch."""
-    if autograd:
-        monkeypatch.setattr(train, "CoreGradients", AutogradGradients)
-    optimiser = {"optimiser": "adam" if autograd else "soap"}  # autograd moves all features
-    sizes = {"batch_size": batch_size, "intensity_batch_size": batch_size}
-    iterations = {"sdf_iterations": 1, "intensity_iterations": 1}
-    few = [values[:2] for values in (scene.points, scene.poses, scene.intensities)]
-    found = []
-    for threads in (1, 3, 16):
-        config = FitConfig(
-            num_threads=threads,
-            returns={"drop_ghosts": False, "onto_planes": False},
-            training=sizes | iterations | optimiser | STAGES[stage],
-        )
-        report = radarsdf.fit(*few, config=config, progress=False).report
-        assert report["iterations_done"] == report["iterations"]
-        found.append(report["losses"])
-    assert all(math.isfinite(value) for one in found for value in one.values())
-    for one in found[1:]:
-        assert one == pytest.approx(found[0], rel=1e-5)
 
 
 def test_joint_iterations_are_spread_over_the_sdf_stage(scene, monkeypatch):

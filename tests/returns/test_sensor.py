@@ -80,9 +80,7 @@ def test_numbers_at_their_limits_and_beyond_the_thresholds():
     ("change", "said"),
     [
         ({"azimuth_rad": (0.5, 0.5)}, "azimuth_rad"),
-        ({"azimuth_rad": (-4.0, 0.5)}, "azimuth_rad"),
         ({"elevation_rad": 0.5}, "two numbers"),
-        ({"range_m": (-1.0, 5.0)}, "range_m"),
         ({"range_m": (1.0, np.nan)}, "range_m"),
         ({"returns_per_scan": 0}, "returns_per_scan"),
         ({"returns_per_scan": 10_000_001}, "returns_per_scan"),

@@ -99,15 +99,12 @@ def test_crossings_of_one_surfel():
     assert crossed(one_surfel(reach_m=0.1), sensor, [11.0, 0.3, 0.2]) == [0]  # 0.09 m off its centre
     assert crossed(one_surfel(reach_m=0.1), sensor, [11.0, 0.2, 0.33]) == [-1]  # 0.12 m off
     assert crossed(one_surfel([1, 0, 0]), sensor, [11.0, 0.2, 0.2]) == [-1]  # comes from behind
-    assert crossed(one_surfel(thickness_m=0.5), sensor, [11.0, 0.2, 0.2]) == [
-        -1
-    ]  # within two of its deviations
-    assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.5, 0.0)) == [
-        -1
-    ]  # within two of the sensor's
-    assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.0, 0.5)) == [
-        0
-    ]  # across the beam: no depth
+    # Within two of its deviations.
+    assert crossed(one_surfel(thickness_m=0.5), sensor, [11.0, 0.2, 0.2]) == [-1]
+    # Within two of the sensor's.
+    assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.5, 0.0)) == [-1]
+    # Across the beam: no depth.
+    assert crossed(one_surfel(), sensor, [11.0, 0.2, 0.2], noise=(0.0, 0.5)) == [0]
 
 
 def test_crossings_beyond_long_empty_ways():

@@ -176,9 +176,8 @@ def test_doppler_and_rates_have_the_documented_noise():
     noise = np.concatenate(motion.doppler_mps) - np.concatenate(speeds)
     assert np.median(np.abs(noise)) / 0.6745 == pytest.approx(0.1, rel=0.2)
     moving = np.abs(noise) > 0.5
-    assert moving.mean() == pytest.approx(
-        0.1 * 0.92, rel=0.05
-    )  # 8 % of a normal variable are within 0.1 deviations
+    # 8 % of a normal variable are within 0.1 deviations.
+    assert moving.mean() == pytest.approx(0.1 * 0.92, rel=0.05)
     assert np.sqrt(np.mean(noise[moving] ** 2)) == pytest.approx(5.2, rel=0.05)
     np.testing.assert_allclose(sim.measured_motion(drive).times_s, 0.1 * np.arange(len(times_s)))
     folded = np.concatenate(sim.measured_motion(drive, rate_hz=5.0, interval_mps=3.0).doppler_mps)

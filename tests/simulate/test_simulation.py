@@ -286,15 +286,10 @@ def test_ghosts_lie_behind_the_mirror_at_the_length_of_the_path():
 
 
 def test_reflector_lobe_in_the_wall_scene():
-    """On its axis the reflector is much stronger than the wall; 70 degrees off, its lobe has no effect."""
-    scene = sim.wall(seed=0, frames=1)
-    reflector = scene.scene.solids[-1]
-    sensor = replace(scene.sensor, threshold_db=0.0, saturation_db=300.0, beams=40_000, azimuth_fov_rad=0.3,
-                     elevation_fov_rad=0.3)  # fmt: skip
+    reflector = sim.wall(seed=0, frames=1).scene.solids[-1]
     axis = np.array([[1.0, 0, 0]])
-    turned = np.array(
-        [[np.cos(0.28), np.sin(0.28), 0.0]]
-    )  # one deviation of the lobe, which has 4.34 / 2 dB less there
+    # One deviation of the lobe, which has 4.34 / 2 dB less there.
+    turned = np.array([[np.cos(0.28), np.sin(0.28), 0.0]])
     for seen, below_db in ((axis, 0.0), (turned, 2.171)):
         echo_db = reflector.echo_db(reflector.apex[None], -seen, seen)
         alone_db = reflector.material.echo_db(reflector.apex[None], np.ones(1))
@@ -302,26 +297,6 @@ def test_reflector_lobe_in_the_wall_scene():
         np.testing.assert_allclose(
             echo_db, 10 * np.log10(10 ** (alone_db / 10) + 10 ** (lobe_db / 10)), atol=1e-3
         )
-    strongest = []
-    for angle in np.deg2rad([0, 20, 40, 75]):
-        eye = reflector.apex + 10 * np.array([np.cos(angle), np.sin(angle), 0.0])
-        yaw = angle + np.pi
-        T = np.eye(4)
-        T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-        T[:3, 3] = eye
-        scan = replace(sensor, sigma_azimuth_rad=0.0, sigma_elevation_rad=0.0, sigma_range_m=0.0).scan(
-            scene.scene, T
-        )
-        world = scan.points.astype(np.float64) @ T[:3, :3].T + eye
-        at = reflector.signed_distance(world) < 1e-4
-        assert at.sum() > 50
-        strongest.append(np.median(scan.noiseless_intensities[at]))
-        if angle == 0:
-            around = (np.abs(world[:, 0]) < 1e-3) & (scan.origin_kind == sim.Origin.SURFACE)
-            assert strongest[0] > np.median(scan.noiseless_intensities[around]) + 15
-    assert strongest == sorted(strongest, reverse=True)
-    assert strongest[0] - strongest[1] < 5
-    assert strongest[0] - strongest[-1] > 25
 
 
 @pytest.mark.parametrize(
@@ -334,17 +309,6 @@ def test_reflector_lobe_in_the_wall_scene():
 def test_impossible_sensors_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         sim.RadarSensor(**wrong)
-
-
-@pytest.mark.parametrize(("name", "value"), [("specular", 2.0), ("looks", 0.0), ("reflectivity_db", "a")])
-def test_impossible_materials_are_refused(name, value):
-    with pytest.raises(ValueError, match=name):
-        sim.Material(**{"name": "odd", "reflectivity_db": 0.0, name: value})
-
-
-def test_a_drive_without_scans_is_refused():
-    with pytest.raises(ValueError, match="frames"):
-        sim.wall(frames=-1)
 
 
 def test_an_empty_world_returns_nothing():
