@@ -88,15 +88,3 @@ TEST_CASE("growing sums equal the sums of the present scans, without a trace of 
   sums.apply(change_by(first, -1));
   CHECK((sums.num_cells() == 0 && sums.num_blocks() == 0));
 }
-
-TEST_CASE("blocks moved to another table and back are unchanged") {
-  GrowingSums sums, other;
-  sums.apply(change_by(Scan(1), 1));
-  const Contents whole = contents_of(sums);
-  other.insert(whole.cells, whole.visibility);
-  check_same(contents_of(other), whole);
-  CHECK_THROWS_AS(other.insert(whole.cells, whole.visibility), std::invalid_argument);
-  check_same(contents_of(other), whole);
-  other.erase(whole.blocks.data(), static_cast<std::int64_t>(whole.blocks.size()));
-  CHECK((other.num_cells() == 0 && other.num_blocks() == 0));
-}

@@ -18,7 +18,6 @@
 #include "util/random_bytes.hpp"
 #include "util/stable_order.hpp"
 #include "util/thread_pool.hpp"
-#include "util/vec3.hpp"
 
 TEST_CASE("bit counts and positions equal those of std::bitset") {
   std::mt19937_64 generator(1);
@@ -157,16 +156,6 @@ TEST_CASE("radix_sort sorts by the upper bits and keeps the order of equal ones"
   std::sort(expected.begin(), expected.end());
   radarsdf::radix_sort(keys, 20, 52);
   CHECK(std::equal(keys.begin(), keys.end(), expected.begin(), expected.end()));
-}
-
-TEST_CASE("the cross product is orthogonal, with the length of the area") {
-  const radarsdf::Vec3 a{1, 2, 2}, b{-3, 0.5, 4}, c = cross(a, b);
-  CHECK(dot(a, c) == doctest::Approx(0));
-  CHECK(dot(b, c) == doctest::Approx(0));
-  CHECK(dot(c, c) == doctest::Approx(dot(a, a) * dot(b, b) - dot(a, b) * dot(a, b)));
-  CHECK(norm(a) == 3);
-  const double rows[] = {0, 0, 0, 2, 4, 4};
-  CHECK(norm(radarsdf::vec3(rows, 1) / 2 - a) == 0);
 }
 
 TEST_CASE("the exception of a task reaches the caller and cancels the other tasks") {
