@@ -6,6 +6,7 @@ import argparse
 import itertools
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +45,19 @@ COLUMNS = {
 }
 
 
+def _quick(peer: Peer) -> Peer:
+    """A peer with few iterations or a shallow octree, to check that it runs."""
+    if "depth" in peer.options:
+        return replace(peer, options=peer.options | {"depth": 8})
+    return peer.with_changes(**QUICK)
+
+
 def reconstructed(
     options: argparse.Namespace, peer: Peer, scene: Scene, held_out: Scene | None = None
 ) -> Reconstruction:
     """Reconstruct a scene by a peer. With `held_out`, also predict its intensities at the returns of that scene."""
     return reconstruct(
-        peer.with_changes(**QUICK) if options.quick else peer,
+        _quick(peer) if options.quick else peer,
         scene.points,
         scene.poses,
         scene.intensities,
