@@ -297,7 +297,6 @@ class Outcomes:
 
     counts: collections.Counter[str] = field(default_factory=collections.Counter)
     failures: list[str] = field(default_factory=list)
-    slowest_s: float = 0.0
 
 
 def damaged(reader: Reader, seed: int) -> Iterator[bytes]:
@@ -333,7 +332,6 @@ def try_file(reader: Reader, path: Path, data: bytes, outcomes: Outcomes) -> Non
         outcomes.failures.append(f"{error!r}")
     seconds = time.process_time() - started
     outcomes.counts[kind] += 1
-    outcomes.slowest_s = max(outcomes.slowest_s, seconds)
     if seconds > MAX_SECONDS:
         outcomes.failures.append(f"{seconds:.1f} s")
 
