@@ -108,7 +108,7 @@ def test_untrackable_scans_are_rejected_without_side_effects(drive):
 
 
 def test_unobservable_motion_along_a_wall_is_rejected():
-    scans = thinned(radarsdf.simulate.wall(seed=91, frames=24), 2)
+    scans = thinned(radarsdf.simulate.wall(seed=91, frames=24), 4)
     live = LiveMap(SETTINGS)
 
     def follow(speeds=None):
