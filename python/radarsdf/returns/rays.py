@@ -72,7 +72,7 @@ class Rays:
         values = () if self.intensities is None else (self.intensities,)
         measured = np.column_stack([self.directions, self.ranges_m])
         # Of a tile, directions and ranges differ in their last bits, which only decide among returns that are equal otherwise.
-        coarse = np.floor(_HASHED_PER_M * measured).astype(np.int32)
+        coarse = np.floor(_HASHED_PER_M * measured).astype(np.int64).astype(np.int32)
         first, second = hashes(*coarse.T, *values), hashes(*measured.T, *values)
         return (first & ~_LAST_BITS) | (second & _LAST_BITS)
 
