@@ -83,7 +83,7 @@ def test_an_interruption_at_any_line_leaves_a_map_of_its_scans(change, stored, t
             grown = mesh_bits(live.mesh())
             live._state._surface = None
             assert grown == mesh_bits(live.mesh())
-        line += 5 if stored else 2
+        line += 5 if stored else 1
     assert line > 30
 
 

@@ -18,7 +18,9 @@ BAND_CELLS = 2.0
 TRUNCATION_CELLS = 3.0
 """Truncation distance, and reach of a ray before and behind its return, leaf cells (VDBFusion: 3 voxels). Measured: 4 and 5
 are as good on simulated scenes, 0.5 and 1.2 points of F-score worse on real ones."""
-_WEIGHT_OF_RETURN = 16  # weights are rounded to this part of that of a return: sums of integers do not depend on their order
+_WEIGHT_OF_RETURN = (
+    16  # weights are rounded to this part of that of a return: sums of integers do not depend on their order
+)
 # Smoothing iterations. Measured: twice as many are 0.0 to 0.1 points of F-score better on whole simulated scenes, half as
 # many 0.0 to 0.3 worse.
 _SMOOTHINGS = 24
