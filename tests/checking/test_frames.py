@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import radarsdf
 from radarsdf.checking.check import check_cheaply
-from radarsdf.checking.frames import CHEAP, FULL, check_clock, check_frames, check_still
+from radarsdf.checking.frames import CHEAP, FULL, check_frames, check_still
 from radarsdf.checking.recording import checked_input
 
 from tests.conftest import recorded_file, recorded_scans
@@ -93,22 +93,6 @@ def test_a_small_gain_is_no_error_at_any_significance():
 def test_few_sparse_scans_have_no_finding(frames, seed):
     scans = radarsdf.simulate.oculii(frames=frames, seed=seed)
     assert worse_than_notes(radarsdf.check(scans.points, scans.poses)) == []
-
-
-def test_a_clock_offset_is_found_if_the_motion_changes():
-    scans = radarsdf.simulate.wall(frames=24)
-    for rows, poses, times_s, words in (
-        (
-            slice(1, None),
-            scans.poses[:-1],
-            None,
-            "With poses from about 1 steps between scans later",
-        ),
-        (slice(-1), scans.poses[1:], 0.2 * np.arange(23), "With poses from about 0.2 s earlier"),
-    ):
-        (found,) = check_clock(checked_input(scans.points[rows], poses, times_s=times_s))
-        assert (found.name, found.severity) == ("clock_offset", "error")
-        assert found.evidence.startswith(words)
 
 
 @pytest.mark.parametrize("name", ["r0009_0024", "r0133_0142"])

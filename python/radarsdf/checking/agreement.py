@@ -203,6 +203,9 @@ def hypotheses(T_world_sensor: Floats, pairs: Ints, *, all_axes: bool = True) ->
             what = f"the sensor is rotated by {degrees} degrees in {name} against the frame of the poses"
             moved = T_vehicle_sensor.T @ motions @ T_vehicle_sensor
             found.append(Hypothesis("sensor_turned", what, moved))
+    found.append(
+        Hypothesis("scans_exchanged", "the order of the scans is reversed", relative(poses[::-1], pairs))
+    )
     return found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from radarsdf.arrays import Bools, Ints
-from radarsdf.checking import frames, noise, piecewise, trajectory
+from radarsdf.checking import drift, frames, noise, piecewise, trajectory
 from radarsdf.checking.doppler import check_doppler
 from radarsdf.checking.intensity import check_intensities
 from radarsdf.checking.recording import SEVERITIES, Finding, checked_input
@@ -102,7 +102,7 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
         ):
             found += check_values(recording)
         found += trajectory.check_duplicates(recording, numbers)
-        found += _of_poses(recording, numbers, config, effort)
+        found += _of_poses(recording, numbers, effort)
     if config is not None and not _stops(found):
         found += noise.check_noise_and_cost(recording, config)
         if not _stops(found):
@@ -111,32 +111,24 @@ def _find(recording: Scans, config: FitConfig | None, effort: frames.Effort) -> 
 
 
 def _drift(recording: Scans, numbers: Ints, config: FitConfig, found: list[Finding]) -> list[Finding]:
-    """Drift of the poses, or another fault that refined poses would hide."""
-    drift = list(noise.check_drift(recording, config))
-    if not drift:
-        return []
-    if any(finding.name == "motion_undecided" for finding in found):
-        return [Finding("undecided", "warning", drift[0].evidence)]
-    return (
-        list(piecewise.check_order(recording, numbers))
-        or list(frames.check_clock(recording, far=True))
-        or drift
-    )
+    """Exchanged scans, which refined poses would hide, or drift of the poses or what explains it better."""
+    faults = list(piecewise.check_order(recording, numbers)) or list(drift.check_drift(recording, config))
+    unknown = any(finding.name == "motion_undecided" for finding in found)
+    return [
+        Finding("undecided", "warning", fault.evidence) if unknown and fault.name == "poses_drift" else fault
+        for fault in faults
+    ]
 
 
-def _of_poses(
-    recording: Scans, numbers: Ints, config: FitConfig | None, effort: frames.Effort
-) -> list[Finding]:
+def _of_poses(recording: Scans, numbers: Ints, effort: frames.Effort) -> list[Finding]:
     found = list(frames.check_still(recording, effort))
     if not found:
         found = list(frames.check_frames(recording, effort))
     if not _stops(found):
         found += trajectory.check_lengths(recording)
-    if not _stops(found):  # else the scans do not agree at any clock offset
+    if not _stops(found):
         found += trajectory.check_jumps(recording, numbers, effort)
         found += check_doppler(recording)
-        if config is not None and all(finding.severity == "note" for finding in found):
-            found += frames.check_clock(recording)
         found += noise.check_ground(recording)
     return found
 

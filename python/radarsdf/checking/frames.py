@@ -1,4 +1,4 @@
-"""Checks of frames, axes, units and clocks by the agreement of scans."""
+"""Checks of frames, axes and units by the agreement of scans."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.checking.agreement import (
@@ -22,9 +21,7 @@ from radarsdf.checking.agreement import (
     pairs_apart,
     relative,
 )
-from radarsdf.checking.recording import Finding, Severity, ascending_times_s, some_points
-from radarsdf.io.poses import Trajectory
-from radarsdf.poses.rigid import between
+from radarsdf.checking.recording import Finding, Severity, some_points
 from radarsdf.scans import Scans
 
 # Minimum gain of a note, as the mean logarithm of distances and in standard errors. The gain over standing still must
@@ -45,10 +42,6 @@ _NOT_BEHIND = 2.5  # standard errors
 _FIELD_OF_VIEW_STAYS = -1.5
 # Skewness of the heights. Measured: 0.6 to 2.9 in drives; -1.2 indoors, where it is misleading.
 _UPSIDE_DOWN = -0.5
-# Small time offsets, in steps, and the number of larger ones to each side.
-_SMALL, _OFFSETS = np.array([0.5, 1, 2, 4, 8]), 128
-# Gains that leave a large offset undecided, and of its error. Measured: at most 0.008 on drifted poses.
-_FAR_GAINS = 0.008, 0.02
 _UNDECIDED = {
     "mirrored": "points or positions are mirrored",
     "poses_inverted": "the poses are inverted",
@@ -136,52 +129,6 @@ def check_still(recording: Scans, effort: Effort = FULL) -> Iterator[Finding]:
             f"neighbours ({change / error:.0f} standard errors)"
         )
     yield Finding("poses_stand_still", "error" if moved else "warning", f"{evidence}.")
-
-
-def check_clock(recording: Scans, *, far: bool = False) -> Iterator[Finding]:
-    """Check whether the scans agree better with poses of an earlier or a later time, or of another row.
-
-    `far`: try all offsets instead of small ones; if refined poses sharpen the map, smaller gains suffice.
-    """
-    poses, times = recording.poses, ascending_times_s(recording)
-    unit = "steps between scans" if times is None else "s"
-    times = np.arange(len(poses), dtype=np.float64) if times is None else times
-    if len(poses) < 2 * _MIN_PAIRS:
-        return
-    step, count = float(np.median(np.diff(times))), FULL.pairs
-    along = Trajectory(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
-    pairs = choose_pairs(recording.points, poses[:, :3, 3], 2 * count if far else count)
-    agreement = Agreement(recording.points, FULL.returns, FULL.queries)
-    given = agreement.scores(pairs, relative(poses, pairs)[None])
-
-    def compared(shift_s: float, most: int) -> tuple[float, float, int]:
-        """Gain, its significance and the number of pairs."""
-        # Beyond the first and the last pose, interpolation is undefined.
-        at = times[pairs] + shift_s
-        valid = np.flatnonzero(((at >= times[0]) & (at <= times[-1])).all(axis=1))
-        if len(valid) < (count // 2 if far else _MIN_PAIRS):
-            return 0.0, 0.0, 0
-        valid = valid[np.unique(np.linspace(0, len(valid) - 1, min(most, len(valid))).astype(int))]
-        motions = between(along.poses(at[valid, 1]), along.poses(at[valid, 0]))
-        comparison = Comparison.of(given[:, valid], agreement.scores(pairs[valid], motions[None]))
-        return float(comparison.gains[0]), float(comparison.significance[0]), len(valid)
-
-    whole = np.arange(1.0, len(poses), max(1, len(poses) // _OFFSETS)) if far else _SMALL
-    shifts = step * np.concatenate([-whole, whole])
-    shifts = shifts[np.abs(shifts) <= (times[-1] - times[0]) / (1 if far else 4)]
-    # All offsets on few pairs of scans, then the best ones on more.
-    for most, kept in ((count // 6, 8), (count // 2, 2), (2 * count, 1)) if far else ((count, 1),):
-        best = sorted(((*compared(shift, most), shift) for shift in shifts.tolist()), reverse=True)[:kept]
-        shifts = np.array([shift for *_, shift in best])
-    gain, significance, used, shift = best[0]
-    if gain >= (_FAR_GAINS[0] if far else _MIN_GAIN) and significance >= _MIN_SIGNIFICANCE + far:
-        evidence = (
-            f"With poses from about {abs(shift):.3g} {unit} {'later' if shift > 0 else 'earlier'}, returns of "
-            f"different scans are {np.exp(gain):.2f} times closer to each other ({used} pairs of scans, {significance:.0f} "
-            "standard errors)."
-        )
-        unclear = gain < _FAR_GAINS[1]
-        yield Finding("undecided" if unclear else "clock_offset", "warning" if unclear else "error", evidence)
 
 
 def _best(

@@ -1,4 +1,4 @@
-"""Elevation, ground, noise and drift of a recording, and the cost of a fit."""
+"""Elevation, ground and noise of a recording, and the cost of a fit."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from radarsdf.arrays import Floats, Ints
-from radarsdf.checking.recording import Finding, ascending_times_s, some_points, some_scans
+from radarsdf.checking.recording import Finding, some_points, some_scans
 from radarsdf.config.fit_config import FitConfig
 from radarsdf.fitting.estimate import check_extent, estimate_rays
-from radarsdf.poses.checked_scans import median_range_m
-from radarsdf.poses.refine import refine_poses
-from radarsdf.poses.rigid import step_vectors
 from radarsdf.returns.noise import SensorNoise, sensor_noise, variances_across
 from radarsdf.returns.planes import Surfels
 from radarsdf.returns.rays import Rays, prepare
@@ -29,15 +26,6 @@ _SIGMAS = 3.0  # returns farther from their surfel are outliers
 _SIGNIFICANCE = 3.0  # standard errors
 _PARTS = 20  # groups of neighbouring surfels for the jackknife standard error
 _MIN_SURFELS = 10 * _PARTS
-
-# Sizes of a sample of windows, scans and returns, evenly spread, so that a large recording takes no longer than a small one.
-_WINDOWS, _SCANS, _RETURNS = 3, 60, 60_000
-_LEAST_SCANS = 4
-# Smallest displacement of returns, as a share of their standard deviation. Measured: true poses of slow sensors with cells
-# of 0.5 m: up to 0.09; a detected drift of 0.01 m and 0.05 degrees per step: 0.27 and more.
-_LEAST_MOVED = 0.15
-# Margin over the share that is expected of four steps. Measured: at most 0.95 for drifts; 1.1 to 3 for single steps.
-_CONCENTRATED = 1.25
 
 
 def check_elevation(recording: Scans) -> Iterator[Finding]:
@@ -140,51 +128,3 @@ def _of_pairs(values: Floats, group: Ints, count: int) -> Floats:
     """(2, G) number of pairs, and sum of their squared differences, of values (N,) in G groups."""
     sums = [np.bincount(group, weights, count) for weights in (None, values, values**2)]
     return np.stack([sums[0] * (sums[0] - 1) / 2, sums[0] * sums[2] - sums[1] ** 2])
-
-
-def check_drift(recording: Scans, config: FitConfig) -> Iterator[Finding]:
-    """Check whether held-out returns agree better with refined poses, in the clearest of some windows of scans.
-
-    If few steps have most of the differences, another fault may be the cause.
-    """
-    count = len(recording)
-    if count < _LEAST_SCANS:
-        return
-    begins = np.linspace(0, max(count - _SCANS, 0), min(_WINDOWS, max(1, count // _SCANS))).astype(np.int64)
-    improved, shares = [], []
-    for begin in begins:
-        part = recording.select(np.arange(begin, min(begin + _SCANS, count)))
-        # Every n-th return, since returns of a scan are ordered by angle.
-        every = max(1, -(-sum(map(len, part.points)) // _RETURNS))
-        points = [np.asarray(scan[::every], np.float64) for scan in part.points]
-        times_s, doppler_mps = ascending_times_s(part), None
-        if part.doppler_mps is not None and times_s is not None:
-            doppler_mps = [speeds[::every] for speeds in part.doppler_mps]
-        refined = refine_poses(
-            points, part.poses, doppler_mps=doppler_mps, times_s=times_s, config=config, progress=False
-        )
-        if refined.improved:
-            report, range_m = refined.report, median_range_m(points)
-            moved_m = np.hypot(report["moved_m"], range_m * report["moved_rad"])
-            noise = SensorNoise(**report["noise"])
-            if moved_m > _LEAST_MOVED * np.hypot(noise.range_m, range_m * noise.angle_rad):
-                improved.append(report)
-                shares.append(_excess_of_few_steps(part.poses, refined.poses, range_m))
-    if improved:
-        best = max(improved, key=lambda report: float(report["gain"] / report["gain_error"]))
-        evidence = (
-            f"With refined poses, returns of other scans are {np.expm1(best['gain']):.1%} denser at held-out returns "
-            f"({best['gain'] / best['gain_error']:.0f} standard errors): steps have errors of {best['sigma_m']:.3f} m and "
-            f"{np.degrees(best['sigma_rad']):.2f} degrees ({len(improved)} of {len(begins)} windows of the recording)."
-        )
-        if max(shares) > _CONCENTRATED:
-            yield Finding("undecided", "warning", f"Few steps differ from refined ones. {evidence}")
-        else:
-            yield Finding("poses_drift", "warning", evidence)
-
-
-def _excess_of_few_steps(given: Floats, refined: Floats, lever_m: float) -> float:
-    """Share of the four largest squared differences of steps, over that of exponentially distributed ones."""
-    off_m = (step_vectors(refined) - step_vectors(given)) * np.repeat([1.0, lever_m], 3)
-    off_m2 = np.sort((off_m**2).sum(axis=1))
-    return float(off_m2[-4:].sum() / off_m2.sum() * len(off_m2) / (4 * np.log(len(off_m2))))

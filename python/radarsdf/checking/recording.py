@@ -56,7 +56,7 @@ FIXES = {
     "poses_disagree": "Use better poses, if there are any; state their errors as returns.pose_sigma_m, if not.",
     "poses_drift": "Refine them: radarsdf poses, radarsdf fit --refine, or radarsdf.refine_poses(points, poses).",
     "scans_exchanged": "Pass the scans in the order of their poses: sort both by time, and file names by number.",
-    "pose_jumps": "Use poses that were smoothed over the whole drive, or leave out the scans at the jumps.",
+    "pose_jumps": "Check the mounting of the sensor there; use poses smoothed over the whole drive, or leave out these scans.",
     "clock_offset": "Use one clock for scans and poses, and the time of measurement, not that of arrival.",
     "motion_undecided": _UNDECIDED,
     "mirroring_undecided": _UNDECIDED,
