@@ -48,6 +48,8 @@ def expected(what):
             "zy"[words[2] == "pitch"], float(words[1]), degrees=True
         ).as_matrix()
         return motions(POSES @ turn)
+    if what == "the order of the scans is reversed":
+        return motions(POSES[::-1])
     quaternions = Rotation.from_matrix(POSES[:, :3, :3]).as_quat()
     if what == "the quaternions of the poses are w x y z, and were read as x y z w":
         quaternions = quaternions[:, [1, 2, 3, 0]]
@@ -67,7 +69,7 @@ def test_hypotheses_move_the_scans_as_described():
         if guess.what.startswith("the points are read"):
             assert guess.up == tuple(read_as(guess.what[24:-1])[2, :3])
     words = [guess.what for guess in others]
-    assert len(set(words)) == len(words) == 2 * 47 + 6 + 2 + 2 * (9 + 4)
+    assert len(set(words)) == len(words) == 2 * 47 + 6 + 2 + 2 * (9 + 4) + 1
     of_axes = {guess.what: guess.finding for guess in others}
     assert of_axes["the points are read as (z, -x, -y)"] == "camera_frame"
     assert of_axes["the points are read as (-y, -z, x)"] == "camera_frame"
