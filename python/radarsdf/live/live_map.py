@@ -277,17 +277,9 @@ class LiveMap:
         return self.move_all({scan_id: pose})
 
     def move_all(self, poses: Mapping[ScanId, ArrayLike]) -> Keys:
-        """Move scans to other poses atomically, as after a loop closure.
+        """Move scans to other `poses` (4, 4), by their ids, atomically, as after a loop closure.
 
-        Parameters
-        ----------
-        poses : mapping
-            Pose, (4, 4), of each scan by its id.
-
-        Raises
-        ------
-        KeyError, ValueError
-            As for :meth:`remove`, or if a pose is invalid.
+        Raises the exceptions of :meth:`remove`, and a ValueError for an invalid pose.
         """
         instance(poses, Mapping, "poses")  # type: ignore[type-abstract]
         with self._owned():
@@ -305,12 +297,8 @@ class LiveMap:
         With a folder, nothing is discarded: regions of 64³ leaf cells outside the ball are written there, and restored
         bit-identically when a scan that reaches them is added, moved or removed. Until then they are not in :meth:`mesh`.
 
-        Parameters
-        ----------
-        centre : (3,) array_like
-            World, m.
-        radius_m : float
-            Blocks are discarded if their centre is farther away, regions are written if they are entirely farther away.
+        Blocks are discarded if their centre is more than `radius_m` from `centre` (3,), world, m; regions are written if they are
+        entirely farther away.
 
         Raises
         ------
@@ -335,14 +323,9 @@ class LiveMap:
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, folder: str | PathLike[str] | None = None) -> LiveMap:
-        """Read a saved map, with its settings, bit-identically. Tracking resumes from the last scans with times.
+        """Read a map written by :meth:`save`, with its settings, bit-identically. Tracking resumes from the last scans with times.
 
-        Parameters
-        ----------
-        path : path-like
-            A file written by :meth:`save`.
-        folder : path-like, optional
-            See the constructor.
+        `folder`: see the constructor.
 
         Raises
         ------
@@ -360,22 +343,10 @@ class LiveMap:
         return live
 
     def mesh(self, **limits: Any) -> trimesh.Trimesh:
-        """Extract the surface as triangles, in voxels of the size of leaf cells. Only changed distances are recomputed.
+        """Extract the surface as triangles, world frame, m, in voxels of the size of leaf cells; none if there is no surface.
 
-        Parameters
-        ----------
-        **limits
-            `min_confidence`, `max_uncertainty` and `min_component_triangles` of :meth:`Map.mesh`.
-
-        Returns
-        -------
-        trimesh.Trimesh
-            World frame, m, see :meth:`Map.mesh`. Empty if there is no surface.
-
-        Raises
-        ------
-        ValueError
-            If a limit is out of range.
+        Only changed distances are recomputed. `limits` are `min_confidence`, `max_uncertainty` and `min_component_triangles` of
+        :meth:`Map.mesh`, which also lists the errors.
         """
         wanted = Limits.of(self.config.leaf_size_m, **limits)
         with self._reading:
@@ -399,12 +370,7 @@ class LiveMap:
         return fit_rays(read, self._state.quick, progress=False)
 
     def finish(self, *, progress: bool | None = None) -> RadarMap:
-        """Fit a map to all scans with all settings, like :func:`radarsdf.fit` with this `origin`.
-
-        Parameters
-        ----------
-        progress : bool, optional
-            Whether to show a progress bar. Default: only on a terminal.
+        """Fit a map to all scans with all settings, like :func:`radarsdf.fit` with this `origin` and `progress`.
 
         Raises
         ------

@@ -18,12 +18,8 @@ _MOST = 500  # maximum number of poses in a report: enough for a plot
 def pose_sigmas(covariance: Floats) -> tuple[float, float]:
     """Compute median standard deviations per axis of the position, m, and rotation, rad, of poses.
 
-    These are the values for ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of a :class:`FitConfig`.
-
-    Parameters
-    ----------
-    covariance : (F, 6, 6) ndarray
-        Covariance of :class:`RefinedPoses` or :class:`Odometry`.
+    `covariance` (F, 6, 6) is that of :class:`RefinedPoses` or :class:`Odometry`. These are the values for
+    ``returns.pose_sigma_m`` and ``pose_sigma_rad`` of a :class:`FitConfig`.
     """
     position_m, turn_rad = np.median(_sigmas(covariance), axis=0).tolist()
     return position_m, turn_rad

@@ -77,17 +77,9 @@ class Sensor:
         return _FWHM * self.noise.azimuth_rad, _FWHM * self.noise.elevation_rad
 
     def threshold(self, ranges_m: Array) -> Floats:
-        """Interpolate the detection threshold.
+        """Interpolate the weakest detected intensity (N,), float64, sensor units, at ranges (N,), m.
 
-        Parameters
-        ----------
-        ranges_m : (N,) ndarray
-            Ranges, m. Beyond the ends of `thresholds`, their values are constant.
-
-        Returns
-        -------
-        (N,) ndarray of float64
-            Weakest detected intensities, sensor units. -inf if the sensor has no `thresholds`.
+        Beyond the ends of `thresholds` it is constant; without them it is -inf.
         """
         if not self.thresholds:
             return np.full(len(ranges_m), -np.inf)
@@ -95,18 +87,7 @@ class Sensor:
         return np.interp(ranges_m, at_m, weakest)
 
     def directions(self, azimuth_rad: Array, elevation_rad: Array) -> Floats:
-        """Convert azimuths and elevations to unit vectors.
-
-        Parameters
-        ----------
-        azimuth_rad, elevation_rad : (N,) ndarray
-            Angles in the sensor frame, rad.
-
-        Returns
-        -------
-        (N, 3) ndarray of float64
-            Unit vectors, sensor frame.
-        """
+        """Convert azimuths and elevations (N,), rad, to unit vectors (N, 3), float64, in the sensor frame."""
         x, y = np.cos(azimuth_rad), np.sin(azimuth_rad)
         cosine = np.cos(elevation_rad)
         return np.stack([cosine * x, cosine * y, np.sin(elevation_rad)], axis=1)
@@ -117,17 +98,9 @@ class Sensor:
 
     @classmethod
     def from_dict(cls, described: dict[str, Any]) -> Sensor:
-        """Build a sensor from the dict of :meth:`to_dict`.
+        """Build a sensor from the dict of :meth:`to_dict`: values by attribute; `noise` is a dict, too.
 
-        Parameters
-        ----------
-        described : dict
-            Values by attribute name; `noise` is a dict, too.
-
-        Raises
-        ------
-        ValueError, TypeError
-            If a number is out of range, or a name is missing or unknown.
+        Raises a ValueError or TypeError if a number is out of range, or a name is missing or unknown.
         """
         return cls(**described | {"noise": SensorNoise(**described["noise"])})
 
