@@ -1,6 +1,7 @@
 #include "kernels/plate_kernels.hpp"
 
 #include "kernels/vector.hpp"
+#include "util/prefetch.hpp"
 
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_shufflevector)
@@ -13,6 +14,7 @@ namespace radarsdf::RADARSDF_ISA {
 namespace {
 
 using Floats = VectorOf<float, kPlateVertices>::Type;
+constexpr std::int64_t kAhead = 8;  // blocks: prefetch distance, scattered vertices are cache misses
 
 // Lane i of the result is lane kLane(i) of `first` and `second` concatenated.
 template <int (*kLane)(int)>
@@ -148,8 +150,15 @@ void pull(const PlateConstraints& constraints, const float* distances_m, float* 
     const std::int32_t* blocks = constraints.corners + 8 * block;
     const Floats one = {1, 1, 1, 1, 1, 1, 1, 1};
     Floats corners[8], pulls[8] = {};
-    for (int c = 0; c < 8; ++c)
+    const std::int64_t ahead = block + kAhead < end ? kAhead : 0;
+    prefetch(blocks + 16 * ahead);
+    prefetch(constraints.layers + constraints.first[block + ahead]);
+    for (int c = 0; c < 8; ++c) {
+      const std::int64_t later = kPlateVertices * std::int64_t{blocks[8 * ahead + c]};
+      prefetch(distances_m + later);
+      prefetch(pulls_m + later);
       corners[c] = load_vector<Floats>(distances_m + kPlateVertices * std::int64_t{blocks[c]});
+    }
     to_corners<1>(corners);
     to_corners<2>(corners);
     to_corners<4>(corners);
