@@ -98,7 +98,6 @@ void bind_poses(py::module_& m) {
            "(P, 3) float64. `extent_m` of a plane; `variances` along the beam, m^2, in azimuth and elevation, rad^2.")
       .def_property_readonly("scale", &CommonPlanes::scale,
                              "Median squared normalised residual, relative to that of Gaussian noise; at least 1.")
-      .def_property_readonly("num_used", &CommonPlanes::num_used, "Number of returns on planes of several scans.")
       .def_property_readonly(
           "weights", [](const CommonPlanes& planes) { return to_array(std::vector<double>(planes.weights())); },
           "Sums of the weights, each at most 1, of the returns of each scan: (F,) float64.")

@@ -158,7 +158,6 @@ void CommonPlanes::find_clusters(Input& input) {
         plane_of_cluster_.push_back(static_cast<std::int32_t>(p));
         scan_of_cluster_.push_back(scan(k));
       }
-      num_used_ += end - begin;
     }
     first_of_plane_.push_back(static_cast<std::int64_t>(scan_of_cluster_.size()));
   }

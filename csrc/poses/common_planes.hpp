@@ -43,7 +43,6 @@ class CommonPlanes {
   // Ratio of the median of the normalised squared residuals to that of a normal distribution, at least 1. It scales all
   // variances, since wrong poses inflate residuals.
   double scale() const { return scale_; }
-  std::int64_t num_used() const { return num_used_; }              // returns on planes of two scans or more
   const std::vector<double>& weights() const { return weights_; }  // (scans), sums over returns, each in [0, 1]
 
   // Solves (H + P) x = -(g + q) for the increments x (scans, 6): H and g are of the planes; P (prior) is block
@@ -67,7 +66,6 @@ class CommonPlanes {
 
   std::int64_t num_scans_, width_;
   double scale_ = 1;
-  std::int64_t num_used_ = 0;
   std::vector<double> weights_;
   std::vector<double> diagonal_;  // (scans, 6, 6), sums of w J J^T
   std::vector<double> gradient_;  // (scans, 6), total

@@ -79,14 +79,8 @@ void average_rays(const VertexTable& table, const AveragedRays& rays, double tru
         in_front[c] = distance_m > size_m ? weight : 0;
         behind[c] = distance_m < -size_m ? weight : 0;
       }
-      for (int c = 0; c < 8; ++c) {
-        Sum& sum = sums[static_cast<std::size_t>(rows[c])];
-        sum.distance += std::int64_t{weight} * cut[c];
-        sum.weight += weight;
-        sum.positive += positive[c];
-        sum.in_front += in_front[c];
-        sum.behind += behind[c];
-      }
+      for (int c = 0; c < 8; ++c)
+        sums[rows[c]] += Sum{std::int64_t{weight} * cut[c], weight, positive[c], in_front[c], behind[c]};
     }
   };
 

@@ -765,11 +765,6 @@ class CommonPlanes:
         Increments (F, 6) of the poses: translation, and rotation vector applied from the left about the sensor; blocks of the inverse on and below the diagonal, (F, 6, 6) and (F - 1, 6, 6), `with_inverse`; squared Mahalanobis norm of the increments. The prior is block tridiagonal: `diagonal` (F, 6, 6), `below` (F - 1, 6, 6), `gradient` (F, 6), all float64.
         """
     @property
-    def num_used(self) -> int:
-        """
-        Number of returns on planes of several scans.
-        """
-    @property
     def scale(self) -> float:
         """
         Median squared normalised residual, relative to that of Gaussian noise; at least 1.
