@@ -131,6 +131,10 @@ def test_doppler_of_other_scans_contradicts_given_poses(street, motion):
     assert compare_with_poses(velocities, motion.times_s, street.poses)[0] is None
     late = dataclasses.replace(velocities, mean_mps=velocities.mean_mps[np.maximum(np.arange(20) - 3, 0)])
     assert "3 scans later" in compare_with_poses(late, motion.times_s, street.poses)[0]
+    # Displacements that are wrong by a share of the change of the speed agree with no delay.
+    before = velocities.mean_mps[np.maximum(np.arange(20) - 1, 0)]
+    mixed = dataclasses.replace(velocities, mean_mps=0.7 * velocities.mean_mps + 0.3 * before)
+    assert compare_with_poses(mixed, motion.times_s, street.poses)[0] is None
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.0, -1.0, 1.2])

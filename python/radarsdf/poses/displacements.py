@@ -201,7 +201,8 @@ def delay_of(
         )
         share, error, remaining = _slope(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
-        if share > needed * error and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
+        # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
+        if share > max(needed * error, 0.5) and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))
     return min(found)[1]
 
