@@ -21,7 +21,6 @@ from radarsdf.poses.doppler import (
     ERRORS,
     LEAST_MPS,
     NOT_USED,
-    YAW_STEP_RAD,
     NoVelocityError,
     SensorVelocities,
     sign_significance,
@@ -277,6 +276,11 @@ class Follower:
         turn, move = self._rates[-1] if self._rates else (None, None)
         expected = drive.predict(len(steps) - 1, turn, move)
         found = self._tracker.register(drive.scans[-1], expected)
+        if drive.velocities is not None and sign and not found.agreeing > 0:
+            # A sensor that turns faster than predicted was dead-reckoned, or lost.
+            _, yaws = sign_significance(drive.scans, drive.velocities, drive.times_s)
+            expected = dataclasses.replace(drive, yaws=yaws).predict(len(steps) - 1, turn, move)
+            found = self._tracker.register(drive.scans[-1], expected)
         pull = (
             np.nan if drive.velocities is None or found.segment else _pull(steps[-2].found, found, expected)
         )
@@ -339,17 +343,12 @@ class Follower:
             # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Without returns that tell it, as
             # in a tunnel, this one is assumed: each comparison with the returns then states the doubt.
             likelier = sign or int(np.sign(evidence))
-            yaws = yaws[int(evidence < 0)]
+            yaws = yaws[::-1] if evidence < 0 else yaws
             decided = abs(evidence) > CLEAR or len(steps) == _START
             sign = sign or (likelier if decided else 0)
             # By the prior alone, a vehicle that turns by 13 degrees between the first scans would be lost.
-            durations_s = np.diff(drive.times_s)
-            rates = [
-                MotionRate(np.array([0.0, 0.0, yaw]), np.zeros((3, 3))) if np.isfinite(yaw) else None
-                for yaw in np.sign(yaws) * np.maximum(np.abs(yaws) - YAW_STEP_RAD, 0.0) / durations_s
-            ]
-            turns = drive.turns.learnt(rates, durations_s)
-            drive = dataclasses.replace(drive, velocities=_signed(velocities, likelier), turns=turns)
+            known = yaws if turns_fast(yaws[0]) else None
+            drive = dataclasses.replace(drive, velocities=_signed(velocities, likelier), yaws=known)
         return sign, track_drive(drive, self.config, self.config.num_threads)[1]
 
 
