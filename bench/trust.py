@@ -142,7 +142,8 @@ def _refine(told: Told) -> str:
 
 
 def _live(told: Told) -> str:
-    live, placed, notes, lost = radarsdf.LiveMap(), [], (), 0
+    live, placed, lost = radarsdf.LiveMap(), [], 0
+    notes: tuple[str, ...] = ()
     for i in range(FRAMES):
         try:
             done = live.integrate(

@@ -198,8 +198,7 @@ class Follower:
             notes = [f"Assumed: the Doppler is right; {other.words('the returns')}."]
         elif trusted is None:
             self._judged_s = -np.inf  # the next scans are judged, too
-            give = "Give the poses of this scan and the next ones, or leave their Doppler out"
-            msg = f"{notes[-1]} {begin} {give}"
+            msg = f"{notes[-1]} {begin} Give the poses of this scan and the next ones, or leave their Doppler out"
             raise Lost(msg)
         self._doubts = tuple(f"{note} {begin}" for note in notes)
 
@@ -337,7 +336,6 @@ class Follower:
         if len(speeds) == len(steps):
             with contextlib.suppress(NoVelocityError):
                 velocities = SensorVelocities.of(points, speeds, drive.times_s)
-
         if velocities is not None:
             evidence, yaws = sign_significance(drive.scans, velocities.scaled(sign or 1.0), drive.times_s)
             # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Without returns that tell it, as

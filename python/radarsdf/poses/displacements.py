@@ -14,12 +14,9 @@ from radarsdf.arrays import Bools, Floats, Ints
 from radarsdf.poses.doppler import ERRORS, DopplerMotion, SensorVelocities
 from radarsdf.poses.rigid import steps
 
-BY_CHANCE = 0.01
-"""Significance level of a contradiction, of all windows of a drive together."""
-FEWEST_STEPS = 6
-"""Minimum number of steps of a window."""
-MOST_LATE = 10
-"""Maximum delay of the Doppler that is tried, scans."""
+BY_CHANCE = 0.01  # significance level of a contradiction, of all windows of a drive together
+FEWEST_STEPS = 6  # of a window
+MOST_LATE = 10  # maximum delay of the Doppler that is tried, scans
 # Relative difference of speeds that axes and scale of a radar and given poses may have, ten times that of two motorway radars.
 _SAME_SPEED = 0.03
 _SAME_RESIDUALS = 1.25  # ratio of squared residuals up to which a delay does not matter
