@@ -278,7 +278,7 @@ class Follower:
         if drive.velocities is not None and sign and not found.agreeing > 0:
             # A sensor that turns faster than predicted was dead-reckoned, or lost.
             _, yaws = sign_significance(drive.scans, drive.velocities, drive.times_s)
-            expected = dataclasses.replace(drive, yaws=yaws).predict(len(steps) - 1, turn, move)
+            expected = dataclasses.replace(drive, yaws=yaws, turns=TURNS).predict(len(steps) - 1, turn, move)
             found = self._tracker.register(drive.scans[-1], expected)
         pull = (
             np.nan if drive.velocities is None or found.segment else _pull(steps[-2].found, found, expected)

@@ -94,10 +94,7 @@ def contradiction(
 def compare_with_poses(
     velocities: SensorVelocities, times_s: Floats, poses: Floats
 ) -> tuple[str | None, Clock]:
-    """Test velocities and times (F,) against given poses (F, 4, 4).
-
-    Return the clearest contradiction in words, None if there is none, and errors of the times.
-    """
+    """Test velocities and times (F,) against poses (F, 4, 4). Return the clearest contradiction in words, and errors of the times."""
     shown, known = steps(poses)[:, :3, 3], velocities.found[:-1] & velocities.found[1:]
     clock = Clock.of(times_s, shown, DopplerMotion.by(velocities, times_s, poses).steps[:, :3, 3], known)
     times_s = times_s - clock.errors_s

@@ -58,12 +58,15 @@ class Drive:
         elapsed_s = (duration_s + before_s) / 2
         if self.gyroscope is not None:
             turned = self.gyroscope.step(i - 1)
-        elif self.yaws is not None and np.isfinite(self.yaws[0, i - 1]):
-            variance = self.turns.usual * duration_s**2
-            variance[2] = YAW_STEP_RAD**2 / 4
-            turned = MotionRate(np.array([0.0, 0.0, self.yaws[0, i - 1]]), np.diag(variance))
         else:
             turned = self.turns.after(turn, elapsed_s).integrate(duration_s)
+            if self.yaws is not None and np.isfinite(yaw := self.yaws[0, i - 1]):
+                before = turned.covariance.copy()
+                if self.turns is TURNS:  # not learnt yet, and expects slower turns
+                    before[2, 2] = np.pi**2
+                gain = before[:, 2] / (before[2, 2] + YAW_STEP_RAD**2 / 4)
+                mean = turned.mean + gain * (yaw - turned.mean[2])
+                turned = MotionRate(mean, before - np.outer(gain, before[2]))
         if self.velocities is not None:
             covariance = self.velocities.step_covariance(i - 1, duration_s)
             begin, end = self.velocities.mean_mps[i - 1 : i + 1]
