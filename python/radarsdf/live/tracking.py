@@ -338,8 +338,8 @@ class Follower:
                 velocities = SensorVelocities.of(points, speeds, drive.times_s)
         if velocities is not None:
             evidence, yaws = sign_significance(drive.scans, velocities.scaled(sign or 1.0), drive.times_s)
-            # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Without returns that tell it, as
-            # in a tunnel, this one is assumed: each comparison with the returns then states the doubt.
+            # Until the sign is clear, the scans are placed by the likelier one, and re-estimated. Where returns do not show
+            # it, as in a tunnel, this one is assumed: each comparison with the returns then states the doubt.
             likelier = sign or int(np.sign(evidence))
             yaws = yaws[::-1] if evidence < 0 else yaws
             decided = abs(evidence) > CLEAR or len(steps) == _START

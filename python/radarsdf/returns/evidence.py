@@ -63,8 +63,8 @@ class Evidence:
 def weights_of(counts: Floats32, ranges_m: Floats32, noise: SensorNoise) -> tuple[Floats32, Floats32]:
     """Return the weights of groups of `counts` (M,) returns with about the same range (M,), m.
 
-    The first is their weight in averages of distances, relative to that of one return. The second, in smoothing, evidence and uncertainty, is
-    1 / variance of the position, m⁻².
+    The first is their weight in averages of distances, relative to that of one return. The second, in smoothing, evidence and
+    uncertainty, is 1 / variance of the position, m⁻².
     """
     return counts, counts / noise.variances_m2(ranges_m)
 
