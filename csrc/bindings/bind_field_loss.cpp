@@ -2,7 +2,6 @@
 #include <array>
 #include <memory>
 #include <optional>
-#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -62,7 +61,8 @@ class LossArrays {
   std::optional<FieldLoss> loss_;
 };
 
-LossBatch points_of(const Array<float>& points, const Array<float>& sdf_m, const Parts& parts) {
+LossBatch batch_of(const Array<float>& points, const Array<float>& sdf_m, const Parts& parts,
+                   const std::optional<Rows<float>>& rays, const std::vector<Drop>& dropout) {
   const std::int64_t count = check_points(points);
   check_shape(sdf_m, {count}, "sdf_m");
   LossBatch batch{points.data(), sdf_m.data(), {}};
@@ -75,27 +75,16 @@ LossBatch points_of(const Array<float>& points, const Array<float>& sdf_m, const
     batch.parts.push_back({samples, labelled});
   }
   if (left != 0) throw std::invalid_argument("each sample must be in a part");
-  return batch;
-}
-
-LossBatch rays_of(const Array<float>& points, const Array<float>& sdf_m, const Parts& parts, const Rows<float>& rays,
-                  const std::vector<Drop>& dropout) {
-  LossBatch batch = points_of(points, sdf_m, parts);
-  batch.rays = rays.data();
-  batch.ray_stride = row_stride(rays, points.shape(0), kRayColumns, "rays");
+  if (rays) {
+    batch.rays = rays->data();
+    batch.ray_stride = row_stride(*rays, count, kRayColumns, "rays");
+  }
   if (dropout.size() > 2) throw std::invalid_argument("only the two encodings can have a dropout");
   for (std::size_t i = 0; i < dropout.size(); ++i) {
     if (dropout[i].second < 1) throw std::invalid_argument("a dropout must keep something");
     batch.dropout[i] = {dropout[i].first, dropout[i].second};
   }
   return batch;
-}
-
-FeatureGradients by_features(const FieldLoss& loss, std::int64_t count, Array<std::int32_t>& located,
-                             Array<float>& interpolated_grad) {
-  check_shape(located, {count, loss.parameters().table->num_levels()}, "located");
-  check_shape(interpolated_grad, {count, loss.parameters().levels()}, "interpolated_grad");
-  return {located.mutable_data(), interpolated_grad.mutable_data()};
 }
 
 void bind_losses(py::module_& m) {
@@ -105,63 +94,46 @@ void bind_losses(py::module_& m) {
       "Losses of batches and their gradients, as defined by the package's neural field and losses. An object is not "
       "thread-safe.");
   cls.def(
-      py::init([](const VertexTable& table, const Array<float>& features,
-                  const std::tuple<double, int, int>& frequencies, const Network& sdf,
-                  const std::optional<Network>& intensity, const std::array<bool, 3>& sees, double sigma_m,
-                  bool intensity_in_free_space) {
-        const auto [half_width_m, first, count] = frequencies;
-        return std::make_unique<LossArrays>(table, features, Frequencies{half_width_m, first, count}, sdf, intensity,
-                                            IntensityInputs{sees[0], sees[1], sees[2]},
+      py::init([](const VertexTable& table, const Array<float>& features, const std::pair<double, int>& frequencies,
+                  const Network& sdf, const std::optional<Network>& intensity, const std::array<bool, 2>& sees,
+                  double sigma_m, bool intensity_in_free_space) {
+        return std::make_unique<LossArrays>(table, features, Frequencies{frequencies.first, frequencies.second}, sdf,
+                                            intensity, IntensityInputs{sees[0], sees[1]},
                                             LossOptions{sigma_m, intensity_in_free_space});
       }),
       py::keep_alive<1, 2>(), "table"_a, "features"_array, "frequencies"_a, "sdf"_array, "intensity"_array, "sees"_a,
       "sigma_m"_a, "intensity_in_free_space"_a,
-      "`features` (num_rows, 8); `frequencies`: half width (m), first exponent and number; `sdf`, `intensity`: weights "
-      "and biases of the layers, `intensity` may be None; `sees`: whether the intensity network has the inputs SDF, "
-      "viewing direction and range. The arrays are kept by reference: each call reads their current values.");
+      "`features` (num_rows, 8); `frequencies`: half width (m) and number; `sdf`, `intensity`: weights "
+      "and biases of the layers, `intensity` may be None; `sees`: whether the intensity network has the inputs viewing "
+      "direction and range. The arrays are kept by reference: each call reads their current values.");
   cls.def(
-      "begin_sdf",
-      [](LossArrays& self, const Array<float>& points, const Array<float>& sdf_m, const Parts& parts, double weight,
-         Array<std::int32_t>& located, Array<float>& interpolated_grad, HeldThreadPool& pool) {
-        FieldLoss& loss = self.loss();
-        const LossBatch batch = points_of(points, sdf_m, parts);
-        const FeatureGradients gradients = by_features(loss, points.shape(0), located, interpolated_grad);
-        loss.begin(TrainedLosses::kSdf, batch, {weight, 0}, gradients, pool.pool());
-        pool.hold(py::make_tuple(py::cast(&self), points, sdf_m, located, interpolated_grad));
-      },
-      "points"_array, "sdf_m"_array, "parts"_a, "weight"_a, "located"_array, "interpolated_grad"_array, "pool"_a,
-      "Starts computing the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m, on the "
-      "other threads of `pool`; `finish` waits for it. `parts` are consecutive samples for one thread: numbers of "
-      "samples, and of samples with intensity labels. Gradients are summed in the order of the parts, independent of "
-      "the number of threads. Gradients of `weight` times the loss are written to `sdf_gradients` and, by the "
-      "interpolated features, to `interpolated_grad` (N, 8 L), the cells of the points to `located` (N, L) int32.");
-  cls.def(
-      "begin_joint",
+      "begin",
       [](LossArrays& self, const Array<float>& points, const Array<float>& sdf_m, const Parts& parts,
-         const Rows<float>& rays, const std::vector<Drop>& dropout, const std::pair<double, double>& weights,
-         Array<std::int32_t>& located, Array<float>& interpolated_grad, HeldThreadPool& pool) {
+         const std::optional<Rows<float>>& rays, const std::vector<Drop>& dropout,
+         std::optional<Array<std::int32_t>> located, std::optional<Array<float>> interpolated_grad,
+         HeldThreadPool& pool) {
         FieldLoss& loss = self.loss();
-        const LossBatch batch = rays_of(points, sdf_m, parts, rays, dropout);
-        const FeatureGradients gradients = by_features(loss, points.shape(0), located, interpolated_grad);
-        loss.begin(TrainedLosses::kBoth, batch, {weights.first, weights.second}, gradients, pool.pool());
+        const LossBatch batch = batch_of(points, sdf_m, parts, rays, dropout);
+        FeatureGradients gradients{nullptr, nullptr};
+        if (located && interpolated_grad) {
+          check_shape(*located, {points.shape(0), loss.parameters().table->num_levels()}, "located");
+          check_shape(*interpolated_grad, {points.shape(0), loss.parameters().levels()}, "interpolated_grad");
+          gradients = {located->mutable_data(), interpolated_grad->mutable_data()};
+        }
+        loss.begin(batch, gradients, pool.pool());
         pool.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays, located, interpolated_grad));
       },
-      "points"_array, "sdf_m"_array, "parts"_a, "rays"_array, "dropout"_a, "weights"_a, "located"_array,
-      "interpolated_grad"_array, "pool"_a,
-      "Like `begin_sdf`, for both losses: their means, and the gradients of their sum weighted by `weights`. `rays` "
-      "(N, 8) are the rays of the samples. `dropout` has up to two pairs, for the encodings of cells and positions: "
-      "seed of `random_bytes` (samples seen, columns), and the bound below which a byte keeps its element.");
-  cls.def(
-      "begin_intensity",
-      [](LossArrays& self, const Array<float>& points, const Array<float>& sdf_m, const Parts& parts,
-         const Rows<float>& rays, const std::vector<Drop>& dropout, double weight, HeldThreadPool& pool) {
-        const LossBatch batch = rays_of(points, sdf_m, parts, rays, dropout);
-        self.loss().begin(TrainedLosses::kIntensity, batch, {0, weight}, {nullptr, nullptr}, pool.pool());
-        pool.hold(py::make_tuple(py::cast(&self), points, sdf_m, rays));
-      },
-      "points"_array, "sdf_m"_array, "parts"_a, "rays"_array, "dropout"_a, "weight"_a, "pool"_a,
-      "Like `begin_joint`, for the intensities alone, with frozen SDF network and features: writes to "
-      "`intensity_gradients` only.");
+      "points"_array, "sdf_m"_array, "parts"_a, "rays"_array.none(true), "dropout"_a, "located"_array.none(true),
+      "interpolated_grad"_array.none(true), "pool"_a,
+      "Starts computing the mean losses of a batch and the gradients of their sum on the other threads of `pool`; "
+      "`finish` waits for it. With `located` (N, L) int32 and `interpolated_grad` (N, 8 L), the loss of the signed "
+      "distances `sdf_m` (N,) at `points` (N, 3), local frame, m: writes the cells of the points and the gradients by "
+      "the interpolated features to these, else features and SDF network are frozen. With the `rays` (N, 8) of the "
+      "samples, that of the intensities. `parts` are consecutive samples for one thread: numbers of samples, and of "
+      "samples with intensity labels. Gradients are summed in the order of the parts, independent of the number of "
+      "threads. `dropout` has up to two pairs, for the encodings of cells and positions: seed of `random_bytes` "
+      "(samples "
+      "seen, columns), and the bound below which a byte keeps its element.");
   cls.def(
       "finish",
       [](LossArrays& self, HeldThreadPool& pool) {

@@ -1,6 +1,4 @@
 #include <optional>
-#include <tuple>
-#include <vector>
 
 #include "bindings/held_thread_pool.hpp"
 #include "bindings/subjects.hpp"
@@ -14,7 +12,7 @@ void bind_optimiser(VertexTableClass& cls) {
   using namespace py::literals;
   cls.def(
       "begin_adam_step",
-      [](const VertexTable& table, const std::vector<std::tuple<Floats, Integers, Rows<float>>>& batches,
+      [](const VertexTable& table, const Floats& points, const Integers& located, const Rows<float>& out_grad,
          Floats& features, Integers& states, const Floats& decays, std::int32_t step, double learning_rate,
          double epsilon, HeldThreadPool& pool) {
         check_shape(features, {table.num_rows(), kFeatureDim}, "features");
@@ -22,14 +20,9 @@ void bind_optimiser(VertexTableClass& cls) {
         if (step < 1) throw std::invalid_argument("step must be at least 1");
         if (decays.ndim() != 2 || decays.shape(0) <= step || decays.shape(1) != 2)
           throw std::invalid_argument("decays must have shape (more than step, 2)");
-        std::vector<PointBatch<float>> points;
-        std::vector<const float*> grads;
-        std::vector<std::int64_t> strides;
-        for (const auto& [batch_points, located, out_grad] : batches) {
-          points.push_back(point_batch(table, batch_points, located, std::optional<Floats>()));
-          grads.push_back(out_grad.data());
-          strides.push_back(row_stride(out_grad, points.back().count, table.num_levels() * kFeatureDim, "out_grad"));
-        }
+        const PointBatch<float> batch = point_batch(table, points, located, std::optional<Floats>());
+        const std::int64_t stride = row_stride(out_grad, batch.count, table.num_levels() * kFeatureDim, "out_grad");
+        const float* grad = out_grad.data();
         const float* powers = decays.data();
         const AdamStep adam{features.mutable_data(),
                             reinterpret_cast<RowState*>(states.mutable_data()),
@@ -38,13 +31,14 @@ void bind_optimiser(VertexTableClass& cls) {
                             static_cast<float>(learning_rate / (1 - static_cast<double>(powers[2 * step]))),
                             static_cast<float>(1 / (1 - static_cast<double>(powers[2 * step + 1]))),
                             static_cast<float>(epsilon)};
-        pool.pool().begin(num_level_tasks(table), [&table, points, grads, strides, adam](std::int64_t task) {
-          adam_task(table, points, grads, strides, adam, level_task(table, task));
+        pool.pool().begin(num_level_tasks(table), [&table, batch, grad, stride, adam](std::int64_t task) {
+          adam_task(table, batch, grad, stride, adam, level_task(table, task));
         });
-        pool.hold(py::make_tuple(py::cast(&table), batches, features, states, decays));
+        pool.hold(py::make_tuple(py::cast(&table), points, located, out_grad, features, states, decays));
       },
-      "batches"_a, "features"_array, "states"_array, "decays"_array, "step"_a, "learning_rate"_a, "epsilon"_a, "pool"_a,
-      "Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed "
+      "points"_array, "located"_array, "out_grad"_array, "features"_array, "states"_array, "decays"_array, "step"_a,
+      "learning_rate"_a, "epsilon"_a, "pool"_a,
+      "Starts a step of Adam for the features touched by `points`, with gradients summed "
       "like `scatter`, on the other threads of `pool`; its `finish` waits for it. `states` (num_rows, 8) int32 "
       "are mean gradients in bfloat16 (4 numbers), their mean square as float32, the last step that updated the "
       "row, and zeros. `decays` (more than step, 2) are the powers of both betas.");

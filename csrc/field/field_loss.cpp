@@ -40,9 +40,8 @@ void add(const std::vector<Layer<float>>& layers, const std::vector<LayerGradien
 FieldLoss::FieldLoss(const FieldParameters& parameters, const LossOptions& options, const NetworkGradients& gradients)
     : parameters_(parameters), options_(options), gradients_(gradients) {
   const Frequencies& f = parameters.frequencies;
-  if (f.first < 0 || f.count < 0 || f.first > kMaxFrequencies || f.count > kMaxFrequencies - f.first) {
-    throw std::invalid_argument("frequencies must lie in [0, " + std::to_string(kMaxFrequencies) + ")");
-  }
+  if (f.count < 0 || f.count > kMaxFrequencies)
+    throw std::invalid_argument("there must be 0 to " + std::to_string(kMaxFrequencies) + " frequencies");
   if (!(f.half_width_m > 0)) throw std::invalid_argument("half_width_m must be positive");
   if (!(options.sigma_m > 0)) throw std::invalid_argument("sigma_m must be positive");
   if (parameters.sdf.empty()) throw std::invalid_argument("there must be an SDF network");
@@ -68,9 +67,8 @@ struct FieldLoss::Job {
   std::unique_ptr<std::int32_t[]> located;    // if the caller does not request it
 };
 
-void FieldLoss::begin(TrainedLosses losses, const LossBatch& batch, FieldLosses weights,
-                      const FeatureGradients& by_features, ThreadPool& pool) {
-  const bool trains = losses != TrainedLosses::kIntensity, sees = losses != TrainedLosses::kSdf;
+void FieldLoss::begin(const LossBatch& batch, const FeatureGradients& by_features, ThreadPool& pool) {
+  const bool trains = by_features.interpolated != nullptr, sees = batch.rays != nullptr;
   if (sees && parameters_.intensity.empty()) throw std::invalid_argument("there is no intensity network");
   if (job_) throw std::logic_error("the batch before this one is not finished");
   const auto job = std::make_shared<Job>(PassWeights(parameters_, trains, sees));
@@ -101,10 +99,9 @@ void FieldLoss::begin(TrainedLosses losses, const LossBatch& batch, FieldLosses 
     job->located = large_array<std::int32_t>(count * parameters_.table->num_levels());
     to.located = job->located.get();
   }
-  const FieldLosses shares{weights.sdf * job->means.sdf, weights.intensity * job->means.intensity};
-  pool.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to, shares](std::int64_t i) {
+  pool.begin(static_cast<std::int64_t>(job->parts.size()), [this, job, to](std::int64_t i) {
     const PassInput& part = job->parts[i];
-    const PassRequest request{shares,
+    const PassRequest request{job->means,
                               job->trains ? &job->by_networks[i].sdf : nullptr,
                               job->sees ? &job->by_networks[i].intensity : nullptr,
                               {to.located + part.before * parameters_.table->num_levels(),

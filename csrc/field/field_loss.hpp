@@ -17,15 +17,15 @@ namespace radarsdf {
 // first columns of the parts, and the number of columns.
 constexpr std::int64_t kRayPoint = 0, kRayDirection = 3, kRayRange = 6, kRayIntensity = 7, kRayColumns = 8;
 
-// Frequencies of the Fourier encoding: 2^first to 2^(first + count - 1), in units of pi / half_width_m.
+// Frequencies of the Fourier encoding: 1 to 2^(count - 1), in units of pi / half_width_m.
 struct Frequencies {
   double half_width_m;
-  int first, count;
+  int count;
 };
 
-// Inputs of the intensity network after the encodings and the geometry feature, in this order.
+// Inputs of the intensity network after the encodings, the geometry feature and the logit, in this order.
 struct IntensityInputs {
-  bool sdf, view_direction, log_range;
+  bool view_direction, log_range;
 };
 
 // Trainable parameters, as in the NeuralField of the Python package. The caller owns the arrays: values may change
@@ -45,7 +45,7 @@ struct FieldParameters {
   std::int64_t waves() const { return 6 * std::int64_t{frequencies.count}; }
   std::int64_t feature() const { return sdf.back().outputs - 1; }
   std::int64_t intensity_inputs() const {
-    return cells() + waves() + feature() + sees.sdf + kHarmonics * sees.view_direction + sees.log_range;
+    return cells() + waves() + sdf.back().outputs + kHarmonics * sees.view_direction + sees.log_range;
   }
 };
 
@@ -88,14 +88,10 @@ struct FeatureGradients {
   float* interpolated;    // (count, 8 num_levels), by the interpolated features
 };
 
-// Means over the batch, or their weights in the gradients.
+// Means over the batch.
 struct FieldLosses {
   double sdf, intensity;
 };
-
-// Which losses a batch trains: that of the signed distances, both, or that of the intensities alone, with frozen
-// features and SDF network.
-enum class TrainedLosses { kSdf, kBoth, kIntensity };
 
 // Asynchronous: `begin` starts a batch, and `finish` waits for it; then all gradients are overwritten. Gradients
 // are computed by part and summed in the order of the parts, independent of the number of threads. One batch at a time;
@@ -107,9 +103,9 @@ class FieldLoss {
 
   const FieldParameters& parameters() const { return parameters_; }
 
-  // by_features: not used by TrainedLosses::kIntensity.
-  void begin(TrainedLosses losses, const LossBatch& batch, FieldLosses weights, const FeatureGradients& by_features,
-             ThreadPool& pool);
+  // Trains the intensities if the batch has rays, and the signed distances if `by_features` has an array; else features
+  // and SDF network are frozen.
+  void begin(const LossBatch& batch, const FeatureGradients& by_features, ThreadPool& pool);
   // Joins the thread pool. Losses that were not requested are 0.
   FieldLosses finish(ThreadPool& pool);
 

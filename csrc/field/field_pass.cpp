@@ -81,8 +81,8 @@ class Pass {
       }
     }
     if (waves_ > 0) {
-      fourier(part_.points, part_.count, field_.frequencies.half_width_m, field_.frequencies.first,
-              field_.frequencies.count, encoding_.get() + cells_, row(), 1);
+      fourier(part_.points, part_.count, field_.frequencies.half_width_m, 0, field_.frequencies.count,
+              encoding_.get() + cells_, row(), 1);
     }
   }
 
@@ -120,8 +120,8 @@ class Pass {
   // Mean absolute error, and gradients by the layers and, if `trains`, by the outputs of the SDF network.
   double intensity_loss(bool trains) {
     const std::int64_t count = part_.num_seen, width = field_.intensity[0].inputs;
-    const std::int64_t links = feature_ + field_.sees.sdf;  // columns from the SDF network
-    const std::int64_t rest = dim() + links;                // columns from here on are data and need no gradient
+    const std::int64_t links = feature_ + 1;  // columns from the SDF network
+    const std::int64_t rest = dim() + links;  // columns from here on are data and need no gradient
     const std::int64_t row_of_x = padded(width);
     const Matrix x = matrix(count, row_of_x);
     drop(part_.dropout[0], cells_, encoding_.get(), row(), x.get(), row_of_x);
@@ -177,7 +177,7 @@ class Pass {
   void fill(std::int64_t i, float* x) const {
     const float* out = out_.get() + i * (1 + feature_);
     x = std::copy_n(out + 1, feature_, x);
-    if (field_.sees.sdf) *x++ = out[0];
+    *x++ = out[0];
     if (field_.sees.view_direction) x += kHarmonics;
     if (field_.sees.log_range) {
       const float range_m = part_.rays[i * part_.ray_stride + kRayRange] - part_.sdf_m[i];
@@ -188,12 +188,11 @@ class Pass {
   // Adds the gradients of the intensity loss by the outputs of the SDF network.
   void add_links() {
     if (!links_grad_) return;
-    const std::int64_t links = feature_ + field_.sees.sdf;
     for (std::int64_t i = 0; i < part_.num_seen; ++i) {
-      const float* from = links_grad_.get() + i * links;
+      const float* from = links_grad_.get() + i * (1 + feature_);
       float* to = out_grad_.get() + i * (1 + feature_);
       for (std::int64_t g = 0; g < feature_; ++g) to[1 + g] += from[g];
-      if (field_.sees.sdf) to[0] += from[feature_];
+      to[0] += from[feature_];
     }
   }
 
@@ -229,7 +228,7 @@ class Pass {
 PassWeights::PassWeights(const FieldParameters& field, bool trains, bool sees) : sdf(field.sdf) {
   if (trains) sdf_backward.emplace(field.sdf, std::vector<MlpInput>{{field.cells(), true}, {field.waves(), false}});
   if (!sees) return;
-  const std::int64_t links = field.feature() + field.sees.sdf;
+  const std::int64_t links = field.feature() + 1;
   const std::int64_t rest = field.intensity_inputs() - field.cells() - field.waves() - links;
   intensity.emplace(field.intensity);
   intensity_backward.emplace(

@@ -24,7 +24,7 @@ struct PassInput {
 
 // Requested gradients of a part.
 struct PassRequest {
-  FieldLosses shares;                                   // weight of one sample in the means over the batch
+  FieldLosses shares;                                   // of one sample in the means over the batch
   const std::vector<LayerGradients<float>>* sdf;        // null: features and SDF network are frozen, without a loss
   const std::vector<LayerGradients<float>>* intensity;  // null: no loss of intensities
   FeatureGradients by_features;                         // `interpolated` is null if they are frozen

@@ -2,7 +2,6 @@
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
 #include "field/level_tasks.hpp"
 #include "field/point_batch.hpp"
@@ -11,10 +10,9 @@
 
 namespace radarsdf {
 
-// One task (see level_tasks.hpp) of a step of Adam on the rows that batches touch, with the gradients that `scatter`
-// would sum over the batches.
-void adam_task(const VertexTable& table, const std::vector<PointBatch<float>>& batches,
-               const std::vector<const float*>& grads, const std::vector<std::int64_t>& strides, const AdamStep& adam,
-               LevelTask task);
+// One task (see level_tasks.hpp) of a step of Adam on the rows that a batch touches, with the gradients that `scatter`
+// would sum.
+void adam_task(const VertexTable& table, const PointBatch<float>& batch, const float* out_grad, std::int64_t stride,
+               const AdamStep& adam, LevelTask task);
 
 }  // namespace radarsdf

@@ -198,13 +198,9 @@ class VertexTable:
         """
     def begin_adam_step(
         self,
-        batches: collections.abc.Sequence[
-            tuple[
-                typing.Annotated[numpy.typing.ArrayLike, numpy.float32],
-                typing.Annotated[numpy.typing.ArrayLike, numpy.int32],
-                typing.Annotated[numpy.typing.ArrayLike, numpy.float32],
-            ]
-        ],
+        points: numpy.typing.NDArray[numpy.float32],
+        located: numpy.typing.NDArray[numpy.int32],
+        out_grad: numpy.typing.NDArray[numpy.float32],
         features: numpy.typing.NDArray[numpy.float32],
         states: numpy.typing.NDArray[numpy.int32],
         decays: numpy.typing.NDArray[numpy.float32],
@@ -214,7 +210,7 @@ class VertexTable:
         pool: ThreadPool,
     ) -> None:
         """
-        Starts a step of Adam for the features touched by batches of (points, located, out_grad), with gradients summed like `scatter`, on the other threads of `pool`; its `finish` waits for it. `states` (num_rows, 8) int32 are mean gradients in bfloat16 (4 numbers), their mean square as float32, the last step that updated the row, and zeros. `decays` (more than step, 2) are the powers of both betas.
+        Starts a step of Adam for the features touched by `points`, with gradients summed like `scatter`, on the other threads of `pool`; its `finish` waits for it. `states` (num_rows, 8) int32 are mean gradients in bfloat16 (4 numbers), their mean square as float32, the last step that updated the row, and zeros. `decays` (more than step, 2) are the powers of both betas.
         """
     def cells_near_surface(
         self,
@@ -455,72 +451,35 @@ class FieldLoss:
         table: VertexTable,
         features: numpy.typing.NDArray[numpy.float32],
         frequencies: tuple[
-            typing.SupportsFloat | typing.SupportsIndex,
-            typing.SupportsInt | typing.SupportsIndex,
-            typing.SupportsInt | typing.SupportsIndex,
+            typing.SupportsFloat | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex
         ],
         sdf: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]],
         intensity: tuple[list[numpy.typing.NDArray[numpy.float32]], list[numpy.typing.NDArray[numpy.float32]]]
         | None,
-        sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(3)"],
+        sees: typing.Annotated[collections.abc.Sequence[bool], "FixedSize(2)"],
         sigma_m: typing.SupportsFloat | typing.SupportsIndex,
         intensity_in_free_space: bool,
     ) -> None:
         """
-        `features` (num_rows, 8); `frequencies`: half width (m), first exponent and number; `sdf`, `intensity`: weights and biases of the layers, `intensity` may be None; `sees`: whether the intensity network has the inputs SDF, viewing direction and range. The arrays are kept by reference: each call reads their current values.
+        `features` (num_rows, 8); `frequencies`: half width (m) and number; `sdf`, `intensity`: weights and biases of the layers, `intensity` may be None; `sees`: whether the intensity network has the inputs viewing direction and range. The arrays are kept by reference: each call reads their current values.
         """
-    def begin_intensity(
+    def begin(
         self,
         points: numpy.typing.NDArray[numpy.float32],
         sdf_m: numpy.typing.NDArray[numpy.float32],
         parts: collections.abc.Sequence[
             tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
-        rays: numpy.typing.NDArray[numpy.float32],
+        rays: numpy.typing.NDArray[numpy.float32] | None,
         dropout: collections.abc.Sequence[
             tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
         ],
-        weight: typing.SupportsFloat | typing.SupportsIndex,
+        located: numpy.typing.NDArray[numpy.int32] | None,
+        interpolated_grad: numpy.typing.NDArray[numpy.float32] | None,
         pool: ThreadPool,
     ) -> None:
         """
-        Like `begin_joint`, for the intensities alone, with frozen SDF network and features: writes to `intensity_gradients` only.
-        """
-    def begin_joint(
-        self,
-        points: numpy.typing.NDArray[numpy.float32],
-        sdf_m: numpy.typing.NDArray[numpy.float32],
-        parts: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        rays: numpy.typing.NDArray[numpy.float32],
-        dropout: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        weights: tuple[
-            typing.SupportsFloat | typing.SupportsIndex, typing.SupportsFloat | typing.SupportsIndex
-        ],
-        located: numpy.typing.NDArray[numpy.int32],
-        interpolated_grad: numpy.typing.NDArray[numpy.float32],
-        pool: ThreadPool,
-    ) -> None:
-        """
-        Like `begin_sdf`, for both losses: their means, and the gradients of their sum weighted by `weights`. `rays` (N, 8) are the rays of the samples. `dropout` has up to two pairs, for the encodings of cells and positions: seed of `random_bytes` (samples seen, columns), and the bound below which a byte keeps its element.
-        """
-    def begin_sdf(
-        self,
-        points: numpy.typing.NDArray[numpy.float32],
-        sdf_m: numpy.typing.NDArray[numpy.float32],
-        parts: collections.abc.Sequence[
-            tuple[typing.SupportsInt | typing.SupportsIndex, typing.SupportsInt | typing.SupportsIndex]
-        ],
-        weight: typing.SupportsFloat | typing.SupportsIndex,
-        located: numpy.typing.NDArray[numpy.int32],
-        interpolated_grad: numpy.typing.NDArray[numpy.float32],
-        pool: ThreadPool,
-    ) -> None:
-        """
-        Starts computing the mean loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m, on the other threads of `pool`; `finish` waits for it. `parts` are consecutive samples for one thread: numbers of samples, and of samples with intensity labels. Gradients are summed in the order of the parts, independent of the number of threads. Gradients of `weight` times the loss are written to `sdf_gradients` and, by the interpolated features, to `interpolated_grad` (N, 8 L), the cells of the points to `located` (N, L) int32.
+        Starts computing the mean losses of a batch and the gradients of their sum on the other threads of `pool`; `finish` waits for it. With `located` (N, L) int32 and `interpolated_grad` (N, 8 L), the loss of the signed distances `sdf_m` (N,) at `points` (N, 3), local frame, m: writes the cells of the points and the gradients by the interpolated features to these, else features and SDF network are frozen. With the `rays` (N, 8) of the samples, that of the intensities. `parts` are consecutive samples for one thread: numbers of samples, and of samples with intensity labels. Gradients are summed in the order of the parts, independent of the number of threads. `dropout` has up to two pairs, for the encodings of cells and positions: seed of `random_bytes` (samples seen, columns), and the bound below which a byte keeps its element.
         """
     def finish(self, pool: ThreadPool) -> tuple[float, float]:
         """

@@ -110,15 +110,12 @@ void adam(radarsdf::Encoding encoding, int threads, Results& results) {
   std::vector<radarsdf::RowState> states(features.size() / 8);
   radarsdf::locate(table, points.data(), kPoints, located.data(), threads);
   const std::vector<float> decays{1, 1, 0.9F, 0.99F, 0.81F, 0.98F};
-  const std::int64_t half = kPoints / 2, stride = 8 * kLevels;
-  const radarsdf::PointBatch<float> whole{points.data(), nullptr, located.data(), half};
-  const radarsdf::PointBatch<float> rest{points.data() + 3 * half, nullptr, located.data() + kLevels * half, half};
+  const radarsdf::PointBatch<float> batch{points.data(), nullptr, located.data(), kPoints};
   for (std::int32_t step = 1; step <= 2; ++step) {
     const radarsdf::AdamStep adam{features.data(), states.data(), decays.data(), step, 0.01F, 1.0F, 1e-8F};
     radarsdf::ThreadPool pool(threads);
     pool.run(radarsdf::num_level_tasks(table), [&](std::int64_t task) {
-      radarsdf::adam_task(table, {whole, rest}, {grad.data(), grad.data() + stride * half}, {stride, stride}, adam,
-                          radarsdf::level_task(table, task));
+      radarsdf::adam_task(table, batch, grad.data(), 8 * kLevels, adam, radarsdf::level_task(table, task));
     });
   }
   results.add(features.data(), 8 * table.num_rows());

@@ -79,15 +79,14 @@ def cells_and_points(encoding, half_m=1.0, count=500):
 
 
 def steps(cells, batches, threads, learning_rate=1e-2):
-    """Features after one step of RowAdam per batch; the loss is the sum of interpolated features times weights."""
+    """Features after one step of RowAdam per batch of parts; the loss is the sum of interpolated features times weights."""
     adam = RowAdam(cells, learning_rate)
     with ThreadPool(threads) as pool:
         for parts in batches:
-            touched = []
-            for points, weights in parts:
-                gradient = np.broadcast_to(weights, (len(points), cells.interpolated_dim)).copy()
-                located = kernels.locate(points, cells.table).numpy()
-                touched.append(Touched(points.numpy(), located, gradient))
+            points = torch.cat([points for points, _ in parts])
+            shape = cells.interpolated_dim
+            gradient = np.concatenate([np.broadcast_to(w, (len(p), shape)).copy() for p, w in parts])
+            touched = Touched(points.numpy(), kernels.locate(points, cells.table).numpy(), gradient)
             adam.step(touched, pool, meanwhile=lambda: None)
     return cells.features.detach().clone()
 

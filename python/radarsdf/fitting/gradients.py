@@ -122,10 +122,10 @@ class CoreGradients(GradientBackend):
         self._loss = _core.FieldLoss(
             table=field.cells.table,
             features=kernels.view(field.cells.features),
-            frequencies=(field.half_width_m, 0, field.num_frequencies),
+            frequencies=(field.half_width_m, field.num_frequencies),
             sdf=_layers(field.sdf_network),
             intensity=None if network is None else _layers(network),
-            sees=(True, networks.view_direction, networks.log_range),
+            sees=(networks.view_direction, networks.log_range),
             sigma_m=field.sigma_m,
             intensity_in_free_space=config.training.intensity_in_free_space,
         )
@@ -143,19 +143,17 @@ class CoreGradients(GradientBackend):
             self._located = np.empty((count, cells.table.num_levels), np.int32)
             self._interpolated_grad = np.empty((count, cells.interpolated_dim), batch.points.dtype)
         touched = Touched(batch.points, self._located, self._interpolated_grad)
-        names = ("points", "sdf_m", "parts")
-        arguments: dict[str, Any] = {name: getattr(batch, name) for name in names} | {"pool": pool}
-        if losses != "intensity":
-            arguments |= {"located": touched.located, "interpolated_grad": touched.gradient}
-        if losses != "sdf":
-            dropout = [(dropout.seed, dropout.keep) for _, dropout in self._draw_dropouts()]
-            arguments |= {"rays": batch.of_ray, "dropout": dropout}
-        if losses == "sdf":
-            self._loss.begin_sdf(**arguments, weight=1.0)
-        elif losses == "joint":
-            self._loss.begin_joint(**arguments, weights=(1.0, 1.0))
-        else:
-            self._loss.begin_intensity(**arguments, weight=1.0)
+        dropouts = [] if losses == "sdf" else self._draw_dropouts()
+        self._loss.begin(
+            points=batch.points,
+            sdf_m=batch.sdf_m,
+            parts=batch.parts,
+            rays=None if losses == "sdf" else batch.of_ray,
+            dropout=[(dropout.seed, dropout.keep) for _, dropout in dropouts],
+            located=None if losses == "intensity" else touched.located,
+            interpolated_grad=None if losses == "intensity" else touched.gradient,
+            pool=pool,
+        )
         try:
             result = meanwhile()
         finally:

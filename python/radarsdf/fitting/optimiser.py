@@ -157,8 +157,8 @@ class RowAdam:
         self.step_count = count
 
     @torch.no_grad()
-    def step(self, touched: Sequence[Touched], pool: ThreadPool, meanwhile: Callable[[], None]) -> None:
-        """Update the rows touched by batches. The calling thread first runs `meanwhile`, then helps the others."""
+    def step(self, touched: Touched, pool: ThreadPool, meanwhile: Callable[[], None]) -> None:
+        """Update the rows touched by a batch. The calling thread first runs `meanwhile`, then helps the others."""
         self.step_count += 1
         if self.step_count >= len(self._decays):
             powers = torch.arange(2 * self.step_count + 1022, dtype=torch.float64, device="cpu")[:, None]
@@ -166,7 +166,9 @@ class RowAdam:
             # Denormal numbers would be slow, and are negligible compared with a gradient.
             self._decays = torch.where(decays < 1e-30, 0.0, decays).to(self._decays.dtype)
         self._cells.table.begin_adam_step(
-            [(t.points, t.located, t.gradient) for t in touched],
+            touched.points,
+            touched.located,
+            touched.gradient,
             *self._arrays,
             self._decays.numpy(),
             self.step_count,

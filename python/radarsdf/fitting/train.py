@@ -334,7 +334,7 @@ class Training:
             else:
                 assert found.touched is not None
                 rows.learning_rate = share * rows.full_rate
-                rows.step([found.touched], self._pool, meanwhile=move_networks)
+                rows.step(found.touched, self._pool, meanwhile=move_networks)
             self.losses[stage.name] = loss
             for name, count in done.items():
                 self.iterations_done[name] = min(count, self.iterations[name])
