@@ -1,3 +1,7 @@
+#include <pybind11/stl.h>
+
+#include <optional>
+
 #include "bindings/arrays.hpp"
 #include "bindings/subjects.hpp"
 #include "returns/scan_rays.hpp"
@@ -68,6 +72,22 @@ void bind_visibility(py::module_& m) {
       "the K selected returns as rays: points and unit directions (K, 3) and ranges (K,) float32, local frame, m. "
       "`rotations` (F, 9) from sensor to world, `positions` (F, 3) of the sensor and `seen_from` (F, 3), the origins "
       "of the rays, local frame, m, `max_ranges_m` (F,), float64.");
+  m.def(
+      "hash_rays",
+      [](const Array<float>& directions, const Array<float>& ranges_m, const std::optional<Array<float>>& intensities,
+         int num_threads) {
+        const std::int64_t count = check_points(directions, "directions");
+        check_shape(ranges_m, {count}, "ranges_m");
+        if (intensities) check_shape(*intensities, {count}, "intensities");
+        Array<std::uint64_t> keys = new_array<std::uint64_t>(count);
+        const float* values = intensities ? intensities->data() : nullptr;
+        without_gil(
+            [&] { hash_rays(directions.data(), ranges_m.data(), values, count, keys.mutable_data(), num_threads); });
+        return keys;
+      },
+      "directions"_array, "ranges_m"_array, "intensities"_array, "num_threads"_a = 0,
+      "Pseudo-random keys (N,) uint64 of rays, for samples that do not depend on their order. `directions` (N, 3), "
+      "`ranges_m` (N,) and `intensities` (N,) or None, float32.");
 }
 
 }  // namespace radarsdf

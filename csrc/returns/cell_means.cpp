@@ -6,6 +6,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "util/bits.hpp"
 #include "util/parallel.hpp"
 #include "util/prefetch.hpp"
 
@@ -16,12 +17,6 @@ constexpr double kDirectionOffset = 0.37;  // keeps bin edges off the axes of th
 constexpr double kFarthestCell = 1e15;     // index of all farther coordinates and of NaN
 constexpr int kViewsPerCell = 8;           // estimate; with fewer views the table grows
 constexpr double kCauchyMedians = 2.0;     // scale of the Cauchy weight, in median absolute values
-
-// Keys use 63 bits, so none equals kEmptyKey. Among a million cells, a collision has a probability of 1e-7.
-std::uint64_t mixed(std::uint64_t hash, std::uint64_t number) {
-  hash = (hash ^ number) * 0x9e3779b97f4a7c15;
-  return hash ^ hash >> 32;
-}
 
 std::uint64_t cell_of(double place) {
   if (!(std::abs(place) < kFarthestCell)) place = kFarthestCell;
@@ -48,6 +43,7 @@ class Tiles {
         per_direction_(kind.direction_step > 0 ? 1 / kind.direction_step : 0),
         per_rad_(kind.incidence_step_rad > 0 ? 1 / kind.incidence_step_rad : 0) {}
 
+  // Of 63 bits, so none equals kEmptyKey. Among a million cells, a collision has a probability of 1e-7.
   std::uint64_t key(const Views& views, std::int64_t i) const {
     std::uint64_t hash = mixed(seed_, cell_of(views.points + 3 * i, per_m_, offset_));
     if (per_direction_ > 0) {

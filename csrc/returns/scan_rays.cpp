@@ -1,7 +1,10 @@
 #include "returns/scan_rays.hpp"
 
 #include <algorithm>
+#include <cmath>
+#include <cstring>
 
+#include "util/bits.hpp"
 #include "util/parallel.hpp"
 #include "util/vec3.hpp"
 
@@ -36,6 +39,26 @@ std::int64_t scan_rays(const PlacedScans& scans, double min_range_m, bool* kept,
     ranges_m[rows++] = ranges_m[i];
   }
   return rows;
+}
+
+void hash_rays(const float* directions, const float* ranges_m, const float* intensities, std::int64_t count,
+               std::uint64_t* keys, int num_threads) {
+  // Directions and ranges of a tile differ in their last bits, which only decide among rays that are equal otherwise.
+  constexpr float kPerMetre = 64;
+  constexpr std::uint64_t kLastBits = 0xffffff;
+  parallel_for(count, 1 << 13, num_threads, [&](std::int64_t i) {
+    const float *d = directions + 3 * i, intensity = intensities != nullptr ? intensities[i] : 0.0F;
+    const float numbers[5] = {d[0], d[1], d[2], ranges_m[i], intensity};
+    std::uint32_t bits[5];
+    std::memcpy(bits, numbers, sizeof bits);
+    std::uint64_t coarse = 0, fine = 0;
+    for (int k = 0; k < (intensities != nullptr ? 5 : 4); ++k) {
+      const std::int64_t place = k < 4 ? static_cast<std::int64_t>(std::floor(kPerMetre * numbers[k])) : bits[k];
+      coarse = mixed(coarse, static_cast<std::uint32_t>(place));
+      fine = mixed(fine, bits[k]);
+    }
+    keys[i] = (coarse & ~kLastBits) | (fine & kLastBits);
+  });
 }
 
 }  // namespace radarsdf

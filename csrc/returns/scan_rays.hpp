@@ -20,4 +20,9 @@ struct PlacedScans {
 std::int64_t scan_rays(const PlacedScans& scans, double min_range_m, bool* kept, float* points, float* directions,
                        float* ranges_m, int num_threads);
 
+// keys: (count), pseudo-random, for samples that do not depend on the order of rays, and of a part of a map only in
+// their last bits. directions: (count, 3), ranges_m: (count), intensities: (count) or null.
+void hash_rays(const float* directions, const float* ranges_m, const float* intensities, std::int64_t count,
+               std::uint64_t* keys, int num_threads);
+
 }  // namespace radarsdf

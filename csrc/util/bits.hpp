@@ -33,4 +33,10 @@ inline int count_bits(std::uint64_t bits) {
   return static_cast<int>((bits * 0x0101010101010101u) >> 56);
 }
 
+// Adds a number to a hash.
+inline std::uint64_t mixed(std::uint64_t hash, std::uint64_t number) {
+  hash = (hash ^ number) * 0x9e3779b97f4a7c15;  // 2^64 over the golden ratio, odd
+  return hash ^ hash >> 32;
+}
+
 }  // namespace radarsdf

@@ -47,6 +47,7 @@ __all__: list[str] = [
     "fit_cell_means",
     "fourier",
     "gather_rows",
+    "hash_rays",
     "instruction_set",
     "marching_cubes_dense",
     "marching_cubes_dense_backward",
@@ -967,6 +968,16 @@ def gather_rows(
 ) -> None:
     """
     Writes the rows `order` (M,) int32 of `blocks` (N, W) float32, concatenated, to `out` (M, sum of the W) float32.
+    """
+
+def hash_rays(
+    directions: numpy.typing.NDArray[numpy.float32],
+    ranges_m: numpy.typing.NDArray[numpy.float32],
+    intensities: numpy.typing.NDArray[numpy.float32] | None,
+    num_threads: typing.SupportsInt | typing.SupportsIndex = 0,
+) -> numpy.typing.NDArray[numpy.uint64]:
+    """
+    Pseudo-random keys (N,) uint64 of rays, for samples that do not depend on their order. `directions` (N, 3), `ranges_m` (N,) and `intensities` (N,) or None, float32.
     """
 
 def instruction_set() -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from radarsdf._core import scan_rays
+from radarsdf._core import hash_rays, scan_rays
 from radarsdf.arrays import Array, Bools, Floats, Floats32, Ints32, Keys
 from radarsdf.checks import (
     MAX_POSITION_M,
@@ -26,10 +26,8 @@ from radarsdf.checks import (
 from radarsdf.checks import positions as check_positions
 from radarsdf.lattice import WorldLattice
 from radarsdf.returns.intensities import Plausible
-from radarsdf.returns.sampling import hashes
 
 _LOG = logging.getLogger("radarsdf.returns")
-_HASHED_PER_M, _LAST_BITS = 64.0, np.uint64(0xFFFFFF)  # resolution of hashes, and bits beyond it
 _COLUMNS = ("points", "directions", "ranges_m", "intensities", "scans")
 _PADDING = 8  # minimum number of repeated rows. Sensors with coarse cells repeat some
 
@@ -67,14 +65,11 @@ class Rays:
             return np.zeros(len(self), np.bool_)
         return ~np.isnan(self.intensities)
 
-    def hashes(self) -> Keys:
+    def hashes(self, num_threads: int = 0) -> Keys:
         """Return keys (N,) for samples that do not depend on the order of scans, nor on the origin."""
-        values = () if self.intensities is None else (self.intensities,)
-        measured = np.column_stack([self.directions, self.ranges_m])
-        # Of a tile, directions and ranges differ in their last bits, which only decide among returns that are equal otherwise.
-        coarse = np.floor(_HASHED_PER_M * measured).astype(np.int64).astype(np.int32)
-        first, second = hashes(*coarse.T, *values), hashes(*measured.T, *values)
-        return (first & ~_LAST_BITS) | (second & _LAST_BITS)
+        intensities = None if self.intensities is None else np.ascontiguousarray(self.intensities)
+        _, directions, ranges_m = self.in_c_order()
+        return hash_rays(directions, ranges_m, intensities, num_threads)
 
     def without_outliers(self) -> Rays:
         """Replace intensity outliers by NaN."""
