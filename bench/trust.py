@@ -188,7 +188,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    kinds = [*_SIMULATED, *KINDS]
+    # The stations of `facade` are 9 to 18 m apart, and the scans at their ends 0.1 s: no Doppler agrees with such a leap.
+    kinds = [*_SIMULATED, *(kind for kind in KINDS if kind != "facade")]
     parser.add_argument("--kinds", nargs="+", default=kinds, choices=kinds)
     parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=list(FAULTS))
     parser.add_argument("--uses", nargs="+", default=list(USES), choices=list(USES))
