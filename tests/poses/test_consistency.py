@@ -126,6 +126,19 @@ def test_motions_that_a_tunnel_does_not_exclude_widen_the_deviations(fault):
     assert worst < 4
 
 
+def test_a_delay_that_the_returns_do_not_exclude_widens_the_deviations():
+    """Regression: poses of a sensor that hardly observes its vertical motion were off by 10 standard deviations."""
+    flat = radarsdf.simulate.astyx(seed=4, frames=20)
+    motion = measured_motion(flat, seed=4)
+    means = CheckedScans.of(flat.points, motion.doppler_mps, motion.times_s).velocities.mean_mps
+    late = means[np.maximum(np.arange(20) - 3, 0)]
+    rays = [points / np.linalg.norm(points, axis=1, keepdims=True) for points in flat.points]
+    speeds = [mps + x @ off for mps, x, off in zip(motion.doppler_mps, rays, means - late, strict=True)]
+    found, worst = odometry(flat, speeds, motion.times_s)
+    assert found.report["doppler"]
+    assert worst < 4
+
+
 def test_doppler_of_other_scans_contradicts_given_poses(street, motion):
     velocities = CheckedScans.of(street.points, motion.doppler_mps, motion.times_s).velocities
     assert compare_with_poses(velocities, motion.times_s, street.poses)[0] is None

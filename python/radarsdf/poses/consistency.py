@@ -27,7 +27,7 @@ from radarsdf.poses.doppler import LEAST_M, NOT_USED, DopplerMotion, SensorVeloc
 from radarsdf.poses.drive import Drive, track_once
 from radarsdf.poses.planes import plane_cell_m
 from radarsdf.poses.rigid import rotation, steps
-from radarsdf.poses.tracking import Tracked, Tracker
+from radarsdf.poses.tracking import Tracker
 
 _PAIRS = 48  # maximum number of pairs of scans to compare
 _DELAYED = 24  # steps to compare with delayed ones
@@ -55,6 +55,7 @@ class Consistency:
     """Comparison of a drive's Doppler with its returns."""
 
     delay: int = 0  # of the Doppler, scans, where one explains the returns significantly better
+    possible_delays: tuple[int, ...] = ()  # not excluded
     contradicted: OtherMotion | None = None  # in a window
     clock: Clock | None = None
     doubts: tuple[OtherMotion, ...] | None = None  # not excluded. None: too few scans with motion
@@ -83,42 +84,48 @@ class Consistency:
         followed = usable & (np.diff([found.segment for found in tracked]) == 0)
         poses = np.stack([found.pose for found in tracked])
         motion = DopplerMotion.by(compared, times_s, poses)
-        own, shown, covariance = motion.steps[:, :3, 3], steps(poses)[:, :3, 3], _step_covariances(tracked)
+        own, shown, axes = motion.steps[:, :3, 3], steps(poses)[:, :3, 3], poses[:-1, :3, :3]
+        in_world = np.stack([found.covariance[:3, :3] for found in tracked[1:]])
+        covariance = np.einsum("fji,fjk,fkl->fil", axes, in_world, axes)  # of `shown`, m²
         along = np.where(followed, _relative_differences(shown, covariance, motion, free), np.nan)
         rows_of_pairs = np.flatnonzero(usable)  # also where tracking was lost: by wrong Doppler, it may be
         rows_of_pairs = rows_of_pairs[:: -(-len(rows_of_pairs) // _PAIRS)]
         pairs = _Pairs.of(scans, motion, along, rows_of_pairs, None if yaws is None else yaws[1])
-        delay = 0
+        delay, possible = 0, tuple[int, ...]()
         if every <= MOST_LATE:
             # The fastest steps: of slow ones, errors of the returns seem delays.
             lengths_m, count = np.linalg.norm(own, axis=1) * usable, min(_DELAYED, len(usable))
             begin = int(np.argmax(np.convolve(lengths_m, np.ones(count), "valid")))
             fastest = followed & (np.abs(np.arange(len(usable)) - begin - (count - 1) / 2) < count / 2)
-            delay = delay_of(velocities, runs_of(drive.times_s), rows, motion, shown, covariance, fastest)
+            before = free.step_covariances(motion.durations_s).diagonal(axis1=1, axis2=2)
+            seen = (1 - covariance.diagonal(axis1=1, axis2=2) / before).clip(0, 1)
+            runs = runs_of(drive.times_s)
+            delay, possible = delay_of(velocities, runs, rows, motion, shown, covariance, seen, fastest)
         shown = own * (1 + np.nan_to_num(along)[:, None])
         clock = Clock.of(times_s, shown, own, np.isfinite(along)) if every == 1 else None
         found, doubts = _judged(pairs, rows[np.append(rows_of_pairs, rows_of_pairs[-1] + 1)])
         known = found is not None or (~pairs.slow).sum() >= FEWEST_STEPS
-        return cls(delay, found, clock, doubts if known else None)
+        return cls(delay, possible, found, clock, doubts if known else None)
 
     def widened(self, poses: Floats, covariance: Floats, segments: Ints, drive: Drive) -> Floats:
         """Return covariances (F, 6, 6), relative to the middle scan of each segment, that include motions in doubt."""
         assert drive.velocities is not None
         covariance, scans, velocities = covariance.copy(), np.arange(len(poses)), drive.velocities.mean_mps
-        moving = np.linalg.norm(velocities, axis=1) >= _STILL_MPS
-        durations_s = np.diff(drive.times_s, prepend=drive.times_s[:1])[:, None]
+        moving = velocities[np.linalg.norm(velocities, axis=1) >= _STILL_MPS]
+        delays = np.array([0, *self.possible_delays])[:, None]  # equally likely
+        delayed = velocities[np.clip(scans + delays, 0, scans[-1])]
+        errors_mps = [*(delayed - velocities) / np.sqrt(len(delays))]
         for doubt in self.doubts or ():
-            inside = (scans > doubt.first) & (scans <= doubt.last)
-            if doubt.ratio is None:
-                speeds = np.median(velocities[moving], axis=0)
-            else:
-                speeds = (doubt.ratio - 1) * velocities
-            steps_m = inside[:, None] * durations_s * np.einsum("...ij,...j->...i", poses[:, :3, :3], speeds)
-            off_m = np.cumsum(steps_m, axis=0) / norm.ppf(1 - BY_CHANCE)
-            for segment in np.unique(segments):
-                rows = np.flatnonzero(segments == segment)
-                off = off_m[rows] - off_m[rows[len(rows) // 2]]
-                covariance[rows, :3, :3] += off[:, :, None] * off[:, None, :]
+            inside = ((scans > doubt.first) & (scans <= doubt.last))[:, None]
+            other = np.median(moving, axis=0) if doubt.ratio is None else (doubt.ratio - 1) * velocities
+            errors_mps.append(inside * other / norm.ppf(1 - BY_CHANCE))
+        durations_s = np.diff(drive.times_s, prepend=drive.times_s[:1])[:, None]
+        steps_m = durations_s * np.einsum("fij,dfj->dfi", poses[:, :3, :3], np.stack(errors_mps))
+        off_m = np.cumsum(steps_m, axis=1)
+        for segment in np.unique(segments):
+            rows = np.flatnonzero(segments == segment)
+            off = off_m[:, rows] - off_m[:, rows[len(rows) // 2], None]
+            covariance[rows, :3, :3] += np.einsum("dfi,dfj->fij", off, off)
         return covariance
 
     def applied(self, velocities: SensorVelocities) -> tuple[SensorVelocities | None, list[str]]:
@@ -151,13 +158,6 @@ def _relative_differences(
     seen = 1 - left / np.maximum(before, 1e-30)
     # Without the share of the prior.
     return np.where(seen > _LEAST_SEEN, along / np.maximum(seen, _LEAST_SEEN), np.nan)
-
-
-def _step_covariances(tracked: list[Tracked]) -> Floats:
-    """Return the covariances (F - 1, 3, 3) of translations between tracked scans, in the frame of the first, m²."""
-    axes = np.stack([found.pose[:3, :3] for found in tracked[:-1]])
-    of_steps = np.stack([found.covariance[:3, :3] for found in tracked[1:]])
-    return np.einsum("fji,fjk,fkl->fil", axes, of_steps, axes)
 
 
 @dataclass(frozen=True)

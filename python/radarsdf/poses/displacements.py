@@ -105,7 +105,7 @@ def compare_with_poses(
     if found is not None:
         return found.words("the poses"), clock
     covariance = np.tile(_unevenness_m2(shown) * np.eye(3), (len(shown), 1, 1))
-    delay = delay_of(velocities, runs_of(times_s), scans, motion, shown, covariance, known)
+    delay, _ = delay_of(velocities, runs_of(times_s), scans, motion, shown, covariance, np.ones(3), known)
     return (delayed_words("the poses", delay) if delay else None), clock
 
 
@@ -166,17 +166,19 @@ def delay_of(
     motion: DopplerMotion,
     shown: Floats,
     covariance: Floats,
+    seen: Floats,
     followed: Bools,
-) -> int:
+) -> tuple[int, tuple[int, ...]]:
     """Return the delay, scans, of the Doppler with which steps (K, 3) by another source agree best, if significantly; else 0.
 
-    `velocities` and `runs`: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of `shown`.
+    And those that are not excluded. `velocities` and `runs`: of all scans; `motion`: of scans `rows`; `covariance` (K, 3, 3): of
+    `shown`; `seen` (K, 3): the shares of its differences from `motion` that it shows, since it has a prior from this motion.
     """
     # The steps by delayed Doppler explain the residuals of those by its own (J test, Davidson and MacKinnon 1981).
     covariance = covariance + motion.velocities.step_covariances(motion.durations_s)
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     own = motion.steps[:, :3, 3]
-    found, last = [(np.inf, 0)], len(velocities.mean_mps) - 1
+    found, possible, last = [(np.inf, 0)], list[int](), len(velocities.mean_mps) - 1
     for delay in set(range(-MOST_LATE, MOST_LATE + 1)) - {0}:
         at = np.clip(rows + delay, 0, last)
         known = (at == rows + delay) & (runs[at] == runs[rows])
@@ -186,19 +188,22 @@ def delay_of(
         delayed = dataclasses.replace(motion.velocities, mean_mps=velocities.mean_mps[at])
         turned = dataclasses.replace(motion, velocities=delayed).turned(motion.steps[:, :3, :3])
         later = turned.steps[:, :3, 3]
-        scaled, left, change = (
-            np.einsum("fij,fj->fi", whitening, moves)[used] for moves in (own, shown - own, later - own)
-        )
+        moves = own, shown - own, later - own, seen * (later - own)
+        scaled, *others = (np.einsum("fij,fj->fi", whitening, each)[used] for each in moves)
         # Without the part that a wrong scale explains.
-        left, change = (
-            v - scaled * (v * scaled).sum() / max((scaled**2).sum(), 1e-12) for v in (left, change)
+        left, change, expected = (
+            v - scaled * (v * scaled).sum() / max((scaled**2).sum(), 1e-12) for v in others
         )
         share, error, remaining = _slope(change, left)
         needed = student.ppf(1 - BY_CHANCE / (2 * MOST_LATE), count - 1)
         # At a share of less than half, steps are nearer to their own Doppler: other errors of the displacements change with speed.
         if share > max(needed * error, 0.5) and (left**2).sum() > _SAME_RESIDUALS * (remaining**2).sum():
             found.append((float((remaining**2).sum()) / count, delay))
-    return min(found)[1]
+        share, error, _ = _slope(expected, left)
+        # Longer delays are compared in so few steps that most drives would not exclude them.
+        if share + needed * error >= 1 and 3 * count > 2 * followed.sum():
+            possible.append(delay)
+    return min(found)[1], tuple(possible)
 
 
 def _slope(x: Floats, y: Floats) -> tuple[float, float, Floats]:
